@@ -1,0 +1,155 @@
+"""Hidden extents: how far a shape reaches down where nobody looked, bounded by free space and by what holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from caryatid import frames
+from caryatid.config import CompletionConfig
+from caryatid.frames import Array
+from caryatid.graph import SceneObject
+from caryatid.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.surface import SupportSurface
+from caryatid.voxels import FREE, VoxelMap
+
+
+def complete(
+    objects: Sequence[SceneObject], surface: SupportSurface, voxels: VoxelMap, config: CompletionConfig
+) -> list[SceneObject]:
+    """Extend the unseen lower side of each object until it meets free space, another shape or the table.
+
+    Objects are taken from the lowest up, so that each finds what lies below it already completed.
+
+    Args:
+        objects: Objects without the support surface; `seen` says which sides points bear out.
+        surface: The table top.
+        voxels: What has been seen free.
+        config: Steps and tolerances.
+    """
+    done: dict[str, SceneObject] = {}
+    for candidate in sorted(objects, key=lambda o: (_lowest(o.shape), o.label)):
+        below = [o.shape for o in done.values()]
+        done[candidate.id] = _extended(candidate, below, surface, voxels, config)
+    return [done[o.id] for o in objects]
+
+
+def _extended(
+    candidate: SceneObject,
+    others: Sequence[Shape],
+    surface: SupportSurface,
+    voxels: VoxelMap,
+    config: CompletionConfig,
+) -> SceneObject:
+    shape = candidate.shape
+    if isinstance(shape, Sphere):
+        return candidate
+    axis, sign = _downward_side(shape)
+    down_world = sign * shape.T_world_object[:3, axis]
+    if candidate.seen[2 * axis + (sign > 0)] or -down_world[2] < np.cos(np.radians(config.max_tilt)):
+        return candidate
+    bottom = _face_grid(shape, axis, sign, config.spacing)
+    to_table = float(np.min(surface.height(bottom) / -(down_world @ surface.normal_world)))
+    if to_table <= 0.0:
+        return replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
+    length, reason = to_table, "reaches down to the table"
+    to_object = _gap_below(bottom, down_world, others, to_table, config)
+    if to_object < length:
+        length, reason = to_object, "reaches down to the object below"
+    to_free = _free_below(shape, bottom, axis, down_world, length, voxels, config)
+    if to_free < length:
+        length, reason = to_free, "ends where free space was seen below it"
+    if length < config.least:
+        return candidate
+    why = f"its lower side was not seen and {reason}, {1000 * length:.0f} mm further"
+    return replace(candidate, shape=_lengthened(shape, axis, sign, length), why=why)
+
+
+def _gap_below(
+    face: Array, down_world: Array, others: Sequence[Shape], limit: float, config: CompletionConfig
+) -> float:
+    """How far [m] a face can move before it meets another shape, by sphere tracing."""
+    length = 0.0
+    while others and length < limit:
+        moved = face + length * down_world
+        nearest = min(float(o.signed_distance(moved).min()) for o in others) + config.overlap
+        if nearest < config.least:
+            return max(length - config.overlap, 0.0)
+        length += nearest
+    return limit
+
+
+def _free_below(
+    shape: Box | Cylinder,
+    face: Array,
+    axis: int,
+    down_world: Array,
+    limit: float,
+    voxels: VoxelMap,
+    config: CompletionConfig,
+) -> float:
+    """How far [m] a face can move before its rim lies in space seen free."""
+    ring = _rim(shape, face, axis, config.inset)
+    length = 0.0
+    while limit - length > config.step:
+        free = voxels.state_at(ring + (length + config.step / 2.0) * down_world) == FREE
+        if float(free.mean()) > config.max_free:
+            return length
+        length += config.step
+    return limit
+
+
+def _downward_side(shape: Box | Cylinder) -> tuple[int, float]:
+    down = -shape.T_world_object[2, :3]
+    axis = 2 if isinstance(shape, Cylinder) else int(np.argmax(np.abs(down)))
+    return axis, 1.0 if down[axis] >= 0.0 else -1.0
+
+
+def _face_grid(shape: Box | Cylinder, axis: int, sign: float, spacing: float) -> Array:
+    """Points (N, 3) [m] all over one face, its rim included."""
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    half = shape.extents / 2.0
+    ticks = [
+        np.linspace(-half[k], half[k], max(3, 1 + int(np.ceil(2.0 * half[k] / spacing)))) for k in (u, v)
+    ]
+    grid_u, grid_v = (g.ravel() for g in np.meshgrid(*ticks, indexing="ij"))
+    local = np.zeros((len(grid_u), 3))
+    local[:, axis], local[:, u], local[:, v] = sign * half[axis], grid_u, grid_v
+    if isinstance(shape, Cylinder):
+        reach = np.hypot(grid_u, grid_v)
+        outside = reach > shape.radius
+        local[outside, :2] *= (shape.radius / reach[outside])[:, None]
+    return frames.transform(shape.T_world_object, local)
+
+
+def _rim(shape: Box | Cylinder, face: Array, axis: int, inset: float) -> Array:
+    """The outermost points of a face grid, drawn in by `inset` [m] so that they lie inside the shape's walls."""
+    local = frames.transform(frames.invert(shape.T_world_object), face)
+    across = [k for k in range(3) if k != axis]
+    half = shape.extents / 2.0
+    if isinstance(shape, Cylinder):
+        on_rim = np.hypot(local[:, 0], local[:, 1]) > 0.99 * shape.radius
+    else:
+        on_rim = (np.abs(local[:, across]) > 0.99 * half[across]).any(axis=1)
+    drawn = local[on_rim]
+    drawn[:, across] *= np.maximum(1.0 - inset / half[across], 0.0)
+    return frames.transform(shape.T_world_object, drawn)
+
+
+def _lengthened(shape: Box | Cylinder, axis: int, sign: float, length: float) -> Box | Cylinder:
+    extents = shape.extents
+    length = max(length, -0.8 * float(extents[axis]))
+    shift = np.zeros(3)
+    shift[axis] = sign * length / 2.0
+    T = frames.rigid(shape.T_world_object[:3, :3], frames.transform(shape.T_world_object, shift))
+    if isinstance(shape, Cylinder):
+        return Cylinder(T, shape.radius, shape.height + length)
+    grown = extents.copy()
+    grown[axis] += length
+    return Box(T, grown)
+
+
+def _lowest(shape: Shape) -> float:
+    return float(shape.T_world_object[2, 3] - shape.support(np.array([[0.0, 0.0, -1.0]]))[0])

@@ -1,0 +1,182 @@
+"""Locally convex parts of a sampled surface: surfels, the verdict on each edge between them, clustering."""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid import frames
+from caryatid.clouds import thin
+from caryatid.config import SegmentationConfig
+from caryatid.frames import Array
+from caryatid.perception_kernels import nearest_seeds
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Surfels:
+    """Patches of samples.
+
+    Attributes:
+        owner: Surfel of each sample (N,), −1 = none.
+        centres: Means of the samples (S, 3) [m].
+        normals: Unit means of the samples' normals (S, 3).
+        sizes: Samples of each surfel (S,).
+    """
+
+    owner: Index
+    centres: Array
+    normals: Array
+    sizes: Index
+
+
+def convex_parts(
+    points: Array, normals: Array, edges: Index, config: SegmentationConfig
+) -> NDArray[np.int32]:
+    """Cut a sampled surface where it is concave.
+
+    The samples are gathered into surfels that end at creases. Each boundary between two surfels attracts
+    where it is flat or convex and repels where it is concave or a step (locally convex connected patches;
+    Stein et al., 2014). Surfels are then merged, the most attractive boundary first, each boundary between
+    clusters weighing the mean over its length, so that one bad edge joins nothing.
+
+    Args:
+        points: Samples (N, 3) [m].
+        normals: Unit normals (N, 3), all on the sensor's side.
+        edges: Pairs of samples (E, 2) that are neighbours on one surface.
+        config: Sizes and angles.
+
+    Returns:
+        Part of each sample (N,), 1 … n in the order of their first samples, 0 = none.
+    """
+    if len(points) == 0:
+        return np.zeros(0, dtype=np.int32)
+    surfels = gather_surfels(points, normals, edges, config)
+    pairs, lengths = surfel_borders(surfels, edges)
+    attraction = border_attraction(surfels, pairs, config)
+    cluster = cluster_by_mean(len(surfels.sizes), pairs, attraction, lengths)
+    cluster = _absorb_small(cluster, surfels.sizes, pairs, lengths, config.min_size)
+    part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
+    kept = np.flatnonzero(np.bincount(part[part >= 0], minlength=len(cluster)) >= config.min_size)
+    part = np.where(np.isin(part, kept), part, -1)
+    return number_by_appearance(part)
+
+
+def gather_surfels(points: Array, normals: Array, edges: Index, config: SegmentationConfig) -> Surfels:
+    """Give each sample (N, 3) to the seed nearest along the surface, turns of the normal counting as distance."""
+    difference = points[edges[:, 0]] - points[edges[:, 1]]
+    turn = 1.0 - np.einsum("ij,ij->i", normals[edges[:, 0]], normals[edges[:, 1]])
+    costs = np.sqrt(np.einsum("ij,ij->i", difference, difference)) / config.surfel + config.crease * turn
+    seeds = thin(points, config.surfel)
+    owner = nearest_seeds(len(points), edges, costs, seeds)
+    count = len(seeds)
+    known = owner >= 0
+    sizes = np.bincount(owner[known], minlength=count)
+    centres = _sum_by(owner[known], points[known], count) / np.maximum(sizes, 1)[:, None]
+    return Surfels(owner, centres, frames.unit(_sum_by(owner[known], normals[known], count)), sizes)
+
+
+def surfel_borders(surfels: Surfels, edges: Index) -> tuple[Index, Array]:
+    """Pairs of surfels (B, 2) that touch, i < j, and the number of sample edges across each border (B,)."""
+    ends = surfels.owner[edges]
+    across = (ends[:, 0] != ends[:, 1]) & (ends >= 0).all(axis=1)
+    low, high = ends[across].min(axis=1), ends[across].max(axis=1)
+    keys, lengths = np.unique(low * len(surfels.sizes) + high, return_counts=True)
+    return np.stack(np.divmod(keys, len(surfels.sizes)), axis=-1), lengths.astype(np.float64)
+
+
+def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
+    """Attraction (B,) in −2 … 1 of surfels over each border: 1 flat or convex, 0 at the limit, below it concave."""
+    i, j = pairs.T
+    between = frames.unit(surfels.centres[j] - surfels.centres[i])
+    rise_j = np.einsum("ij,ij->i", surfels.normals[i], between)
+    rise_i = -np.einsum("ij,ij->i", surfels.normals[j], between)
+    bend = 1.0 - np.maximum(rise_i + rise_j, 0.0) / np.radians(config.concavity)
+    step = 1.0 - np.maximum(rise_i, rise_j) / np.sin(np.radians(config.step))
+    return np.clip(np.minimum(bend, step), -2.0, 1.0)
+
+
+def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array) -> Index:
+    """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
+
+    Args:
+        count: Number of nodes.
+        pairs: Borders (B, 2) between nodes.
+        attraction: Signed attraction of each border (B,).
+        lengths: Weight of each border in the mean (B,).
+
+    Returns:
+        Cluster of each node (count,): the number of one of its nodes.
+    """
+    borders: list[dict[int, tuple[float, float]]] = [{} for _ in range(count)]
+    heap: list[tuple[float, int, int, float]] = []
+    for (i, j), weight, length in zip(pairs.tolist(), attraction.tolist(), lengths.tolist(), strict=True):
+        borders[i][j] = borders[j][i] = (weight * length, length)
+        if weight > 0.0:
+            heap.append((-weight, i, j, length))
+    heapq.heapify(heap)
+    parent = list(range(count))
+    while heap:
+        _, i, j, length = heapq.heappop(heap)
+        if parent[i] != i or parent[j] != j or borders[i][j][1] != length:
+            continue
+        if len(borders[i]) < len(borders[j]):
+            i, j = j, i
+        parent[j] = i
+        del borders[i][j]
+        for k, (total, size) in borders[j].items():
+            if k == i:
+                continue
+            del borders[k][j]
+            known_total, known_size = borders[i].get(k, (0.0, 0.0))
+            total, size = known_total + total, known_size + size
+            borders[i][k] = borders[k][i] = (total, size)
+            if total > 0.0:
+                heapq.heappush(heap, (-total / size, min(i, k), max(i, k), size))
+        borders[j] = {}
+    return _roots(parent)
+
+
+def number_by_appearance(part: Index) -> NDArray[np.int32]:
+    """Number parts 1 … n in the order of their first samples; negative = 0."""
+    values, first, inverse = np.unique(part, return_index=True, return_inverse=True)
+    first = np.where(values < 0, -1, first)
+    rank = np.argsort(np.argsort(first)) + (0 if (values < 0).any() else 1)
+    return rank[inverse].astype(np.int32)
+
+
+def _absorb_small(cluster: Index, sizes: Index, pairs: Index, lengths: Array, min_size: int) -> Index:
+    """Give clusters that are too small for an object to the neighbour they share the longest border with."""
+    cluster = cluster.copy()
+    for _ in range(3):
+        total = np.bincount(cluster, weights=sizes, minlength=len(cluster))
+        i, j = cluster[pairs[:, 0]], cluster[pairs[:, 1]]
+        source, target = np.concatenate([i, j]), np.concatenate([j, i])
+        weight = np.concatenate([lengths, lengths])
+        loose = (source != target) & (total[source] < min_size) & (total[target] >= min_size)
+        if not loose.any():
+            break
+        keys, inverse = np.unique(source[loose] * len(cluster) + target[loose], return_inverse=True)
+        border = np.bincount(inverse, weights=weight[loose])
+        small, large = np.divmod(keys, len(cluster))
+        order = np.lexsort((large, border, small))
+        last = np.append(small[order][1:] != small[order][:-1], True)
+        merged = np.arange(len(cluster))
+        merged[small[order][last]] = large[order][last]
+        cluster = merged[cluster]
+    return cluster
+
+
+def _roots(parent: list[int]) -> Index:
+    roots = np.array(parent, dtype=np.intp)
+    while not np.array_equal(roots, roots[roots]):
+        roots = roots[roots]
+    return roots
+
+
+def _sum_by(owner: Index, vectors: Array, count: int) -> Array:
+    return np.stack([np.bincount(owner, vectors[:, axis], minlength=count) for axis in range(3)], axis=-1)

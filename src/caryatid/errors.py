@@ -1,0 +1,33 @@
+"""What can go wrong, said so that a user can mend it."""
+
+from __future__ import annotations
+
+from os import PathLike
+
+
+class CaryatidError(Exception):
+    """Any failure the command line reports in one line, without a traceback."""
+
+
+class InputError(CaryatidError):
+    """An input that cannot be used.
+
+    Args:
+        source: The file, field or argument at fault.
+        reason: What is wrong with it.
+        remedy: What the user can do about it.
+    """
+
+    def __init__(self, source: str | PathLike[str], reason: str, remedy: str = "") -> None:
+        self.source = str(source)
+        self.reason = reason
+        self.remedy = remedy
+        super().__init__(f"{self.source}: {reason}" + (f"; {remedy}" if remedy else ""))
+
+
+class PerceptionError(CaryatidError):
+    """A view in which nothing can be perceived: no readings, or no support surface."""
+
+
+class PlanningError(CaryatidError):
+    """No next view exists: none is reachable, or all have been visited."""

@@ -1,0 +1,233 @@
+"""Precision, recall and F1 of a support graph against a truth: method notes 5, eqs. 4 and 5 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import EvaluationConfig
+from caryatid.evaluation.overlaps import TrueObject, assign, mask_ious, volume_ious
+from caryatid.graph import SupportGraph
+from caryatid.shapes import Box, Cylinder, Sphere
+
+TABLE: Final = "table"
+"""Name of the support surface among the true vertices."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TrueScene:
+    """A support graph over solids: the truth, or any graph to compare with it.
+
+    Attributes:
+        vertices: Names, the table's too.
+        edges: Directed pairs (supporter, supported) of names.
+        objects: The solids of the vertices that are objects; a vertex without one is never found.
+        table: Name of the vertex that is the support surface, or None.
+        table_top: Height of its top [m], or None where it has none.
+    """
+
+    vertices: tuple[str, ...]
+    edges: frozenset[tuple[str, str]]
+    objects: tuple[TrueObject, ...]
+    table: str | None = None
+    table_top: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """How a graph compares with the truth.
+
+    A ratio whose denominator is 0 is 1 where there was nothing to find either, and 0 otherwise.
+
+    Attributes:
+        precision: Eq. 4, vertices and edges together [1].
+        recall: Eq. 5, vertices and edges together [1].
+        f1: Their harmonic mean [1].
+        vertex_precision: Vertices alone, the table included [1].
+        vertex_recall: Vertices alone [1].
+        edge_precision: Edges alone [1].
+        edge_recall: Edges alone [1].
+        mean_iou: Mean IoU of the matched objects, the table left out; 0 where none is matched [1].
+        matches: Extracted vertex to the true vertex it is.
+        ious: IoU of each matched object [1].
+    """
+
+    precision: float
+    recall: float
+    f1: float
+    vertex_precision: float
+    vertex_recall: float
+    edge_precision: float
+    edge_recall: float
+    mean_iou: float
+    matches: Mapping[str, str] = field(default_factory=dict)
+    ious: Mapping[str, float] = field(default_factory=dict)
+
+
+def score(
+    graph: SupportGraph, truth: TrueScene, rng: np.random.Generator, config: EvaluationConfig | None = None
+) -> Score:
+    """Score a graph of fitted shapes against true solids.
+
+    Every edge of the graph counts, the uncertain ones too: a guess that is wrong costs precision. An edge is
+    true when both its ends are matched and the directed pair is in the truth, whatever its kind.
+
+    Args:
+        graph: The extracted graph, in the world frame of the truth.
+        truth: The true scene.
+        rng: Draws the points volumes are measured with.
+        config: Least IoU, tolerance of the table's height, points a pair.
+    """
+    return score_scenes(as_scene(graph), truth, rng, config)
+
+
+def score_scenes(
+    found: TrueScene, truth: TrueScene, rng: np.random.Generator, config: EvaluationConfig | None = None
+) -> Score:
+    """Score one scene of solids against another; a scene against itself scores 1.
+
+    Args:
+        found: What was extracted.
+        truth: The true scene.
+        rng: Draws the points volumes are measured with.
+        config: Least IoU, tolerance of the table's height, points a pair.
+    """
+    config = config or EvaluationConfig()
+    iou = volume_ious(found.objects, truth.objects, config.samples, rng)
+    pairs = assign(iou, config.min_iou)
+    ious = {found.objects[i].name: float(iou[i, j]) for i, j in pairs}
+    matches = {found.objects[i].name: truth.objects[j].name for i, j in pairs}
+    if (
+        found.table is not None
+        and truth.table is not None
+        and found.table_top is not None
+        and truth.table_top is not None
+        and abs(found.table_top - truth.table_top) <= config.table_tolerance
+    ):
+        matches[found.table] = truth.table
+    return score_matches(found.vertices, found.edges, truth.vertices, truth.edges, matches, ious)
+
+
+def score_masks(
+    graph: SupportGraph,
+    labels: Sequence[NDArray[np.int32]],
+    true_labels: Sequence[NDArray[np.int32]],
+    vertices: Sequence[str],
+    edges: frozenset[tuple[str, str]],
+    config: EvaluationConfig | None = None,
+) -> Score:
+    """Score a graph by pixels, for real frames, where there are no true shapes.
+
+    An object is a true one when its pixels and a true mask are paired one-to-one at the least IoU; the table
+    when graph and truth both have one. Over several frames the pixels of all are pooled.
+
+    Args:
+        graph: The extracted graph.
+        labels: Label images (H, W), k = the object with label k, one for each frame.
+        true_labels: The true ones, k = the vertex `object<k>`, of the same sizes.
+        vertices: True vertices, the table's name among them where there is one.
+        edges: True directed pairs of names.
+        config: Least IoU.
+
+    Raises:
+        InputError: Images differ in number or size.
+    """
+    config = config or EvaluationConfig()
+    objects = [o for o in graph.objects if o.role == "object"]
+    names = [name for name in vertices if name != TABLE]
+    numbers = [_object_number(name) for name in names]
+    iou = mask_ious(labels, true_labels, [o.label for o in objects], numbers)
+    pairs = assign(iou, config.min_iou)
+    ious = {objects[i].id: float(iou[i, j]) for i, j in pairs}
+    matches = {objects[i].id: names[j] for i, j in pairs}
+    surface = graph.support_surface
+    if surface is not None and TABLE in vertices:
+        matches[surface.id] = TABLE
+    found_vertices = tuple(o.id for o in graph.objects)
+    found_edges = frozenset(s.pair for s in graph.supports)
+    return score_matches(found_vertices, found_edges, tuple(vertices), edges, matches, ious)
+
+
+def score_matches(
+    found_vertices: Sequence[str],
+    found_edges: frozenset[tuple[str, str]],
+    vertices: Sequence[str],
+    edges: frozenset[tuple[str, str]],
+    matches: Mapping[str, str],
+    ious: Mapping[str, float],
+) -> Score:
+    """Eqs. 4 and 5 once it is known which extracted vertex is which true one.
+
+    Args:
+        found_vertices: Extracted vertices.
+        found_edges: Extracted directed pairs.
+        vertices: True vertices.
+        edges: True directed pairs.
+        matches: Extracted vertex to true vertex, one-to-one.
+        ious: IoU of each matched object [1].
+    """
+    true_vertices = len(matches)
+    true_edges = sum((matches.get(a), matches.get(b)) in edges for a, b in found_edges)
+    true_both = true_vertices + true_edges
+    precision = _ratio(true_both, len(found_vertices) + len(found_edges), len(vertices) + len(edges))
+    recall = _ratio(true_both, len(vertices) + len(edges), len(found_vertices) + len(found_edges))
+    return Score(
+        precision=precision,
+        recall=recall,
+        f1=2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0,
+        vertex_precision=_ratio(true_vertices, len(found_vertices), len(vertices)),
+        vertex_recall=_ratio(true_vertices, len(vertices), len(found_vertices)),
+        edge_precision=_ratio(true_edges, len(found_edges), len(edges)),
+        edge_recall=_ratio(true_edges, len(edges), len(found_edges)),
+        mean_iou=float(np.mean(list(ious.values()))) if ious else 0.0,
+        matches=dict(matches),
+        ious=dict(ious),
+    )
+
+
+def as_scene(graph: SupportGraph) -> TrueScene:
+    """Take a graph of fitted shapes as a scene of solids, vertices named by their ids."""
+    surface = graph.support_surface
+    return TrueScene(
+        vertices=tuple(o.id for o in graph.objects),
+        edges=frozenset(s.pair for s in graph.supports),
+        objects=tuple(_solid(o.id, o.shape) for o in graph.objects if o.role == "object"),
+        table=None if surface is None else surface.id,
+        table_top=None if surface is None else top_height(surface.shape),
+    )
+
+
+def top_height(shape: Box | Cylinder | Sphere) -> float:
+    """Height [m] of the middle of a shape's top; of a box, of its most level upper face."""
+    T_world_object = shape.T_world_object
+    if isinstance(shape, Box):
+        rise = np.abs(T_world_object[2, :3])
+        up = int(np.argmax(rise))
+        return float(T_world_object[2, 3] + rise[up] * shape.extents[up] / 2.0)
+    return float(T_world_object[2, 3] + shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
+
+
+def _solid(name: str, shape: Box | Cylinder | Sphere) -> TrueObject:
+    reach = shape.support(np.eye(3))
+    centre = shape.T_world_object[:3, 3]
+    return TrueObject(
+        name,
+        lambda points_world: shape.signed_distance(points_world) <= 0.0,
+        np.stack([centre - reach, centre + reach]),
+    )
+
+
+def _ratio(true: int, claimed: int, other: int) -> float:
+    if claimed == 0:
+        return 1.0 if other == 0 else 0.0
+    return true / claimed
+
+
+def _object_number(name: str) -> int:
+    """Label of a vertex `object<obj_id>`; 0, which is no object, for any other name."""
+    digits = name.removeprefix("object")
+    return int(digits) if name.startswith("object") and digits.isascii() and digits.isdigit() else 0

@@ -1,0 +1,159 @@
+"""Rigid transforms as 4×4 arrays, named `T_target_source`: `p_target = T_target_source @ p_source`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from caryatid.errors import InputError
+
+Array = NDArray[np.float64]
+
+RIGID_TOLERANCE = 1e-4
+"""How far RᵀR may be from the identity (per entry, no unit) before a matrix is refused as a rotation."""
+
+
+def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
+    """Check that `T` is a rigid transform and return it as float64.
+
+    Args:
+        T: 4×4 homogeneous matrix, translation in metres.
+        name: What to call it in the error.
+
+    Raises:
+        InputError: The matrix has another shape, holds NaN, is no proper rotation or has a wrong last row.
+    """
+    matrix = np.asarray(T, dtype=np.float64)
+    if matrix.shape != (4, 4):
+        raise InputError(name, f"shape {matrix.shape} is not (4, 4)", "give a homogeneous rigid transform")
+    if not np.isfinite(matrix).all():
+        raise InputError(name, "holds NaN or infinity", "give a finite rigid transform")
+    if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE):
+        raise InputError(name, "the last row is not 0 0 0 1", "give a homogeneous rigid transform")
+    R = matrix[:3, :3]
+    if not np.allclose(R.T @ R, np.eye(3), atol=RIGID_TOLERANCE) or np.linalg.det(R) < 0.0:
+        raise InputError(
+            name,
+            "its 3×3 part is no rotation (not orthonormal, or mirrored)",
+            "check units and row order; p_world = T_world_camera @ p_camera",
+        )
+    return matrix
+
+
+def rigid(R: ArrayLike, t: ArrayLike) -> Array:
+    """Put a 3×3 rotation and a translation (3,) [m] together into a 4×4 transform."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def invert(T_a_b: Array) -> Array:
+    """Return `T_b_a` of a rigid `T_a_b`; leading axes (..., 4, 4) are kept."""
+    R_b_a = np.swapaxes(T_a_b[..., :3, :3], -1, -2)
+    T_b_a = np.zeros_like(T_a_b)
+    T_b_a[..., :3, :3] = R_b_a
+    T_b_a[..., :3, 3] = -np.einsum("...ij,...j->...i", R_b_a, T_a_b[..., :3, 3])
+    T_b_a[..., 3, 3] = 1.0
+    return T_b_a
+
+
+def transform(T_a_b: Array, points_b: Array) -> Array:
+    """Move points (..., 3) [m] from frame b to frame a."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def rotate(T_a_b: Array, vectors_b: Array) -> Array:
+    """Turn vectors (..., 3) from frame b into frame a, without the translation."""
+    return vectors_b @ T_a_b[:3, :3].T
+
+
+def unit(vectors: ArrayLike) -> Array:
+    """Scale vectors (..., 3) to length 1; zero vectors stay zero."""
+    array = np.asarray(vectors, dtype=np.float64)
+    length = np.linalg.norm(array, axis=-1, keepdims=True)
+    return array / np.where(length > 0.0, length, 1.0)
+
+
+def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
+    """Angle between vectors (..., 3) [rad], exact for small and for opposite directions."""
+    u, v = unit(a), unit(b)
+    return 2.0 * np.arctan2(np.linalg.norm(u - v, axis=-1), np.linalg.norm(u + v, axis=-1))
+
+
+def perpendicular(axis: ArrayLike) -> Array:
+    """Return unit vectors (..., 3) perpendicular to `axis` (..., 3)."""
+    a = unit(axis)
+    helper = np.eye(3)[np.argmin(np.abs(a), axis=-1)]
+    return unit(np.cross(a, helper))
+
+
+def rotation_from_vector(rotation_vector: ArrayLike) -> Array:
+    """Rodrigues' formula: rotation vector (3,) [rad] to a 3×3 rotation."""
+    w = np.asarray(rotation_vector, dtype=np.float64)
+    angle = float(np.linalg.norm(w))
+    if angle < 1e-12:
+        return np.eye(3) + skew(w)
+    k = skew(w / angle)
+    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+
+
+def skew(w: Array) -> Array:
+    """Cross-product matrix of `w` (3,)."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+def random_rotation(rng: np.random.Generator) -> Array:
+    """Draw a 3×3 rotation uniformly over SO(3)."""
+    q = unit(rng.normal(size=4))
+    w, x, y, z = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def look_at(eye_world: ArrayLike, target_world: ArrayLike, up_world: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
+    """Pose `T_world_camera` of an OpenCV camera (x right, y down, z forward) at `eye` that looks at `target`.
+
+    Straight up or down, where `up` gives no roll, the image's top points along world +x (or +y).
+
+    Args:
+        eye_world: Camera centre (3,) [m].
+        target_world: Point on the optical axis (3,) [m].
+        up_world: Direction (3,) that is up in the image.
+
+    Raises:
+        InputError: Eye and target are the same point.
+    """
+    eye = np.asarray(eye_world, dtype=np.float64)
+    forward = np.asarray(target_world, dtype=np.float64) - eye
+    if np.linalg.norm(forward) < 1e-9:
+        raise InputError("look_at", "eye and target are the same point", "give two different points")
+    z = unit(forward)
+    x = np.cross(z, np.asarray(up_world, dtype=np.float64))
+    if np.linalg.norm(x) < 1e-6:
+        x = np.cross(z, perpendicular(z) if abs(z[0]) > 0.9 else (1.0, 0.0, 0.0))
+    x = unit(x)
+    return rigid(np.stack([x, np.cross(z, x), z], axis=1), eye)
+
+
+def level_world(normal: ArrayLike, point: ArrayLike) -> Array:
+    """`T_world_camera` for a frame without a pose, from the support plane seen by the camera.
+
+    World z is the plane's normal, the world's origin is the plane's point below the camera, and world x
+    is the camera's viewing direction laid into the plane.
+
+    Args:
+        normal: Unit normal (3,) of the plane in the camera frame, pointing up.
+        point: Any point (3,) [m] of the plane in the camera frame.
+    """
+    up = unit(normal)
+    forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
+    x = unit(forward) if np.linalg.norm(forward) > 1e-6 else perpendicular(up)
+    R_world_camera = np.stack([x, np.cross(up, x), up])
+    height = -float(np.dot(up, np.asarray(point, dtype=np.float64)))
+    return rigid(R_world_camera, (0.0, 0.0, height))

@@ -1,0 +1,175 @@
+"""Fusing support graphs over views: matching objects and counting evidence (section III-B, Table I)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from caryatid.config import FusionConfig
+from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
+from caryatid.merging import axes_rotation, merge
+from caryatid.shapes import Cylinder, Shape, Sphere
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Evidence:
+    """What the graphs of all views so far have said.
+
+    Attributes:
+        sightings: Per fused object id, its vertex in each view's graph that has it: view → vertex.
+        supports: Per (supporter, supported), the edge in each view's graph that has it: view → edge.
+        views: How many views have been fused.
+    """
+
+    sightings: Mapping[str, Mapping[int, SceneObject]] = field(default_factory=dict)
+    supports: Mapping[Pair, Mapping[int, Support]] = field(default_factory=dict)
+    views: int = 0
+
+
+def fuse(
+    evidence: Evidence, graph: SupportGraph, config: FusionConfig, *, same_labels: bool
+) -> tuple[Evidence, dict[str, str]]:
+    """Add one view's support graph to the evidence.
+
+    Args:
+        evidence: All views before.
+        graph: G_s^{t+1}: of this view alone (`sg`), or of the registered cloud so far (`pc`, `pc+sg`).
+        config: Tolerances of the match.
+        same_labels: A label means the same object in every view, so that shapes need not be compared.
+
+    Returns:
+        The evidence with this view, and the fused id of each of the graph's objects.
+    """
+    known = {i: _vertex(list(seen.values()), config) for i, seen in evidence.sightings.items()}
+    names = match(list(known.values()), list(graph.objects), config, same_labels=same_labels)
+    taken = {*known, *names.values()}
+    for o in graph.objects:
+        if o.id not in names:
+            names[o.id] = _fresh_id(o, taken)
+            taken.add(names[o.id])
+    sightings = {i: dict(seen) for i, seen in evidence.sightings.items()}
+    for o in graph.objects:
+        new_id = names[o.id]
+        label = o.label if new_id == o.id else int(new_id[1:])
+        sightings.setdefault(new_id, {})[evidence.views] = replace(o, id=new_id, label=label)
+    supports = {pair: dict(seen) for pair, seen in evidence.supports.items()}
+    for s in graph.supports:
+        renamed = replace(s, supporter=names[s.supporter], supported=names[s.supported])
+        supports.setdefault(renamed.pair, {})[evidence.views] = renamed
+    return Evidence(sightings, supports, evidence.views + 1), names
+
+
+def fused_graph(
+    evidence: Evidence, config: FusionConfig, contradicted: Mapping[str, int] | None = None
+) -> SupportGraph:
+    """Read the fused graph off the evidence.
+
+    With `pc` it is the newest graph, with its counts; with `sg` all that most of the views that could tell
+    agree on; with `pc+sg` the newest graph's edges, and those of earlier ones that were mostly found.
+
+    Args:
+        evidence: All views.
+        config: Method and the share an edge must keep.
+        contradicted: Per object id, in how many views something behind it was seen instead.
+    """
+    contradicted = contradicted or {}
+    newest = evidence.views - 1
+    objects: dict[str, SceneObject] = {}
+    for i, seen in evidence.sightings.items():
+        if config.method == "pc" and newest not in seen:
+            continue
+        opportunities = len(seen) + contradicted.get(i, 0)
+        if len(seen) >= config.keep_share * opportunities:
+            vertex = _vertex([seen[v] for v in sorted(seen)], config)
+            objects[i] = replace(vertex, occurrences=len(seen), opportunities=opportunities)
+    supports = []
+    for pair, found in evidence.supports.items():
+        if pair[0] not in objects or pair[1] not in objects:
+            continue
+        both = evidence.sightings[pair[0]].keys() & evidence.sightings[pair[1]].keys()
+        is_newest = newest in found
+        mostly = len(found) >= config.keep_share * len(both)
+        kept = {
+            "pc": is_newest,
+            "sg": mostly,
+            "pc+sg": is_newest or len(found) > config.keep_share * len(both),
+        }
+        if kept[config.method]:
+            last = found[max(found)]
+            certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
+            supports.append(replace(last, certain=certain, occurrences=len(found), opportunities=len(both)))
+    ordered = sorted(objects.values(), key=lambda o: (o.role != "support_surface", o.label))
+    rank = {o.id: k for k, o in enumerate(ordered)}
+    supports.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))
+    return SupportGraph(tuple(ordered), tuple(supports))
+
+
+def match(
+    known: list[SceneObject], seen: list[SceneObject], config: FusionConfig, *, same_labels: bool
+) -> dict[str, str]:
+    """Match objects one to one: by label, or by shape, position, orientation and extent.
+
+    Args:
+        known: The fused objects.
+        seen: The objects of a new graph.
+        config: Tolerances.
+        same_labels: A label means the same object in both; nothing else is compared then.
+
+    Returns:
+        Id of a new object → id of the known one it is.
+    """
+    if not known or not seen:
+        return {}
+    if same_labels:
+        by_label = {(k.role, k.label): k.id for k in known}
+        return {s.id: by_label[s.role, s.label] for s in seen if (s.role, s.label) in by_label}
+    cost = np.array([[_difference(k, s, config) for s in seen] for k in known])
+    rows, columns = linear_sum_assignment(np.where(np.isfinite(cost), cost, 1e6))
+    return {seen[c].id: known[r].id for r, c in zip(rows, columns, strict=True) if np.isfinite(cost[r, c])}
+
+
+def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> float:
+    """How different two sightings are: 0 the same, up to 4 within the tolerances, infinite beyond."""
+    if known.role != seen.role:
+        return np.inf
+    if known.role == "support_surface":
+        return 0.0
+    a, b = known.shape, seen.shape
+    reach = max(config.max_distance, float(min(a.extents.min(), b.extents.min())) / 2.0)
+    distance = float(np.linalg.norm(known.centre_world - seen.centre_world)) / reach
+    ratio = _extent_ratio(a, b)
+    kind_differs = a.kind != b.kind
+    angle = 0.0 if kind_differs or _is_round(a) else np.degrees(axes_rotation(b, a)[1]) / config.max_angle
+    size = np.log(ratio) / np.log(config.max_ratio)
+    total = distance + size + angle + float(kind_differs)
+    return total if max(distance, size, angle) <= 1.0 else np.inf
+
+
+def _extent_ratio(a: Shape, b: Shape) -> float:
+    x, y = np.sort(a.extents), np.sort(b.extents)
+    return float(np.max(np.maximum(x / y, y / x)))
+
+
+def _is_round(shape: Shape) -> bool:
+    """Orientation says nothing of a sphere, nor of a cylinder about as high as wide."""
+    if isinstance(shape, Cylinder):
+        return abs(shape.height - 2.0 * shape.radius) < 0.2 * shape.height
+    return isinstance(shape, Sphere)
+
+
+def _vertex(sightings: list[SceneObject], config: FusionConfig) -> SceneObject:
+    return merge(sightings) if config.method == "sg" else sightings[-1]
+
+
+def _fresh_id(o: SceneObject, taken: set[str]) -> str:
+    if o.role == "support_surface":
+        return SUPPORT_SURFACE_ID
+    label = o.label
+    while object_id(label) in taken:
+        label += 1
+    return object_id(label)

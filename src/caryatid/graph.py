@@ -1,0 +1,178 @@
+"""The support graph: objects with their shapes, and who supports whom, certain and uncertain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import networkx as nx
+
+from caryatid import frames
+from caryatid.frames import Array
+from caryatid.shapes import Box, Cylinder, Sphere
+
+Role = Literal["object", "support_surface"]
+Kind = Literal["bottom-up", "lean", "top-down"]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneObject:
+    """A vertex of the support graph.
+
+    Attributes:
+        id: Its name, `o` + label; `o0` is the support surface.
+        label: Its number in label images.
+        shape: The fitted primitive, in the world frame. The support surface is a thin box.
+        role: `object` or `support_surface`.
+        occurrences: In how many views it was extracted.
+        opportunities: In how many views it could have been.
+        residual: Mean absolute distance of its points to the shape [m].
+        poor_fit: None of the three shapes explains its points within the configured error.
+        seen: Extents (along the object's axes, both sides of each: -x, +x, -y, +y, -z, +z) that points bear out.
+        why: How the shape came about, for a person to read.
+    """
+
+    id: str
+    label: int
+    shape: Box | Cylinder | Sphere
+    role: Role = "object"
+    occurrences: int = 1
+    opportunities: int = 1
+    residual: float = 0.0
+    poor_fit: bool = False
+    seen: tuple[bool, bool, bool, bool, bool, bool] = (True,) * 6
+    why: str = ""
+
+    @property
+    def centre_world(self) -> Array:
+        """Centre (3,) [m] of the shape."""
+        return self.shape.T_world_object[:3, 3]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Support:
+    """A directed edge: `supporter` holds up `supported`.
+
+    Attributes:
+        supporter: Id of the object that supports.
+        supported: Id of the object that is supported.
+        kind: `bottom-up` from below, `lean` from the side, `top-down` by weight from above.
+        certain: False where it was added because an object looked unstable or leans.
+        occurrences: How many times it was extracted and matched: #occ(e) of eq. 2.
+        opportunities: How many times both its ends were extracted, so that it could have been.
+        contact_world: Centre (3,) [m] of the contact patch, or None.
+        normal_world: Normal (3,) of the separating plane, from supporter to supported, or None.
+        why: Which test put it there, with figures.
+    """
+
+    supporter: str
+    supported: str
+    kind: Kind = "bottom-up"
+    certain: bool = True
+    occurrences: int = 1
+    opportunities: int = 1
+    contact_world: Array | None = None
+    normal_world: Array | None = None
+    why: str = ""
+
+    @property
+    def pair(self) -> tuple[str, str]:
+        """(supporter, supported)."""
+        return self.supporter, self.supported
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SupportGraph:
+    """G_s = (V, E) of the paper, section III-A, in the order of the objects' labels.
+
+    Attributes:
+        objects: The vertices, the support surface first.
+        supports: The edges.
+        stability: Per object id the support area ratio r_s of eq. 1 and the verdict of both tests.
+    """
+
+    objects: tuple[SceneObject, ...] = ()
+    supports: tuple[Support, ...] = ()
+    stability: dict[str, Stability] = field(default_factory=dict)
+
+    def __getitem__(self, object_id: str) -> SceneObject:
+        for candidate in self.objects:
+            if candidate.id == object_id:
+                return candidate
+        raise KeyError(f"no object '{object_id}'; there are {', '.join(o.id for o in self.objects)}")
+
+    @property
+    def support_surface(self) -> SceneObject | None:
+        """The table, or None where none has been found."""
+        return next((o for o in self.objects if o.role == "support_surface"), None)
+
+    def support(self, supporter: str, supported: str) -> Support | None:
+        """Return the edge between two ids, or None."""
+        return next((s for s in self.supports if s.pair == (supporter, supported)), None)
+
+    def supporters(self, object_id: str) -> list[Support]:
+        """Edges that end at `object_id`."""
+        return [s for s in self.supports if s.supported == object_id]
+
+    def moved(self, T: Array) -> SupportGraph:
+        """Return the graph moved by a rigid transform of the world (4, 4)."""
+        objects = tuple(replace(o, shape=o.shape.moved(T)) for o in self.objects)
+        supports = tuple(
+            replace(
+                s,
+                contact_world=None if s.contact_world is None else frames.transform(T, s.contact_world),
+                normal_world=None if s.normal_world is None else frames.rotate(T, s.normal_world),
+            )
+            for s in self.supports
+        )
+        return SupportGraph(objects, supports, self.stability)
+
+    def to_networkx(self) -> nx.DiGraph:
+        """Return a DiGraph, supporter → supported; nodes and edges carry `data`, the frozen objects here."""
+        graph = nx.DiGraph()
+        for o in self.objects:
+            graph.add_node(o.id, data=o, role=o.role, shape=o.shape.kind)
+        for s in self.supports:
+            graph.add_edge(s.supporter, s.supported, data=s, kind=s.kind, certain=s.certain)
+        return graph
+
+
+@dataclass(frozen=True, slots=True)
+class Stability:
+    """What the support polygon of an object says.
+
+    Attributes:
+        ratio: Support area ratio r_s in [0, 1], eq. 1.
+        overhang: How far [m] the centre of mass projects outside the support polygon; negative inside.
+        small_area: r_s < r_s,min fired.
+        tips: The centre-of-mass test fired.
+    """
+
+    ratio: float
+    overhang: float
+    small_area: bool
+    tips: bool
+
+    @property
+    def stable(self) -> bool:
+        """Neither test fired."""
+        return not (self.small_area or self.tips)
+
+
+def object_id(label: int) -> str:
+    """Id of the object with this label."""
+    return f"o{label}"
+
+
+SUPPORT_SURFACE_ID = "o0"
+
+__all__ = [
+    "SUPPORT_SURFACE_ID",
+    "Kind",
+    "Role",
+    "SceneObject",
+    "Stability",
+    "Support",
+    "SupportGraph",
+    "object_id",
+]

@@ -1,0 +1,173 @@
+"""From one view or cloud to labelled, oriented points in the world frame, and the support surface among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid import frames
+from caryatid.clouds import oriented_points
+from caryatid.config import Config, SegmentationMethod
+from caryatid.errors import InputError, PerceptionError
+from caryatid.frames import Array
+from caryatid.segmentation import segment, segment_cloud
+from caryatid.surface import SupportSurface, find_support_surface
+from caryatid.views import SUPPORT_LABEL, Cloud, View
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Percept:
+    """What one view shows.
+
+    Attributes:
+        view: The view, posed; None where the source was a cloud.
+        cloud: Oriented points in the world frame with labels: 0 nothing, 65535 the support surface.
+        pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
+        surface: The support surface as this view shows it.
+    """
+
+    view: View | None
+    cloud: Cloud
+    pixels: NDArray[np.intp]
+    surface: SupportSurface
+
+    @property
+    def labels(self) -> NDArray[np.int32]:
+        """Label (N,) of each point."""
+        if self.cloud.labels is None:
+            raise ValueError("a percept's cloud is labelled")
+        return self.cloud.labels
+
+    def relabelled(self, names: dict[int, int]) -> Percept:
+        """Return the percept with some labels changed: old → new."""
+        labels = self.labels.copy()
+        for old, new in names.items():
+            labels[self.labels == old] = new
+        return replace(self, cloud=replace(self.cloud, labels=labels))
+
+    def moved(self, T: Array) -> Percept:
+        """Return the percept moved by a rigid transform of the world."""
+        cloud = replace(
+            self.cloud,
+            points_world=frames.transform(T, self.cloud.points_world),
+            normals_world=frames.rotate(T, self.cloud.normals_world),
+        )
+        view = None if self.view is None else self.view.with_pose(T @ self.view.pose)
+        return replace(self, view=view, cloud=cloud, surface=self.surface.moved(T))
+
+
+def perceive(
+    source: View | Cloud,
+    config: Config,
+    *,
+    segmentation: SegmentationMethod | None,
+    known: SupportSurface | None,
+    rng: np.random.Generator,
+) -> Percept:
+    """Find the support surface and the parts on it.
+
+    Args:
+        source: A view (only the first one may lack a pose: the table then gives it one) or a cloud, z up.
+        config: All stages' settings.
+        segmentation: `labels` demands labels, `auto` ignores them, None takes them where they are given.
+        known: The support surface as known before, or None.
+        rng: Source of the samples.
+
+    Raises:
+        InputError: Labels are demanded and missing, or a later view has no pose.
+        PerceptionError: There are no readings, or no support surface.
+    """
+    if segmentation == "labels" and source.labels is None:
+        raise InputError(source.name, "has no labels", "give masks, or segment with --segmentation auto")
+    use_labels = source.labels is not None and segmentation != "auto"
+    if isinstance(source, View) and source.T_world_camera is None:
+        if known is not None:
+            raise InputError(source.name, "has no camera pose", "only a single view may come without one")
+        source = _levelled(source, config, use_labels, rng)
+    cloud, pixels = _points(source, config)
+    given = source.labels.ravel()[pixels] if use_labels and source.labels is not None else None
+    surface = _surface(cloud, given, known, config, rng)
+    if given is not None:
+        labels = given
+    elif isinstance(source, View):
+        labels = segment(source, surface, config.segmentation, config.cloud).ravel()[pixels]
+    else:
+        labels = segment_cloud(cloud, surface, config.segmentation)
+    labels = labels.astype(np.int32)
+    on_surface = (
+        (labels == 0)
+        & (np.abs(surface.height(cloud.points_world)) < config.surface.tolerance)
+        & (surface.distance_outside(cloud.points_world) < config.surface.tolerance)
+    )
+    labels[on_surface] = SUPPORT_LABEL
+    view = source if isinstance(source, View) else None
+    return Percept(view, replace(cloud, labels=labels), pixels, surface)
+
+
+def label_image(percept: Percept, source: View | Cloud) -> NDArray[np.int32]:
+    """Labels of all pixels (H, W) of a view, or of all points (N,) of a cloud."""
+    labels = percept.labels
+    shape = source.depth.shape if isinstance(source, View) else (len(source),)
+    image = np.zeros(shape, dtype=np.int32)
+    image.ravel()[percept.pixels] = labels
+    return image
+
+
+def _points(source: View | Cloud, config: Config) -> tuple[Cloud, NDArray[np.intp]]:
+    if isinstance(source, Cloud):
+        if len(source) == 0:
+            raise PerceptionError(f"{source.name}: holds no points")
+        return source, np.arange(len(source), dtype=np.intp)
+    points, normals, pixels = oriented_points(source, config.cloud)
+    if len(points) == 0:
+        limits = f"{config.cloud.min_depth:g}–{config.cloud.max_depth:g} m"
+        raise PerceptionError(f"{source.name}: holds no depth readings within {limits}")
+    rgb = None if source.rgb is None else source.rgb.reshape(-1, 3)[pixels]
+    eye = None if source.T_world_camera is None else source.T_world_camera[:3, 3]
+    return Cloud(points, normals, None, rgb, eye, source.name), pixels
+
+
+def _levelled(view: View, config: Config, use_labels: bool, rng: np.random.Generator) -> View:
+    """Give a view without a pose the world frame of its support plane."""
+    cloud, pixels = _points(view, config)
+    given = view.labels.ravel()[pixels] if use_labels and view.labels is not None else None
+    loose = _loose(cloud, given, config)
+    surface = _found(cloud, loose, None, config, rng)
+    return view.with_pose(frames.level_world(surface.normal_world, surface.point_world))
+
+
+def _surface(
+    cloud: Cloud,
+    given: NDArray[np.int32] | None,
+    known: SupportSurface | None,
+    config: Config,
+    rng: np.random.Generator,
+) -> SupportSurface:
+    loose = _loose(cloud, given, config)
+    if known is None:
+        return _found(cloud, loose, UP, config, rng)
+    near = loose[np.abs(known.height(cloud.points_world[loose])) < config.surface.search]
+    try:
+        return _found(cloud, near, UP, config, rng)
+    except PerceptionError:
+        return known
+
+
+def _loose(cloud: Cloud, given: NDArray[np.int32] | None, config: Config) -> NDArray[np.intp]:
+    """Indices of at most `max_points` points that belong to no given object."""
+    loose = np.arange(len(cloud)) if given is None else np.flatnonzero(given == 0)
+    return loose[:: max(1, len(loose) // config.surface.max_points)]
+
+
+def _found(
+    cloud: Cloud, loose: NDArray[np.intp], up: Array | None, config: Config, rng: np.random.Generator
+) -> SupportSurface:
+    points, normals = cloud.points_world[loose], cloud.normals_world[loose]
+    try:
+        return find_support_surface(points, normals, up, config.surface, rng)
+    except PerceptionError as error:
+        raise PerceptionError(f"{cloud.name}: {error}") from None

@@ -1,0 +1,142 @@
+"""The default planner: look where most of what is hidden would come into sight.
+
+It keeps the frame of Algorithm 2, c = s − h with inhibition of return over the reachable part of the view
+sphere, and asks of each candidate what it would show that no earlier view has: the surface of the fitted
+objects, the unseen space on the table in which a supporter may stand, and the points of Algorithm 1. A
+point counts when its line of sight is free of what was seen occupied and of the fitted shapes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from caryatid import frames
+from caryatid.frames import Array
+from caryatid.interest import PointOfInterest, inhibition_of_return, painted, points_of_interest
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+from caryatid.planners.hidden import (
+    SPACE,
+    Samples,
+    join,
+    relation_samples,
+    space_samples,
+    surface_samples,
+    visibility,
+    weighted,
+)
+from caryatid.shapes import fibonacci_sphere
+
+WORTH_SAYING = 0.05
+"""Shares of the whole below this are not mentioned."""
+
+
+class SupportPlanner:
+    """Takes the candidate that promises to show most of what is hidden, at little cost."""
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the candidate with the largest c = s − w·h, eq. 3; of equal ones the first.
+
+        s is the worth of what a candidate shows anew, in shares of the best candidate's, with the
+        inhibition of return.
+        """
+        check_candidates(state)
+        config, sphere, candidates = state.config, state.sphere, state.candidates
+        relations = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
+        samples, gain, chosen = _expected_gain(state, relations)
+
+        total = gain.sum(axis=0)
+        saliency = total / max(float(total.max(initial=0.0)), 1e-9)
+        saliency = saliency + inhibition_of_return(state.visited, candidates.directions[chosen], config)
+        cost = path_cost(state)
+        score = saliency - config.travel_weight * cost[chosen]
+        best = int(np.argmax(score))
+        index = int(chosen[best])
+
+        points = (*relations, *_hidden_points(state, samples, gain))
+        nearest = KDTree(candidates.directions[chosen]).query(candidates.directions)[1]
+        candidate_saliency = saliency[nearest]
+        sphere_saliency = painted(points, sphere.directions, float(np.deg2rad(config.spread))).max(
+            axis=1, initial=0.0
+        ) + inhibition_of_return(state.visited, sphere.directions, config)
+        if candidates.indices is not None:
+            sphere_saliency[candidates.indices] = candidate_saliency
+        return Decision(
+            candidates.T_world_camera[index],
+            index,
+            float(saliency[best]),
+            float(cost[index]),
+            float(score[best]),
+            _why(samples, gain[:, best]),
+            points,
+            candidate_saliency,
+            sphere_saliency,
+        )
+
+
+def _expected_gain(
+    state: PlanningState, relations: list[PointOfInterest]
+) -> tuple[Samples, Array, np.ndarray[tuple[int], np.dtype[np.intp]]]:
+    """Samples, what each of some candidates shows of them anew (K, C), and which candidates those are (C,)."""
+    config, sphere, candidates = state.config, state.sphere, state.candidates
+    solid = state.voxels.with_shapes([o.shape for o in state.graph.objects])
+    samples = join(
+        [
+            surface_samples(state.graph, solid, config),
+            weighted(space_samples(state.graph, solid, config), config.space_weight),
+            weighted(relation_samples(relations), config.relation_weight),
+        ]
+    )
+    chosen = _thin(candidates.directions, config.look_directions)
+    now = visibility(samples, candidates.T_world_camera[chosen], solid, config)
+    before = visibility(samples, sphere.poses(state.visited), solid, config).max(axis=1, initial=0.0)
+    unseen_space = np.array([name == SPACE for name in samples.names])
+    if len(samples.names):
+        before[unseen_space[samples.subjects]] = 0.0
+    gain = samples.weights[:, None] * np.maximum(now - before[:, None], 0.0)
+    return samples, gain, chosen
+
+
+def _thin(directions: Array, count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+    """Pick the candidates nearest to `count` directions spread over the whole sphere, as many as lie near one."""
+    if len(directions) <= count // 8:
+        return np.arange(len(directions))
+    distance, nearest = KDTree(directions).query(fibonacci_sphere(count))
+    near = distance < np.sqrt(4.0 * np.pi / count)
+    return np.unique(nearest[near]) if near.any() else np.unique(nearest)
+
+
+def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[PointOfInterest]:
+    """One point of interest per object and for the unseen space: the middle of what is left to be seen of it.
+
+    Its saliency is how much of that there is, in shares of the subject with most of it.
+    """
+    left = gain.max(axis=1, initial=0.0)
+    worth = np.bincount(samples.subjects, weights=left, minlength=len(samples.names))
+    points = []
+    for i, name in enumerate(samples.names):
+        share = left * (samples.subjects == i)
+        if worth[i] <= WORTH_SAYING * worth.max() or np.count_nonzero(share) < 2:
+            continue
+        middle = np.average(samples.points_world, axis=0, weights=share)
+        outward = share @ samples.normals_world
+        if np.linalg.norm(outward) < 1e-9:
+            outward = middle - state.sphere.centre_world
+        subject = () if name == SPACE else (name,)
+        why = f"{name} on the table" if name == SPACE else f"part of {name} has not been seen"
+        saliency = float(worth[i] / worth.max())
+        points.append(PointOfInterest(middle, frames.unit(outward), saliency, subject, why))
+    return points
+
+
+def _why(samples: Samples, gain: Array) -> str:
+    """One sentence: which objects a view shows more of."""
+    total = float(gain.sum())
+    if total <= 0.0:
+        return "nothing hidden is expected to come into sight; the cheapest new view"
+    worth: dict[str, float] = {}
+    for i, name in enumerate(samples.names):
+        worth[name] = worth.get(name, 0.0) + float(gain[samples.subjects == i].sum())
+    ranked = sorted(worth.items(), key=lambda item: -item[1])[:3]
+    parts = [f"{name} ({share / total:.0%})" for name, share in ranked if share > WORTH_SAYING * total]
+    return "shows most of what is still hidden: " + ", ".join(parts)

@@ -1,0 +1,135 @@
+"""Least squares on the geometric residual: the signed distance of points to a shape's surface."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caryatid import frames
+from caryatid.frames import Array
+from caryatid.shapes import Box, Cylinder, Sphere
+
+ROBUST_WIDTH = 2.5
+"""Residuals beyond this many robust standard deviations lose most of their weight (Geman–McClure)."""
+NOISE_FLOOR = 0.0005
+"""Least standard deviation the weights assume [m]: keeps exact points from being outliers of one another."""
+
+
+def linearise(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Array, Array]:
+    """Signed distances (N,) [m] of points (N, 3) and their derivatives (N, 6 + sizes).
+
+    The columns are a translation [m] and a rotation [rad] of the shape in its own frame, then its sizes [m]:
+    three extents of a box, radius and height of a cylinder, the radius of a sphere.
+    """
+    T = shape.T_world_object
+    p = (points_world - T[:3, 3]) @ T[:3, :3]
+    if isinstance(shape, Sphere):
+        length = np.linalg.norm(p, axis=1)
+        gradient = p / np.maximum(length, 1e-12)[:, None]
+        return length - shape.radius, _jacobian(p, gradient, -np.ones((len(p), 1)))
+    if isinstance(shape, Cylinder):
+        ring = np.hypot(p[:, 0], p[:, 1])
+        q = np.stack([ring - shape.radius, np.abs(p[:, 2]) - shape.height / 2.0], axis=1)
+        distance, share = _corner_distance(q)
+        outward = p[:, :2] / np.maximum(ring, 1e-12)[:, None]
+        gradient = np.concatenate([share[:, :1] * outward, share[:, 1:] * np.sign(p[:, 2:])], axis=1)
+        return distance, _jacobian(p, gradient, -share * (1.0, 0.5))
+    distance, share = _corner_distance(np.abs(p) - shape.extents / 2.0)
+    return distance, _jacobian(p, share * np.sign(p), -0.5 * share)
+
+
+def stepped(shape: Box | Cylinder | Sphere, step: Array, min_extent: float) -> Box | Cylinder | Sphere:
+    """Return the shape changed by a step (6 + sizes,) in the columns of `linearise`, no extent below `min_extent`."""
+    T = shape.T_world_object @ frames.rigid(frames.rotation_from_vector(step[3:6]), step[:3])
+    if isinstance(shape, Sphere):
+        return Sphere(T, max(shape.radius + float(step[6]), min_extent / 2.0))
+    if isinstance(shape, Cylinder):
+        radius = max(shape.radius + float(step[6]), min_extent / 2.0)
+        return Cylinder(T, radius, max(shape.height + float(step[7]), min_extent))
+    return Box(T, np.maximum(shape.extents + step[6:9], min_extent))
+
+
+def refine(
+    shape: Box | Cylinder | Sphere,
+    points_world: Array,
+    *,
+    steps: int,
+    min_extent: float,
+    shrink: float,
+) -> Box | Cylinder | Sphere:
+    """Minimise robust squared signed distances by Levenberg–Marquardt with Geman–McClure weights.
+
+    Args:
+        shape: Where to start.
+        points_world: (N, 3) [m].
+        steps: Steps at the most.
+        min_extent: Least extent [m].
+        shrink: Gradient [m] that pulls every extent inwards, so that sides nobody saw stay small. A face that
+            holds a share s of the points is moved by shrink / (2·s) only.
+    """
+    damping = 1e-3
+    best = shape
+    distance, J = linearise(best, points_world)
+    for _ in range(steps):
+        scale = ROBUST_WIDTH * max(1.4826 * float(np.median(np.abs(distance))), NOISE_FLOOR)
+        weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2 / len(distance)
+        gradient = J.T @ (weight * distance)
+        pull = np.zeros(J.shape[1])
+        pull[6:] = shrink / 2.0
+        H = J.T @ (weight[:, None] * J)
+        cost = _cost(distance, scale) + shrink * _sizes(best)
+        for _ in range(6):
+            ridge = damping * (
+                np.diag(H) + 1e-3 * np.concatenate([np.full(3, 1.0), np.full(len(H) - 3, 1e-2)])
+            )
+            step = -np.linalg.solve(H + np.diag(ridge), gradient + pull)
+            trial = stepped(best, _limited(step), min_extent)
+            trial_distance, trial_J = linearise(trial, points_world)
+            trial_cost = _cost(trial_distance, scale) + shrink * _sizes(trial)
+            if trial_cost < cost:
+                break
+            damping *= 6.0
+        else:
+            return best
+        best, distance, J = trial, trial_distance, trial_J
+        damping = max(damping / 10.0, 1e-7)
+        if cost - trial_cost < 1e-4 * cost:
+            break
+    return best
+
+
+def _jacobian(p: Array, gradient: Array, sizes: Array) -> Array:
+    return np.concatenate([-gradient, -np.cross(p, gradient), sizes], axis=1)
+
+
+def _corner_distance(q: Array) -> tuple[Array, Array]:
+    """Distance (N,) for the signed gaps q (N, k) to each pair of faces, and each gap's share (N, k) in it."""
+    outside = np.maximum(q, 0.0)
+    length = np.linalg.norm(outside, axis=1)
+    nearest = np.argmax(q, axis=1)
+    rows = np.arange(len(q))
+    share = np.zeros_like(q)
+    share[rows, nearest] = 1.0
+    far = length > 1e-9
+    share[far] = outside[far] / length[far, None]
+    return np.where(far, length, q[rows, nearest]), share
+
+
+def _cost(distance: Array, scale: float) -> float:
+    squared = (distance / scale) ** 2
+    return float(np.mean(squared / (1.0 + squared))) * scale**2
+
+
+def _sizes(shape: Box | Cylinder | Sphere) -> float:
+    if isinstance(shape, Sphere):
+        return shape.radius
+    if isinstance(shape, Cylinder):
+        return shape.radius + shape.height
+    return float(np.sum(shape.extents))
+
+
+def _limited(step: Array) -> Array:
+    """Shorten a step to 3 cm and 0.3 rad, over which the linearisation means something."""
+    longest = max(
+        float(np.abs(np.delete(step, [3, 4, 5])).max()) / 0.03, float(np.abs(step[3:6]).max()) / 0.3, 1.0
+    )
+    return step / longest

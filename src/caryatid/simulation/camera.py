@@ -1,0 +1,201 @@
+"""A depth camera in simulation: depth, normals, colour and labels by casting one ray a pixel, without GL."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid import frames
+from caryatid.config import NoiseConfig, NoiseModel, SensorConfig
+from caryatid.errors import InputError
+from caryatid.frames import Array
+from caryatid.simulation.noise import add_depth_noise, misregister
+from caryatid.simulation.world import INVISIBLE_GROUP, SimulatedScene
+from caryatid.views import View, check_intrinsics
+
+GEOM_GROUPS = 6
+"""Groups MuJoCo sorts geoms into."""
+
+UNSET_COLOUR = 0.5
+"""Red, green and blue of a geom that is given no colour: its material's counts then."""
+
+BACKGROUND = (0.55, 0.62, 0.70)
+"""Colour where a ray meets nothing."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Rendering:
+    """What the rays of a perfect camera meet.
+
+    Attributes:
+        depth: Along the optical axis (H, W) [m], 0 = nothing.
+        normals_world: Unit normals (H, W, 3) that face the camera, zero where there is nothing.
+        incidence: Angle (H, W) [rad] between ray and normal; π/2 where there is nothing.
+        labels: Label of the object (H, W), 0 = anything else.
+        rgb: Colour (H, W, 3) uint8.
+    """
+
+    depth: Array
+    normals_world: Array
+    incidence: Array
+    labels: NDArray[np.int32]
+    rgb: NDArray[np.uint8]
+
+
+class SimulatedCamera:
+    """A depth camera that can be anywhere in a simulated scene.
+
+    Captures are numbered; each draws its noise from its own stream made of the seed and its number, so a run
+    is reproduced from the seed whatever else draws random numbers meanwhile.
+
+    Args:
+        scene: What it looks at.
+        noise: `none`, or `carmine` for sensor noise and registration error.
+        noise_config: Figures of the noise.
+        rng: Where the seed of all captures is drawn from.
+        sensor: Image size, focal length and light.
+        K: Pinhole matrix (3, 3) [px] in place of the sensor's centred one.
+
+    Raises:
+        InputError: The noise model is not one of the two, or K is not valid.
+    """
+
+    def __init__(
+        self,
+        scene: SimulatedScene,
+        noise: NoiseModel = "none",
+        noise_config: NoiseConfig | None = None,
+        rng: np.random.Generator | None = None,
+        sensor: SensorConfig | None = None,
+        K: Array | None = None,
+    ) -> None:
+        if noise not in ("none", "carmine"):
+            raise InputError("noise", f"'{noise}' is no noise model", "choose none or carmine")
+        self.scene = scene
+        self.noise = noise
+        self.noise_config = noise_config or NoiseConfig()
+        self.sensor = sensor or SensorConfig()
+        self.K = check_intrinsics(intrinsics(self.sensor) if K is None else K, "simulated camera")
+        self._seed = int((rng or np.random.default_rng(0)).integers(2**63))
+        self._captures = 0
+
+    def capture(self, T_world_camera: Array) -> View:
+        """Take one view from a pose.
+
+        Args:
+            T_world_camera: Where the camera truly is (4, 4), OpenCV camera frame.
+
+        Returns:
+            The view. With noise its depth is noisy, it has no normals, and the pose it carries is the one
+            registration believes in; labels stay as seen also where depth is missing.
+
+        Raises:
+            InputError: The pose is no rigid transform.
+        """
+        T = frames.as_rigid(T_world_camera, "T_world_camera")
+        image = render(self.scene, T, self.K, self.sensor)
+        rng = np.random.default_rng([self._seed, self._captures])
+        name = f"{self.scene.name} view {self._captures}"
+        self._captures += 1
+        if self.noise == "none":
+            depth, T_reported = image.depth, T
+            normals = (image.normals_world @ T[:3, :3]).astype(np.float32)
+        else:
+            depth = add_depth_noise(image.depth, image.incidence, self.noise_config, rng)
+            T_reported, normals = misregister(T, self.noise_config, rng), None
+        return View(depth.astype(np.float32), self.K, T_reported, image.rgb, image.labels, normals, name)
+
+
+def intrinsics(sensor: SensorConfig) -> Array:
+    """Pinhole matrix (3, 3) [px] with the principal point in the middle of the image."""
+    return np.array(
+        [
+            [sensor.focal, 0.0, (sensor.width - 1) / 2.0],
+            [0.0, sensor.focal, (sensor.height - 1) / 2.0],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: SensorConfig) -> Rendering:
+    """Cast one ray through the middle of each pixel.
+
+    Args:
+        scene: What is there; geoms of group 3 are not seen.
+        T_world_camera: Camera pose (4, 4).
+        K: Pinhole matrix (3, 3) [px].
+        sensor: Image size, range and light.
+    """
+    shape = (sensor.height, sensor.width)
+    rays_world, lengths = pixel_rays(K, T_world_camera[:3, :3], sensor.width, sensor.height)
+    geoms = np.empty(lengths.size, dtype=np.int32)
+    depth = np.empty(lengths.size)
+    normals_world = np.empty((lengths.size, 3))
+    visible = np.ones(GEOM_GROUPS, dtype=np.uint8)
+    visible[INVISIBLE_GROUP] = 0
+    mujoco.mj_multiRay(
+        scene.model,
+        scene.data,
+        T_world_camera[:3, 3],
+        rays_world.ravel(),
+        visible,
+        1,
+        -1,
+        geoms,
+        depth,
+        normals_world.reshape(-1),
+        lengths.size,
+        sensor.far * float(lengths.max()),
+    )
+    missed = (geoms < 0) | (depth > sensor.far)
+    geoms[missed], depth[missed], normals_world[missed] = -1, 0.0, 0.0
+    cosine = -np.einsum("ij,ij->i", normals_world, rays_world) / lengths
+    normals_world[cosine < 0.0] *= -1.0
+    labels = np.append(scene.geom_labels, np.int32(0))[geoms]
+    return Rendering(
+        depth.reshape(shape),
+        normals_world.reshape(*shape, 3),
+        np.arccos(np.minimum(np.abs(cosine), 1.0)).reshape(shape),
+        labels.reshape(shape),
+        _shade(scene, geoms, normals_world, sensor).reshape(*shape, 3),
+    )
+
+
+def pixel_rays(K: Array, R_world_camera: Array, width: int, height: int) -> tuple[Array, Array]:
+    """Rays through the pixels, row by row.
+
+    Each ray is one metre long along the optical axis, so that distances counted in rays are depths.
+
+    Args:
+        K: Pinhole matrix (3, 3) [px].
+        R_world_camera: Rotation (3, 3) of the camera.
+        width: Image width [px].
+        height: Image height [px].
+
+    Returns:
+        Rays (H·W, 3) in the world frame and their lengths (H·W,) [m].
+    """
+    u = ((np.arange(width) - K[0, 2]) / K[0, 0])[None, :, None]
+    v = ((np.arange(height) - K[1, 2]) / K[1, 1])[:, None, None]
+    x, y, z = R_world_camera.T
+    rays_world = u * x + (v * y + z)
+    return rays_world.reshape(-1, 3), np.sqrt(u**2 + v**2 + 1.0).reshape(-1)
+
+
+def _shade(
+    scene: SimulatedScene, geoms: NDArray[np.int32], normals_world: Array, sensor: SensorConfig
+) -> NDArray[np.uint8]:
+    """Lambert's law with one lamp and ambient light: colours (N, 3)."""
+    model = scene.model
+    colours = model.geom_rgba[:, :3].astype(np.float32)
+    plain = (model.geom_matid >= 0) & (colours == UNSET_COLOUR).all(axis=1)
+    colours[plain] = model.mat_rgba[model.geom_matid[plain], :3]
+    colours = np.concatenate([colours, np.float32([BACKGROUND])])
+    lit = np.einsum("ij,j->i", normals_world, frames.unit(sensor.light))
+    brightness = sensor.ambient + (1.0 - sensor.ambient) * np.maximum(lit, 0.0)
+    brightness[geoms < 0] = 1.0
+    shaded = colours[geoms] * (255.0 * brightness.astype(np.float32))[:, None] + np.float32(0.5)
+    return np.minimum(shaded, 255.0).astype(np.uint8)

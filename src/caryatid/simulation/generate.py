@@ -1,0 +1,245 @@
+"""Random scenes by size and seed: piles set down one by one, and dense heaps between screens and walls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caryatid import frames
+from caryatid.config import GenerationConfig, PhysicsConfig
+from caryatid.errors import InputError
+from caryatid.frames import Array
+from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.simulation.mjcf import TABLE_HEIGHT, TABLE_SIZE, Side, Solid, build_spec
+from caryatid.simulation.solids import bounds, true_shapes
+from caryatid.simulation.world import SimulatedScene, scene_from_spec
+
+PILE_SIZES = (1, 25)
+"""Fewest and most objects of a pile."""
+
+DENSE_SIZES = (10, 25)
+"""Fewest and most objects of a dense scene, the screens among them."""
+
+_DENSE_TABLE = (0.7, 1.0)
+_SCREEN_DENSITY = 1200.0
+_SIDES: tuple[Side, ...] = ("+x", "+y", "-y")
+_DOWN = np.array([[0.0, 0.0, -1.0]])
+_AXES = np.eye(3)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Drop:
+    """A solid where it is let go; `stacked` if it is meant to stay on another one."""
+
+    solid: Solid
+    stacked: bool = False
+
+
+_Draw = Callable[[np.random.Generator, SimulatedScene | None], _Drop]
+
+
+def generate_pile(
+    size: int, seed: int, config: GenerationConfig | None = None, physics: PhysicsConfig | None = None
+) -> SimulatedScene:
+    """Set primitives down one by one, most of them on what is there already.
+
+    Args:
+        size: Number of objects.
+        seed: Seed; the same size and seed give the same scene.
+        config: Sizes and habits.
+        physics: When an object is at rest.
+
+    Raises:
+        InputError: The size or the seed is out of range, or an object would not stay where it is put.
+    """
+    name = f"pile-{size}-{seed}"
+    _check(name, size, seed, PILE_SIZES)
+    habits = config or GenerationConfig()
+
+    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
+        shape = _upright(rng, habits)
+        if scene is None or rng.random() >= habits.stacked:
+            half = np.array(TABLE_SIZE) / 2.0 - habits.margin
+            return _Drop(_let_go(shape, rng.uniform(-half, half), scene, habits))
+        below = true_shapes(scene)[int(rng.integers(1, len(scene.object_bodies) + 1))]
+        reach = below.support(_AXES)[:2]
+        xy = below.T_world_object[:2, 3] + habits.jitter * reach * rng.uniform(-1.0, 1.0, size=2)
+        return _Drop(_let_go(shape, xy, scene, habits), stacked=True)
+
+    rng = np.random.default_rng([0, size, seed])
+    return _set_down(name, [], [draw] * size, rng, _Place(TABLE_SIZE, ()), habits, physics)
+
+
+def generate_dense(
+    size: int, seed: int, config: GenerationConfig | None = None, physics: PhysicsConfig | None = None
+) -> SimulatedScene:
+    """Heap primitives between tall free screens, with walls that close part of the circle for a robot.
+
+    Args:
+        size: Number of objects, the screens among them.
+        seed: Seed; the same size and seed give the same scene.
+        config: Sizes and habits.
+        physics: When an object is at rest.
+
+    Raises:
+        InputError: The size or the seed is out of range, or an object would not stay where it is put.
+    """
+    name = f"dense-{size}-{seed}"
+    _check(name, size, seed, DENSE_SIZES)
+    habits = config or GenerationConfig()
+    rng = np.random.default_rng([1, size, seed])
+    screens = _screens(rng, habits)
+    count = int(rng.integers(habits.walls[0], habits.walls[1] + 1))
+    walls = tuple(_SIDES[i] for i in sorted(rng.choice(len(_SIDES), size=count, replace=False)))
+
+    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
+        shape = _tilted(rng, habits) if rng.random() < habits.heap_tilted else _upright(rng, habits)
+        solid = _let_go(shape, _in_disc(rng, habits.heap_radius), scene, habits)
+        for _ in range(habits.tries):
+            if not _over(solid.shape, [screen.shape for screen in screens]):
+                break
+            solid = _let_go(shape, _in_disc(rng, habits.heap_radius), scene, habits)
+        return _Drop(solid)
+
+    place = _Place(_DENSE_TABLE, walls)
+    return _set_down(name, screens, [draw] * (size - len(screens)), rng, place, habits, physics)
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """What stays put: the table's size [m] and where walls stand."""
+
+    table: tuple[float, float]
+    walls: tuple[Side, ...]
+
+
+def _set_down(
+    name: str,
+    solids: list[Solid],
+    draws: Sequence[_Draw],
+    rng: np.random.Generator,
+    place: _Place,
+    habits: GenerationConfig,
+    physics: PhysicsConfig | None,
+) -> SimulatedScene:
+    """Let solids go one after the other, each when all are at rest; what goes wrong is tried again."""
+
+    def settled(solids: list[Solid]) -> SimulatedScene:
+        spec = build_spec(solids, name, place.table, place.walls)
+        return scene_from_spec(spec, name, name, physics, least=habits.settling)
+
+    scene = settled(solids) if solids else None
+    for draw in draws:
+        for attempt in range(habits.tries):
+            drop = draw(rng, scene)
+            solids_tried = [*solids, drop.solid]
+            tried = settled(solids_tried)
+            insist = drop.stacked and attempt < habits.tries // 2
+            if _stands(tried, solids, place, habits) and (not insist or _is_raised(tried, habits)):
+                break
+        else:
+            raise InputError(name, f"object{len(solids)} would not stay on the table", "choose another seed")
+        shapes = true_shapes(tried)
+        solids = [replace(solid, shape=shapes[i]) for i, solid in enumerate(solids_tried, start=1)]
+        scene = tried
+    spec = build_spec(solids, name, place.table, place.walls)
+    return scene_from_spec(spec, name, name, physics)
+
+
+def _stands(scene: SimulatedScene, before: list[Solid], place: _Place, habits: GenerationConfig) -> bool:
+    """All objects are at rest on or over the table, and the earlier ones about where they were."""
+    shapes = true_shapes(scene)
+    half = np.array(place.table) / 2.0 - habits.brink
+    for label, shape in shapes.items():
+        if bounds(scene, label)[0][2] < TABLE_HEIGHT - habits.gap:
+            return False
+        if (np.abs(shape.T_world_object[:2, 3]) > half).any():
+            return False
+    shifts = [
+        np.linalg.norm(shapes[label].T_world_object[:3, 3] - solid.shape.T_world_object[:3, 3])
+        for label, solid in enumerate(before, start=1)
+    ]
+    return scene.at_rest and max(shifts, default=0.0) <= habits.upset
+
+
+def _is_raised(scene: SimulatedScene, habits: GenerationConfig) -> bool:
+    """The last object does not reach the table."""
+    return bool(bounds(scene, len(scene.object_bodies))[0][2] > TABLE_HEIGHT + habits.gap)
+
+
+def _let_go(
+    shape: Box | Cylinder | Sphere, xy: Array, scene: SimulatedScene | None, habits: GenerationConfig
+) -> Solid:
+    """Put a shape a little over whatever the boxes around objects say is below it."""
+    over = shape.moved(frames.rigid(np.eye(3), (*xy, 0.0)))
+    tops = [TABLE_HEIGHT]
+    if scene is not None:
+        shapes = true_shapes(scene)
+        tops += [float(bounds(scene, label)[1][2]) for label in shapes if _over(over, [shapes[label]])]
+    z = max(tops) + float(shape.support(_DOWN)[0]) + habits.gap
+    return Solid(over.moved(frames.rigid(np.eye(3), (0.0, 0.0, z))))
+
+
+def _over(shape: Box | Cylinder | Sphere, others: Sequence[Box | Cylinder | Sphere]) -> bool:
+    """Whether the level boxes around two shapes overlap seen from above."""
+    return any(
+        (
+            np.abs(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3])
+            < (shape.support(_AXES) + other.support(_AXES))[:2]
+        ).all()
+        for other in others
+    )
+
+
+def _upright(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
+    """Draw a shape at the origin with one axis vertical: a box on any face, a cylinder on an end or lying."""
+    yaw = frames.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    R = yaw @ _ON_ITS_SIDE if rng.random() < habits.lying else yaw
+    return _shape(rng, R, habits)
+
+
+def _tilted(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
+    return _shape(rng, frames.random_rotation(rng), habits)
+
+
+def _shape(rng: np.random.Generator, R: Array, habits: GenerationConfig) -> Box | Cylinder | Sphere:
+    T = frames.rigid(R, np.zeros(3))
+    kind = rng.choice(3, p=habits.mixture)
+    radius = float(rng.uniform(*habits.radius))
+    if kind == 0:
+        return Box(T, rng.uniform(*habits.box_edge, size=3))
+    if kind == 1:
+        return Cylinder(T, radius, float(rng.uniform(*habits.height)))
+    return Sphere(T, radius)
+
+
+def _screens(rng: np.random.Generator, habits: GenerationConfig) -> list[Solid]:
+    """Tall thin boxes all around the middle, their broad sides to it."""
+    count = int(rng.integers(habits.screens[0], habits.screens[1] + 1))
+    step = 2.0 * np.pi / count
+    azimuths = rng.uniform(-np.pi, np.pi) + step * (np.arange(count) + rng.uniform(-0.2, 0.2, size=count))
+    screens = []
+    for azimuth in azimuths:
+        distance = rng.uniform(*habits.screen_distance)
+        width, height = rng.uniform(*habits.screen_width), rng.uniform(*habits.screen_height)
+        at = (distance * np.cos(azimuth), distance * np.sin(azimuth), TABLE_HEIGHT + height / 2.0)
+        T = frames.rigid(frames.rotation_from_vector((0.0, 0.0, azimuth)), at)
+        screens.append(Solid(Box(T, np.array([habits.screen_thickness, width, height])), _SCREEN_DENSITY))
+    return screens
+
+
+def _in_disc(rng: np.random.Generator, radius: float) -> Array:
+    r, azimuth = radius * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
+    return np.array([r * np.cos(azimuth), r * np.sin(azimuth)])
+
+
+def _check(name: str, size: int, seed: int, sizes: tuple[int, int]) -> None:
+    if not sizes[0] <= size <= sizes[1]:
+        raise InputError(name, f"{size} objects cannot be set up", f"ask for {sizes[0]} to {sizes[1]}")
+    if seed < 0:
+        raise InputError(name, f"seed {seed} is negative", "give 0 or more")
+
+
+_ON_ITS_SIDE = frames.rotation_from_vector((np.pi / 2.0, 0.0, 0.0))

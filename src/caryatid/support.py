@@ -1,0 +1,285 @@
+"""Support relations from shapes: separating planes, leaning, weight from above, and why (section III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from shapely.geometry.base import BaseGeometry
+
+from caryatid import frames
+from caryatid.config import SupportConfig
+from caryatid.contacts import Contact, find_contacts
+from caryatid.errors import InputError
+from caryatid.frames import Array, rigid
+from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.stability import (
+    Tipping,
+    assess,
+    contact_patch,
+    drop_distance,
+    find_tipping,
+    support_polygon,
+)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Touch:
+    """A contact as one of its two objects feels it.
+
+    Attributes:
+        other: The object that touches it.
+        normal_world: Unit normal (3,) of the separating plane, pointing away from `other`.
+        gap: [m], negative where they overlap.
+        tilt: Angle of the normal to the vertical [deg]; below 90 where `other` is the lower one.
+        sure: The contact is there whether or not it is needed: near enough, and not too steep for that.
+        point_world: Centre (3,) [m] of the contact.
+        patch: Contact area projected to the ground [m].
+    """
+
+    other: SceneObject
+    normal_world: Array
+    gap: float
+    tilt: float
+    sure: bool
+    point_world: Array
+    patch: BaseGeometry
+
+    def __str__(self) -> str:
+        return f"normal {self.tilt:.0f}° from the vertical, {_gap(self.gap)}"
+
+
+def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph:
+    """Infer who supports whom among the objects of one scene model.
+
+    From each separating plane the lower object supports the upper one. An object whose centre of mass lies
+    outside what then carries it looks for what keeps it from tipping: first contacts below it that a slightly
+    wrong fit may have opened or made steep, then neighbours it leans on and objects that weigh it down. What
+    touches nothing below it is let down until it does.
+
+    Args:
+        objects: Shapes in the world frame; the one with role `support_surface` is supported by nothing.
+        config: The stage's numbers.
+    """
+    ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
+    touches = _find_touches(ordered, config)
+    supported = [o for o in ordered if o.role != "support_surface"]
+    carried: dict[str, tuple[list[Support], Tipping]] = {}
+    stability: dict[str, Stability] = {}
+    for o in supported:
+        supports, patches = _from_below(o, touches[o.id], config)
+        if not supports:
+            supports, patches = _let_down(o, ordered, config)
+        carried[o.id] = supports, find_tipping(o.shape, support_polygon(patches))
+        stability[o.id] = assess(o.shape, patches, config)
+    edges: list[Support] = []
+    for o in supported:
+        supports, tipping = carried[o.id]
+        edges += supports
+        known = {s.supporter for s in supports}
+        beside = [t for t in touches[o.id] if t.other.id not in known]
+        riders = [t for t in beside if any(s.supporter == o.id for s in carried.get(t.other.id, ([],))[0])]
+        if supports and stability[o.id].tips:
+            edges += _leaning(o, beside, tipping, config)
+        edges += _weighed_down(o, riders, stability[o.id], tipping, config)
+    rank = {o.id: i for i, o in enumerate(ordered)}
+    edges.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))
+    return SupportGraph(ordered, tuple(edges), stability)
+
+
+def explain(graph: SupportGraph, supporter: str, supported: str, config: SupportConfig) -> str:
+    """Say in a sentence why `supporter` supports `supported`, or why it does not.
+
+    Args:
+        graph: As `infer` returns it.
+        supporter: Id of the one below, beside or on top.
+        supported: Id of the one held.
+        config: The numbers the graph was inferred with.
+
+    Raises:
+        InputError: There is no object with one of the ids, or both are the same.
+    """
+    for name in (supporter, supported):
+        if name not in {o.id for o in graph.objects}:
+            raise InputError(
+                name, "no such object in the graph", f"there are {', '.join(o.id for o in graph.objects)}"
+            )
+    if supporter == supported:
+        raise InputError(supporter, "an object does not support itself", "ask about two different objects")
+    edge = graph.support(supporter, supported)
+    if edge is not None:
+        return edge.why
+    a, b = graph[supporter], graph[supported]
+    if b.role == "support_surface":
+        return f"{supported} is the support surface: nothing supports it."
+    apart = float(np.linalg.norm(a.centre_world - b.centre_world))
+    touch = _touch(a, b, find_contacts([a.shape, b.shape], apart)[0], config)
+    head = f"{supporter} does not support {supported}: "
+    if touch.gap > config.reach:
+        return f"{head}they do not touch, {_gap(touch.gap)} > reach {_mm(config.reach)}."
+    verdict = _verdict(supported, graph.stability[supported], config)
+    if touch.tilt >= 180.0 - config.max_tilt:
+        return f"{head}it lies above it ({touch}) and could only weigh it down; {verdict}."
+    if touch.tilt > config.max_tilt:
+        steep = f"{touch.tilt:.0f}° from the vertical, bottom-up up to {config.max_tilt:.0f}°"
+        return f"{head}they touch side by side (normal {steep}); {verdict}, and it does not lean that way."
+    return f"{head}the contact is doubtful ({touch}, margin {_mm(config.contact_margin)}) and not needed; {verdict}."
+
+
+def _find_touches(objects: Sequence[SceneObject], config: SupportConfig) -> dict[str, list[Touch]]:
+    touches: dict[str, list[Touch]] = {o.id: [] for o in objects}
+    for contact in find_contacts([o.shape for o in objects], config.reach):
+        a, b = objects[contact.a], objects[contact.b]
+        touches[b.id].append(_touch(a, b, contact, config))
+        touches[a.id].append(_touch(b, a, _swapped(contact), config))
+    return touches
+
+
+def _swapped(contact: Contact) -> Contact:
+    return Contact(contact.b, contact.a, contact.points_world, -contact.normal_world, contact.distance)
+
+
+def _touch(other: SceneObject, o: SceneObject, contact: Contact, config: SupportConfig) -> Touch:
+    normal_world, gap, sure = _separating_plane(other, o, contact, config)
+    tilt = float(np.degrees(frames.angle_between(normal_world, (0.0, 0.0, 1.0))))
+    margin = config.contact_margin if tilt <= config.gentle_tilt else config.steep_margin
+    patch = contact_patch(o.shape, other.shape, normal_world, contact.points_world, config)
+    point_world = contact.points_world.mean(axis=0)
+    return Touch(other, normal_world, gap, tilt, sure and gap <= margin, point_world, patch)
+
+
+def _separating_plane(
+    other: SceneObject, o: SceneObject, contact: Contact, config: SupportConfig
+) -> tuple[Array, float, bool]:
+    """Normal (3,) from `other` to `o`, gap [m] and whether the plane is beyond doubt.
+
+    Everything lies above the support surface. Where two shapes overlap and a level plane would part them at
+    nearly the same cost as a steep one, such as at the end of a plank, the level one is possible too.
+    """
+    up = np.array([0.0, 0.0, 1.0])
+    for surface, sign in ((other, 1.0), (o, -1.0)):
+        if surface.role == "support_surface":
+            axes_world = surface.shape.T_world_object[:3, :3]
+            normal_world = axes_world[:, np.argmax(np.abs(axes_world[2]))]
+            return sign * np.sign(normal_world[2]) * normal_world, contact.distance, True
+    steep = abs(contact.normal_world[2]) < np.cos(np.radians(config.max_tilt))
+    if steep and contact.distance < 0.0:
+        rise = float(o.centre_world[2] - other.centre_world[2])
+        level_gap = abs(rise) - float(o.shape.support(up[None])[0] + other.shape.support(up[None])[0])
+        if level_gap > contact.distance - config.contact_margin:
+            return np.copysign(up, rise), level_gap, False
+    return contact.normal_world, contact.distance, True
+
+
+def _from_below(
+    o: SceneObject, touches: list[Touch], config: SupportConfig
+) -> tuple[list[Support], list[BaseGeometry]]:
+    """Bottom-up supports, and the contact areas they carry the object by."""
+    below = [t for t in touches if t.tilt <= config.max_tilt]
+    sure = [t for t in below if t.sure]
+    supports = [
+        _support(
+            t, o, "bottom-up", True, f"{t.other.id} lies below the plane that parts it from {o.id} ({t})."
+        )
+        for t in sure
+    ]
+    patches = [t.patch for t in sure]
+    overhang = find_tipping(o.shape, support_polygon(patches)).overhang
+    for t in sorted((t for t in below if not t.sure), key=lambda t: t.gap):
+        if overhang <= config.overhang:
+            break
+        gained = find_tipping(o.shape, support_polygon([*patches, t.patch])).overhang
+        if gained < overhang:
+            need = f"without it {_overhang_text(o.id, overhang)}"
+            why = f"{t.other.id} lies below the plane that parts it from {o.id} ({t}); {need}."
+            supports.append(_support(t, o, "bottom-up", t.gap <= config.contact_margin, why))
+            patches.append(t.patch)
+            overhang = gained
+    return supports, patches
+
+
+def _let_down(
+    o: SceneObject, objects: Sequence[SceneObject], config: SupportConfig
+) -> tuple[list[Support], list[BaseGeometry]]:
+    """Supports of an object that touches nothing below it: what it meets first on its way straight down."""
+    others = [other for other in objects if other is not o]
+    drops = [drop_distance(o.shape, other.shape, config.max_drop) for other in others]
+    drop = min(drops, default=np.inf)
+    if not np.isfinite(drop):
+        return [], []
+    lowered = o.shape.moved(rigid(np.eye(3), (0.0, 0.0, -drop)))
+    supports, patches = [], []
+    for other, own_drop in zip(others, drops, strict=True):
+        if own_drop > drop + config.contact_margin:
+            continue
+        moved = SceneObject(o.id, o.label, lowered)
+        for contact in find_contacts([other.shape, lowered], 2.0 * config.contact_margin):
+            t = _touch(other, moved, contact, config)
+            if t.tilt <= config.max_tilt or own_drop == drop:
+                why = f"{o.id} touches nothing below it; let down {_mm(own_drop)} it meets {other.id}."
+                supports.append(_support(t, o, "bottom-up", own_drop <= config.contact_margin, why))
+                patches.append(t.patch)
+    return supports, patches
+
+
+def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
+    """Leaning supports of an object that tips: neighbours that push against it, the nearest if none touches."""
+    push = np.cos(np.radians(config.lean_angle))
+    aside = [t for t in touches if config.max_tilt < t.tilt < 180.0 - config.max_tilt]
+    against = [t for t in aside if t.normal_world[:2] @ tipping.direction_xy < -push]
+    against.sort(key=lambda t: t.gap)
+    touching = [t for t in against if t.gap <= config.contact_margin] or against[:1]
+    head = _overhang_text(o.id, tipping.overhang)
+    return [_support(t, o, "lean", False, f"{head}; {t.other.id} stands in its way ({t}).") for t in touching]
+
+
+def _weighed_down(
+    o: SceneObject, riders: list[Touch], stability: Stability, tipping: Tipping, config: SupportConfig
+) -> list[Support]:
+    """Top-down supports: what rests on an unstable object, all of it or only what weighs against its tipping."""
+    if stability.stable:
+        return []
+    head = _verdict(o.id, stability, config)
+    found = []
+    for t in riders:
+        load_xy = np.asarray(t.patch.centroid.coords[0])
+        lever = float((tipping.pivot_xy - load_xy) @ tipping.direction_xy)
+        if config.top_down == "paper":
+            found.append(_support(t, o, "top-down", False, f"{head}; {t.other.id} rests on it."))
+        elif stability.tips and lever > 0.0:
+            why = f"{head}; {t.other.id} rests on it {_mm(lever)} behind the edge it tips over."
+            found.append(_support(t, o, "top-down", False, why))
+    return found
+
+
+def _support(t: Touch, o: SceneObject, kind: Kind, certain: bool, why: str) -> Support:
+    return Support(
+        t.other.id, o.id, kind, certain, contact_world=t.point_world, normal_world=t.normal_world, why=why
+    )
+
+
+def _verdict(object_id: str, stability: Stability, config: SupportConfig) -> str:
+    """Both tests in words."""
+    area = f"{object_id}'s support area ratio {stability.ratio:.2f}"
+    sign = "<" if stability.small_area else "≥"
+    return (
+        f"{area} {sign} {config.min_area_ratio:g}, {_overhang_text('it', stability.overhang)}"
+        if (np.isfinite(stability.overhang))
+        else f"{object_id} rests on nothing"
+    )
+
+
+def _overhang_text(name: str, overhang: float) -> str:
+    if not np.isfinite(overhang):
+        return f"{name} rests on nothing"
+    side = "outside" if overhang > 0.0 else "inside"
+    return f"{name} has its centre of mass {_mm(abs(overhang))} {side} its support polygon"
+
+
+def _gap(gap: float) -> str:
+    return f"gap {_mm(gap)}" if gap >= 0.0 else f"overlap {_mm(-gap)}"
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1000.0:.1f} mm"

@@ -1,0 +1,89 @@
+"""The view sphere: possible camera positions around the scene, all looking at its centre (section IV)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from caryatid import frames
+from caryatid.config import ActiveVisionConfig
+from caryatid.frames import Array
+from caryatid.shapes import fibonacci_sphere
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ViewSphere:
+    """Evenly spread view points around a centre.
+
+    Attributes:
+        centre_world: Centre (3,) [m]: the centroid of the table-top segment of the first view.
+        radius: Distance of the views from the centre [m].
+        directions: Unit vectors (N, 3) from the centre to the views.
+    """
+
+    centre_world: Array
+    radius: float
+    directions: Array
+
+    @classmethod
+    def around(cls, centre_world: ArrayLike, config: ActiveVisionConfig) -> ViewSphere:
+        """Build the sphere of `config.sphere_points` views and radius `config.sphere_radius` around a point (3,) [m]."""
+        centre = np.array(centre_world, dtype=np.float64)
+        return cls(centre, config.sphere_radius, fibonacci_sphere(config.sphere_points))
+
+    @property
+    def positions_world(self) -> Array:
+        """Camera positions (N, 3) [m]."""
+        return self.centre_world + self.radius * self.directions
+
+    def poses(self, directions: Array) -> Array:
+        """Camera poses that look at the centre without roll.
+
+        Straight above and below, where that leaves the roll open, the image's top points along world +x.
+
+        Args:
+            directions: Unit vectors (M, 3) from the centre.
+
+        Returns:
+            `T_world_camera` (M, 4, 4).
+        """
+        forward = -directions
+        right = np.stack([forward[:, 1], -forward[:, 0], np.zeros(len(forward))], axis=-1)
+        vertical = np.linalg.norm(right, axis=-1) < 1e-6
+        right[vertical] = np.cross(forward[vertical], (1.0, 0.0, 0.0))
+        right = frames.unit(right)
+        T_world_camera = np.zeros((len(directions), 4, 4))
+        T_world_camera[:, :3, 0] = right
+        T_world_camera[:, :3, 1] = np.cross(forward, right)
+        T_world_camera[:, :3, 2] = forward
+        T_world_camera[:, :3, 3] = self.centre_world + self.radius * directions
+        T_world_camera[:, 3, 3] = 1.0
+        return T_world_camera
+
+    def direction_of(self, T_world_camera: Array) -> Array:
+        """Unit vectors (..., 3) from the centre to cameras (..., 4, 4), wherever they are."""
+        return frames.unit(T_world_camera[..., :3, 3] - self.centre_world)
+
+
+def spread(direction_from: Array, directions: Array, sigma: float) -> Array:
+    """Fall off with the angle: exp(−angle² / 2σ²), a Gaussian on the sphere.
+
+    Args:
+        direction_from: Unit vectors (K, 3) of the bumps' tops, where the value is 1.
+        directions: Unit vectors (M, 3).
+        sigma: Angle at which the value has fallen to exp(−½) [rad].
+
+    Returns:
+        (M, K).
+    """
+    angle = np.arccos(np.clip(directions @ direction_from.T, -1.0, 1.0))
+    return np.exp(-0.5 * (angle / sigma) ** 2)
+
+
+def direction(azimuth: float, elevation: float) -> Array:
+    """Unit vector (3,) with an azimuth from +x towards +y and an elevation over the horizontal [rad]."""
+    return np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )

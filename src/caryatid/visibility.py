@@ -1,0 +1,37 @@
+"""What a view says about a shape it should show."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caryatid import frames
+from caryatid.shapes import Shape
+from caryatid.views import View
+
+SPACING = 0.01
+"""Spacing of the samples on the surface [m]."""
+MARGIN = 0.02
+"""How far behind the surface a reading must lie to contradict it [m]; 2σ of registration and depth together."""
+
+
+def seen_through(shape: Shape, view: View) -> bool:
+    """Whether a view looks through most of where the shape should be.
+
+    Args:
+        shape: In the world frame.
+        view: A view with a pose.
+    """
+    points_world, normals_world = shape.surface(SPACING)
+    eye_world = view.pose[:3, 3]
+    facing = np.sum((eye_world - points_world) * normals_world, axis=1) > 0.0
+    p = frames.transform(frames.invert(view.pose), points_world[facing])
+    p = p[p[:, 2] > 1e-3]
+    u = np.rint(p[:, 0] / p[:, 2] * view.K[0, 0] + view.K[0, 2]).astype(np.intp)
+    v = np.rint(p[:, 1] / p[:, 2] * view.K[1, 1] + view.K[1, 2]).astype(np.intp)
+    height, width = view.depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    depth = view.depth[v[inside], u[inside]]
+    read = depth > 0.0
+    if not read.any():
+        return False
+    return bool((depth[read] > p[inside, 2][read] + MARGIN).mean() > 0.5)

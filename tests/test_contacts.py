@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from caryatid import frames
+from caryatid.contacts import find_contacts
+from caryatid.errors import InputError
+from caryatid.frames import Array, rigid
+from caryatid.shapes import Box, Cylinder, Shape, Sphere
+
+
+def at(x: float, y: float, z: float, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
+    return rigid(frames.rotation_from_vector(np.radians(turn)), (x, y, z))
+
+
+def cube(x: float, y: float, z: float, side: float = 0.1) -> Box:
+    return Box(at(x, y, z), np.full(3, side))
+
+
+def random_shapes(count: int, rng: np.random.Generator, side: float) -> list[Shape]:
+    shapes: list[Shape] = []
+    for k in range(count):
+        T = rigid(frames.random_rotation(rng), rng.uniform(-side, side, 3))
+        a, b, c = rng.uniform(0.04, 0.15, 3)
+        shapes.append([Box(T, np.array([a, b, c])), Cylinder(T, a / 2.0, b), Sphere(T, a / 2.0)][k % 3])
+    return shapes
+
+
+def pairs(shapes: list[Shape], margin: float | list[float]) -> list[tuple[int, int]]:
+    return [(c.a, c.b) for c in find_contacts(shapes, margin)]
+
+
+@pytest.mark.parametrize(
+    ("upper", "lower"),
+    [
+        (cube(0, 0, 0.1), cube(0, 0, 0)),
+        (Cylinder(at(0, 0, 0.1), 0.03, 0.1), cube(0, 0, 0)),
+        (Sphere(at(0, 0, 0.08), 0.03), cube(0, 0, 0)),
+        (Sphere(at(0, 0, 0.08), 0.03), Cylinder(at(0, 0, 0), 0.04, 0.1)),
+        (Cylinder(at(0, 0, 0.1), 0.03, 0.1), Cylinder(at(0, 0, 0), 0.04, 0.1)),
+        (Sphere(at(0, 0, 0.08), 0.03), Sphere(at(0, 0, 0), 0.05)),
+    ],
+)
+def test_every_pair_of_kinds_touches_with_the_normal_from_a_to_b(upper: Shape, lower: Shape) -> None:
+    for gap in (0.004, -0.004):
+        lifted = upper.moved(at(0, 0, gap))
+        (up,) = find_contacts([lower, lifted], 0.01)
+        (down,) = find_contacts([lifted, lower], 0.01)
+        np.testing.assert_allclose(up.normal_world, (0, 0, 1), atol=1e-3)
+        np.testing.assert_allclose(down.normal_world, (0, 0, -1), atol=1e-3)
+        assert up.distance == pytest.approx(gap, abs=1e-4)
+        np.testing.assert_allclose(up.points_world[:, 2].mean(), 0.05 + gap / 2.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("margin", [0.001, 0.005, 0.02])
+def test_margin_is_the_largest_gap(margin: float) -> None:
+    near, far = cube(0, 0, 0.1 + 0.95 * margin), cube(0, 0, 0.1 + 1.05 * margin)
+    assert pairs([cube(0, 0, 0), near], margin) == [(0, 1)]
+    assert pairs([cube(0, 0, 0), far], margin) == []
+
+
+def test_margins_of_each_shape_count_by_their_mean() -> None:
+    shapes: list[Shape] = [cube(0, 0, 0), cube(0, 0, 0.109)]
+    assert pairs(shapes, [0.002, 0.018]) == [(0, 1)]
+    assert pairs(shapes, [0.002, 0.014]) == []
+
+
+def test_zero_margin_still_finds_overlap() -> None:
+    assert pairs([cube(0, 0, 0), cube(0, 0, 0.099)], 0.0) == [(0, 1)]
+    assert pairs([cube(0, 0, 0), cube(0, 0, 0.101)], 0.0) == []
+
+
+def test_all_pairs_are_checked_and_sorted() -> None:
+    shapes: list[Shape] = [cube(0.03 * k, 0, 0) for k in range(4)]
+    assert pairs(shapes, 0.0) == [(i, j) for i in range(4) for j in range(i + 1, 4)]
+
+
+def test_deep_overlap_of_noisy_fits_keeps_the_plane() -> None:
+    base = Box(at(0, 0, 0), np.array([0.3, 0.3, 0.04]))
+    for upper in (
+        Box(at(0.05, 0.02, 0.05, (2, 1, 30)), np.array([0.1, 0.08, 0.09])),
+        Cylinder(at(0.05, 0.02, 0.05, (2, 1, 0)), 0.04, 0.09),
+        Sphere(at(0.05, 0.02, 0.045), 0.04),
+    ):
+        (contact,) = find_contacts([base, upper], 0.005)
+        assert contact.distance < -0.01
+        assert np.degrees(frames.angle_between(contact.normal_world, (0, 0, 1))) < 5.0
+
+
+def test_distance_and_points_agree_with_signed_distance() -> None:
+    rng = np.random.default_rng(3)
+    seen = 0
+    for _ in range(10):
+        shapes = random_shapes(8, rng, 0.15)
+        for contact in find_contacts(shapes, 0.02):
+            a, b = shapes[contact.a], shapes[contact.b]
+            assert contact.points_world.shape[1:] == (3,)
+            assert np.linalg.norm(contact.normal_world) == pytest.approx(1.0)
+            if contact.distance > 0.0:
+                seen += 1
+                apart = a.signed_distance(contact.points_world) + b.signed_distance(contact.points_world)
+                assert apart.min() == pytest.approx(contact.distance, abs=5e-4)
+    assert seen > 10
+
+
+def test_rigid_motion_moves_contacts_along() -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(10):
+        shapes = random_shapes(9, rng, 0.15)
+        T = rigid(frames.random_rotation(rng), rng.uniform(-1, 1, 3))
+        still, moved = find_contacts(shapes, 0.01), find_contacts([s.moved(T) for s in shapes], 0.01)
+        assert [(c.a, c.b) for c in moved] == [(c.a, c.b) for c in still]
+        for one, other in zip(still, moved, strict=True):
+            assert other.distance == pytest.approx(one.distance, abs=1e-4)
+
+
+def test_inputs_stay_as_they_were() -> None:
+    rng = np.random.default_rng(1)
+    shapes = random_shapes(6, rng, 0.1)
+    before = [s.T_world_object.copy() for s in shapes]
+    find_contacts(shapes, 0.01)
+    for shape, T in zip(shapes, before, strict=True):
+        np.testing.assert_array_equal(shape.T_world_object, T)
+
+
+def test_few_shapes_and_bad_margins() -> None:
+    assert find_contacts([], 0.01) == []
+    assert find_contacts([cube(0, 0, 0)], 0.01) == []
+    for bad in (-0.001, float("nan"), [0.1]):
+        with pytest.raises(InputError, match="margin"):
+            find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], bad)
+
+
+def test_fifty_shapes_take_milliseconds() -> None:
+    shapes = random_shapes(50, np.random.default_rng(0), 0.3)
+    best = np.inf
+    for _ in range(5):
+        start = time.perf_counter()
+        find_contacts(shapes, 0.01)
+        best = min(best, time.perf_counter() - start)
+    assert best < 0.05

@@ -1,0 +1,313 @@
+"""Recordings: what is written is read back, real ones are read, bad ones are refused in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from caryatid import frames
+from caryatid.errors import InputError
+from caryatid.formats import read_recording, write_recording
+from caryatid.views import View
+
+SHARED = Path(__file__).parents[2] / "shared"
+K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
+
+
+def make_views(count=3, poses=True):
+    rng = np.random.default_rng(count)
+    views = []
+    for _ in range(count):
+        depth = rng.uniform(0.4, 3.0, (48, 64)).astype(np.float32)
+        depth[:5] = 0.0
+        labels = np.zeros((48, 64), dtype=np.int32)
+        labels[10:20, 10:30] = 7
+        labels[20:30, 12:20] = 300
+        views.append(
+            View(
+                depth=depth, K=K, labels=labels, rgb=rng.integers(0, 256, (48, 64, 3), dtype=np.uint8),
+                T_world_camera=frames.look_at(rng.normal(size=3) + (0, 0, 5), rng.normal(size=3)) if poses else None,
+            )
+        )
+    return views
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_recording(tmp_path / "scene", make_views())
+    return tmp_path / "scene"
+
+
+def edit(folder, name, change):
+    path = folder / name
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def refused(folder, said, load=False):
+    with pytest.raises(InputError) as caught:
+        recording = read_recording(folder)
+        if load:
+            list(recording)
+    message = str(caught.value)
+    assert said in message
+    assert "\n" not in message
+    assert caught.value.remedy
+    assert str(folder) in message
+    return message
+
+
+def test_what_is_written_is_read_back(folder):
+    views = make_views()
+    recording = read_recording(folder)
+    assert len(recording) == 3
+    assert recording.has_poses
+    assert recording.has_labels
+    for view, again in zip(views, recording, strict=True):
+        assert np.abs(view.depth - again.depth).max() < 0.51e-4
+        assert ((view.depth == 0) == (again.depth == 0)).all()
+        assert (view.rgb == again.rgb).all()
+        assert (view.labels == again.labels).all()
+        assert np.allclose(view.K, again.K)
+        assert np.allclose(view.T_world_camera, again.T_world_camera, atol=1e-8)
+    assert [v.name for v in recording] == ["scene/000000", "scene/000001", "scene/000002"]
+    assert recording.frame("elsewhere/000001") is recording.frames[1]
+    assert len(recording[1:]) == 2
+    with pytest.raises(InputError, match="no frame"):
+        recording.frame("000009")
+
+
+def test_millimetres_and_world_to_camera_become_metres_and_camera_to_world(tmp_path):
+    (tmp_path / "depth").mkdir()
+    Image.fromarray(np.full((4, 5), 2000, np.uint16)).save(tmp_path / "depth/000004.png")
+    camera = {"cam_K": K.ravel().tolist(), "depth_scale": 0.5, "cam_R_w2c": np.eye(3).ravel().tolist(),
+              "cam_t_w2c": [0, 0, 500]}
+    (tmp_path / "scene_camera.json").write_text(json.dumps({"4": camera}))
+    view = read_recording(tmp_path)[0]
+    assert np.allclose(view.depth, 1.0)
+    assert np.allclose(view.T_world_camera[:3, 3], (0, 0, -0.5))
+    assert view.rgb is None
+    assert view.labels is None
+
+
+def test_views_are_read_one_by_one_and_not_kept(folder):
+    recording = read_recording(folder)
+    assert recording[0] is not recording[0]
+    for path in (folder / "depth").glob("*.png"):
+        path.unlink()
+    with pytest.raises(InputError, match="missing"):
+        recording[0]
+
+
+def test_a_single_frame_needs_no_pose(tmp_path):
+    write_recording(tmp_path / "one", make_views(1, poses=False))
+    assert read_recording(tmp_path / "one")[0].T_world_camera is None
+
+
+def test_several_frames_without_poses_are_refused(tmp_path):
+    write_recording(tmp_path / "scene", make_views(3, poses=False))
+    assert "3 of 3" in refused(tmp_path / "scene", "have no pose")
+
+
+def test_one_frame_of_several_without_a_pose_is_refused(folder):
+    edit(folder, "scene_camera.json", lambda d: [d["1"].pop(k) for k in ("cam_R_w2c", "cam_t_w2c")])
+    refused(folder, "frame 1")
+
+
+@pytest.mark.parametrize("name", ["depth/000001.png", "rgb/000001.png", "mask_visib/000001_000001.png"])
+def test_a_missing_image_is_refused(folder, name):
+    (folder / name).unlink()
+    assert name in refused(folder, "missing")
+
+
+@pytest.mark.parametrize("name", ["depth/000001.png", "rgb/000001.png", "mask_visib/000001_000001.png"])
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.9])
+def test_a_truncated_image_is_refused_before_anything_is_decoded(folder, name, keep):
+    path = folder / name
+    content = path.read_bytes()
+    path.write_bytes(content[: int(len(content) * keep)])
+    assert name in refused(folder, "000001")
+
+
+@pytest.mark.parametrize("position", [0.2, 0.5, 0.8])
+def test_a_damaged_image_is_refused(folder, position):
+    path = folder / "depth/000001.png"
+    content = bytearray(path.read_bytes())
+    content[int(len(content) * position)] ^= 0xFF
+    path.write_bytes(bytes(content))
+    refused(folder, "depth/000001.png", load=True)
+
+
+def test_a_truncated_jpeg_is_refused(folder):
+    rgb = Image.open(folder / "rgb/000001.png")
+    buffer = io.BytesIO()
+    rgb.save(buffer, format="JPEG")
+    (folder / "rgb/000001.png").unlink()
+    (folder / "rgb/000001.jpg").write_bytes(buffer.getvalue())
+    assert read_recording(folder)[1].rgb.shape == (48, 64, 3)
+    (folder / "rgb/000001.jpg").write_bytes(buffer.getvalue() + b"rubbish at the end")
+    assert len(read_recording(folder)) == 3
+    (folder / "rgb/000001.jpg").write_bytes(buffer.getvalue()[:-200])
+    refused(folder, "rgb/000001.jpg")
+
+
+def test_text_in_place_of_an_image_is_refused(folder):
+    (folder / "depth/000000.png").write_text("no image at all")
+    refused(folder, "is no image")
+
+
+@pytest.mark.parametrize("name", ["rgb/000001.png", "mask_visib/000001_000001.png"])
+def test_sizes_that_differ_are_refused(folder, name):
+    image = Image.open(folder / name)
+    image.resize((63, 48)).save(folder / name)
+    message = refused(folder, name)
+    assert "63×48" in message
+    assert "64×48" in message
+
+
+@pytest.mark.parametrize("mode", ["L", "RGB", "1"])
+def test_depth_that_is_not_16_bit_is_refused(folder, mode):
+    Image.new(mode, (64, 48), 1).save(folder / "depth/000002.png")
+    refused(folder, f"mode {mode}, not a 16-bit grey PNG")
+
+
+def test_a_colour_mask_is_refused(folder):
+    Image.new("RGB", (64, 48)).save(folder / "mask_visib/000000_000000.png")
+    refused(folder, "mode RGB")
+
+
+def test_an_empty_frame_is_refused_when_it_is_read(folder):
+    Image.fromarray(np.zeros((48, 64), np.uint16)).save(folder / "depth/000001.png")
+    assert "empty" in refused(folder, "depth/000001.png", load=True)
+
+
+def test_masks_that_overlap_are_refused(folder):
+    path = folder / "mask_visib/000000_000001.png"
+    mask = np.array(Image.open(path))
+    mask[15:17, 10:12] = 255
+    Image.fromarray(mask).save(path)
+    message = refused(folder, "000000_000001.png", load=True)
+    assert "obj_id 7 in 4 pixels" in message
+
+
+def test_an_empty_mask_is_an_object_out_of_sight(folder):
+    Image.new("L", (64, 48)).save(folder / "mask_visib/000000_000001.png")
+    assert set(np.unique(read_recording(folder)[0].labels)) == {0, 7}
+
+
+def test_a_mask_that_names_no_object_is_refused(folder):
+    (folder / "mask_visib/000000_000000.png").rename(folder / "mask_visib/000000_000002.png")
+    refused(folder, "names no object: scene_gt.json has no entry for mask 2 of frame 0")
+
+
+def test_frames_without_masks_carry_no_labels(folder):
+    edit(folder, "scene_gt.json", lambda d: d.pop("2"))
+    for path in (folder / "mask_visib").glob("000002_*"):
+        path.unlink()
+    recording = read_recording(folder)
+    assert recording[2].labels is None
+    assert not recording.has_labels
+    with pytest.raises(InputError, match="no masks"):
+        recording.frames[2].load_labels()
+
+
+def nothing(document):
+    document.clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "said"),
+    [
+        ("scene_camera.json", nothing, "has no frames"),
+        ("scene_camera.json", lambda d: d["1"].pop("cam_K"), "'cam_K' is missing"),
+        ("scene_camera.json", lambda d: d["1"].update(cam_K=[1, 2]), "9 finite numbers"),
+        ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(0, 0.0), "focal lengths 0"),
+        ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(4, -5), "focal lengths"),
+        ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(0, "f"), "9 finite numbers"),
+        ("scene_camera.json", lambda d: d["1"].pop("depth_scale"), "'depth_scale' is missing"),
+        ("scene_camera.json", lambda d: d["1"].update(depth_scale=0), "depth_scale"),
+        ("scene_camera.json", lambda d: d["1"].update(depth_scale=-1.0), "depth_scale"),
+        ("scene_camera.json", lambda d: d["1"].pop("cam_t_w2c"), "'cam_t_w2c' is missing"),
+        ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[0.0] * 9), "no rotation"),
+        ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[-1, 0, 0, 0, 1, 0, 0, 0, 1]), "no rotation"),
+        ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[1.1, 0, 0, 0, 1, 0, 0, 0, 1]), "no rotation"),
+        ("scene_camera.json", lambda d: d.pop("1"), "no entry in scene_camera.json"),
+        ("scene_camera.json", lambda d: d.update({"9": d["1"]}), "depth/000009.png"),
+        ("scene_camera.json", lambda d: d.update({"first": d["1"]}), "'first'"),
+        ("scene_camera.json", lambda d: d.update({"01": d["1"]}), "'01'"),
+        ("scene_camera.json", lambda d: d.update({"1": 5}), "no JSON object"),
+        ("scene_gt.json", lambda d: d["1"][0].pop("obj_id"), "'obj_id' is missing"),
+        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=0), "obj_id is 0"),
+        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=65535), "65535"),
+        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=300), "two masks have obj_id 300"),
+        ("scene_gt.json", lambda d: d["1"].append({"obj_id": 4}), "missing"),
+        ("scene_gt.json", lambda d: d.pop("1"), "names no object"),
+        ("scene_gt.json", lambda d: d.update({"1": {"obj_id": 1}}), "no list"),
+        ("scene_gt.json", lambda d: d.update({"8": []}), "not in scene_camera.json"),
+    ],
+)
+def test_bad_cameras_and_object_tables_are_refused(folder, name, change, said):
+    edit(folder, name, change)
+    refused(folder, said)
+
+
+@pytest.mark.parametrize("name", ["scene_camera.json", "scene_gt.json"])
+def test_broken_and_missing_json_is_refused(folder, name):
+    (folder / name).write_text('{"0": ')
+    assert name in refused(folder, "broken JSON")
+    (folder / name).unlink()
+    assert name in refused(folder, "missing")
+
+
+def test_a_rotation_that_drifted_is_made_a_rotation(folder):
+    edit(folder, "scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[1.0005, 2e-4, 0, 0, 1, 0, 0, 0, 1.0002]))
+    R = read_recording(folder).frames[1].T_world_camera[:3, :3]
+    assert np.allclose(R.T @ R, np.eye(3), atol=1e-12)
+    assert np.allclose(R, np.eye(3), atol=1e-3)
+
+
+def test_no_folder_is_refused(tmp_path):
+    refused(tmp_path / "nowhere", "is no folder")
+
+
+def test_writing_refuses_what_does_not_fit(tmp_path, folder):
+    with pytest.raises(InputError, match="no views"):
+        write_recording(tmp_path / "none", [])
+    far = View(depth=np.full((4, 4), 7.0, np.float32), K=K, name="far")
+    with pytest.raises(InputError, match=r"7\.0 m"):
+        write_recording(tmp_path / "far", [far])
+    with pytest.raises(InputError, match="there already"):
+        write_recording(folder, make_views())
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["scene"]
+    write_recording(tmp_path / "far", [far], depth_scale=1.0)
+    assert read_recording(tmp_path / "far")[0].depth.max() == pytest.approx(7.0)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared")
+def test_real_kinect_frames_are_read():
+    folders = sorted(p for p in (SHARED / "data/mosd").iterdir() if p.is_dir())
+    assert folders
+    for folder in folders:
+        (view,) = read_recording(folder)
+        entries = json.loads((folder / "scene_gt.json").read_text())["0"]
+        assert view.T_world_camera is None
+        assert view.depth.shape == (480, 640)
+        assert set(np.unique(view.labels)) == {0} | {entry["obj_id"] for entry in entries}
+        assert 0.3 < np.median(view.depth[view.valid]) < 3.0
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared")
+def test_a_real_recording_with_poses_is_read():
+    recording = read_recording(SHARED / "data/redkitchen")
+    assert len(recording) == 21
+    assert recording.has_poses
+    first, second = recording[0], recording[1]
+    points = [frames.transform(v.pose, v.points_camera[v.valid]) for v in (first, second)]
+    heights = [np.histogram(p[:, 2], bins=200, range=(-1.5, 1.0))[0] for p in points]
+    assert np.corrcoef(heights[0], heights[1])[0, 1] > 0.9

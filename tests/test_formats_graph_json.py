@@ -1,0 +1,248 @@
+"""graph.json: what is written is read back, the same graph gives the same bytes, and bad files are refused."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from caryatid import frames
+from caryatid.errors import InputError
+from caryatid.formats import graph_from_json, graph_text, graph_to_json, read_graph
+from caryatid.formats.json_files import json_text, read_json
+from caryatid.graph import SceneObject, Stability, Support, SupportGraph
+from caryatid.shapes import Box, Cylinder, Sphere
+
+
+def random_graph(seed, count=5):
+    rng = np.random.default_rng(seed)
+    objects = [
+        SceneObject(
+            "o0", 65535, Box(frames.rigid(np.eye(3), (0.0, 0.0, 0.7)), np.array([1.0, 0.8, 0.04])),
+            role="support_surface",
+        )
+    ]
+    for label in range(1, count + 1):
+        T = frames.rigid(frames.random_rotation(rng), rng.normal(size=3))
+        shape = [
+            Box(T, rng.uniform(0.02, 0.3, 3)),
+            Cylinder(T, rng.uniform(0.02, 0.1), rng.uniform(0.02, 0.3)),
+            Sphere(T, rng.uniform(0.02, 0.1)),
+        ][int(rng.integers(3))]
+        seen = tuple(bool(b) for b in rng.integers(0, 2, 6))
+        objects.append(
+            SceneObject(
+                f"o{label}", label, shape, occurrences=int(rng.integers(1, 9)), opportunities=9,
+                residual=float(rng.uniform(0, 0.01)), poor_fit=bool(rng.integers(2)), seen=seen, why="σ ≤ 5 mm",
+            )
+        )
+    pairs = [(a, b) for a in range(count + 1) for b in range(1, count + 1) if a != b]
+    supports = [
+        Support(
+            f"o{a}", f"o{b}", ("bottom-up", "lean", "top-down")[int(rng.integers(3))], bool(rng.integers(2)),
+            int(rng.integers(1, 4)), 4, rng.normal(size=3) if rng.integers(2) else None,
+            frames.unit(rng.normal(size=3)) if rng.integers(2) else None, "contact",
+        )
+        for a, b in pairs
+        if rng.random() < 0.3
+    ]
+    stability = {"o1": Stability(float(rng.uniform()), float(rng.normal()), True, False)}
+    return SupportGraph(tuple(objects), tuple(supports), stability)
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=40, deadline=None)
+def test_what_is_written_is_read_back(seed):
+    graph = random_graph(seed)
+    again = graph_from_json(json.loads(graph_text(graph)), "graph.json")
+    assert graph_text(again) == graph_text(graph)
+    for a, b in zip(graph.objects, again.objects, strict=True):
+        assert (a.id, a.label, a.role, a.occurrences, a.opportunities) == (
+            b.id, b.label, b.role, b.occurrences, b.opportunities,
+        )
+        assert (a.poor_fit, a.seen, a.why, a.shape.kind) == (b.poor_fit, b.seen, b.why, b.shape.kind)
+        assert np.allclose(a.shape.T_world_object, b.shape.T_world_object, atol=1e-9)
+        assert np.allclose(a.shape.extents, b.shape.extents, atol=2e-9)
+    for a, b in zip(graph.supports, again.supports, strict=True):
+        assert (a.pair, a.kind, a.certain, a.occurrences, a.why) == (
+            b.pair, b.kind, b.certain, b.occurrences, b.why,
+        )
+        for p, q in ((a.contact_world, b.contact_world), (a.normal_world, b.normal_world)):
+            assert (p is None and q is None) or np.allclose(p, q, atol=1e-9)
+    assert again.stability["o1"].small_area and not again.stability["o1"].tips
+
+
+def test_the_document_is_as_documented():
+    T = frames.rigid(np.eye(3), (0.0, 0.0, 0.8))
+    graph = SupportGraph(
+        (SceneObject("o1", 1, Sphere(T, 0.05)), SceneObject("o3", 3, Cylinder(T, 0.04, 0.12), occurrences=4)),
+        (Support("o1", "o3", "bottom-up", True, 3, 4),),
+    )
+    document = graph_to_json(graph)
+    assert (document["format"], document["version"], document["frame"]) == (
+        "caryatid/graph", 1, "world, z up, metres",
+    )
+    cylinder = document["objects"][1]
+    assert cylinder["size"] == {"radius": 0.04, "height": 0.12}
+    assert cylinder["T_world_object"] == [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.8], [0, 0, 0, 1]]
+    assert {k: document["supports"][0][k] for k in ("supporter", "supported", "kind", "certain")} == {
+        "supporter": "o1", "supported": "o3", "kind": "bottom-up", "certain": True,
+    }
+    assert (document["supports"][0]["occurrences"], document["supports"][0]["opportunities"]) == (3, 4)
+
+
+def test_noise_below_a_nanometre_and_negative_zero_change_no_byte():
+    def graph(offset):
+        return SupportGraph((SceneObject("o1", 1, Sphere(frames.rigid(np.eye(3), (offset, 0, 1)), 0.05)),))
+
+    assert graph_text(graph(0.0)) == graph_text(graph(-1e-12))
+    assert graph_text(graph(0.0)) != graph_text(graph(1e-6))
+
+
+def test_a_minimal_file_of_another_program_is_read(tmp_path):
+    path = tmp_path / "graph.json"
+    path.write_text(
+        json.dumps(
+            {
+                "format": "caryatid/graph", "version": 1, "colour": "red",
+                "objects": [
+                    {"id": "a", "role": "object", "label": 1, "shape": "box", "size": [0.1, 0.1, 0.1],
+                     "T_world_object": np.eye(4).tolist(), "mood": "good"},
+                    {"id": "b", "role": "object", "label": 2, "shape": "sphere", "size": {"radius": 1},
+                     "T_world_object": np.eye(4).tolist()},
+                ],
+                "supports": [{"supporter": "a", "supported": "b", "kind": "lean"}],
+            }
+        )
+    )
+    graph = read_graph(path)
+    assert graph.supports[0].certain
+    assert graph["a"].shape.volume == pytest.approx(1e-3)
+
+
+def change(document, *path_and_value):
+    *path, last, value = path_and_value
+    at = document
+    for key in path:
+        at = at[key]
+    if value is ...:
+        del at[last]
+    else:
+        at[last] = value
+
+
+@pytest.mark.parametrize(
+    ("where", "said"),
+    [
+        (("format", "other"), "caryatid/graph"),
+        (("version", 2), "version 2"),
+        (("version", True), "version"),
+        (("objects", ...), "'objects' is missing"),
+        (("objects", 3), "objects"),
+        (("objects", 1, "id", "o0"), "two objects are called 'o0'"),
+        (("objects", 1, "id", ...), "'id' is missing"),
+        (("objects", 1, "role", "hero"), "hero"),
+        (("objects", 1, "role", "support_surface"), "two support surfaces"),
+        (("objects", 1, "label", 1.5), "label"),
+        (("objects", 1, "label", -1), "label"),
+        (("objects", 1, "label", 70000), "70000"),
+        (("objects", 1, "T_world_object", [[1, 2], [3, 4]]), "4×4"),
+        (("objects", 1, "T_world_object", np.diag([2.0, 2, 2, 1]).tolist()), "no rotation"),
+        (("objects", 1, "T_world_object", np.diag([-1.0, 1, 1, 1]).tolist()), "no rotation"),
+        (("objects", 1, "shape", "banana"), "banana"),
+        (("objects", 1, "size", [0.1, -0.1, 0.1]), "not positive"),
+        (("objects", 1, "size", [0.1, 0.1]), "0.1"),
+        (("objects", 1, "size", [[0.1], 0.1, 0.1]), "size"),
+        (("objects", 1, "occurrences", -3), "occurrences"),
+        (("objects", 1, "seen", [True]), "seen"),
+        (("objects", 1, "residual", "small"), "residual"),
+        (("objects", 1, 7), "no JSON object"),
+        (("supports", 0, "supporter", "o99"), "o99"),
+        (("supports", 0, "supported", "o0"), "o0"),
+        (("supports", 0, "kind", "glue"), "glue"),
+        (("supports", 0, "certain", "yes"), "certain"),
+        (("supports", 0, "contact", [1, 2]), "3 finite numbers"),
+        (("stability", {"o99": {}}), "o99"),
+    ],
+)
+def test_a_bad_file_is_refused_with_its_name_and_the_reason(where, said):
+    document = graph_to_json(
+        SupportGraph(
+            (
+                SceneObject("o0", 65535, Box(np.eye(4), np.ones(3)), role="support_surface"),
+                SceneObject("o1", 1, Box(np.eye(4), np.ones(3))),
+            ),
+            (Support("o0", "o1", contact_world=np.ones(3)),),
+        )
+    )
+    graph_from_json(copy.deepcopy(document), "right.json")
+    change(document, *where)
+    with pytest.raises(InputError) as caught:
+        graph_from_json(document, "wrong.json")
+    assert "wrong.json" in str(caught.value)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert caught.value.remedy
+
+
+def test_an_edge_that_is_there_twice_is_refused():
+    document = graph_to_json(random_graph(3))
+    document["supports"].append(document["supports"][0])
+    with pytest.raises(InputError, match="twice"):
+        graph_from_json(document, "wrong.json")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b'{"format": ', "broken JSON"),
+        (b"", "broken JSON"),
+        (b"[1, 2]", "list"),
+        (b'{"a": NaN}', "NaN"),
+        (b"\xff\xfe\x00", "UTF-8"),
+        (b"[" * 200_000, "graph.json"),
+        (b'{"format": "caryatid/graph", "version": ' + b"9" * 5000 + b"}", "graph.json"),
+    ],
+)
+def test_broken_json_is_refused_in_one_line(tmp_path, content, said):
+    path = tmp_path / "graph.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        read_graph(path)
+    assert str(path) in str(caught.value)
+    assert said in str(caught.value)
+    assert len(str(caught.value)) < 400 + len(str(path))
+
+
+def test_a_missing_file_is_said_to_be_missing(tmp_path):
+    with pytest.raises(InputError, match=r"graph\.json: the file is missing"):
+        read_graph(tmp_path / "graph.json")
+
+
+def test_nan_is_never_written():
+    with pytest.raises(ValueError, match="JSON"):
+        json_text({"a": float("nan")})
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.floats(-1e6, 1e6) | st.text(),
+        lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_no_document_crashes_the_reader(document):
+    if not isinstance(document, dict):
+        document = {"objects": document, "format": "caryatid/graph", "version": 1}
+    with pytest.raises(InputError):
+        graph_from_json({"supports": [], **document}, "any.json")
+
+
+def test_json_text_takes_numpy_values(tmp_path):
+    path = tmp_path / "x.json"
+    path.write_text(json_text({"a": np.float32(0.5), "b": np.arange(3), 4: (True, None, np.int64(7))}))
+    assert read_json(path) == {"a": 0.5, "b": [0, 1, 2], "4": [True, None, 7]}
