@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caryatid import frames
-from caryatid.contacts import find_contacts
+from caryatid.contacts import find_contacts, find_gap
 from caryatid.errors import InputError
 from caryatid.frames import Array, rigid
 from caryatid.shapes import Box, Cylinder, Shape, Sphere
@@ -104,6 +104,12 @@ def test_distance_and_points_agree_with_signed_distance() -> None:
                 apart = a.signed_distance(contact.points_world) + b.signed_distance(contact.points_world)
                 assert apart.min() == pytest.approx(contact.distance, abs=5e-4)
     assert seen > 10
+
+
+def test_gap_of_shapes_far_apart() -> None:
+    assert find_gap(cube(0, 0, 0), cube(0.3, 0.02, 0)) == pytest.approx(0.2, abs=1e-4)
+    assert find_gap(cube(0, 0, 0), Sphere(at(0.05, 0.0, 0.4), 0.03)) == pytest.approx(0.32, abs=1e-4)
+    assert find_gap(cube(0, 0, 0), cube(0, 0, 0.09)) == pytest.approx(-0.01, abs=1e-3)
 
 
 def test_rigid_motion_moves_contacts_along() -> None:

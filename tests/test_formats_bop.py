@@ -30,8 +30,11 @@ def make_views(count=3, poses=True):
         labels[20:30, 12:20] = 300
         views.append(
             View(
-                depth=depth, K=K, labels=labels, rgb=rng.integers(0, 256, (48, 64, 3), dtype=np.uint8),
-                T_world_camera=frames.look_at(rng.normal(size=3) + (0, 0, 5), rng.normal(size=3)) if poses else None,
+                depth=depth,
+                K=K,
+                labels=labels,
+                rgb=rng.integers(0, 256, (48, 64, 3), dtype=np.uint8),
+                T_world_camera=frames.look_at(rng.normal(5.0, 1.0, 3), rng.normal(size=3)) if poses else None,
             )
         )
     return views
@@ -52,9 +55,7 @@ def edit(folder, name, change):
 
 def refused(folder, said, load=False):
     with pytest.raises(InputError) as caught:
-        recording = read_recording(folder)
-        if load:
-            list(recording)
+        list(read_recording(folder)) if load else read_recording(folder)
     message = str(caught.value)
     assert said in message
     assert "\n" not in message
@@ -86,8 +87,12 @@ def test_what_is_written_is_read_back(folder):
 def test_millimetres_and_world_to_camera_become_metres_and_camera_to_world(tmp_path):
     (tmp_path / "depth").mkdir()
     Image.fromarray(np.full((4, 5), 2000, np.uint16)).save(tmp_path / "depth/000004.png")
-    camera = {"cam_K": K.ravel().tolist(), "depth_scale": 0.5, "cam_R_w2c": np.eye(3).ravel().tolist(),
-              "cam_t_w2c": [0, 0, 500]}
+    camera = {
+        "cam_K": K.ravel().tolist(),
+        "depth_scale": 0.5,
+        "cam_R_w2c": np.eye(3).ravel().tolist(),
+        "cam_t_w2c": [0, 0, 500],
+    }
     (tmp_path / "scene_camera.json").write_text(json.dumps({"4": camera}))
     view = read_recording(tmp_path)[0]
     assert np.allclose(view.depth, 1.0)
@@ -236,7 +241,11 @@ def nothing(document):
         ("scene_camera.json", lambda d: d["1"].pop("cam_t_w2c"), "'cam_t_w2c' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[0.0] * 9), "no rotation"),
         ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[-1, 0, 0, 0, 1, 0, 0, 0, 1]), "no rotation"),
-        ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[1.1, 0, 0, 0, 1, 0, 0, 0, 1]), "no rotation"),
+        (
+            "scene_camera.json",
+            lambda d: d["1"].update(cam_R_w2c=[1.1, 0, 0, 0, 1, 0, 0, 0, 1]),
+            "no rotation",
+        ),
         ("scene_camera.json", lambda d: d.pop("1"), "no entry in scene_camera.json"),
         ("scene_camera.json", lambda d: d.update({"9": d["1"]}), "depth/000009.png"),
         ("scene_camera.json", lambda d: d.update({"first": d["1"]}), "'first'"),
@@ -266,7 +275,11 @@ def test_broken_and_missing_json_is_refused(folder, name):
 
 
 def test_a_rotation_that_drifted_is_made_a_rotation(folder):
-    edit(folder, "scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[1.0005, 2e-4, 0, 0, 1, 0, 0, 0, 1.0002]))
+    edit(
+        folder,
+        "scene_camera.json",
+        lambda d: d["1"].update(cam_R_w2c=[1.0005, 2e-4, 0, 0, 1, 0, 0, 0, 1.0002]),
+    )
     R = read_recording(folder).frames[1].T_world_camera[:3, :3]
     assert np.allclose(R.T @ R, np.eye(3), atol=1e-12)
     assert np.allclose(R, np.eye(3), atol=1e-3)

@@ -49,7 +49,13 @@ def at(degrees: float) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("views", "middle"),
-    [([180.0], 0.0), ([30.0], -150.0), ([180.0, 90.0], -45.0), ([170.0, -170.0], 0.0), ([0.0, 120.0, 200.0], -80.0)],
+    [
+        ([180.0], 0.0),
+        ([30.0], -150.0),
+        ([180.0, 90.0], -45.0),
+        ([170.0, -170.0], 0.0),
+        ([0.0, 120.0, 200.0], -80.0),
+    ],
 )
 def test_the_largest_arc_has_its_middle_far_from_all_views(views: list[float], middle: float):
     azimuth = np.rad2deg(largest_arc(np.stack([at(v) for v in views])))
@@ -77,7 +83,10 @@ def test_equation_2_decreasing_falls_to_two_lambda_minus_one():
 @pytest.mark.parametrize(
     "shape",
     [
-        Box(frames.rigid(frames.rotation_from_vector((0.3, 0.2, 0.9)), (0.1, 0.0, 0.8)), np.array([0.1, 0.2, 0.05])),
+        Box(
+            frames.rigid(frames.rotation_from_vector((0.3, 0.2, 0.9)), (0.1, 0.0, 0.8)),
+            np.array([0.1, 0.2, 0.05]),
+        ),
         Cylinder(frames.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.04, 0.12),
         Sphere(frames.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.05),
     ],
@@ -122,9 +131,7 @@ def test_a_relations_saliency_follows_equation_2():
 
 
 def test_a_point_in_the_spheres_centre_is_projected_upwards():
-    pair = SupportGraph(
-        (TABLE, box(1, (0.0, 0.0, 0.77), (0.1, 0.1, 0.04))), (Support("o0", "o1"),)
-    )
+    pair = SupportGraph((TABLE, box(1, (0.0, 0.0, 0.77), (0.1, 0.1, 0.04))), (Support("o0", "o1"),))
     point = points_of_interest(pair, SPHERE, HOME, 1, PAPER)[0]
     np.testing.assert_allclose(point.direction, [0.0, 0.0, 1.0])
 

@@ -117,7 +117,7 @@ class TestHumanoidRobot:
             gaze = yaw + posture.head_yaw
             level = np.cos(posture.head_pitch)
             axis = [level * np.cos(gaze), level * np.sin(gaze), np.sin(posture.head_pitch)]
-            np.testing.assert_allclose([x, y] + forward, T[:2, 3], atol=1e-9)
+            np.testing.assert_allclose(np.array([x, y]) + forward, T[:2, 3], atol=1e-9)
             np.testing.assert_allclose(axis, T[:3, 2], atol=1e-9)
             assert posture.camera_height == T[2, 3]
 

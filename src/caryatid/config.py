@@ -105,22 +105,28 @@ class SegmentationConfig:
     """Pixels between samples of the organised image; 2 keeps 6 mm at 1.5 m."""
     margin: float = 0.05
     """Points further than this outside the support surface's outline belong to no object on it [m]."""
-    edge_jump: float = 0.012
-    """A depth step between samples beyond this, at 1 m and growing with z², parts two surfaces [m]."""
-    surfel: float = 0.02
+    edge_jump: float = 0.006
+    """A sample further than this from its neighbour's plane is another surface's [m], at 1 m and times z²."""
+    max_jump: float = 0.009
+    """A depth step between samples beyond this parts two surfaces, however steep [m], at 1 m and times z²."""
+    surfel: float = 0.015
     """Size of the patches whose edges are judged convex or concave [m]; five times the noise at 1.5 m."""
     crease: float = 4.0
-    """What a turn of the normal by 90° adds to a path on the surface [surfels], so that surfels end at edges."""
-    step: float = 25.0
-    """Angle under which one surfel rises over its neighbour's plane beyond which they are two layers [deg]."""
+    """What a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at edges."""
+    step: float = 0.005
+    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]."""
     neighbours: int = 10
     """Nearest points a point of an unorganised cloud is joined to [1]."""
     reach: float = 0.012
     """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
-    concavity: float = 10.0
+    concavity: float = 15.0
     """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's usual value."""
-    min_size: int = 60
+    min_size: int = 40
     """Samples a part needs to be an object [points]."""
+    min_width: float = 0.015
+    """A part narrower than this beside a larger one belongs to it [m]; normals are blurred so far."""
+    normal_size: float = 0.013
+    """Side of the window normals are estimated over, at the objects' median distance [m]."""
     clearance: float = 0.008
     """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
     max_height: float = 0.6
@@ -200,15 +206,13 @@ class SupportConfig:
     """Support relations, section III-A."""
 
     contact_margin: float = 0.005
-    """Gap up to which two shapes are in contact [m]; 1σ of the gap between two fits that are each 3 mm off."""
+    """Gap up to which two shapes are in contact [m]; 1σ of the gap between two fits each 3 mm off."""
     reach: float = 0.012
     """Gap up to which a contact is believed where an object would tip without it [m]; 2.5σ of the same."""
     gentle_tilt: float = 25.0
-    """Separating planes steeper than this carry an object that rests safely on others only if overlapping [deg]."""
-    steep_margin: float = -0.002
-    """What stands for the contact margin at those steeper planes [m]; negative: the shapes must overlap."""
+    """Planes steeper than this, where nothing overlaps, carry only what would tip without them [deg]."""
     max_tilt: float = 75.0
-    """Separating planes steeper than this carry nothing [deg]: the contact normal is too near the horizontal."""
+    """Separating planes steeper than this carry nothing [deg]: the normal is too near the horizontal."""
     patch_depth: float = 0.003
     """Surface this near to the first contact counts as touching [m]; the noise of one reading at 1.5 m."""
     patch_tilt: float = 1.0
@@ -220,7 +224,7 @@ class SupportConfig:
     lean_angle: float = 75.0
     """Widest angle between a sideways push and the direction straight against an object's tipping [deg]."""
     top_down: Literal["paper", "balance"] = "balance"
-    """Whether all that rests on an unstable object holds it (`paper`), or only what weighs against its tipping."""
+    """All that rests on an unstable object holds it (`paper`), or only what weighs against its tipping."""
     max_drop: float = 0.04
     """How far below an unsupported object its supporter may lie, hidden gap between them [m]."""
 
@@ -289,9 +293,9 @@ class ActiveVisionConfig:
     """Views at the most, the first one too; the paper's."""
     clearance: float = 0.05
     """Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
-    look_directions: int = 2000
-    """Directions on the whole sphere the planner `support` looks in [1]; about 5° apart."""
-    surface_samples: int = 600
+    look_directions: int = 1200
+    """Directions on the whole sphere the planner `support` looks in [1]; about 6° apart."""
+    surface_samples: int = 400
     """Points on the fitted shapes the planner `support` tests for being seen [1]."""
     sample_clearance: float = 0.025
     """Length of a surface point's line of sight that does not count [m]; its own surface, 2 voxels and a half."""
@@ -299,12 +303,10 @@ class ActiveVisionConfig:
     """A surface met at less than this from its normal is seen as well as can be [deg]."""
     space_spacing: float = 0.04
     """Spacing of the points in unseen space the planner `support` tests for being seen [m]."""
-    space_weight: float = 0.5
-    """Worth of all the space on the table against the objects' whole surface [1]."""
+    space_weight: float = 1.0
+    """Worth of all the space on the table against all the objects' surfaces [1]."""
     relation_weight: float = 0.1
-    """Worth of all relations' points of interest against the objects' whole surface [1]."""
-    travel_weight: float = 0.2
-    """Weight of the path cost against saliency in the planner `support` [1]."""
+    """Worth of all relations' points of interest against all the objects' surfaces [1]."""
     view_cone: float = 30.0
     """Angle from the optical axis within which a point is in the image [deg]; 57° × 43° sensor."""
 
@@ -409,18 +411,25 @@ class GenerationConfig:
     """Height over what is below from which an object is let go [m]."""
     margin: float = 0.06
     """Objects are set down at least this far from the table's edge [m]."""
-    tries: int = 60
-    """Times an object is set down anew while it falls off, rolls away or upsets others."""
+    tries: int = 10
+    """Times an object is set down anew while it falls off, rolls away or upsets others; then the one before
+    it is taken up again as well."""
+    patience: int = 40
+    """Objects set down, for each that is wanted, before a scene is given up."""
+    rest_time: float = 2.0
+    """An object that has not come to rest after this long is set down anew [s]."""
     lying: float = 0.3
     """Share of upright objects that are laid on their side, for cylinders [1]."""
     settling: float = 0.3
     """Time an object is given before rest is asked for [s]."""
     brink: float = 0.01
     """An object whose middle is nearer to the table's edge than this has as good as fallen [m]."""
+    max_height: float = 0.36
+    """Nothing is set down so that it reaches higher over the table top [m]."""
     upset: float = 0.04
-    """Setting an object down may shift others by this much [m]; more, and it is tried again."""
-    heap_radius: float = 0.15
-    """Radius of the heap of a dense scene [m]."""
+    """Setting an object down may shift a pile's others, or a heap's screens, by this much [m]."""
+    heap_radius: float = 0.12
+    """Radius of the heap of a dense scene of 16 [m]; it grows with the root of the number beyond that."""
     heap_tilted: float = 0.3
     """Share of a heap's objects that are dropped in any attitude and not upright [1]."""
     screens: tuple[int, int] = (2, 4)
@@ -470,7 +479,7 @@ class ReportConfig:
     cloud_points: int = 200_000
     """Points drawn at the most, evenly picked; 0.1 s."""
     point_size: float = 0.0075
-    """Side of a point as drawn [m]; one and a half times the spacing of the fused cloud leaves no gaps."""
+    """Side of a point as drawn [m], the surface's twice that; half more than the spacing leaves no gaps."""
     sphere_width: int = 260
     """Width of the painted view sphere [px]; one cell of 40,000 is 2 px."""
     hidden: float = 0.02

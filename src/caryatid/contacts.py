@@ -75,6 +75,13 @@ def find_contacts(shapes: Sequence[Shape], margin: float | Sequence[float]) -> l
     return contacts
 
 
+def find_gap(a: Shape, b: Shape) -> float:
+    """Distance [m] between two shapes however far apart; negative where they overlap."""
+    data = _collide([a, b], np.zeros(2))
+    apart = float(np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3]))
+    return float(mujoco.mj_geomDistance(data.model, data, 0, 1, apart, np.empty(6)))
+
+
 def _collide(shapes: Sequence[Shape], margins: Array) -> mujoco.MjData:
     """Run MuJoCo's collision detection once on shapes with margins (N,) [m], one free body each."""
     spec = mujoco.MjSpec()

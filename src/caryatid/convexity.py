@@ -16,6 +16,9 @@ from caryatid.perception_kernels import nearest_seeds
 
 Index = NDArray[np.intp]
 
+EDGES_ACROSS = 3.0
+"""Sample edges that cross a border for each sample along it, on a grid with diagonals."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Surfels:
@@ -59,7 +62,8 @@ def convex_parts(
     pairs, lengths = surfel_borders(surfels, edges)
     attraction = border_attraction(surfels, pairs, config)
     cluster = cluster_by_mean(len(surfels.sizes), pairs, attraction, lengths)
-    cluster = _absorb_small(cluster, surfels.sizes, pairs, lengths, config.min_size)
+    min_width = config.min_width / _spacing(points, edges)
+    cluster = _absorb_slivers(cluster, surfels.sizes, pairs, lengths, config.min_size, min_width)
     part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
     kept = np.flatnonzero(np.bincount(part[part >= 0], minlength=len(cluster)) >= config.min_size)
     part = np.where(np.isin(part, kept), part, -1)
@@ -67,7 +71,7 @@ def convex_parts(
 
 
 def gather_surfels(points: Array, normals: Array, edges: Index, config: SegmentationConfig) -> Surfels:
-    """Give each sample (N, 3) to the seed nearest along the surface, turns of the normal counting as distance."""
+    """Give each sample (N, 3) to the seed nearest along the surface; turns of the normal add distance."""
     difference = points[edges[:, 0]] - points[edges[:, 1]]
     turn = 1.0 - np.einsum("ij,ij->i", normals[edges[:, 0]], normals[edges[:, 1]])
     costs = np.sqrt(np.einsum("ij,ij->i", difference, difference)) / config.surfel + config.crease * turn
@@ -90,13 +94,14 @@ def surfel_borders(surfels: Surfels, edges: Index) -> tuple[Index, Array]:
 
 
 def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
-    """Attraction (B,) in −2 … 1 of surfels over each border: 1 flat or convex, 0 at the limit, below it concave."""
+    """Attraction (B,) of surfels over each border: 1 flat or convex, 0 at the limit, to −2 concave or a step."""
     i, j = pairs.T
-    between = frames.unit(surfels.centres[j] - surfels.centres[i])
+    between = surfels.centres[j] - surfels.centres[i]
     rise_j = np.einsum("ij,ij->i", surfels.normals[i], between)
     rise_i = -np.einsum("ij,ij->i", surfels.normals[j], between)
-    bend = 1.0 - np.maximum(rise_i + rise_j, 0.0) / np.radians(config.concavity)
-    step = 1.0 - np.maximum(rise_i, rise_j) / np.sin(np.radians(config.step))
+    distance = np.maximum(np.linalg.norm(between, axis=-1), 1e-9)
+    bend = 1.0 - np.maximum(rise_i + rise_j, 0.0) / distance / np.radians(config.concavity)
+    step = 1.0 - np.maximum(rise_i, rise_j) / config.step
     return np.clip(np.minimum(bend, step), -2.0, 1.0)
 
 
@@ -138,7 +143,7 @@ def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array)
             if total > 0.0:
                 heapq.heappush(heap, (-total / size, min(i, k), max(i, k), size))
         borders[j] = {}
-    return _roots(parent)
+    return _roots(np.array(parent, dtype=np.intp))
 
 
 def number_by_appearance(part: Index) -> NDArray[np.int32]:
@@ -149,30 +154,46 @@ def number_by_appearance(part: Index) -> NDArray[np.int32]:
     return rank[inverse].astype(np.int32)
 
 
-def _absorb_small(cluster: Index, sizes: Index, pairs: Index, lengths: Array, min_size: int) -> Index:
-    """Give clusters that are too small for an object to the neighbour they share the longest border with."""
+def _absorb_slivers(
+    cluster: Index, sizes: Index, pairs: Index, lengths: Array, min_size: int, min_width: float
+) -> Index:
+    """Give clusters too small or too narrow for an object to the neighbour with the longest common border.
+
+    A sliver lies along a larger neighbour: its width [samples] is its size over the length of their border.
+    """
     cluster = cluster.copy()
     for _ in range(3):
         total = np.bincount(cluster, weights=sizes, minlength=len(cluster))
         i, j = cluster[pairs[:, 0]], cluster[pairs[:, 1]]
-        source, target = np.concatenate([i, j]), np.concatenate([j, i])
-        weight = np.concatenate([lengths, lengths])
-        loose = (source != target) & (total[source] < min_size) & (total[target] >= min_size)
-        if not loose.any():
+        outer = i != j
+        keys, inverse = np.unique(
+            np.concatenate([i[outer], j[outer]]) * len(cluster) + np.concatenate([j[outer], i[outer]]),
+            return_inverse=True,
+        )
+        if len(keys) == 0:
             break
-        keys, inverse = np.unique(source[loose] * len(cluster) + target[loose], return_inverse=True)
-        border = np.bincount(inverse, weights=weight[loose])
+        border = np.bincount(inverse, weights=np.concatenate([lengths[outer], lengths[outer]]))
         small, large = np.divmod(keys, len(cluster))
+        narrow = total[small] * EDGES_ACROSS < min_width * border
+        absorbed = (total[small] < total[large]) & (narrow | (total[small] < min_size))
+        small, large, border = small[absorbed], large[absorbed], border[absorbed]
         order = np.lexsort((large, border, small))
-        last = np.append(small[order][1:] != small[order][:-1], True)
         merged = np.arange(len(cluster))
-        merged[small[order][last]] = large[order][last]
-        cluster = merged[cluster]
+        merged[small[order]] = large[order]
+        cluster = _roots(merged)[cluster]
     return cluster
 
 
-def _roots(parent: list[int]) -> Index:
-    roots = np.array(parent, dtype=np.intp)
+def _spacing(points: Array, edges: Index) -> float:
+    """Usual distance between neighbouring samples [m]."""
+    distance = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=-1)
+    distance = distance[distance > 0.0]
+    return float(np.median(distance)) if len(distance) else np.inf
+
+
+def _roots(parent: Index) -> Index:
+    """Follow each node's parent to the end of its chain."""
+    roots = parent
     while not np.array_equal(roots, roots[roots]):
         roots = roots[roots]
     return roots

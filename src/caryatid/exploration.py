@@ -152,7 +152,7 @@ def next_best_view(
         visited = scene.sphere.direction_of(robot.T_world_camera)[None]
     candidates = robot.candidates(scene.sphere)
     state = PlanningState(
-        scene.map_graph, scene.sphere, scene.voxels, visited, candidates, scene.config.active
+        scene.graph, scene.sphere, scene.voxels, visited, candidates, scene.config.active
     )
     rng = np.random.default_rng([seed, len(visited)])
     return chooser.plan(state, rng), candidates

@@ -1,4 +1,4 @@
-"""The floor the robot drives on: where its platform may stand, how far it is, and which walls hide the table."""
+"""The floor the robot drives on: where its platform may stand, how far it is, what walls hide."""
 
 from __future__ import annotations
 

@@ -43,7 +43,8 @@ def points_of_interest(
     """Generate the points of interest of a support graph, Algorithm 1.
 
     An object without a supporter gives the point where the line from the middle of the largest arc between
-    earlier views to its centre meets its surface. Every support relation gives one point, `config.edge_point`.
+    earlier views to its centre meets its surface. Every support relation gives one point where
+    `config.edge_point` says.
 
     Args:
         graph: What is known.
@@ -127,7 +128,8 @@ def inhibition_of_return(visited: Array, directions: Array, config: ActiveVision
 def _unsupported(subject: SceneObject, sphere: ViewSphere, azimuth: float) -> PointOfInterest:
     middle = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     position = surface_point(subject.shape, sphere.centre_world + sphere.radius * middle)
-    why = f"nothing is known to support {subject.id}; the largest gap between views is at {np.rad2deg(azimuth):.0f}°"
+    gap = f"the largest gap between views is at {np.rad2deg(azimuth):.0f}°"
+    why = f"nothing is known to support {subject.id}; {gap}"
     return PointOfInterest(position, middle, MAX_SALIENCY, (subject.id,), why)
 
 

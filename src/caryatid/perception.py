@@ -108,6 +108,27 @@ def perceive(
     return Percept(view, replace(cloud, labels=labels), pixels, surface)
 
 
+def level_cloud(
+    cloud: Cloud, config: Config, *, segmentation: SegmentationMethod | None, rng: np.random.Generator
+) -> Cloud:
+    """Move a cloud from its sensor's frame into the world frame of its support plane.
+
+    Raises:
+        PerceptionError: There are no points, or no support surface.
+    """
+    if len(cloud) == 0:
+        raise PerceptionError(f"{cloud.name}: holds no points")
+    given = None if segmentation == "auto" else cloud.labels
+    surface = _found(cloud, _loose(cloud, given, config), None, config, rng)
+    T = frames.level_world(surface.normal_world, surface.point_world)
+    return replace(
+        cloud,
+        points_world=frames.transform(T, cloud.points_world),
+        normals_world=frames.rotate(T, cloud.normals_world),
+        viewpoint_world=None if cloud.viewpoint_world is None else frames.transform(T, cloud.viewpoint_world),
+    )
+
+
 def label_image(percept: Percept, source: View | Cloud) -> NDArray[np.int32]:
     """Labels of all pixels (H, W) of a view, or of all points (N,) of a cloud."""
     labels = percept.labels

@@ -1,4 +1,4 @@
-"""Compiled loops over depth images and sample graphs, each beside the plain reference that tests hold it against."""
+"""Compiled loops over depth images and sample graphs, each beside the plain reference it is tested against."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def _plane_normals(a: Image, b: Image, c: Image, K: Array) -> Image:
 
 @njit(cache=True)
 def _window_planes(image, radius, edge_jump, max_slope):  # type: ignore[no-untyped-def]
-    """Coefficients of 1/z = a·du + b·dv + c over each pixel's window; c = 0 where there are too few readings."""
+    """Coefficients of 1/z = a·du + b·dv + c over each pixel's window; c = 0 where readings are too few."""
     height, width = image.shape
     a = np.zeros((height, width), np.float32)
     b = np.zeros((height, width), np.float32)

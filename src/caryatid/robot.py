@@ -186,10 +186,10 @@ class HumanoidRobot:
         level = np.hypot(forward[:, 0], forward[:, 1]) < 1e-6
         roll = np.where(level, np.arcsin(np.clip(np.abs(right[:, 2]), 0.0, 1.0)), roll)
         pitch = np.arcsin(np.clip(forward[:, 2], -1.0, 1.0))
-        # The right axis is level without roll, so it gives the heading even where the camera looks straight down.
+        # Without roll the right axis is level: it gives the heading even where the view is straight down.
         heading = np.arctan2(right[:, 0], -right[:, 1])
 
-        yaws = np.linspace(*np.deg2rad(config.yaw), config.head_yaws)
+        yaws = np.deg2rad(np.linspace(*config.yaw, config.head_yaws))
         yaws = yaws[np.argsort(np.abs(yaws), kind="stable")]
         platform_yaw = heading[:, None] - yaws
         offset = config.camera_forward * np.stack([np.cos(platform_yaw), np.sin(platform_yaw)], axis=-1)

@@ -17,7 +17,7 @@ from caryatid.fusion import Evidence, fuse, fused_graph
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.perception import UP, Percept, label_image, perceive
 from caryatid.primitives import FitFailure, fit
-from caryatid.registration import align, twist_transform
+from caryatid.registration import align
 from caryatid.stopwatch import Stopwatch
 from caryatid.support import infer
 from caryatid.surface import SupportSurface, find_support_surface
@@ -36,12 +36,12 @@ class Scene:
         seed: Seed of every random choice; the same seed and views give the same model.
 
     Attributes:
-        graph: The fused support graph, in the world.
-        map_graph: The same in the map, the frame of `voxels` and `cloud`.
+        graph: The fused support graph.
         labels: Label image (H, W) of the newest view, or labels (N,) of a cloud; 65535 is the support surface.
         surface: The support surface, or None before the first view.
         voxels: Free, occupied and unknown space, or None before the first view.
         sphere: The view sphere around the table top, or None before the first view.
+        T_world_camera: Pose (4, 4) of the newest view after registration, or None for a cloud.
         views: How many views the model is made of.
         timings: Seconds the stages of the newest update took.
     """
@@ -57,11 +57,9 @@ class Scene:
         self.surface: SupportSurface | None = None
         self.voxels: VoxelMap | None = None
         self.sphere: ViewSphere | None = None
+        self.T_world_camera: Array | None = None
         self.views = 0
         self.timings: dict[str, float] = {}
-        self.map_graph = SupportGraph()
-        self._twists: list[Array] = []
-        self._pivot: Array = np.zeros(3)
         self._points: dict[int, list[Cloud]] = {}
         self._fits: dict[int, SceneObject] = {}
         self._evidence = Evidence()
@@ -71,11 +69,6 @@ class Scene:
     def supports(self) -> nx.DiGraph:
         """The support graph as a DiGraph, supporter → supported."""
         return self.graph.to_networkx()
-
-    @property
-    def T_world_map(self) -> Array:
-        """From the map, in which the first view's pose is exact, to the world, in which the views' errors average out."""
-        return twist_transform(-np.mean(self._twists or [np.zeros(6)], axis=0), self._pivot)
 
     @property
     def cloud(self) -> Cloud:
@@ -109,24 +102,22 @@ class Scene:
         names = self._fused(newest, percept)
         percept = percept.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
         self.labels = label_image(percept, source)
+        self.T_world_camera = None if percept.view is None else percept.view.pose
         self.views += 1
         watch.lap("fuse")
         self.timings = watch.laps
         return self.graph
 
     def _registered(self, percept: Percept) -> Percept:
-        """Lay the view onto the map; remember by how much, for the mean of all views is the best guess of the world."""
+        """Lay the view onto the map, which the first view's pose ties to the world."""
         config = self.config
-        if self.surface is None or not config.registration.enabled:
-            self._twists.append(np.zeros(6))
+        if self.sphere is None or not config.registration.enabled:
             return percept
         cloud = percept.cloud.select(percept.labels != 0)
         cloud = cloud.select(thin(cloud.points_world, config.cloud.voxel * 2.0))
         if not self._labels_given(percept.view):
             cloud = replace(cloud, labels=None)
-        alignment = align(cloud, self.cloud, self._pivot, config.registration)
-        self._twists.append(alignment.twist)
-        return percept.moved(alignment.T)
+        return percept.moved(align(cloud, self.cloud, self.sphere.centre_world, config.registration).T)
 
     def _associated(self, percept: Percept, source: View | Cloud) -> Percept:
         """Give automatic parts the labels of the objects they belong to."""
@@ -159,7 +150,7 @@ class Scene:
     def _map_space(self, percept: Percept) -> None:
         """Build view sphere and voxel map around the first view's table, and enter the view."""
         if self.sphere is None or self.voxels is None:
-            centre = self._pivot = percept.surface.point_world
+            centre = percept.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
             self.voxels = VoxelMap.around(centre, self.config.voxels)
         if percept.view is not None:
@@ -210,8 +201,7 @@ class Scene:
                 if o.role == "object" and o.id not in found and seen_through(o.shape, percept.view):
                     self._contradicted[o.id] = self._contradicted.get(o.id, 0) + 1
         fused = fused_graph(self._evidence, config, self._contradicted)
-        self.map_graph = replace(fused, stability=newest.stability)
-        self.graph = self.map_graph.moved(self.T_world_map)
+        self.graph = replace(fused, stability=newest.stability)
         return names
 
     def _pooled(self) -> dict[int, Cloud]:

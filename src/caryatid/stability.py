@@ -18,7 +18,7 @@ from caryatid.shapes import Shape
 
 _RING = 48
 """Corners of the polygon that stands for the rim of a ball's cap; 0.2 % of its radius off."""
-_MARCH_POINTS = 24
+_MARCH_POINTS = 16
 """Surface points along the longest side of a shape that is let down."""
 _MARCH_STEPS = 40
 """Steps by the signed distance: enough to come within a hair wherever the way is not along a wall."""
@@ -43,7 +43,7 @@ class Tipping:
 
 def ground_outline(shape: Shape) -> BaseGeometry:
     """P_A: the polygon [m] the shape's extent projects to on the ground."""
-    return _hull(shape.outline())
+    return _hull(_cap(shape, np.array([0.0, 0.0, 1.0]), np.inf))
 
 
 def contact_patch(
@@ -73,6 +73,9 @@ def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
     Points all over the lower side of the one and the upper side of the other march to the opposite shape by
     its signed distance.
     """
+    apart = float(np.linalg.norm(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3]))
+    if apart > (np.linalg.norm(shape.extents) + np.linalg.norm(other.extents)) / 2.0:
+        return float(np.inf)
     down, up = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
     return min(_march(shape, other, down, limit), _march(other, shape, up, limit))
 
@@ -114,16 +117,22 @@ def _touching_depth(shape: Shape, config: SupportConfig) -> float:
 
 
 def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) -> float:
-    points_world, normals_world = shape.surface(float(shape.extents.max()) / _MARCH_POINTS)
-    points_world = points_world[normals_world @ direction_world > 0.0]
-    points_world = np.concatenate([points_world, shape.outline()])
-    points_world = points_world[target.signed_distance(points_world) > 0.0]
+    """Way [m] until the first surface point meets the target; what touches at once lies beside it."""
+    spacing = float(shape.extents.max()) / _MARCH_POINTS
+    corners_world = shape.outline() if shape.kind != "sphere" else np.empty((0, 3))
+    points_world = np.concatenate([shape.surface(spacing)[0], corners_world])
+    in_front = shape.signed_distance(points_world + 2.0 * _MARCH_HIT * direction_world) > _MARCH_HIT
+    points_world = points_world[in_front & (target.signed_distance(points_world) > _MARCH_HIT)]
     travelled = np.zeros(len(points_world))
+    step = np.full(len(points_world), np.inf)
     for _ in range(_MARCH_STEPS):
         step = target.signed_distance(points_world + travelled[:, None] * direction_world)
-        travelled += np.maximum(step, 0.0)
-    hit = (np.abs(step) < _MARCH_HIT) & (travelled <= limit) if len(points_world) else np.zeros(0, bool)
-    return float(travelled[hit].min()) if hit.any() else float(np.inf)
+        on_its_way = (travelled + step <= limit) & (step > -_MARCH_HIT)
+        points_world, step = points_world[on_its_way], step[on_its_way]
+        travelled = travelled[on_its_way] + step
+        if not len(step) or step.max() < _MARCH_HIT:
+            break
+    return float(travelled[step < _MARCH_HIT].min(initial=np.inf))
 
 
 def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from shapely.geometry.base import BaseGeometry
 
 from caryatid import frames
 from caryatid.config import SupportConfig
-from caryatid.contacts import Contact, find_contacts
+from caryatid.contacts import Contact, find_contacts, find_gap
 from caryatid.errors import InputError
 from caryatid.frames import Array, rigid
 from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
@@ -33,7 +33,6 @@ class Touch:
         normal_world: Unit normal (3,) of the separating plane, pointing away from `other`.
         gap: [m], negative where they overlap.
         tilt: Angle of the normal to the vertical [deg]; below 90 where `other` is the lower one.
-        sure: The contact is there whether or not it is needed: near enough, and not too steep for that.
         point_world: Centre (3,) [m] of the contact.
         patch: Contact area projected to the ground [m].
     """
@@ -42,7 +41,6 @@ class Touch:
     normal_world: Array
     gap: float
     tilt: float
-    sure: bool
     point_world: Array
     patch: BaseGeometry
 
@@ -61,7 +59,12 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
     Args:
         objects: Shapes in the world frame; the one with role `support_surface` is supported by nothing.
         config: The stage's numbers.
+
+    Raises:
+        InputError: Two objects have the same id.
     """
+    if len({o.id for o in objects}) < len(objects):
+        raise InputError("objects", "two of them have the same id", "give every object an id of its own")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
     touches = _find_touches(ordered, config)
     supported = [o for o in ordered if o.role != "support_surface"]
@@ -81,7 +84,7 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
         beside = [t for t in touches[o.id] if t.other.id not in known]
         riders = [t for t in beside if any(s.supporter == o.id for s in carried.get(t.other.id, ([],))[0])]
         if supports and stability[o.id].tips:
-            edges += _leaning(o, beside, tipping, config)
+            edges += _leaning(o, [t for t in beside if t not in riders], tipping, config)
         edges += _weighed_down(o, riders, stability[o.id], tipping, config)
     rank = {o.id: i for i, o in enumerate(ordered)}
     edges.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))
@@ -113,18 +116,22 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
     a, b = graph[supporter], graph[supported]
     if b.role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
-    apart = float(np.linalg.norm(a.centre_world - b.centre_world))
-    touch = _touch(a, b, find_contacts([a.shape, b.shape], apart)[0], config)
+    contact = next(iter(find_contacts([a.shape, b.shape], config.reach)), None)
     head = f"{supporter} does not support {supported}: "
-    if touch.gap > config.reach:
-        return f"{head}they do not touch, {_gap(touch.gap)} > reach {_mm(config.reach)}."
-    verdict = _verdict(supported, graph.stability[supported], config)
+    if contact is None:
+        gap = _gap(find_gap(a.shape, b.shape))
+        limits = f"margin {_mm(config.contact_margin)}, {_mm(config.reach)} where it is needed"
+        return f"{head}they do not touch, {gap} ({limits})."
+    touch = _touch(a, b, contact, config)
+    stability = graph.stability.get(supported)
+    verdict = _verdict(supported, stability, config) if stability else f"how {supported} stands is not known"
     if touch.tilt >= 180.0 - config.max_tilt:
         return f"{head}it lies above it ({touch}) and could only weigh it down; {verdict}."
     if touch.tilt > config.max_tilt:
         steep = f"{touch.tilt:.0f}° from the vertical, bottom-up up to {config.max_tilt:.0f}°"
         return f"{head}they touch side by side (normal {steep}); {verdict}, and it does not lean that way."
-    return f"{head}the contact is doubtful ({touch}, margin {_mm(config.contact_margin)}) and not needed; {verdict}."
+    margin = _mm(config.contact_margin)
+    return f"{head}the contact is doubtful ({touch}, margin {margin}) and not needed; {verdict}."
 
 
 def _find_touches(objects: Sequence[SceneObject], config: SupportConfig) -> dict[str, list[Touch]]:
@@ -141,35 +148,20 @@ def _swapped(contact: Contact) -> Contact:
 
 
 def _touch(other: SceneObject, o: SceneObject, contact: Contact, config: SupportConfig) -> Touch:
-    normal_world, gap, sure = _separating_plane(other, o, contact, config)
+    normal_world = _plane_normal(other, o, contact)
     tilt = float(np.degrees(frames.angle_between(normal_world, (0.0, 0.0, 1.0))))
-    margin = config.contact_margin if tilt <= config.gentle_tilt else config.steep_margin
     patch = contact_patch(o.shape, other.shape, normal_world, contact.points_world, config)
-    point_world = contact.points_world.mean(axis=0)
-    return Touch(other, normal_world, gap, tilt, sure and gap <= margin, point_world, patch)
+    return Touch(other, normal_world, contact.distance, tilt, contact.points_world.mean(axis=0), patch)
 
 
-def _separating_plane(
-    other: SceneObject, o: SceneObject, contact: Contact, config: SupportConfig
-) -> tuple[Array, float, bool]:
-    """Normal (3,) from `other` to `o`, gap [m] and whether the plane is beyond doubt.
-
-    Everything lies above the support surface. Where two shapes overlap and a level plane would part them at
-    nearly the same cost as a steep one, such as at the end of a plank, the level one is possible too.
-    """
-    up = np.array([0.0, 0.0, 1.0])
+def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:
+    """Normal (3,) of the separating plane from `other` to `o`; everything lies above the support surface."""
     for surface, sign in ((other, 1.0), (o, -1.0)):
         if surface.role == "support_surface":
             axes_world = surface.shape.T_world_object[:3, :3]
             normal_world = axes_world[:, np.argmax(np.abs(axes_world[2]))]
-            return sign * np.sign(normal_world[2]) * normal_world, contact.distance, True
-    steep = abs(contact.normal_world[2]) < np.cos(np.radians(config.max_tilt))
-    if steep and contact.distance < 0.0:
-        rise = float(o.centre_world[2] - other.centre_world[2])
-        level_gap = abs(rise) - float(o.shape.support(up[None])[0] + other.shape.support(up[None])[0])
-        if level_gap > contact.distance - config.contact_margin:
-            return np.copysign(up, rise), level_gap, False
-    return contact.normal_world, contact.distance, True
+            return sign * np.sign(normal_world[2]) * normal_world
+    return contact.normal_world
 
 
 def _from_below(
@@ -177,22 +169,16 @@ def _from_below(
 ) -> tuple[list[Support], list[BaseGeometry]]:
     """Bottom-up supports, and the contact areas they carry the object by."""
     below = [t for t in touches if t.tilt <= config.max_tilt]
-    sure = [t for t in below if t.sure]
-    supports = [
-        _support(
-            t, o, "bottom-up", True, f"{t.other.id} lies below the plane that parts it from {o.id} ({t})."
-        )
-        for t in sure
-    ]
+    sure = [t for t in below if t.gap <= (config.contact_margin if t.tilt <= config.gentle_tilt else 0.0)]
+    supports = [_support(t, o, "bottom-up", True, f"{_below_text(t, o)}.") for t in sure]
     patches = [t.patch for t in sure]
     overhang = find_tipping(o.shape, support_polygon(patches)).overhang
-    for t in sorted((t for t in below if not t.sure), key=lambda t: t.gap):
+    for t in sorted((t for t in below if t not in sure), key=lambda t: t.gap):
         if overhang <= config.overhang:
             break
         gained = find_tipping(o.shape, support_polygon([*patches, t.patch])).overhang
         if gained < overhang:
-            need = f"without it {_overhang_text(o.id, overhang)}"
-            why = f"{t.other.id} lies below the plane that parts it from {o.id} ({t}); {need}."
+            why = f"{_below_text(t, o)}; without it {_overhang_text(o.id, overhang)}."
             supports.append(_support(t, o, "bottom-up", t.gap <= config.contact_margin, why))
             patches.append(t.patch)
             overhang = gained
@@ -202,29 +188,29 @@ def _from_below(
 def _let_down(
     o: SceneObject, objects: Sequence[SceneObject], config: SupportConfig
 ) -> tuple[list[Support], list[BaseGeometry]]:
-    """Supports of an object that touches nothing below it: what it meets first on its way straight down."""
-    others = [other for other in objects if other is not o]
-    drops = [drop_distance(o.shape, other.shape, config.max_drop) for other in others]
-    drop = min(drops, default=np.inf)
-    if not np.isfinite(drop):
-        return [], []
-    lowered = o.shape.moved(rigid(np.eye(3), (0.0, 0.0, -drop)))
-    supports, patches = [], []
-    for other, own_drop in zip(others, drops, strict=True):
-        if own_drop > drop + config.contact_margin:
-            continue
-        moved = SceneObject(o.id, o.label, lowered)
-        for contact in find_contacts([other.shape, lowered], 2.0 * config.contact_margin):
-            t = _touch(other, moved, contact, config)
-            if t.tilt <= config.max_tilt or own_drop == drop:
-                why = f"{o.id} touches nothing below it; let down {_mm(own_drop)} it meets {other.id}."
-                supports.append(_support(t, o, "bottom-up", own_drop <= config.contact_margin, why))
-                patches.append(t.patch)
-    return supports, patches
+    """Supports of an object that touches nothing below it: what it lands on first when let straight down."""
+    landings: list[tuple[float, Touch]] = []
+    for other in objects:
+        drop = drop_distance(o.shape, other.shape, config.max_drop) if other is not o else np.inf
+        if np.isfinite(drop):
+            lowered = replace(o, shape=o.shape.moved(rigid(np.eye(3), (0.0, 0.0, -drop))))
+            contacts = find_contacts([other.shape, lowered.shape], config.contact_margin)
+            landings += [(drop, _touch(other, lowered, contact, config)) for contact in contacts]
+    landings = [(drop, t) for drop, t in landings if t.tilt <= config.max_tilt]
+    first = min((drop for drop, _ in landings), default=np.inf)
+    landings = [(drop, t) for drop, t in landings if drop <= first + config.contact_margin]
+    head = f"{o.id} touches nothing below it; let down"
+    supports = [
+        _support(
+            t, o, "bottom-up", drop <= config.contact_margin, f"{head} {_mm(drop)} it meets {t.other.id}."
+        )
+        for drop, t in landings
+    ]
+    return supports, [t.patch for _, t in landings]
 
 
 def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
-    """Leaning supports of an object that tips: neighbours that push against it, the nearest if none touches."""
+    """Leaning supports of an object that tips: who pushes against it, the nearest one if none touches."""
     push = np.cos(np.radians(config.lean_angle))
     aside = [t for t in touches if config.max_tilt < t.tilt < 180.0 - config.max_tilt]
     against = [t for t in aside if t.normal_world[:2] @ tipping.direction_xy < -push]
@@ -237,7 +223,7 @@ def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: Sup
 def _weighed_down(
     o: SceneObject, riders: list[Touch], stability: Stability, tipping: Tipping, config: SupportConfig
 ) -> list[Support]:
-    """Top-down supports: what rests on an unstable object, all of it or only what weighs against its tipping."""
+    """Top-down supports: what rests on an unstable object, all or only what weighs against its tipping."""
     if stability.stable:
         return []
     head = _verdict(o.id, stability, config)
@@ -259,15 +245,17 @@ def _support(t: Touch, o: SceneObject, kind: Kind, certain: bool, why: str) -> S
     )
 
 
+def _below_text(t: Touch, o: SceneObject) -> str:
+    return f"{t.other.id} lies below the plane that parts it from {o.id} ({t})"
+
+
 def _verdict(object_id: str, stability: Stability, config: SupportConfig) -> str:
     """Both tests in words."""
-    area = f"{object_id}'s support area ratio {stability.ratio:.2f}"
+    if not np.isfinite(stability.overhang):
+        return _overhang_text(object_id, stability.overhang)
     sign = "<" if stability.small_area else "≥"
-    return (
-        f"{area} {sign} {config.min_area_ratio:g}, {_overhang_text('it', stability.overhang)}"
-        if (np.isfinite(stability.overhang))
-        else f"{object_id} rests on nothing"
-    )
+    ratio = f"{object_id} has a support area ratio {stability.ratio:.2f} {sign} {config.min_area_ratio:g}"
+    return f"{ratio}, {_overhang_text('it', stability.overhang)}"
 
 
 def _overhang_text(name: str, overhang: float) -> str:

@@ -85,9 +85,9 @@ def find_support_surface(
     """Find the table among the planes of a scene.
 
     The planes across `up` are taken out one by one, largest first. Those that have a table-sized plane a
-    storey above them are floors; of the rest the one with most points, what the camera looks at, is the table.
-    Without `up`, the largest plane that faces the camera and has the rest of the scene in front of it gives
-    the direction.
+    storey above them are floors; of the rest the one with most points, what the camera looks at, is the
+    table. Without `up`, the largest plane that faces the camera and has the rest of the scene in front of it
+    gives the direction.
 
     Args:
         cloud_points: (N, 3) [m]; in the camera frame if `up` is None.

@@ -62,6 +62,11 @@ class VoxelMap:
         table[0, 0] = UNKNOWN
         return table[self.passes, self.hits]
 
+    @property
+    def end_world(self) -> Array:
+        """Corner (3,) [m] opposite to the origin."""
+        return self.origin_world + self.config.size * np.array(self.hits.shape)
+
     def integrate(self, view: View, max_depth: float) -> VoxelMap:
         """Return the map with one more view: free along its rays, occupied where they end.
 
@@ -132,7 +137,7 @@ class VoxelMap:
         Args:
             points_world: Points of interest (P, 3) [m].
             targets_world: Camera positions (T, 3) [m].
-            clearance: Occupied voxels nearer to the point along the ray do not count [m]: the point's own surface.
+            clearance: Occupied voxels this near to the point do not count [m]: its own surface.
             asked: Which lines to test (P, T), or None for all; the others count as free.
 
         Returns:
@@ -157,7 +162,8 @@ class VoxelMap:
 
     def _index(self, points_world: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         index = np.floor((points_world - self.origin_world) / self.config.size).astype(np.intp)
-        return index, ((index >= 0) & (index < self.hits.shape)).all(axis=-1)
+        inside = np.logical_and(index >= 0, index < self.hits.shape)
+        return index, np.all(inside, axis=-1)
 
 
 def _count(total: NDArray[np.uint8], once: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -30,8 +30,8 @@ class RunWriter:
 
     Until `finish` everything lies in a hidden sibling folder `.NAME.partial-…`, so nothing half-written
     looks whole; leaving the `with` block without `finish`, by an error or otherwise, removes it. After an
-    interrupt call `finish`, inside the block, to keep the views done so far. A run folder already there is replaced, at
-    `finish` and not before; a folder that is no run is never touched.
+    interrupt call `finish`, inside the block, to keep the views done so far. A run folder already there is
+    replaced, at `finish` and not before; a folder that is no run is never touched.
 
     Args:
         folder: RUN.

@@ -95,8 +95,8 @@ class StagedFolder:
     def discard(self) -> None:
         """Remove what has been written and leave the place as it was; does nothing after `publish`."""
         self._open = False
-        if self._old.exists() and not self.folder.exists():
-            with suppress(OSError):
+        with suppress(OSError):
+            if self._old.exists() and not self.folder.exists():
                 self._old.rename(self.folder)
         shutil.rmtree(self.partial, ignore_errors=True)
         for parent in reversed(self._made):
@@ -126,8 +126,7 @@ def said_clearly(folder: Path) -> Iterator[None]:
     except OSError as error:
         if error.errno in (errno.ENOSPC, errno.EDQUOT):
             reason, remedy = "the disk is full", "free some space or write elsewhere; nothing was left behind"
-        elif error.errno in (errno.EROFS, errno.EACCES, errno.EPERM):
-            reason, remedy = "cannot be written (read-only)", "give a folder you may write to"
         else:
-            reason, remedy = f"cannot be written ({error.strerror or error})", "give another folder"
+            reason = f"cannot be written ({(error.strerror or str(error)).lower()})"
+            remedy = "give a folder you may write to"
         raise InputError(folder, reason, remedy) from error

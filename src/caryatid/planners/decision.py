@@ -26,7 +26,7 @@ class PlanningState:
         graph: The fused support graph.
         sphere: The view sphere.
         voxels: Space seen free, occupied, or not at all.
-        visited: Unit directions (V, 3) of the earlier views from the sphere's centre; the last is where the robot is.
+        visited: Unit directions (V, 3) from the centre to the views so far; the last is the current one.
         candidates: The views that can be reached.
         config: Settings of section IV.
     """

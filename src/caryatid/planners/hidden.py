@@ -1,4 +1,4 @@
-"""What has not been seen yet, as weighted points: hidden surface of the objects, unseen space, open relations."""
+"""What there is to see, as weighted points: the objects' surfaces, unseen space, relations."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
 from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, SupportGraph
@@ -53,7 +52,8 @@ def join(parts: Sequence[Samples]) -> Samples:
 def surface_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConfig) -> Samples:
     """Spread points over the objects' surfaces; together they weigh 1.
 
-    What touches another shape or the table can never be seen and is left out.
+    Every object weighs the same, small or large: each is one vertex of the graph. What touches another
+    shape or the table can never be seen and is left out.
 
     Args:
         graph: The objects.
@@ -61,21 +61,20 @@ def surface_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionCo
         config: How many points.
     """
     objects = [o for o in graph.objects if o.role == "object"]
-    area = sum(_area(o) for o in objects)
-    spacing = max(0.01, np.sqrt(area / config.surface_samples)) if objects else 0.01
     parts = []
     for o in objects:
-        points, normals = o.shape.surface(spacing)
+        spacing = np.sqrt(_area(o) * len(objects) / config.surface_samples)
+        points, normals = o.shape.surface(max(float(spacing), solid.config.size))
         before = solid.state_at(points + 1.5 * solid.config.size * normals)
         keep = before != OCCUPIED
-        share = _area(o) / area / len(points)
+        share = 1.0 / (len(objects) * len(points))
         zeros = np.zeros(keep.sum(), dtype=np.intp)
         parts.append(Samples(points[keep], normals[keep], np.full(keep.sum(), share), zeros, (o.id,)))
     return join(parts) if parts else _nothing()
 
 
 def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConfig) -> Samples:
-    """Spread points over the unseen space on the table in which something may stand; together they weigh at most 1.
+    """Spread points over the unseen space on the table, where something may stand; they weigh at most 1.
 
     Space counts up to the height of the highest object, fully at the table and less the higher it is: what
     stands there has to be carried. All of the table unseen up to there weighs 1.
@@ -94,14 +93,15 @@ def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConf
     low, high = table.centre_world - reach, table.centre_world + reach
     low[2] = high[2] + 2.0 * solid.config.size
     high[2] = max(float(o.centre_world[2] + o.shape.support(axes[2:])[0]) for o in objects)
-    if high[2] <= low[2]:
+    low, high = np.maximum(low, solid.origin_world), np.minimum(high, solid.end_world)
+    if (high <= low).any():
         return _nothing()
     grid = np.meshgrid(*(np.arange(a, b, config.space_spacing) for a, b in zip(low, high, strict=True)))
     points = np.stack([g.ravel() for g in grid], axis=-1)
     local = (points - table.centre_world) @ table.shape.T_world_object[:3, :3]
     on_table = (np.abs(local[:, :2]) <= table.shape.extents[:2] / 2.0).all(axis=1)
     weights = np.where(on_table, 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2]), 0.0)
-    weights /= weights.sum()
+    weights /= max(float(weights.sum()), 1e-9)
     unseen = on_table & (solid.state_at(points) == UNKNOWN)
     points = points[unseen]
     zeros = np.zeros(len(points), dtype=np.intp)
@@ -109,7 +109,7 @@ def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConf
 
 
 def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
-    """Take the points of interest of Algorithm 1 as points to be seen from any side; together they weigh 1."""
+    """Take the points of interest of Algorithm 1 as points seen from any side; together they weigh 1."""
     if not points:
         return _nothing()
     positions = np.stack([p.position_world for p in points])

@@ -9,6 +9,7 @@ point counts when its line of sight is free of what was seen occupied and of the
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from caryatid import frames
@@ -35,7 +36,7 @@ class SupportPlanner:
     """Takes the candidate that promises to show most of what is hidden, at little cost."""
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
-        """Choose the candidate with the largest c = s − w·h, eq. 3; of equal ones the first.
+        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
 
         s is the worth of what a candidate shows anew, in shares of the best candidate's, with the
         inhibition of return.
@@ -49,7 +50,7 @@ class SupportPlanner:
         saliency = total / max(float(total.max(initial=0.0)), 1e-9)
         saliency = saliency + inhibition_of_return(state.visited, candidates.directions[chosen], config)
         cost = path_cost(state)
-        score = saliency - config.travel_weight * cost[chosen]
+        score = saliency - cost[chosen]
         best = int(np.argmax(score))
         index = int(chosen[best])
 
@@ -76,8 +77,8 @@ class SupportPlanner:
 
 def _expected_gain(
     state: PlanningState, relations: list[PointOfInterest]
-) -> tuple[Samples, Array, np.ndarray[tuple[int], np.dtype[np.intp]]]:
-    """Samples, what each of some candidates shows of them anew (K, C), and which candidates those are (C,)."""
+) -> tuple[Samples, Array, NDArray[np.intp]]:
+    """Samples, what some candidates show of them anew (K, C), and which candidates those are (C,)."""
     config, sphere, candidates = state.config, state.sphere, state.candidates
     solid = state.voxels.with_shapes([o.shape for o in state.graph.objects])
     samples = join(
@@ -97,8 +98,8 @@ def _expected_gain(
     return samples, gain, chosen
 
 
-def _thin(directions: Array, count: int) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-    """Pick the candidates nearest to `count` directions spread over the whole sphere, as many as lie near one."""
+def _thin(directions: Array, count: int) -> NDArray[np.intp]:
+    """Pick the candidates nearest to those of `count` directions all over the sphere that have one near."""
     if len(directions) <= count // 8:
         return np.arange(len(directions))
     distance, nearest = KDTree(directions).query(fibonacci_sphere(count))

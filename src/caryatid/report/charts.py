@@ -48,10 +48,14 @@ def line_chart(
         y_range: Ends of the y axis.
     """
     values = np.array([line.values for line in lines], dtype=np.float64)
-    ticks_y = _ticks(*(y_range or (0.0, max(float(np.nanmax(values, initial=0.0)), 1.0))))
-    ticks_x = _ticks(
-        min(x), max(x) if max(x) > min(x) else min(x) + 1.0, whole=all(float(v).is_integer() for v in x)
-    )
+    if y_range is None:
+        finite = values[np.isfinite(values)]
+        top = max(float(finite.max(initial=0.0)), 1.0)
+        ticks_y = _ticks(0.0, top, whole=bool((finite == finite.round()).all()))
+    else:
+        ticks_y = _ticks(*y_range)
+    last = max(x) if max(x) > min(x) else min(x) + 1.0
+    ticks_x = _ticks(min(x), last, whole=all(float(v).is_integer() for v in x))
     low_x, high_x = min(ticks_x[0], min(x)), max(ticks_x[-1], max(x))
     low_y, high_y = ticks_y[0], ticks_y[-1]
 

@@ -13,7 +13,7 @@ from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.report import colours, svg
 from caryatid.report.wireframes import Projection, draw_shapes
-from caryatid.views import Cloud
+from caryatid.views import SUPPORT_LABEL, Cloud
 
 ELEVATION = np.deg2rad(28.0)
 """How far above the horizon the eye stands."""
@@ -36,7 +36,7 @@ TAG_SIZE = 15.0
 def draw_cloud(cloud: Cloud, graph: SupportGraph, azimuth: float, config: ReportConfig) -> str:
     """Draw the labelled cloud and the shapes fitted to it as SVG.
 
-    Points are little squares lit from above the eye, pale where the surface is seen from behind; shapes are lines.
+    Points are little squares lit from above the eye, pale where one sees a surface from behind.
 
     Args:
         cloud: The fused points, labelled.
@@ -49,7 +49,12 @@ def draw_cloud(cloud: Cloud, graph: SupportGraph, azimuth: float, config: Report
     )
     frame = _framed(cloud, graph, towards_eye, config)
     height, width = frame.depth.shape
-    pixels, depth = _splat(cloud, frame, towards_eye, config)
+    labels = np.zeros(len(cloud)) if cloud.labels is None else cloud.labels
+    surface = labels == SUPPORT_LABEL
+    pixels, depth = _splat(cloud.select(~surface), frame, towards_eye, config.point_size, config)
+    below, depth_below = _splat(cloud.select(surface), frame, towards_eye, 2.0 * config.point_size, config)
+    nearer = (depth_below > 0.0) & ((depth == 0.0) | (depth_below < depth))
+    pixels, depth = np.where(nearer[..., None], below, pixels), np.where(nearer, depth_below, depth)
     projection = replace(frame, depth=depth)
     names = []
     for item in graph.objects:
@@ -93,9 +98,9 @@ def _framed(cloud: Cloud, graph: SupportGraph, towards_eye: Array, config: Repor
 
 
 def _splat(
-    cloud: Cloud, projection: Projection, towards_eye: Array, config: ReportConfig
+    cloud: Cloud, projection: Projection, towards_eye: Array, size: float, config: ReportConfig
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Paint the points far to near; return pixels (H, W, 4) and distances (H, W) [m]."""
+    """Paint the points far to near, `size` [m] wide; return pixels (H, W, 4) and distances (H, W) [m]."""
     stride = max(1, -(-len(cloud) // config.cloud_points))
     points_world, normals_world = cloud.points_world[::stride], cloud.normals_world[::stride]
     count = len(points_world)
@@ -108,7 +113,7 @@ def _splat(
     at, z = projection.project(points_world)
     order = np.argsort(-z)
     height, width = projection.depth.shape
-    half = max(1, round(config.point_size * projection.K[0, 0] / 2.0))
+    half = max(1, round(size * projection.K[0, 0] / 2.0))
     offset = np.arange(-half, half)
     u = np.rint(at[order, 0]).astype(int)[:, None, None] + offset[None, None, :]
     v = np.rint(at[order, 1]).astype(int)[:, None, None] + offset[None, :, None]

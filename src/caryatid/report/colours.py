@@ -20,7 +20,8 @@ SURFACE_COLOUR = "#9c9184"
 NOTHING_COLOUR = "#b9bec4"
 """Points that belong to no object."""
 SALIENCY_STOPS = (
-    (-1.0, "#1f4e9e"), (-0.5, "#86a9d9"), (0.0, "#ececec"), (0.35, "#fbe08a"), (0.7, "#f39c34"), (1.0, "#b3301b"),
+    (-1.0, "#1f4e9e"), (-0.5, "#86a9d9"), (0.0, "#ececec"),
+    (0.35, "#fbe08a"), (0.7, "#f39c34"), (1.0, "#b3301b"),
 )  # fmt: skip
 """Saliency −1 … 1: blue where it is inhibited, grey at 0, yellow to red where there is something to see."""
 DEPTH_STOPS = ((0.0, "#ffe945"), (0.33, "#bcae6c"), (0.66, "#4b6579"), (1.0, "#00204c"))

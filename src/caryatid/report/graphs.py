@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.report import colours, svg
-from caryatid.report.layout import arrange
+from caryatid.report.layout import Layout, Pair
 
-COLUMN, ROW = 92.0, 104.0
+COLUMN, ROW = 78.0, 110.0
 """Distance of vertices within a layer, and of layers [px]."""
-NODE_WIDTH, NODE_HEIGHT = 62.0, 40.0
+NODE_WIDTH, NODE_HEIGHT = 56.0, 40.0
 """Size of a vertex [px]."""
-BORDER = 52.0
-"""Free space around the outermost vertices' centres [px]."""
+BORDER, BOTTOM = 46.0, 30.0
+"""Free space around the outermost vertices' centres, and below the table's [px]."""
 LEAST_WIDTH = 560.0
 """Small graphs are drawn in this much space so that their letters do not grow [px]."""
+PORT = 13.0
+"""Distance of edges that meet the same side of a vertex [px]."""
+BESIDE = 7.5
+"""Graphs wider than this many vertices are too small to read beside another picture."""
 LEAST_ASPECT = 0.73
 """Lowest ratio of height to width, so that the drawing fills its place beside the camera's picture."""
 TEXT = 12.0
@@ -27,19 +32,22 @@ TRIES = (0.5, 0.62, 0.38, 0.72, 0.28, 0.8, 0.2)
 """Where along an edge its evidence may be written, the best first."""
 
 
-def draw_graph(graph: SupportGraph) -> str:
+def draw_graph(graph: SupportGraph, layout: Layout) -> str:
     """Draw the support graph as SVG.
 
-    Edges run from supporter to supported and carry occurrences/opportunities; uncertain ones are dashed, leaning
-    and top-down ones say so. Vertices have the shape of their primitive and a dashed rim where nothing is known
-    to support them.
+    Edges run from supporter to supported and carry occurrences/opportunities; uncertain ones are dashed,
+    leaning and top-down ones say so. Vertices have the shape of their primitive, and a dashed rim where
+    nothing is known to support them.
+
+    Args:
+        graph: What to draw.
+        layout: Where, from `arrange`.
     """
-    layout = arrange(graph)
     span = layout.width * COLUMN + 2.0 * BORDER
     width = max(span, LEAST_WIDTH)
-    tall = max(layout.layers - 1, 0) * ROW + 2.0 * BORDER
-    height = max(tall, LEAST_ASPECT * width)
-    floor = (height + tall) / 2.0 - BORDER
+    tall = max(layout.layers - 1, 0) * ROW + BORDER + BOTTOM
+    height = tall if layout.width > BESIDE else max(tall, LEAST_ASPECT * width)
+    floor = (height + tall) / 2.0 - BOTTOM
     left = (width - span) / 2.0 + BORDER
 
     def place(x: float, level: float) -> tuple[float, float]:
@@ -48,12 +56,12 @@ def draw_graph(graph: SupportGraph) -> str:
     centre = {name: place(*at) for name, at in layout.position.items()}
     surface = graph.support_surface
     table = None if surface is None else surface.id
+    ports = _ports(graph, layout)
     lines: list[tuple[Support, Array]] = []
     for support in graph.supports:
         if support.pair in layout.route:
             points = np.array([place(*at) for at in layout.route[support.pair]])
-            both = graph.support(support.supported, support.supporter) is not None
-            lines.append((support, _trimmed(points, support, table, 13.0 if both else 0.0)))
+            lines.append((support, _trimmed(points, support, table, ports)))
         else:
             lines.append(
                 (support, _arc(np.array(centre[support.supporter]), np.array(centre[support.supported])))
@@ -69,18 +77,38 @@ def draw_graph(graph: SupportGraph) -> str:
     )  # fmt: skip
 
 
-def _trimmed(points: Array, support: Support, table: str | None, aside: float) -> Array:
-    """Let an edge (N, 2) begin and end at the rims of its vertices, `aside` of their middles."""
+def _ports(graph: SupportGraph, layout: Layout) -> dict[tuple[str, Pair], float]:
+    """Where each edge meets its vertices: pixels aside of their middles, in the order the edges come from.
+
+    Edges that meet a vertex from above and from below are spread each on their own.
+    """
+    meeting: dict[tuple[str, bool], list[tuple[float, Pair]]] = {}
+    for pair in (s.pair for s in graph.supports if s.pair in layout.route):
+        route = layout.route[pair]
+        for name, (_, own), (x, level) in ((pair[0], route[0], route[1]), (pair[1], route[-1], route[-2])):
+            meeting.setdefault((name, level > own), []).append((x, pair))
+    ports = {}
+    for (name, _), ends in meeting.items():
+        pitch = min(PORT, (NODE_WIDTH - 10.0) / max(len(ends) - 1, 1))
+        for k, (_, pair) in enumerate(sorted(ends)):
+            ports[name, pair] = pitch * (k - (len(ends) - 1) / 2.0)
+    return ports
+
+
+def _trimmed(
+    points: Array, support: Support, table: str | None, ports: dict[tuple[str, Pair], float]
+) -> Array:
+    """Let an edge (N, 2) begin and end at the rims of its vertices, and rise straight from the table."""
     line = points.copy()
-    upward = line[0, 1] > line[-1, 1]
-    sign = -1.0 if upward else 1.0
-    line[:, 0] += aside * sign
+    line[0, 0] += ports[support.supporter, support.pair]
+    line[-1, 0] += ports[support.supported, support.pair]
     if support.supporter == table:
         line[0, 0] = line[1, 0]
     if support.supported == table:
         line[-1, 0] = line[-2, 0]
-    line[0, 1] += sign * (NODE_HEIGHT / 2.0 + 1.0)
-    line[-1, 1] -= sign * (NODE_HEIGHT / 2.0 + 3.0)
+    down = 1.0 if line[-1, 1] > line[0, 1] else -1.0
+    line[0, 1] += down * (NODE_HEIGHT / 2.0 + 1.0)
+    line[-1, 1] -= down * (NODE_HEIGHT / 2.0 + 3.0)
     return _smooth(line)
 
 
@@ -89,7 +117,7 @@ def _smooth(line: Array) -> Array:
     share = np.linspace(0.0, 1.0, 17)[:, None]
     wave = 3.0 * share**2 - 2.0 * share**3
     pieces = []
-    for a, b in zip(line[:-1], line[1:], strict=True):
+    for a, b in pairwise(line):
         bent = np.concatenate([a[0] + (b[0] - a[0]) * wave, a[1] + (b[1] - a[1]) * share], axis=1)
         straight = a + (b - a) * share
         pieces.append(bent if len(line) > 2 else 0.35 * bent + 0.65 * straight)
@@ -131,28 +159,31 @@ def _edge(
     note = f"{support.occurrences}/{support.opportunities}"
     if support.kind != "bottom-up":
         note = f"{support.kind} {note}"
-    size = np.array([len(note) * svg.GLYPH_WIDTH * TEXT + 8.0, TEXT + 6.0])
-    others = np.concatenate([other for s, other in lines if s is not support] or [np.empty((0, 2))])
+    size = np.array([len(note) * svg.GLYPH_WIDTH * TEXT + 2.0, TEXT + 2.0])
+    around = np.concatenate([other for _, other in lines])
 
     def covered(at: Array) -> float:
         plates = sum(float(np.prod(np.clip((size + b[2:]) / 2 - np.abs(b[:2] - at), 0, size))) for b in taken)
-        return plates + 20.0 * float((np.abs(others - at) < size / 2.0).all(axis=1).sum())
+        return plates + 20.0 * float((np.abs(around - at) < size / 2.0).all(axis=1).sum())
 
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    spots = [np.array([np.interp(t * along[-1], along, line[:, k]) for k in range(2)]) for t in TRIES]
-    at = min(spots, key=covered)
+    at = min(_spots(line, size), key=covered)
     taken.append(np.concatenate([at, size]))
-    plate = svg.element(
-        "rect",
-        x=at[0] - size[0] / 2,
-        y=at[1] - size[1] / 2,
-        width=size[0],
-        height=size[1],
-        rx=4,
-        class_="plate",
-    )
     words = svg.text(at[0], at[1] + 0.36 * TEXT, note, class_="note" if support.certain else "note uncertain")
-    return drawn, svg.element("g", plate, words)
+    return drawn, words
+
+
+def _spots(line: Array, size: Array) -> list[Array]:
+    """Places for a note of `size` (2,) beside an edge (N, 2), right and left of it, the best first."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    spots = []
+    for share in TRIES:
+        at = np.array([np.interp(share * along[-1], along, line[:, k]) for k in range(2)])
+        before = np.array([np.interp((share - 0.05) * along[-1], along, line[:, k]) for k in range(2)])
+        ahead = (at - before) / max(float(np.linalg.norm(at - before)), 1e-9)
+        across = np.array([ahead[1], -ahead[0]]) * (-1.0 if ahead[1] < 0.0 else 1.0)
+        clear = float(np.abs(across) @ size) / 2.0 + 4.0
+        spots += [at + clear * across, at - clear * across]
+    return spots
 
 
 def _node(item: SceneObject, at: tuple[float, float], graph: SupportGraph) -> str:
@@ -162,11 +193,9 @@ def _node(item: SceneObject, at: tuple[float, float], graph: SupportGraph) -> st
     unsupported = not graph.supporters(item.id)
     match item.shape.kind:
         case "cylinder":
-            d = (
-                f"M{x - w / 2:.1f} {y - h / 2 + 5:.1f}a{w / 2} 5 0 0 1 {w} 0v{h - 10}a{w / 2} 5 0 0 1 {-w} 0z"
-                f"a{w / 2} 5 0 0 0 {w} 0"
-            )
-            body = svg.element("path", d=d)
+            start = f"M{x - w / 2:.1f} {y - h / 2 + 5:.1f}a{w / 2} 5 0 0"
+            lid, d = f"{start} 0 {w} 0", f"{start} 1 {w} 0v{h - 10}a{w / 2} 5 0 0 1 {-w} 0z"
+            body = svg.element("path", d=d) + svg.element("path", d=lid, fill="none")
         case "sphere":
             body = svg.element("ellipse", cx=x, cy=y, rx=w / 2, ry=h / 2)
         case _:

@@ -55,7 +55,7 @@ def draw_image(view: View, labels: NDArray[np.int32], graph: SupportGraph, confi
 
 
 def _window(objects: Sequence[SceneObject], projection: Projection) -> tuple[float, float, float, float]:
-    """Part of the image that is shown, x, y, width, height [px]: around the objects, never less than a share."""
+    """Part of the image that is shown (x, y, width, height) [px]: the objects with room around them."""
     height, width = projection.depth.shape
     pixels = [at[z > 0.0] for at, z in (projection.project(o.shape.outline()) for o in objects)]
     inside = np.clip(np.concatenate([*pixels, np.empty((0, 2))]), 0.0, (width, height))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import networkx as nx
 import numpy as np
@@ -48,13 +49,15 @@ def arrange(graph: SupportGraph) -> Layout:
     layer: dict[str, int] = {**layer_of}
     links: list[Pair] = []
     for chain in stops.values():
-        for (name, level), (following, _) in zip(chain[:-1], chain[1:], strict=True):
+        for (name, level), (following, _) in pairwise(chain):
             layer[name] = level
             links.append((name, following))
     rows = [
         [n for n, level in layer.items() if level == k] for k in range(max(layer.values(), default=-1) + 1)
     ]
-    x = _abscissae(rows, [pair for pair in links if table not in pair])
+    links += [pair for pair, chain in stops.items() if not chain]
+    links = [pair for pair in links if table not in pair]
+    x = _packed(_abscissae(rows, links), rows, links, table)
     if table is not None:
         others = [v for n, v in x.items() if n != table]
         x[table] = (min(others) + max(others)) / 2.0 if others else 0.0
@@ -69,7 +72,7 @@ def arrange(graph: SupportGraph) -> Layout:
 
 
 def layers(graph: SupportGraph) -> dict[str, int]:
-    """Height of each object in the order of support: 0 for the table, one more than its highest supporter else.
+    """Layer of each object in the support order: 0 for the table, else one more than its highest supporter.
 
     Edges count in the order certain bottom-up, uncertain bottom-up, lean, top-down (turned round, for what
     presses from above lies higher); one that would close a circle is left out.
@@ -104,7 +107,7 @@ def _stops(pair: Pair, layer: Mapping[str, int]) -> list[tuple[str, int]]:
 
 
 def _abscissae(rows: Sequence[Sequence[str]], links: Sequence[Pair]) -> dict[str, float]:
-    """Return x of each name: rows ordered by neighbours, then spaced one unit (half beside a bend) or more."""
+    """Return x of each name: rows ordered by neighbours, spaced as wide as their vertices."""
     neighbours: dict[str, list[str]] = {name: [] for row in rows for name in row}
     for a, b in links:
         neighbours[a].append(b)
@@ -116,13 +119,36 @@ def _abscissae(rows: Sequence[Sequence[str]], links: Sequence[Pair]) -> dict[str
         for k in range(len(order)) if upwards else reversed(range(len(order))):
             row = order[k]
             wish = {n: float(np.mean([x[m] for m in neighbours[n]])) if neighbours[n] else x[n] for n in row}
-            row.sort(key=lambda n: wish[n])  # noqa: B023
+            row.sort(key=lambda n: wish[n])
             x.update(zip(row, _spaced(np.array([wish[n] for n in row]), _gaps(row)).tolist(), strict=True))
     return x
 
 
+def _packed(
+    x: Mapping[str, float], rows: Sequence[Sequence[str]], links: Sequence[Pair], table: str | None
+) -> dict[str, float]:
+    """Move parts of the graph that share no edge together, as far as each row has room."""
+    row_of = {name: k for k, row in enumerate(rows) for name in row}
+    whole = nx.Graph(links)
+    whole.add_nodes_from(name for name in row_of if name != table)
+    parts = sorted(nx.connected_components(whole), key=lambda part: np.mean([x[name] for name in part]))
+    packed: dict[str, float] = {}
+    edge = np.full(len(rows), 0.0)
+    for part in parts:
+        shift = max(edge[row_of[name]] + _half(name) - x[name] for name in part)
+        for name in sorted(part, key=lambda n: x[n]):
+            packed[name] = x[name] + shift
+            edge[row_of[name]] = packed[name] + _half(name)
+    return packed
+
+
+def _half(name: str) -> float:
+    """Half the width of a vertex, or of an edge that passes by."""
+    return 0.2 if "|" in name else 0.5
+
+
 def _gaps(row: Sequence[str]) -> NDArray[np.float64]:
-    half = np.array([0.2 if "|" in name else 0.5 for name in row])
+    half = np.array([_half(name) for name in row])
     return half[:-1] + half[1:]
 
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from caryatid.config import ReportConfig
 from caryatid.graph import SupportGraph
-from caryatid.report.charts import Line, bar_chart, line_chart
 from caryatid.report.cloud import draw_cloud
-from caryatid.report.graphs import draw_graph
+from caryatid.report.graphs import BESIDE, draw_graph
 from caryatid.report.images import draw_image
+from caryatid.report.layout import arrange
 from caryatid.report.rows import (
     ObjectRow,
     PointRow,
@@ -26,6 +26,7 @@ from caryatid.report.rows import (
     support_rows,
 )
 from caryatid.report.sphere import draw_sphere
+from caryatid.report.summary import cards, changes, charts
 from caryatid.views import Cloud, View
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ class Figure:
     svg: str
     heading: str
     caption: str
+    wide: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +95,9 @@ def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
     )
     figures = page.figures
     if step.candidates is not None or step.decision is not None:
-        sphere = Figure("sphere", draw_sphere(step, config), "Where to look next", _sphere_caption(step))
+        sphere = Figure(
+            "sphere", draw_sphere(step, config), "Where to look next", _sphere_caption(step), wide=True
+        )
         figures = (*figures, sphere)
     return replace(
         page,
@@ -114,7 +118,7 @@ def draw_model(
     *,
     view: View | None = None,
     labels: NDArray[np.int32] | None = None,
-    azimuth: float = 0.0,
+    azimuth: float | None = None,
     config: ReportConfig | None = None,
 ) -> ViewPage:
     """Draw a scene model without any planning: what `extract` finds in a view, or in a cloud.
@@ -124,7 +128,8 @@ def draw_model(
         cloud: The points they were fitted to, labelled.
         view: The newest view, or None for a cloud.
         labels: Label image (H, W) of the view, or None to leave its parts out.
-        azimuth: Direction about the vertical from which the cloud is drawn [rad]; also from the opposite one.
+        azimuth: Direction about the vertical from which the cloud is drawn, and from the opposite one [rad];
+            None for the side of the sensor.
         config: Sizes of the pictures.
     """
     config = config or ReportConfig()
@@ -133,23 +138,28 @@ def draw_model(
         parts = np.zeros(view.depth.shape, dtype=np.int32) if labels is None else labels
         kind = "colour image" if view.rgb is not None else "depth image, near bright and far dark"
         caption = (
-            f"The {kind} around the objects, tinted by the parts found in it, with the outlines of the shapes "
-            "fitted so far. Outlines are thin where something nearer hides them; a pale name has no pixel here."
+            f"The {kind} around the objects, tinted by the parts found in it, with the outlines of the "
+            "shapes fitted so far. Outlines are thin where something nearer hides them; what a pale name "
+            "belongs to has no pixel here."
         )
         drawn = draw_image(view, parts, graph, config)
         figures.append(Figure("camera", drawn, "What the camera saw", caption))
     caption = (
-        "Arrows run from supporter to supported; on them, in how many of the views that could have shown it the "
-        "relation was found. Dashed arrows are uncertain; objects with a dashed rim have no known supporter."
+        "Arrows run from supporter to supported; beside them, in how many of the views that could have shown "
+        "it the relation was found. Dashed arrows are uncertain; an object with a dashed rim has no known "
+        "supporter."
     )
-    figures.append(Figure("graph", draw_graph(graph), "What supports what", caption))
-    for turn, side in ((0.0, "from the side of the first view"), (np.pi, "from the opposite side")):
-        drawn = draw_cloud(cloud, graph, azimuth + turn, config)
+    layout = arrange(graph)
+    drawn = draw_graph(graph, layout)
+    figures.append(Figure("graph", drawn, "What supports what", caption, wide=layout.width > BESIDE))
+    side_seen = _sensor_azimuth(view, cloud) if azimuth is None else azimuth
+    for turn, side in ((0.0, "from the first view's side"), (np.pi, "from the opposite side")):
+        drawn = draw_cloud(cloud, graph, side_seen + turn, config)
         caption = (
-            f"{len(cloud):,} points fused so far in their objects' colours, pale where a surface is seen from "
-            "its inside, which no camera can have done."
+            f"{len(cloud):,} points fused so far in their objects' colours, with the fitted shapes. "
+            "Pale: one looks at the inside of a surface, its other side has not been seen."
         )
-        figures.append(Figure("cloud", drawn, f"Cloud and shapes {side}", caption))
+        figures.append(Figure("cloud", drawn, f"The cloud {side}", caption))
     name = cloud.name if view is None else view.name
     return ViewPage(0, name, tuple(figures), object_rows(graph), support_rows(graph))
 
@@ -186,22 +196,34 @@ def render_report(
         title=title,
         pages=pages,
         last=pages[-1],
-        changes=[_changes(a, b) for a, b in zip([None, *pages[:-1]], pages, strict=True)],
-        cards=_cards(pages, scores),
-        charts=_charts(pages, scores),
+        changes=[changes(a, b) for a, b in zip([None, *pages[:-1]], pages, strict=True)],
+        cards=cards(pages, scores),
+        charts=charts(pages, scores),
         scores=scores,
         settings=settings_rows(settings),
     )
 
 
+def _sensor_azimuth(view: View | None, cloud: Cloud) -> float:
+    """Direction [rad] from the scene to the sensor; where unknown, the world's x runs away from it."""
+    if view is not None and view.T_world_camera is not None:
+        backward = -view.T_world_camera[:3, 2]
+        return float(np.arctan2(backward[1], backward[0]))
+    if cloud.viewpoint_world is not None and len(cloud):
+        backward = cloud.viewpoint_world - cloud.points_world.mean(axis=0)
+        return float(np.arctan2(backward[1], backward[0]))
+    return float(np.pi)
+
+
 def _sphere_caption(step: Step) -> str:
-    said = "The view sphere, coloured by saliency; washed out where the robot cannot bring its camera. "
-    said += "Rays lead from each point of interest to where it is best seen. Numbers: views made; next: the choice."
+    said = (
+        "The view sphere, coloured by saliency; washed out where the robot cannot bring its camera. Rays "
+        "lead from points of interest to where they are best seen. Numbers: views made; next: the choice."
+    )
     if step.candidates is not None:
+        said += f" {len(step.candidates):,} views can be reached"
         refused = ", ".join(f"{count:,} {reason}" for reason, count in step.candidates.rejected.items())
-        said += f" {len(step.candidates.directions):,} views can be reached" + (
-            f"; refused: {refused}." if refused else "."
-        )
+        said += f"; refused: {refused}." if refused else "."
     return said
 
 
@@ -209,103 +231,6 @@ def _choice(step: Step) -> str:
     if step.decision is None:
         return ""
     d = step.decision
-    return f"{d.why.rstrip('.')}. Saliency {d.saliency:.2f}, cost of the way {d.cost:.2f}, score {d.score:.2f}."
-
-
-def _changes(before: ViewPage | None, after: ViewPage) -> str:
-    """Say what a view added to and took from the graph."""
-    if before is None:
-        return ""
-    objects = ({o.id: o for o in before.objects}, {o.id: o for o in after.objects})
-    edges = (
-        {(s.supporter, s.supported): s for s in before.supports},
-        {(s.supporter, s.supported): s for s in after.supports},
+    return (
+        f"{d.why.rstrip('.')}. Saliency {d.saliency:.2f}, cost of the way {d.cost:.2f}, score {d.score:.2f}."
     )
-    arrow = "{} → {}".format
-    both = edges[0].keys() & edges[1].keys()
-    parts = [
-        ("new objects", [n for n in objects[1] if n not in objects[0]]),
-        ("objects gone", [n for n in objects[0] if n not in objects[1]]),
-        ("new supports", [arrow(*p) for p in edges[1] if p not in edges[0]]),
-        ("supports gone", [arrow(*p) for p in edges[0] if p not in edges[1]]),
-        (
-            "now certain",
-            [arrow(*p) for p in edges[1] if p in both and edges[1][p].certain and not edges[0][p].certain],
-        ),
-        (
-            "now in doubt",
-            [arrow(*p) for p in edges[1] if p in both and edges[0][p].certain and not edges[1][p].certain],
-        ),
-        (
-            "other shape",
-            [n for n in objects[1] if n in objects[0] and objects[0][n].shape != objects[1][n].shape],
-        ),
-    ]
-    return "; ".join(f"{name}: {', '.join(items)}" for name, items in parts if items) or "nothing new"
-
-
-def _cards(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[tuple[str, str, str]]:
-    """Big figures of the summary: (name, figure, what it is made of)."""
-    last = pages[-1]
-    objects = [o for o in last.objects if not o.surface]
-    kinds = [(kind, sum(o.shape == kind for o in objects)) for kind in ("box", "cylinder", "sphere")]
-    plural = {"box": "boxes", "cylinder": "cylinders", "sphere": "spheres"}
-    uncertain = sum(not s.certain for s in last.supports)
-    seconds = [sum(page.timings.values()) for page in pages]
-    cards = [
-        (
-            "objects",
-            str(len(objects)),
-            ", ".join(f"{n} {k if n == 1 else plural[k]}" for k, n in kinds if n) or "none found",
-        ),
-        (
-            "supports",
-            str(len(last.supports)),
-            f"{len(last.supports) - uncertain} certain, {uncertain} uncertain",
-        ),
-        ("views", str(len(pages)), last.stop or "no stop reason given"),
-        (
-            "travelled",
-            f"{np.rad2deg(last.angle_travelled):.0f}°",
-            f"around the scene; {last.path_travelled:.1f} m over the floor",
-        ),
-        ("per view", f"{np.mean(seconds):.2f} s", f"slowest {max(seconds):.2f} s"),
-    ]
-    if scores is not None:
-        final = scores[-1]
-        cards.insert(
-            0, ("F1", f"{final.f1:.3f}", f"precision {final.precision:.3f}, recall {final.recall:.3f}")
-        )
-    return cards
-
-
-def _charts(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[str]:
-    number = [float(page.index) for page in pages]
-    charts = []
-    if scores is not None:
-        kinds = (("F1", "f1"), ("precision", "precision"), ("recall", "recall"))
-        lines = [Line(name, [float(getattr(score, key)) for score in scores]) for name, key in kinds]
-        charts.append(line_chart(number, lines, title="Score over views", x_name="view", y_range=(0.0, 1.0)))
-        path = [page.path_travelled for page in pages]
-        unit = "path over the floor [m]"
-        if path[-1] == 0.0 and pages[-1].angle_travelled > 0.0:
-            path, unit = (
-                [float(np.rad2deg(page.angle_travelled)) for page in pages],
-                "angle around the scene [°]",
-            )
-        if path[-1] > path[0]:
-            charts.append(
-                line_chart(path, lines[:1], title="F1 over travelled path", x_name=unit, y_range=(0.0, 1.0))
-            )
-    if len(pages) > 1:
-        found = [
-            Line("objects", [sum(not o.surface for o in page.objects) for page in pages]),
-            Line("supports", [len(page.supports) for page in pages]),
-            Line("uncertain supports", [sum(not s.certain for s in page.supports) for page in pages]),
-        ]
-        charts.append(line_chart(number, found, title="Found so far", x_name="view"))
-    if any(page.timings for page in pages):
-        charts.append(
-            bar_chart([page.timings for page in pages], title="Time of each view [s]", x_name="view")
-        )
-    return charts

@@ -91,7 +91,9 @@ def point_rows(decision: Decision | None) -> tuple[PointRow, ...]:
     """Say of each point of interest what it is about, the most salient first."""
     points = () if decision is None else decision.points_of_interest
     return tuple(
-        PointRow(" – ".join(p.subject) or "–", colours.saliency_colour(p.saliency), f"{p.saliency:.2f}", p.why)
+        PointRow(
+            " – ".join(p.subject) or "–", colours.saliency_colour(p.saliency), f"{p.saliency:.2f}", p.why
+        )
         for p in sorted(points, key=lambda p: -p.saliency)
     )
 

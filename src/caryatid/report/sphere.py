@@ -1,4 +1,4 @@
-"""The view sphere (the paper's Fig. 4): saliency, points of interest with their rays, views made and chosen."""
+"""The view sphere (the paper's Fig. 4): saliency, points of interest with rays, views made and chosen."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TAG_SIZE = 13.0
 
 
 def draw_sphere(step: Step, config: ReportConfig) -> str:
-    """Draw the view sphere twice as SVG: in space, with rays from the points of interest, and unrolled from above.
+    """Draw the view sphere twice as SVG: in space with the points of interest' rays, and unrolled from above.
 
     Full colour where the robot can bring its camera, washed out elsewhere. The picture from above holds the
     whole upper half, zenith in the middle and horizon on the rim.
@@ -59,7 +59,7 @@ def draw_sphere(step: Step, config: ReportConfig) -> str:
 
 
 def _eye(sphere: ViewSphere, visited: Array, chosen: Array | None) -> Array:
-    """Look from between the current and the chosen view, so that both are on the near side where they can be."""
+    """Look from between the current and the chosen view, so that both are on the near side if they can."""
     current = visited[-1] if len(visited) else np.array([1.0, 0.0, 0.0])
     azimuth = float(np.arctan2(current[1], current[0]))
     if chosen is not None:
@@ -159,15 +159,17 @@ def _painted(step: Step, directions: Array, inside: NDArray[np.bool_]) -> NDArra
 
     queried = directions[inside]
     saliency = None if step.decision is None else step.decision.sphere_saliency
-    values = np.zeros(len(queried))
-    if saliency is not None:
-        values = saliency[cKDTree(step.sphere.directions).query(queried)[1]]
+    _, nearest = cKDTree(step.sphere.directions).query(queried)
+    values = np.zeros(len(queried)) if saliency is None else saliency[nearest]
     colour = colours.scale(values, colours.SALIENCY_STOPS).astype(np.float64)
-    if step.candidates is not None and len(step.candidates.directions) > DENSE:
-        distance, _ = cKDTree(step.candidates.directions).query(queried)
+    candidates = step.candidates
+    if candidates is not None and len(candidates) > DENSE:
+        if candidates.indices is not None:
+            reachable = np.isin(np.arange(len(step.sphere.directions)), candidates.indices)[nearest]
+        else:
+            reachable = cKDTree(candidates.directions).query(queried)[0] <= 2.0 * np.sin(REACH / 2.0)
         grey = np.array(colours.rgb(colours.saliency_colour(0.0)), dtype=np.float64)
-        beyond = (distance > 2.0 * np.sin(REACH / 2.0))[:, None]
-        colour = np.where(beyond, WASHED * grey + (1.0 - WASHED) * colour, colour)
+        colour = np.where(reachable[:, None], colour, WASHED * grey + (1.0 - WASHED) * colour)
     pixels = np.zeros((*inside.shape, 4), dtype=np.uint8)
     pixels[inside, :3] = colour.round()
     pixels[inside, 3] = 255
@@ -210,7 +212,7 @@ def _said(point: PointOfInterest) -> str:
 def _marks(step: Step, chosen: Array | None, place: Place) -> str:
     """Mark single candidates, the numbered views made so far and the chosen next view."""
     drawn = []
-    if step.candidates is not None and len(step.candidates.directions) <= DENSE:
+    if step.candidates is not None and len(step.candidates) <= DENSE:
         spots, behind = place(step.candidates.directions)
         for (x, y), far in zip(spots, behind, strict=True):
             drawn.append(

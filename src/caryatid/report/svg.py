@@ -175,6 +175,6 @@ def keep_apart(anchors: Array, sizes: Array, bounds: tuple[float, float, float, 
 
 
 def _value(value: object) -> str:
-    if isinstance(value, float | np.floating):
+    if isinstance(value, float):
         return f"{value:.1f}".rstrip("0").rstrip(".") if abs(value) >= 1.0 else f"{value:.3g}"
     return escape(str(value))

@@ -47,7 +47,7 @@ class Projection:
         return on_plane @ self.K[:2, :2].T + self.K[:2, 2], z
 
     def hidden(self, pixels: Array, z: Array, margin: float) -> NDArray[np.bool_]:
-        """Say for each pixel (N, 2) at distance z (N,) whether the picture shows something nearer by `margin`."""
+        """Say of pixels (N, 2) at distances z (N,) whether the picture shows something nearer by `margin`."""
         height, width = self.depth.shape
         u, v = np.rint(np.clip(pixels, -1.0, (width, height))).astype(int).T
         inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
@@ -56,7 +56,7 @@ class Projection:
 
 
 def wireframe(shape: Box | Cylinder | Sphere, eye_world: Array) -> list[Array]:
-    """Return the lines (M, 3) [m] that draw a shape: edges and rims, and the silhouette seen from `eye` (3,)."""
+    """Return lines (M, 3) [m] that draw a shape: edges, rims, and the silhouette seen from `eye` (3,)."""
     match shape:
         case Box():
             lines = _box_edges(shape.extents / 2.0)

@@ -1,1 +1,31 @@
 """Simulated tables: scenes in physics, a depth camera without GL, and the truth about what holds up what."""
+
+from __future__ import annotations
+
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.generate import generate_dense, generate_pile
+from caryatid.simulation.scenes import is_builtin, list_scenes, load_scene, write_scene
+from caryatid.simulation.solids import bounds, contains, static_boxes, table_top, true_shapes
+from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, read_truth, write_truth
+from caryatid.simulation.world import SimulatedScene
+
+__all__ = [
+    "GroundTruth",
+    "SimulatedCamera",
+    "SimulatedScene",
+    "TrueEdge",
+    "bounds",
+    "contains",
+    "generate_dense",
+    "generate_pile",
+    "ground_truth",
+    "is_builtin",
+    "list_scenes",
+    "load_scene",
+    "read_truth",
+    "static_boxes",
+    "table_top",
+    "true_shapes",
+    "write_scene",
+    "write_truth",
+]

@@ -48,8 +48,9 @@ class Rendering:
 class SimulatedCamera:
     """A depth camera that can be anywhere in a simulated scene.
 
-    Captures are numbered; each draws its noise from its own stream made of the seed and its number, so a run
-    is reproduced from the seed whatever else draws random numbers meanwhile.
+    The first capture is the reference the others are registered to, so its pose is exact: the error is one
+    between views. Captures are numbered; each draws its noise from its own stream made of the seed and its
+    number, so a run is reproduced from the seed whatever else draws random numbers meanwhile.
 
     Args:
         scene: What it looks at.
@@ -97,15 +98,16 @@ class SimulatedCamera:
         """
         T = frames.as_rigid(T_world_camera, "T_world_camera")
         image = render(self.scene, T, self.K, self.sensor)
-        rng = np.random.default_rng([self._seed, self._captures])
-        name = f"{self.scene.name} view {self._captures}"
+        number = self._captures
+        rng = np.random.default_rng([self._seed, number])
+        name = f"{self.scene.name} view {number}"
         self._captures += 1
         if self.noise == "none":
             depth, T_reported = image.depth, T
             normals = (image.normals_world @ T[:3, :3]).astype(np.float32)
         else:
             depth = add_depth_noise(image.depth, image.incidence, self.noise_config, rng)
-            T_reported, normals = misregister(T, self.noise_config, rng), None
+            T_reported, normals = misregister(T, self.noise_config, rng) if number else T, None
         return View(depth.astype(np.float32), self.K, T_reported, image.rgb, image.labels, normals, name)
 
 
@@ -193,7 +195,7 @@ def _shade(
     colours = model.geom_rgba[:, :3].astype(np.float32)
     plain = (model.geom_matid >= 0) & (colours == UNSET_COLOUR).all(axis=1)
     colours[plain] = model.mat_rgba[model.geom_matid[plain], :3]
-    colours = np.concatenate([colours, np.float32([BACKGROUND])])
+    colours = np.concatenate([colours, np.array([BACKGROUND], dtype=np.float32)])
     lit = np.einsum("ij,j->i", normals_world, frames.unit(sensor.light))
     brightness = sensor.ambient + (1.0 - sensor.ambient) * np.maximum(lit, 0.0)
     brightness[geoms < 0] = 1.0

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
+import mujoco
 import numpy as np
 
 from caryatid import frames
@@ -14,7 +16,7 @@ from caryatid.frames import Array
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.simulation.mjcf import TABLE_HEIGHT, TABLE_SIZE, Side, Solid, build_spec
 from caryatid.simulation.solids import bounds, true_shapes
-from caryatid.simulation.world import SimulatedScene, scene_from_spec
+from caryatid.simulation.world import SimulatedScene, displacement, scene_from_spec, state_of
 
 PILE_SIZES = (1, 25)
 """Fewest and most objects of a pile."""
@@ -23,6 +25,7 @@ DENSE_SIZES = (10, 25)
 """Fewest and most objects of a dense scene, the screens among them."""
 
 _DENSE_TABLE = (0.7, 1.0)
+_HEAP_OF = 16
 _SCREEN_DENSITY = 1200.0
 _SIDES: tuple[Side, ...] = ("+x", "+y", "-y")
 _DOWN = np.array([[0.0, 0.0, -1.0]])
@@ -90,17 +93,18 @@ def generate_dense(
     _check(name, size, seed, DENSE_SIZES)
     habits = config or GenerationConfig()
     rng = np.random.default_rng([1, size, seed])
+    radius = habits.heap_radius * max(1.0, np.sqrt(size / _HEAP_OF))
     screens = _screens(rng, habits)
     count = int(rng.integers(habits.walls[0], habits.walls[1] + 1))
     walls = tuple(_SIDES[i] for i in sorted(rng.choice(len(_SIDES), size=count, replace=False)))
 
     def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
         shape = _tilted(rng, habits) if rng.random() < habits.heap_tilted else _upright(rng, habits)
-        solid = _let_go(shape, _in_disc(rng, habits.heap_radius), scene, habits)
+        solid = _let_go(shape, _in_disc(rng, radius), scene, habits)
         for _ in range(habits.tries):
             if not _over(solid.shape, [screen.shape for screen in screens]):
                 break
-            solid = _let_go(shape, _in_disc(rng, habits.heap_radius), scene, habits)
+            solid = _let_go(shape, _in_disc(rng, radius), scene, habits)
         return _Drop(solid)
 
     place = _Place(_DENSE_TABLE, walls)
@@ -124,44 +128,71 @@ def _set_down(
     habits: GenerationConfig,
     physics: PhysicsConfig | None,
 ) -> SimulatedScene:
-    """Let solids go one after the other, each when all are at rest; what goes wrong is tried again."""
+    """Let solids go one after the other, each when all are at rest; what goes wrong is tried again.
 
-    def settled(solids: list[Solid]) -> SimulatedScene:
-        spec = build_spec(solids, name, place.table, place.walls)
-        return scene_from_spec(spec, name, name, physics, least=habits.settling)
+    Solids that were there from the start must not be upset; where there were none, no earlier one must be.
+    Where nothing can be set down any more, the last solid is taken up again too.
+    """
+    physics = physics or PhysicsConfig()
+    impatient = replace(physics, settle_time=habits.rest_time)
 
-    scene = settled(solids) if solids else None
-    for draw in draws:
-        for attempt in range(habits.tries):
-            drop = draw(rng, scene)
-            solids_tried = [*solids, drop.solid]
-            tried = settled(solids_tried)
-            insist = drop.stacked and attempt < habits.tries // 2
-            if _stands(tried, solids, place, habits) and (not insist or _is_raised(tried, habits)):
-                break
-        else:
-            raise InputError(name, f"object{len(solids)} would not stay on the table", "choose another seed")
-        shapes = true_shapes(tried)
-        solids = [replace(solid, shape=shapes[i]) for i, solid in enumerate(solids_tried, start=1)]
-        scene = tried
-    spec = build_spec(solids, name, place.table, place.walls)
-    return scene_from_spec(spec, name, name, physics)
+    def spec_of(solids: list[Solid]) -> Any:
+        return build_spec(solids, name, place.table, place.walls)
+
+    fixed, wanted, failures = len(solids), len(solids) + len(draws), 0
+    below = scene_from_spec(spec_of(solids), name, name, physics) if solids else None
+    for _ in range(habits.patience * wanted):
+        if len(solids) == wanted:
+            return scene_from_spec(spec_of(solids), name, name, physics)
+        drop = draws[len(solids) - fixed](rng, below)
+        tried = scene_from_spec(spec_of([*solids, drop.solid]), name, name, impatient, least=habits.settling)
+        insist = drop.stacked and failures < habits.tries // 2
+        if _stands(tried, solids[:fixed] or solids, place, habits, physics) and (
+            not insist or _is_raised(tried, habits)
+        ):
+            shapes = true_shapes(tried)
+            solids = [
+                replace(solid, shape=shapes[label])
+                for label, solid in enumerate([*solids, drop.solid], start=1)
+            ]
+            below, failures = tried, 0
+            continue
+        failures += 1
+        if failures == habits.tries and len(solids) > fixed:
+            solids, failures = solids[:-1], 0
+            below = scene_from_spec(spec_of(solids), name, name, physics) if solids else None
+    raise InputError(name, f"object{len(solids)} would not stay on the table", "choose another seed")
 
 
-def _stands(scene: SimulatedScene, before: list[Solid], place: _Place, habits: GenerationConfig) -> bool:
-    """All objects are at rest on or over the table, and the earlier ones about where they were."""
+def _stands(
+    scene: SimulatedScene,
+    firm: list[Solid],
+    place: _Place,
+    habits: GenerationConfig,
+    physics: PhysicsConfig,
+) -> bool:
+    """All objects are at rest on or over the table, and the firm ones, the first, about where they were."""
     shapes = true_shapes(scene)
     half = np.array(place.table) / 2.0 - habits.brink
     for label, shape in shapes.items():
-        if bounds(scene, label)[0][2] < TABLE_HEIGHT - habits.gap:
+        low, high = bounds(scene, label)
+        if low[2] < TABLE_HEIGHT - habits.gap or high[2] > TABLE_HEIGHT + habits.max_height:
             return False
         if (np.abs(shape.T_world_object[:2, 3]) > half).any():
             return False
     shifts = [
-        np.linalg.norm(shapes[label].T_world_object[:3, 3] - solid.shape.T_world_object[:3, 3])
-        for label, solid in enumerate(before, start=1)
+        float(np.linalg.norm(shapes[label].T_world_object[:3, 3] - solid.shape.T_world_object[:3, 3]))
+        for label, solid in enumerate(firm, start=1)
     ]
-    return scene.at_rest and max(shifts, default=0.0) <= habits.upset
+    return scene.at_rest and max(shifts, default=0.0) <= habits.upset and _keeps_still(scene, physics)
+
+
+def _keeps_still(scene: SimulatedScene, physics: PhysicsConfig) -> bool:
+    """Nothing moves by itself, not even slowly, while one would watch what taking an object away does."""
+    data = state_of(scene)
+    mujoco.mj_step(scene.model, data, nstep=round(physics.removal_time / scene.model.opt.timestep))
+    distance, angle = displacement(scene.data.xpos, scene.data.xmat, data.xpos, data.xmat)
+    return bool(distance.max() < physics.moved / 2.0 and angle.max() < np.deg2rad(physics.turned) / 2.0)
 
 
 def _is_raised(scene: SimulatedScene, habits: GenerationConfig) -> bool:

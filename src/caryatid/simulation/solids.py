@@ -17,7 +17,7 @@ from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.simulation.world import SimulatedScene
 
 _GEOM = mujoco.mjtGeom
-_FLAT = (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)
+_FLAT = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -85,9 +85,9 @@ def true_shapes(scene: SimulatedScene) -> dict[int, Box | Cylinder | Sphere]:
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
     """Oriented boxes around the geoms that belong to no object, the table's first; planes are no obstacle."""
     table = scene.geoms(0)
-    others = [g for g in np.flatnonzero(scene.geom_labels == 0) if g not in table]
-    solid = [g for g in (*table, *others) if scene.model.geom_type[g] not in _FLAT]
-    return tuple(_geom_box(scene, int(g)) for g in solid)
+    others = [g for g in np.flatnonzero(scene.geom_labels == 0).tolist() if g not in table]
+    solid = [g for g in (*table, *others) if int(scene.model.geom_type[g]) not in _FLAT]
+    return tuple(_geom_box(scene, g) for g in solid)
 
 
 def table_top(scene: SimulatedScene) -> TableTop:

@@ -55,9 +55,9 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
     """Ask physics what holds up what.
 
     A supports B `bottom-up` when the mean contact force of A on B has an upward part above 3 % of B's weight.
-    Each object A is then taken away for a second: a B in contact with A that moves by more than 1 cm or 8° and
-    is not held by A from below is supported by it all the same: `top-down` where A presses on B, `lean` where
-    the force between them is mostly horizontal.
+    Each object A is then taken away for a second: a B in contact with A that moves by more than 1 cm or 8°
+    and is not held by A from below is supported by it all the same: `top-down` where A presses on B, `lean`
+    where the force between them is mostly horizontal.
 
     Args:
         scene: A settled scene; its state is not changed.
@@ -94,8 +94,8 @@ def mean_contact_forces(scene: SimulatedScene, config: PhysicsConfig) -> dict[tu
         config: Length of the window.
 
     Returns:
-        (label of A, label of B) to the force (3,) [N] in the world frame; both directions of a pair, label 0 is
-        the table. Contacts with anything else are left out.
+        (label of A, label of B) to the force (3,) [N] in the world frame, for both directions of a pair.
+        Label 0 is the table; contacts with anything else are left out.
     """
     labels = _labels_with_table(scene)
     data = state_of(scene)
@@ -161,7 +161,7 @@ def read_truth(path: Path) -> GroundTruth:
     edges = tuple(_edge(entry, index, set(vertices), path) for index, entry in enumerate(entries))
     removal = document.get("removal", {})
     if not isinstance(removal, dict) or not all(
-        isinstance(moved, list) and set(moved) <= set(vertices) for moved in removal.values()
+        isinstance(moved, list) and all(name in vertices for name in moved) for moved in removal.values()
     ):
         raise InputError(
             path, "'removal' does not map objects to lists of vertices", "correct it or leave it out"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,10 +66,15 @@ class SimulatedScene:
         return int(self.model.body(name).id)
 
     def geoms(self, label: int) -> list[int]:
-        """Geoms of the object with this label, or of the table with 0, bodies welded to it included."""
+        """Geoms of the object with this label, or of the table with 0, bodies welded to it included.
+
+        Raises:
+            InputError: No object carries the label.
+        """
+        body = self.body_id(label)
         if label != 0:
             return [int(g) for g in np.flatnonzero(self.geom_labels == label)]
-        below = _subtree(self.model, self.body_id(0))
+        below = _subtree(self.model, body)
         return [g for g in range(self.model.ngeom) if int(self.model.geom_bodyid[g]) in below]
 
 
@@ -138,11 +145,20 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
     Raises:
         InputError: The simulation blew up.
     """
+    with _mujoco_warnings_ignored():
+        at_rest = _run_to_rest(model, data, source, config, least)
+    data.qvel[:] = 0.0
+    data.qacc_warmstart[:] = 0.0
+    data.time = 0.0
+    mujoco.mj_forward(model, data)
+    return at_rest
+
+
+def _run_to_rest(model: Any, data: Any, source: str, config: PhysicsConfig, least: float) -> bool:
     mujoco.mj_forward(model, data)
     mujoco.mj_step(model, data, nstep=round(least / model.opt.timestep))
     mujoco.mj_forward(model, data)
     steps = max(1, round(config.rest_window / model.opt.timestep))
-    at_rest = False
     for _ in range(max(1, round(config.settle_time / config.rest_window))):
         before = data.qpos.copy()
         positions, rotations = data.xpos.copy(), data.xmat.copy()
@@ -152,13 +168,8 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
         distance, angle = displacement(positions, rotations, data.xpos, data.xmat)
         if distance.max() <= config.rest_distance and angle.max() <= np.deg2rad(config.rest_angle):
             data.qpos[:] = before
-            at_rest = True
-            break
-    data.qvel[:] = 0.0
-    data.qacc_warmstart[:] = 0.0
-    data.time = 0.0
-    mujoco.mj_forward(model, data)
-    return at_rest
+            return True
+    return False
 
 
 def displacement(
@@ -210,6 +221,17 @@ def _subtree(model: Any, body: int) -> set[int]:
         if int(model.body_parentid[child]) in inside:
             inside.add(child)
     return inside
+
+
+@contextmanager
+def _mujoco_warnings_ignored() -> Iterator[None]:
+    """Keep MuJoCo from printing and from writing a log where the user is; the state counts its warnings."""
+    handler = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(handler)
 
 
 def _check_stable(data: Any, source: str) -> None:

@@ -1,0 +1,36 @@
+"""Active vision for physically plausible support relations in cluttered table-top scenes."""
+
+from caryatid.config import Config
+from caryatid.errors import CaryatidError, InputError
+from caryatid.exploration import Step, explore, next_best_view
+from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.planners import Planner
+from caryatid.primitives import fit
+from caryatid.robot import Robot
+from caryatid.scene import Scene
+from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.views import Camera, Cloud, View
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Box",
+    "Camera",
+    "CaryatidError",
+    "Cloud",
+    "Config",
+    "Cylinder",
+    "InputError",
+    "Planner",
+    "Robot",
+    "Scene",
+    "SceneObject",
+    "Sphere",
+    "Step",
+    "Support",
+    "SupportGraph",
+    "View",
+    "explore",
+    "fit",
+    "next_best_view",
+]

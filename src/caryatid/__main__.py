@@ -1,0 +1,7 @@
+"""`python -m caryatid`."""
+
+import sys
+
+from caryatid.cli import main
+
+sys.exit(main())

@@ -1,0 +1,45 @@
+"""`caryatid evaluate`: a run against the truth."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from caryatid.commands.options import Common
+from caryatid.evaluation.truths import evaluate_run
+from caryatid.formats.json_files import json_text
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(Common):
+    """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU.
+
+    Example: `caryatid evaluate run scenes/tower`.
+    """
+
+    run: Annotated[Path, tyro.conf.Positional]
+    """Run folder."""
+    truth: Annotated[Path, tyro.conf.Positional]
+    """Scene folder (scene.xml and gt.json), or recording with masks and gt.json."""
+
+    def __call__(self) -> int:
+        """Run the command."""
+        scores = evaluate_run(self.run, self.truth)
+        if self.json:
+            sys.stdout.write(json_text({"views": [s.to_json() for s in scores]}) + "\n")
+            return 0
+        table = Table(title=f"{self.run} against {self.truth}", title_justify="left")
+        for column in ("view", "precision", "recall", "F1", "edge precision", "edge recall", "mean IoU"):
+            table.add_column(column, justify="right")
+        for view in scores:
+            s = view.score
+            figures = (s.precision, s.recall, s.f1, s.edge_precision, s.edge_recall, s.mean_iou)
+            table.add_row(str(view.view + 1), *(f"{f:.3f}" for f in figures))
+        Console().print(table)
+        return 0

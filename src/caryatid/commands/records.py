@@ -1,0 +1,77 @@
+"""What run.json and view.json say."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from caryatid.config import Config
+from caryatid.evaluation.scores import Score
+from caryatid.exploration import Step
+
+PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
+"""Whose versions a run records."""
+
+
+def run_record(
+    config: Config, options: Mapping[str, Any], steps: Sequence[Mapping[str, Any]], scores: Sequence[Score]
+) -> dict[str, Any]:
+    """What run.json holds.
+
+    Args:
+        config: All settings.
+        options: Source, planner, noise, seed and so on.
+        steps: `step_record` of each view.
+        scores: Score after each view, where the truth is known.
+    """
+    record: dict[str, Any] = {
+        "command": dict(options),
+        "settings": asdict(config),
+        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "steps": list(steps),
+    }
+    if scores:
+        record["scores"] = [
+            {"precision": s.precision, "recall": s.recall, "f1": s.f1, "mean_iou": s.mean_iou} for s in scores
+        ]
+    return record
+
+
+def step_record(step: Step) -> dict[str, Any]:
+    """Timings [s], angle [rad] and path [m] of one view."""
+    return {
+        "view": step.index,
+        "timings": step.timings,
+        "angle_travelled": step.angle_travelled,
+        "path_travelled": step.path_travelled,
+        "stop": step.stop,
+    }
+
+
+def view_record(step: Step) -> dict[str, Any]:
+    """The candidates' summary and the choice of the next view."""
+    record: dict[str, Any] = {}
+    if step.candidates is not None:
+        record["candidates"] = {"reachable": len(step.candidates), "rejected": step.candidates.rejected}
+    if step.decision is not None:
+        d = step.decision
+        record["next"] = {
+            "T_world_camera": d.T_world_camera,
+            "saliency": d.saliency,
+            "cost": d.cost,
+            "score": d.score,
+            "why": d.why,
+            "points_of_interest": [
+                {"position": p.position_world, "saliency": p.saliency, "subject": list(p.subject), "why": p.why}
+                for p in d.points_of_interest
+            ],
+        }
+        if d.candidate_saliency is not None:
+            quartiles = np.quantile(d.candidate_saliency, (0.0, 0.25, 0.5, 0.75, 1.0))
+            record["next"]["candidate_saliency_quartiles"] = quartiles
+    return record

@@ -1,0 +1,83 @@
+"""What SOURCE is: a scene to simulate, a recording to play back, or a cloud."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caryatid.config import Config, NoiseModel, SegmentationMethod
+from caryatid.errors import InputError
+from caryatid.evaluation.scores import TrueScene
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.formats.bop import Recording, read_recording
+from caryatid.recording_camera import RecordingCamera
+from caryatid.recording_robot import RecordingRobot
+from caryatid.robot import Robot
+from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.stage import set_stage
+from caryatid.simulation.truth import ground_truth, read_truth
+from caryatid.views import Camera
+
+CLOUD_SUFFIXES = (".pcd", ".ply")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Source:
+    """Something to explore.
+
+    Attributes:
+        name: Short name.
+        camera: Gives its views.
+        robot: Stands at the first view.
+        truth: What is really there, where known.
+        views: Views there are, or None without a limit.
+    """
+
+    name: str
+    camera: Camera
+    robot: Robot
+    truth: TrueScene | None
+    views: int | None
+
+
+def is_recording(source: str) -> bool:
+    """Whether SOURCE is a folder in the BOP format."""
+    return (Path(source) / "scene_camera.json").is_file() or (Path(source) / "depth").is_dir()
+
+
+def open_source(source: str, config: Config, *, noise: NoiseModel, seed: int) -> Source:
+    """Open an MJCF file or folder, the name of a built-in scene, or a recording.
+
+    Raises:
+        InputError: It is none of them, or broken.
+    """
+    if Path(source).suffix.lower() in CLOUD_SUFFIXES:
+        raise InputError(source, "is a single cloud, and there is nowhere to go", "use `caryatid extract`")
+    if is_recording(source):
+        return _open_recording(read_recording(source))
+    scene = load_scene(source)
+    truth_file = Path(scene.source).parent / "gt.json"
+    known = read_truth(truth_file) if truth_file.is_file() else None
+    truth = ground_truth(scene) if known is None else known
+    stage = set_stage(scene, config, noise=noise, seed=seed)
+    return Source(
+        scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None
+    )
+
+
+def check_labels(source: str, recording: Recording, segmentation: SegmentationMethod | None) -> None:
+    """Refuse `labels` for a recording without masks before any work is done.
+
+    Raises:
+        InputError: Labels are demanded and there are none.
+    """
+    if segmentation == "labels" and not recording.has_labels:
+        raise InputError(source, "has no masks", "add mask_visib/, or use --segmentation auto")
+
+
+def _open_recording(recording: Recording) -> Source:
+    camera = RecordingCamera(recording)
+    poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
+    return Source(recording.folder.name, camera, RecordingRobot(poses), None, len(recording))

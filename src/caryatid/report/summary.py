@@ -1,0 +1,114 @@
+"""What the whole run comes to: big figures, charts, and what each view changed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from caryatid.report.charts import Line, bar_chart, line_chart
+
+if TYPE_CHECKING:
+    from caryatid.evaluation.scores import Score
+    from caryatid.report.page import ViewPage
+
+
+def changes(before: ViewPage | None, after: ViewPage) -> str:
+    """Say what a view added to and took from the graph."""
+    if before is None:
+        return ""
+    objects = ({o.id: o for o in before.objects}, {o.id: o for o in after.objects})
+    edges = (
+        {(s.supporter, s.supported): s for s in before.supports},
+        {(s.supporter, s.supported): s for s in after.supports},
+    )
+    arrow = "{} → {}".format
+    both = edges[0].keys() & edges[1].keys()
+    parts = [
+        ("new objects", [n for n in objects[1] if n not in objects[0]]),
+        ("objects gone", [n for n in objects[0] if n not in objects[1]]),
+        ("new supports", [arrow(*p) for p in edges[1] if p not in edges[0]]),
+        ("supports gone", [arrow(*p) for p in edges[0] if p not in edges[1]]),
+        (
+            "now certain",
+            [arrow(*p) for p in edges[1] if p in both and edges[1][p].certain and not edges[0][p].certain],
+        ),
+        (
+            "now in doubt",
+            [arrow(*p) for p in edges[1] if p in both and edges[0][p].certain and not edges[1][p].certain],
+        ),
+        (
+            "other shape",
+            [n for n in objects[1] if n in objects[0] and objects[0][n].shape != objects[1][n].shape],
+        ),
+    ]
+    return "; ".join(f"{name}: {', '.join(items)}" for name, items in parts if items) or "nothing new"
+
+
+def cards(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[tuple[str, str, str]]:
+    """Big figures of the summary: (name, figure, what it is made of)."""
+    last = pages[-1]
+    objects = [o for o in last.objects if not o.surface]
+    kinds = [(kind, sum(o.shape == kind for o in objects)) for kind in ("box", "cylinder", "sphere")]
+    plural = {"box": "boxes", "cylinder": "cylinders", "sphere": "spheres"}
+    uncertain = sum(not s.certain for s in last.supports)
+    seconds = [sum(page.timings.values()) for page in pages]
+    figures = [
+        (
+            "objects",
+            str(len(objects)),
+            ", ".join(f"{n} {k if n == 1 else plural[k]}" for k, n in kinds if n) or "none found",
+        ),
+        (
+            "supports",
+            str(len(last.supports)),
+            f"{len(last.supports) - uncertain} certain, {uncertain} uncertain",
+        ),
+        ("views", str(len(pages)), last.stop or "all there were"),
+        ("per view", f"{np.mean(seconds):.2f} s", f"slowest {max(seconds):.2f} s"),
+    ]
+    if last.angle_travelled > 0.0 or last.path_travelled > 0.0:
+        travelled = f"{np.rad2deg(last.angle_travelled):.0f}°"
+        figures.append(
+            ("travelled", travelled, f"around the scene; {last.path_travelled:.1f} m over the floor")
+        )
+    if scores is not None:
+        final = scores[-1]
+        figures.insert(
+            0, ("F1", f"{final.f1:.3f}", f"precision {final.precision:.3f}, recall {final.recall:.3f}")
+        )
+    return figures
+
+
+def charts(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[str]:
+    """Draw the summary's charts as SVG: scores over views and path, what was found, time."""
+    number = [float(page.index) for page in pages]
+    drawn = []
+    if scores is not None:
+        kinds = (("F1", "f1"), ("precision", "precision"), ("recall", "recall"))
+        lines = [Line(name, [float(getattr(score, key)) for score in scores]) for name, key in kinds]
+        drawn.append(line_chart(number, lines, title="Score over views", x_name="view", y_range=(0.0, 1.0)))
+        path = [page.path_travelled for page in pages]
+        unit = "path over the floor [m]"
+        if path[-1] == 0.0 and pages[-1].angle_travelled > 0.0:
+            path, unit = (
+                [float(np.rad2deg(page.angle_travelled)) for page in pages],
+                "angle around the scene [°]",
+            )
+        if path[-1] > path[0]:
+            drawn.append(
+                line_chart(path, lines[:1], title="F1 over travelled path", x_name=unit, y_range=(0.0, 1.0))
+            )
+    if len(pages) > 1:
+        found = [
+            Line("objects", [sum(not o.surface for o in page.objects) for page in pages]),
+            Line("supports", [len(page.supports) for page in pages]),
+            Line("uncertain supports", [sum(not s.certain for s in page.supports) for page in pages]),
+        ]
+        drawn.append(line_chart(number, found, title="Found so far", x_name="view"))
+    if any(page.timings for page in pages):
+        drawn.append(
+            bar_chart([page.timings for page in pages], title="Time of each view [s]", x_name="view")
+        )
+    return drawn

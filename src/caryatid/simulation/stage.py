@@ -1,0 +1,58 @@
+"""A simulated robot with its camera before a scene, ready to explore."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from caryatid.config import Config, NoiseModel
+from caryatid.floor import FloorGrid
+from caryatid.robot import HumanoidRobot, home_view
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.solids import static_boxes, table_top
+from caryatid.simulation.world import SimulatedScene
+from caryatid.view_sphere import ViewSphere
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Stage:
+    """What `explore` needs of a simulation.
+
+    Attributes:
+        scene: The scene in physics.
+        camera: Gives views of it.
+        robot: Stands where the first view is taken.
+    """
+
+    scene: SimulatedScene
+    camera: SimulatedCamera
+    robot: HumanoidRobot
+
+
+def set_stage(scene: SimulatedScene, config: Config, *, noise: NoiseModel, seed: int) -> Stage:
+    """Put the robot before the table, at its home view, with the furniture on its floor map.
+
+    Args:
+        scene: The scene in physics.
+        config: Robot, sensor, noise and view sphere.
+        noise: Noise of the camera.
+        seed: Seed of the noise.
+
+    Raises:
+        PlanningError: No view of the table can be reached.
+    """
+    boxes = static_boxes(scene)
+    top = table_top(scene)
+    centre = np.append(top.corners_world[:, :2].mean(axis=0), top.height)
+    floor = FloorGrid.from_boxes(
+        [b.T_world_object[:3, 3] for b in boxes],
+        [b.extents / 2.0 for b in boxes],
+        [b.T_world_object[:3, :3] for b in boxes],
+        config.robot,
+        centre[:2],
+    )
+    robot = HumanoidRobot(floor, config.robot)
+    robot.move_to(home_view(robot, ViewSphere.around(centre, config.active), config.robot))
+    camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor)
+    return Stage(scene, camera, robot)

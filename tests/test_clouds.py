@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from raycast import K, from_the_side, table_scene
+
+from caryatid import frames
+from caryatid.clouds import estimate_normals, normals_from_depth, oriented_points, thin
+from caryatid.config import CloudConfig
+from caryatid.errors import InputError
+from caryatid.perception_kernels import (
+    inverse_depth_normals,
+    inverse_depth_normals_reference,
+    nearest_seeds,
+    nearest_seeds_reference,
+)
+from caryatid.views import View
+
+CONFIG = CloudConfig()
+SPHERE = (np.array([0.0, 0.0, 0.87]), 0.12)
+
+
+def angles(a, b):
+    return np.degrees(frames.angle_between(a, b))
+
+
+def test_normals_of_a_plane_are_its_normal():
+    T = from_the_side(elevation=35.0)
+    view = table_scene(T, half_table=(5.0, 5.0))
+    normals = normals_from_depth(view, CONFIG)
+    found = np.linalg.norm(normals, axis=-1) > 0
+    assert found[(view.depth > 0.4) & (view.depth < 2.9)].all()
+    assert angles(frames.rotate(T, normals[found].astype(np.float64)), (0.0, 0.0, 1.0)).max() < 0.5
+
+
+def test_normals_of_a_noisy_sphere_point_outwards():
+    T = from_the_side(distance=0.9)
+    view = table_scene(T, spheres=[SPHERE], sigma=0.001)
+    points, normals, pixels = oriented_points(view, CONFIG)
+    on_sphere = view.labels.ravel()[pixels] == 1
+    outward = points[on_sphere] - SPHERE[0]
+    assert np.median(angles(normals[on_sphere], outward)) < 6.0
+    assert np.einsum("ij,ij->i", normals, T[:3, 3] - points).min() > 0.0
+
+
+def test_normals_do_not_smooth_over_depth_edges():
+    depth = np.full((60, 80), 1.0, dtype=np.float32)
+    depth[:, 40:] = 1.1
+    normals = normals_from_depth(View(depth=depth, K=K), CONFIG)
+    np.testing.assert_allclose(normals[:, 38:42], np.broadcast_to((0.0, 0.0, -1.0), (60, 4, 3)), atol=1e-3)
+
+
+def test_no_normal_where_there_is_no_reading():
+    depth = np.zeros((40, 40), dtype=np.float32)
+    depth[20, 20] = 1.0
+    depth[:10] = 5.0
+    assert not normals_from_depth(View(depth=depth, K=K), CONFIG).any()
+
+
+def test_given_normals_are_used():
+    given = np.tile(np.float32([0.0, 0.6, -0.8]), (48, 64, 1))
+    view = View(depth=np.full((48, 64), 1.0, dtype=np.float32), K=K, normals_camera=given)
+    np.testing.assert_array_equal(normals_from_depth(view, CONFIG), given)
+
+
+def test_normals_kernel_equals_its_reference():
+    depth = table_scene(from_the_side(), spheres=[SPHERE], sigma=0.001).depth[150:270, 200:360]
+    inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
+    inverse[::7, ::5] = 0.0
+    for radius in (2, 4):
+        fast = inverse_depth_normals(inverse, K, radius, 0.01, 0.004)
+        plain = inverse_depth_normals_reference(inverse, K, radius, 0.01, 0.004)
+        assert (np.linalg.norm(plain, axis=-1) > 0).mean() > 0.9
+        np.testing.assert_allclose(fast, plain, atol=2e-3)
+
+
+def test_nearest_seeds_equal_dijkstra():
+    rng = np.random.default_rng(3)
+    edges = np.unique(np.sort(rng.integers(0, 300, size=(700, 2)), axis=1), axis=0)
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    costs = rng.uniform(0.1, 1.0, size=len(edges))
+    seeds = rng.choice(300, size=12, replace=False)
+    owner = nearest_seeds(300, edges, costs, seeds)
+    np.testing.assert_array_equal(owner, nearest_seeds_reference(300, edges, costs, seeds))
+    assert (owner[seeds] == np.arange(12)).all()
+    assert (nearest_seeds(4, np.array([[0, 1]]), np.array([1.0]), np.array([0])) == [0, 0, -1, -1]).all()
+
+
+def test_oriented_points_keep_to_the_working_range_and_the_stride():
+    view = table_scene(from_the_side())
+    points, normals, pixels = oriented_points(view, CloudConfig(max_depth=1.2), stride=4)
+    row, column = np.divmod(pixels, 640)
+    assert len(points) == len(normals) == len(pixels) > 1000
+    assert (row % 4 == 0).all()
+    assert (column % 4 == 0).all()
+    assert view.depth.ravel()[pixels].max() <= 1.2
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-5)
+    assert points[view.labels.ravel()[pixels] == 0][:, 2].max() < 0.7501
+
+
+def test_normals_of_a_cloud_follow_rigid_motion_and_face_the_viewpoint():
+    rng = np.random.default_rng(0)
+    directions = frames.unit(rng.normal(size=(2000, 3)))
+    points, viewpoint = 0.1 * directions, np.array([0.0, 0.0, 3.0])
+    normals = estimate_normals(points, viewpoint, 12)
+    upper = directions[:, 2] > 0.3
+    assert angles(normals[upper], directions[upper]).max() < 12.0
+    assert (np.einsum("ij,ij->i", normals, viewpoint - points) >= 0.0).all()
+    T = frames.rigid(frames.random_rotation(rng), (0.3, -0.2, 0.5))
+    moved = estimate_normals(frames.transform(T, points), frames.transform(T, viewpoint), 12)
+    np.testing.assert_allclose(moved, frames.rotate(T, normals), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5])
+def test_normals_of_degenerate_clouds_face_the_viewpoint(count):
+    points = np.outer(np.arange(count), (0.01, 0.0, 0.0))
+    normals = estimate_normals(points, np.array([0.0, 0.0, 1.0]), 8)
+    assert normals.shape == (count, 3)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0)
+    assert (normals[:, 2] > 0.9).all()
+
+
+def test_normals_refuse_nan():
+    with pytest.raises(InputError, match="NaN"):
+        estimate_normals(np.array([[0.0, np.nan, 0.0]]), np.zeros(3), 5)
+
+
+def test_thin_keeps_one_real_point_per_voxel():
+    points = np.random.default_rng(1).uniform(-0.1, 0.1, size=(5000, 3))
+    index = thin(points, 0.02)
+    voxels = np.floor(points / 0.02).astype(int)
+    assert len(index) == len(np.unique(voxels, axis=0)) == len(np.unique(voxels[index], axis=0))
+    assert (np.diff(index) > 0).all()
+    one = (voxels == voxels[index[0]]).all(axis=1)
+    nearest = np.argmin(np.linalg.norm(points - points[one].mean(axis=0), axis=1) + 9.0 * ~one)
+    assert index[0] == nearest
+
+
+def test_thin_bears_far_points_and_none():
+    assert len(thin(np.zeros((0, 3)), 0.01)) == 0
+    assert len(thin(np.array([[0.0, 0.0, 0.0], [1e6, -1e6, 1e6]]), 1e-3)) == 2
+    with pytest.raises(InputError, match="not positive"):
+        thin(np.zeros((1, 3)), 0.0)
+
+
+def test_normals_of_a_vga_view_are_quick():
+    view = table_scene(from_the_side(), spheres=[SPHERE])
+    normals_from_depth(view, CONFIG)
+    times = []
+    for _ in range(3):
+        start = time.perf_counter()
+        normals_from_depth(view, CONFIG)
+        times.append(time.perf_counter() - start)
+    assert min(times) < 0.2

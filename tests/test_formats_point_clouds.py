@@ -1,0 +1,349 @@
+"""Clouds: PCD and PLY in all encodings, and headers that lie."""
+
+from __future__ import annotations
+
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import lzf
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from caryatid.config import CloudConfig
+from caryatid.errors import InputError
+from caryatid.formats import read_cloud, read_recording, read_stored_cloud
+
+SHARED = Path(__file__).parents[2] / "shared"
+DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgba", "<u4"), ("label", "<u4")])
+
+
+def plane(count=60, seed=0):
+    """Points of the plane z = 1 before a camera in the origin."""
+    rng = np.random.default_rng(seed)
+    data = np.zeros(count, DTYPE)
+    data["x"], data["y"] = rng.uniform(-0.3, 0.3, (2, count))
+    data["z"] = 1.0
+    data["rgba"] = (10 << 16) | (20 << 8) | 30
+    data["label"] = np.arange(count) % 4
+    return data
+
+
+def header(data, encoding, **changed):
+    lines = {
+        "VERSION": "0.7",
+        "FIELDS": " ".join(data.dtype.names),
+        "SIZE": " ".join(str(data.dtype[n].itemsize) for n in data.dtype.names),
+        "TYPE": " ".join({"f": "F", "u": "U", "i": "I"}[data.dtype[n].kind] for n in data.dtype.names),
+        "COUNT": " ".join("1" for _ in data.dtype.names),
+        "WIDTH": len(data),
+        "HEIGHT": 1,
+        "VIEWPOINT": "0 0 0 1 0 0 0",
+        "POINTS": len(data),
+        "DATA": encoding,
+    } | changed
+    return "# .PCD v0.7\n" + "".join(f"{k} {v}\n" for k, v in lines.items() if v is not None)
+
+
+def body(data, encoding):
+    match encoding:
+        case "ascii":
+            return "\n".join(" ".join(repr(v.item()) for v in row) for row in data).encode() + b"\n"
+        case "binary":
+            return data.tobytes()
+    columns = b"".join(np.ascontiguousarray(data[name]).tobytes() for name in data.dtype.names)
+    packed = lzf.compress(columns)
+    return struct.pack("<II", len(packed), len(columns)) + packed
+
+
+def write(path, data, encoding="binary", **changed):
+    path.write_bytes(header(data, encoding, **changed).encode() + body(data, encoding))
+    return path
+
+
+def refused(path, said, **arguments):
+    with pytest.raises(InputError) as caught:
+        read_stored_cloud(path, **arguments)
+    message = str(caught.value)
+    assert said in message
+    assert str(path) in message
+    assert "\n" not in message
+    assert caught.value.remedy
+
+
+ENCODINGS = ["ascii", "binary", "binary_compressed"]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_all_encodings_give_the_same_cloud(tmp_path, encoding):
+    data = plane()
+    cloud = read_cloud(write(tmp_path / "a.pcd", data, encoding), CloudConfig())
+    assert np.allclose(cloud.points_world, np.stack([data["x"], data["y"], data["z"]], axis=-1), atol=1e-7)
+    assert (cloud.labels == data["label"]).all()
+    assert (cloud.rgb == (10, 20, 30)).all()
+    assert np.allclose(cloud.normals_world, (0, 0, -1), atol=1e-6)
+    assert cloud.name == "a.pcd"
+
+
+def test_normals_point_to_the_viewpoint(tmp_path):
+    path = write(tmp_path / "a.pcd", plane(), VIEWPOINT="0 0 3 1 0 0 0")
+    cloud = read_cloud(path, CloudConfig())
+    assert np.allclose(cloud.normals_world, (0, 0, 1), atol=1e-6)
+    assert np.allclose(cloud.viewpoint_world, (0, 0, 3))
+
+
+def test_stored_normals_are_used_as_they_are(tmp_path):
+    data = plane()
+    names = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
+    full = np.zeros(len(data), [(name, "<f4") for name in names])
+    for name in ("x", "y", "z"):
+        full[name] = data[name]
+    full["normal_x"] = 2.0
+    path = write(tmp_path / "a.pcd", full)
+    assert np.allclose(read_cloud(path, CloudConfig()).normals_world, (1, 0, 0))
+    full["normal_x"][3] = np.nan
+    write(path, full)
+    assert np.allclose(read_cloud(path, CloudConfig()).normals_world, (0, 0, -1), atol=1e-6)
+
+
+@given(st.integers(1, 40), st.integers(0, 1000))
+@settings(max_examples=25, deadline=None)
+def test_missing_readings_are_dropped_and_labels_spread_back(tmp_path_factory, missing, seed):
+    rng = np.random.default_rng(seed)
+    data = plane(60, seed)
+    gone = rng.choice(60, missing, replace=False)
+    for axis, value in (("x", np.nan), ("y", np.inf), ("z", -np.inf)):
+        hit = gone[rng.random(missing) < 0.6] if axis != "x" else gone
+        data[axis][hit] = value
+    stored = read_stored_cloud(write(tmp_path_factory.mktemp("c") / "a.pcd", data, WIDTH=10, HEIGHT=6))
+    cloud = stored.to_cloud(CloudConfig())
+    assert stored.size == (10, 6)
+    assert len(cloud) == 60 - missing == stored.kept.sum()
+    assert np.isfinite(cloud.points_world).all()
+    assert np.isfinite(cloud.normals_world).all()
+    back = stored.spread(cloud.labels + 5)
+    assert (back[gone] == 0).all()
+    assert (back[stored.kept] == data["label"][stored.kept] + 5).all()
+
+
+def test_points_in_the_sensor_itself_are_no_readings(tmp_path):
+    data = plane()
+    for axis in ("x", "y", "z"):
+        data[axis][:7] = 0.0
+    assert len(read_cloud(write(tmp_path / "a.pcd", data), CloudConfig())) == 53
+
+
+def test_label_divisor_joins_parts_to_objects(tmp_path):
+    data = plane()
+    data["label"] = 20 + np.arange(60) % 3
+    data["label"][:5] = 3
+    stored = read_stored_cloud(write(tmp_path / "a.pcd", data), label_divisor=10)
+    assert (stored.labels == np.where(np.arange(60) < 5, 0, 2)).all()
+
+
+@pytest.mark.parametrize("field_type", ["<f4", "<i4", "<u1"])
+def test_labels_may_be_of_any_number_type(tmp_path, field_type):
+    data = np.zeros(6, [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("label", field_type)])
+    data["z"], data["label"] = 1.0, [0, 1, 2, 3, 4, 5]
+    assert read_stored_cloud(write(tmp_path / "a.pcd", data)).labels.tolist() == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize(("value", "kind"), [(-1, "<i4"), (0.5, "<f4"), (np.nan, "<f4"), (65535, "<u4")])
+def test_labels_that_are_no_object_numbers_are_refused(tmp_path, value, kind):
+    data = np.zeros(6, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("label", kind)])
+    data["z"], data["label"] = 1.0, value
+    refused(write(tmp_path / "a.pcd", data), "label")
+
+
+def test_odd_but_honest_ascii_is_read(tmp_path):
+    path = tmp_path / "a.pcd"
+    text = (
+        "# c\nVERSION .7\r\nFIELDS x y z\r\nSIZE 4 4 4\r\nTYPE F F F\r\nWIDTH 2\r\nHEIGHT 1\r\nPOINTS 2\r\n"
+    )
+    path.write_bytes((text + "DATA ascii\r\n1  2\t3 \r\n\r\nnan nan nan\r\n").encode())
+    stored = read_stored_cloud(path)
+    assert stored.points[0].tolist() == [1, 2, 3]
+    assert stored.kept.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("points", [59, 61, 1000, 4_000_000_000])
+def test_a_header_that_lies_about_the_number_of_points_is_refused(tmp_path, encoding, points):
+    path = write(tmp_path / "a.pcd", plane(), encoding, POINTS=points, WIDTH=points)
+    refused(path, "the header lies or the file is truncated")
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+@pytest.mark.parametrize("keep", [0.3, 0.9])
+def test_a_truncated_file_is_refused(tmp_path, encoding, keep):
+    path = write(tmp_path / "a.pcd", plane(), encoding)
+    head = len(header(plane(), encoding))
+    content = path.read_bytes()
+    path.write_bytes(content[: head + int((len(content) - head) * keep)])
+    refused(path, "a.pcd")
+
+
+def test_a_compressed_file_that_promises_gigabytes_is_refused(tmp_path):
+    path = tmp_path / "a.pcd"
+    points = 200_000_000
+    head = header(plane(), "binary_compressed", WIDTH=points, POINTS=points)
+    path.write_bytes(head.encode() + struct.pack("<II", 100, points * DTYPE.itemsize) + bytes(100))
+    refused(path, "cannot hold them")
+
+
+def test_rubbish_in_place_of_compressed_data_is_refused(tmp_path):
+    path = write(tmp_path / "a.pcd", plane(), "binary_compressed")
+    content = bytearray(path.read_bytes())
+    start = len(header(plane(), "binary_compressed")) + 8
+    content[start:] = bytes([0xFF]) * (len(content) - start)
+    path.write_bytes(bytes(content))
+    refused(path, "cannot be decoded")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"WIDTH": 30}, "WIDTH 30 × HEIGHT 1 is not POINTS 60"),
+        ({"FIELDS": "x y z rgba"}, "do not agree"),
+        ({"FIELDS": "a b c d e"}, "no fields x y z"),
+        ({"FIELDS": None}, "no fields x y z"),
+        ({"FIELDS": "x y z x label"}, "do not agree"),
+        ({"SIZE": "4 4 4 4"}, "do not agree"),
+        ({"SIZE": "4 4 4 4 3"}, "SIZE 3"),
+        ({"SIZE": "4 4 4 4 -4"}, "SIZE"),
+        ({"SIZE": "4 4 4 4 99999999999999999999"}, "SIZE"),
+        ({"TYPE": "F F F U X"}, "TYPE X"),
+        ({"TYPE": "U F F U U"}, "floating point"),
+        ({"COUNT": "1 1 1 1 0"}, "COUNT 0"),
+        ({"COUNT": "1 1 1 1 5"}, "header lies"),
+        ({"POINTS": "many"}, "POINTS"),
+        ({"POINTS": "-60"}, "POINTS"),
+        ({"POINTS": "60 60"}, "POINTS"),
+        ({"POINTS": None}, "POINTS"),
+        ({"POINTS": 0, "WIDTH": 0}, "no points"),
+        ({"VIEWPOINT": "0 0 0"}, "VIEWPOINT"),
+        ({"VIEWPOINT": "a b c d e f g"}, "VIEWPOINT"),
+        ({"DATA": "zip"}, "DATA is 'zip'"),
+        ({"DATA": None}, "no DATA line"),
+    ],
+)
+def test_headers_that_make_no_sense_are_refused(tmp_path, changed, said):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(header(plane(), "binary", **changed).encode() + body(plane(), "binary"))
+    refused(path, said)
+
+
+@pytest.mark.parametrize(
+    ("row", "said"), [("1 2", "2 numbers"), ("1 2 3 4 5 6", "6 numbers"), ("a b c 1 2", "decoded")]
+)
+def test_rows_that_do_not_fit_the_header_are_refused(tmp_path, row, said):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(header(plane(2), "ascii").encode() + b"1 2 3 4 5\n" + row.encode() + b"\n")
+    refused(path, said)
+
+
+@given(st.binary(max_size=300), st.sampled_from(ENCODINGS))
+@settings(max_examples=60, deadline=None)
+def test_no_data_crashes_the_reader(tmp_path_factory, rubbish, encoding):
+    path = tmp_path_factory.mktemp("c") / "a.pcd"
+    path.write_bytes(header(plane(3), encoding).encode() + rubbish)
+    with suppress(InputError):
+        assert len(read_stored_cloud(path).points) == 3
+
+
+def test_files_of_no_use_are_refused(tmp_path):
+    refused(tmp_path / "nowhere.pcd", "missing")
+    refused(tmp_path / "nowhere.ply", "missing")
+    (tmp_path / "a.xyz").write_text("1 2 3")
+    refused(tmp_path / "a.xyz", "no .pcd or .ply")
+    (tmp_path / "folder.pcd").mkdir()
+    refused(tmp_path / "folder.pcd", "cannot be read")
+    data = plane()
+    data["x"] = np.nan
+    refused(write(tmp_path / "nan.pcd", data), "no finite points")
+    with pytest.raises(InputError, match="label_divisor"):
+        read_stored_cloud(write(tmp_path / "a.pcd", plane()), label_divisor=0)
+
+
+def ply(data, encoding, points=None):
+    kinds = {"f4": "float", "u1": "uchar", "i4": "int", "u4": "uint"}
+    names = "".join(f"property {kinds[data.dtype[n].str[1:]]} {n}\n" for n in data.dtype.names)
+    count = len(data) if points is None else points
+    head = f"ply\nformat {encoding} 1.0\ncomment made by hand\nelement vertex {count}\n{names}end_header\n"
+    return head.encode() + body(data, "ascii" if encoding == "ascii" else "binary")
+
+
+PLY_DTYPE = [(n, "<f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")] + [("label", "<i4")]
+
+
+def ply_plane(count=60):
+    data, source = np.zeros(count, PLY_DTYPE), plane(count)
+    for name in ("x", "y", "z", "label"):
+        data[name] = source[name]
+    data["red"], data["green"], data["blue"] = 10, 20, 30
+    return data
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_ply_is_read_with_labels_and_colour(tmp_path, encoding):
+    data = ply_plane()
+    data["x"][5] = np.nan
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply(data, encoding))
+    cloud = read_cloud(path, CloudConfig())
+    keep = np.arange(60) != 5
+    assert np.allclose(cloud.points_world[:, 0], data["x"][keep], atol=1e-7)
+    assert (cloud.labels == data["label"][keep]).all()
+    assert (cloud.rgb == (10, 20, 30)).all()
+    assert np.allclose(cloud.normals_world, (0, 0, -1), atol=1e-6)
+
+
+def test_the_vertices_of_a_mesh_are_a_cloud(tmp_path):
+    import trimesh
+
+    mesh = trimesh.creation.box((0.1, 0.2, 0.3))
+    mesh.export(tmp_path / "a.ply", vertex_normal=True)
+    stored = read_stored_cloud(tmp_path / "a.ply")
+    assert len(stored.points) == 8
+    assert np.allclose(np.abs(stored.points), (0.05, 0.1, 0.15))
+    assert stored.normals is not None
+    assert stored.labels is None
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("points", [61, 4_000_000_000])
+def test_a_ply_header_that_lies_is_refused(tmp_path, encoding, points):
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply(ply_plane(), encoding, points))
+    refused(path, "header lies")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"ply\n",
+        b"no ply at all",
+        b"ply\nformat ascii 1.0\nend_header\n",
+        b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float a\nend_header\n1\n",
+        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n",
+    ],
+)
+def test_what_is_no_ply_is_refused(tmp_path, content):
+    path = tmp_path / "a.ply"
+    path.write_bytes(content)
+    refused(path, "a.ply")
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared")
+def test_a_real_organised_cloud_agrees_with_its_recording():
+    stored = read_stored_cloud(SHARED / "data/clouds/learn22.pcd", label_divisor=10)
+    view = read_recording(SHARED / "data/mosd/learn22")[0]
+    assert stored.size == (640, 480)
+    assert len(stored.points) == 307200
+    assert (stored.labels == view.labels.ravel()).mean() > 0.999
+    kept = stored.kept & view.valid.ravel()
+    assert kept.sum() > 0.99 * stored.kept.sum()
+    assert np.abs(stored.points[kept] - view.points_camera.reshape(-1, 3)[kept]).max() < 0.002

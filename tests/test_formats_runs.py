@@ -1,0 +1,299 @@
+"""Run folders: whole or not there at all."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caryatid import frames
+from caryatid.errors import CaryatidError, InputError
+from caryatid.formats import RunWriter, read_run
+from caryatid.graph import SceneObject, SupportGraph
+from caryatid.shapes import Sphere
+
+T = frames.rigid(np.eye(3), (0.1, 0.2, 1.5))
+K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
+
+
+def graph(count=1):
+    shapes = [Sphere(frames.rigid(np.eye(3), (0.1 * k, 0, 0)), 0.05) for k in range(1, count + 1)]
+    return SupportGraph(tuple(SceneObject(f"o{k}", k, shape) for k, shape in enumerate(shapes, start=1)))
+
+
+def labels():
+    image = np.zeros((6, 8), np.int32)
+    image[2:4, 1:3], image[5] = 300, 65535
+    return image
+
+
+def write_run(folder, views=2, seed=7):
+    with RunWriter(folder) as run:
+        for index in range(views):
+            run.add_view(
+                graph(index + 1),
+                labels(),
+                name=f"scene/{index:06d}",
+                T_world_camera=T,
+                K=K,
+                record={"choice": {"saliency": 0.5, "why": "o2 is held by nothing"}},
+            )
+        run.finish(
+            graph(views), {"seed": seed, "timings": [{"perceive": np.float64(0.25)}]}, "<html>σ</html>"
+        )
+
+
+def test_a_run_is_read_back(tmp_path):
+    write_run(tmp_path / "deep" / "RUN")
+    run = read_run(tmp_path / "deep" / "RUN")
+    assert run.record["seed"] == 7
+    assert run.record["timings"] == [{"perceive": 0.25}]
+    assert [len(v.graph.objects) for v in run.views] == [1, 2]
+    assert len(run.graph.objects) == 2
+    view = run.views[1]
+    assert view.name == "scene/000001"
+    assert np.allclose(view.T_world_camera, T)
+    assert np.allclose(view.K, K)
+    assert view.record["choice"]["why"] == "o2 is held by nothing"
+    assert (view.load_labels() == labels()).all()
+    assert (tmp_path / "deep/RUN/report.html").read_text(encoding="utf-8") == "<html>σ</html>"
+
+
+def test_the_folder_is_laid_out_as_documented(tmp_path):
+    write_run(tmp_path / "RUN")
+    files = sorted(str(p.relative_to(tmp_path / "RUN")) for p in (tmp_path / "RUN").rglob("*") if p.is_file())
+    view = ["graph.json", "labels.png", "view.json"]
+    assert files == sorted(
+        ["graph.json", "report.html", "run.json", *(f"views/{n}/{f}" for n in ("00", "01") for f in view)]
+    )
+    assert [p.name for p in tmp_path.iterdir()] == ["RUN"]
+
+
+def test_clouds_have_one_label_a_point(tmp_path):
+    with RunWriter(tmp_path / "RUN") as run:
+        run.add_view(graph(), np.array([0, 3, 65535]), name="a.pcd")
+        run.finish(graph(), {})
+    view = read_run(tmp_path / "RUN").views[0]
+    assert view.load_labels().tolist() == [0, 3, 65535]
+    assert view.load_labels().dtype == np.int32
+    assert np.load(tmp_path / "RUN/views/00/labels.npy").dtype == np.int32
+    assert view.T_world_camera is None
+
+
+def test_the_same_run_gives_the_same_bytes(tmp_path):
+    for name in ("a", "b"):
+        write_run(tmp_path / name)
+    for path in (tmp_path / "a").rglob("*.*"):
+        assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+def test_a_run_that_fails_leaves_nothing(tmp_path, error):
+    def fail():
+        with RunWriter(tmp_path / "new" / "RUN") as run:
+            run.add_view(graph(), labels(), name="a")
+            assert not (tmp_path / "new/RUN").exists()
+            raise error
+
+    with pytest.raises(error):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_that_is_not_finished_leaves_nothing(tmp_path):
+    with RunWriter(tmp_path / "RUN") as run:
+        run.add_view(graph(), labels(), name="a")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(ValueError, match="discarded"):
+        run.add_view(graph(), labels(), name="a")
+
+
+def test_an_interrupted_run_can_be_finished_with_the_views_done(tmp_path, monkeypatch):
+    write = Path.write_bytes
+
+    def interrupt(path, data):
+        if path.name == "view.json" and path.parent.name == "01":
+            raise KeyboardInterrupt
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", interrupt)
+    with RunWriter(tmp_path / "RUN") as run:
+        run.add_view(graph(1), labels(), name="a")
+        with pytest.raises(KeyboardInterrupt):
+            run.add_view(graph(2), labels(), name="b")
+        run.finish(graph(1), {"interrupted": True})
+    again = read_run(tmp_path / "RUN")
+    assert [view.name for view in again.views] == ["a"]
+    assert not (tmp_path / "RUN/views/01").exists()
+
+
+def test_a_run_without_views_is_no_run(tmp_path):
+    with pytest.raises(CaryatidError, match="no view"), RunWriter(tmp_path / "RUN") as run:
+        run.finish(graph(), {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_older_run_is_replaced_at_the_end_and_not_before(tmp_path):
+    write_run(tmp_path / "RUN", views=3, seed=1)
+    with RunWriter(tmp_path / "RUN") as run:
+        run.add_view(graph(), labels(), name="a")
+        assert read_run(tmp_path / "RUN").record["seed"] == 1
+        run.finish(graph(), {"seed": 2})
+    assert read_run(tmp_path / "RUN").record["seed"] == 2
+    assert not (tmp_path / "RUN/views/02").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["RUN"]
+
+
+def test_an_older_run_survives_a_newer_one_that_fails(tmp_path, monkeypatch):
+    write_run(tmp_path / "RUN", seed=1)
+    rename = Path.rename
+
+    def refuse(path, target):
+        if Path(target).name == "RUN" and not path.name.endswith("-replaced"):
+            raise OSError(errno.EIO, "Input/output error")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(InputError, match="input/output error"):
+        write_run(tmp_path / "RUN", seed=2)
+    assert read_run(tmp_path / "RUN").record["seed"] == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["RUN"]
+
+
+@pytest.mark.parametrize("content", ['{"format": "something else"}', "my notes", None])
+def test_what_is_no_run_is_never_touched(tmp_path, content):
+    folder = tmp_path / "thesis"
+    folder.mkdir()
+    name = "run.json" if content and content.startswith("{") else "thesis.tex"
+    (folder / name).write_text(content or "")
+    with pytest.raises(InputError, match="holds other files") as caught:
+        RunWriter(folder)
+    assert str(folder) in str(caught.value)
+    assert caught.value.remedy
+    assert (folder / name).read_text() == (content or "")
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis"]
+
+
+def test_files_and_empty_folders_in_the_way(tmp_path):
+    (tmp_path / "file").write_text("kept")
+    with pytest.raises(InputError, match="no folder"):
+        RunWriter(tmp_path / "file")
+    with pytest.raises(InputError, match="file/RUN"):
+        RunWriter(tmp_path / "file" / "RUN")
+    assert (tmp_path / "file").read_text() == "kept"
+    (tmp_path / "RUN").mkdir()
+    write_run(tmp_path / "RUN")
+    assert len(read_run(tmp_path / "RUN").views) == 2
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [(errno.ENOSPC, "the disk is full"), (errno.EROFS, "read-only"), (errno.EIO, "cannot be written")],
+)
+@pytest.mark.parametrize("name", ["labels.png", "graph.json", "view.json", "run.json", "report.html"])
+def test_a_disk_that_refuses_is_said_clearly_and_nothing_is_left(tmp_path, monkeypatch, code, said, name):
+    write = Path.write_bytes
+
+    def refuse(path, data):
+        if path.name == name:
+            write(path, data[: len(data) // 2])
+            raise OSError(code, os.strerror(code))
+        return write(path, data)
+
+    monkeypatch.setattr(Path, "write_bytes", refuse)
+    with pytest.raises(InputError, match=said) as caught:
+        write_run(tmp_path / "RUN")
+    assert str(tmp_path / "RUN") in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_one_may_not_write_to_is_said_at_once(tmp_path):
+    locked = tmp_path / "locked"
+    locked.mkdir()
+    locked.chmod(0o555)
+    if os.access(locked, os.W_OK):
+        pytest.skip("this user may write anywhere")
+    with pytest.raises(InputError, match="permission denied"):
+        RunWriter(locked / "RUN")
+
+
+def test_a_place_one_may_not_even_look_at_is_said_at_once(tmp_path, monkeypatch):
+    exists = Path.exists
+
+    def refuse(path):
+        if "locked" in path.parts and path.name != "locked":
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+        return exists(path)
+
+    (tmp_path / "locked").mkdir()
+    monkeypatch.setattr(Path, "exists", refuse)
+    with pytest.raises(InputError, match="permission denied"):
+        RunWriter(tmp_path / "locked" / "a" / "RUN")
+
+
+def test_labels_that_leave_16_bits_are_refused(tmp_path):
+    for bad in (-1, 65536):
+        with pytest.raises(InputError, match="labels leave"), RunWriter(tmp_path / "RUN") as run:
+            run.add_view(graph(), np.full((2, 2), bad), name="a")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("run.json", '{"format": "caryatid/run"', "broken JSON"),
+        ("run.json", '{"format": "other"}', "is not of format"),
+        ("run.json", '{"format": "caryatid/run", "version": 1}', "'views' is missing"),
+        ("graph.json", "{}", "caryatid/graph"),
+        ("views/01/graph.json", None, "missing"),
+        ("views/01/view.json", "{}", "'name' is missing"),
+        ("views/01/view.json", '{"name": "a", "T_world_camera": [1]}', "4×4"),
+        ("views/01/labels.png", None, "missing"),
+        ("views/01/labels.png", "text", "no image"),
+    ],
+)
+def test_a_broken_run_is_refused(tmp_path, name, content, said):
+    write_run(tmp_path / "RUN")
+    path = tmp_path / "RUN" / name
+    path.unlink() if content is None else path.write_text(content)
+    with pytest.raises(InputError, match=said) as caught:
+        read_run(tmp_path / "RUN").views[1].load_labels()
+    assert str(tmp_path / "RUN") in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"rubbish", b"\x93NUMPY\x01\x00", None])
+def test_broken_cloud_labels_are_refused(tmp_path, content):
+    with RunWriter(tmp_path / "RUN") as run:
+        run.add_view(graph(), np.array([0, 3]), name="a.pcd")
+        run.finish(graph(), {})
+    path = tmp_path / "RUN/views/00/labels.npy"
+    path.unlink() if content is None else path.write_bytes(content)
+    with pytest.raises(InputError, match=r"labels\.npy"):
+        read_run(tmp_path / "RUN").views[0].load_labels()
+
+
+def test_numbers_in_labels_npy_must_be_whole(tmp_path):
+    with RunWriter(tmp_path / "RUN") as run:
+        run.add_view(graph(), np.array([0, 3]), name="a.pcd")
+        run.finish(graph(), {})
+    np.save(tmp_path / "RUN/views/00/labels.npy", np.array([0.5]))
+    with pytest.raises(InputError, match="whole numbers"):
+        read_run(tmp_path / "RUN").views[0].load_labels()
+
+
+def test_what_is_no_run_folder_is_refused(tmp_path):
+    with pytest.raises(InputError, match="is no folder"):
+        read_run(tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"run\.json"):
+        read_run(tmp_path)
+
+
+def test_run_json_is_plain_json(tmp_path):
+    write_run(tmp_path / "RUN")
+    document = json.loads((tmp_path / "RUN/run.json").read_text())
+    assert (document["format"], document["views"]) == ("caryatid/run", 2)

@@ -1,0 +1,443 @@
+"""Scores: eqs. 4 and 5, matching by volume and by mask, runs against scenes and recordings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from caryatid import frames
+from caryatid.errors import InputError
+from caryatid.evaluation import (
+    as_scene,
+    evaluate_run,
+    read_true_scene,
+    score,
+    score_masks,
+    score_scenes,
+)
+from caryatid.evaluation.overlaps import TrueObject, assign, mask_ious, volume_ious
+from caryatid.evaluation.scores import TrueScene, score_matches, top_height
+from caryatid.formats import RunWriter, read_recording, write_recording
+from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.simulation.truth import read_truth
+from caryatid.views import SUPPORT_LABEL, View
+
+SHARED = Path(__file__).parents[2] / "shared"
+
+
+def at(x=0.0, y=0.0, z=0.0):
+    return frames.rigid(np.eye(3), (x, y, z))
+
+
+def table(height=0.75):
+    shape = Box(at(z=height - 0.02), np.array([1.0, 1.0, 0.04]))
+    return SceneObject("o0", SUPPORT_LABEL, shape, role="support_surface")
+
+
+def tower(levels=3, table_height=0.75, edge=0.1):
+    """Cubes on each other on a table."""
+    objects, supports = [table(table_height)], []
+    for level in range(levels):
+        shape = Box(at(z=0.75 + edge * (level + 0.5)), np.full(3, edge))
+        objects.append(SceneObject(f"o{level + 1}", level + 1, shape))
+        supports.append(Support(f"o{level}", f"o{level + 1}"))
+    return SupportGraph(tuple(objects), tuple(supports))
+
+
+def random_scene(seed):
+    rng = np.random.default_rng(seed)
+    objects = [table()]
+    for label in range(1, int(rng.integers(1, 8)) + 1):
+        T = frames.rigid(frames.random_rotation(rng), rng.uniform((-0.2, -0.2, 0.7), (0.2, 0.2, 1.1)))
+        shape = [
+            Box(T, rng.uniform(0.03, 0.2, 3)),
+            Cylinder(T, rng.uniform(0.02, 0.08), rng.uniform(0.03, 0.2)),
+            Sphere(T, rng.uniform(0.02, 0.08)),
+        ][int(rng.integers(3))]
+        objects.append(SceneObject(f"o{label}", label, shape))
+    count = len(objects)
+    supports = [
+        Support(f"o{a}", f"o{b}")
+        for a in range(count)
+        for b in range(1, count)
+        if a != b and rng.random() < 0.4
+    ]
+    return SupportGraph(tuple(objects), tuple(supports))
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_truth_against_itself_is_one(seed):
+    graph = random_scene(seed)
+    result = score(graph, as_scene(graph), np.random.default_rng(seed))
+    ratios = (
+        result.precision,
+        result.recall,
+        result.f1,
+        result.vertex_precision,
+        result.vertex_recall,
+        result.edge_precision,
+        result.edge_recall,
+        result.mean_iou,
+    )
+    assert ratios == (1.0,) * 8
+    assert result.matches == {o.id: o.id for o in graph.objects}
+
+
+@given(st.integers(0, 10_000), st.integers(0, 10_000))
+@settings(max_examples=30, deadline=None)
+def test_swapping_graph_and_truth_swaps_precision_and_recall(seed_a, seed_b):
+    a, b = random_scene(seed_a), random_scene(seed_b)
+    forward = score(a, as_scene(b), np.random.default_rng(0))
+    assert 0.0 <= forward.f1 <= 1.0
+    swapped = score_matches(
+        as_scene(b).vertices,
+        as_scene(b).edges,
+        as_scene(a).vertices,
+        as_scene(a).edges,
+        {t: f for f, t in forward.matches.items()},
+        {},
+    )
+    assert (swapped.precision, swapped.recall) == (forward.recall, forward.precision)
+    assert swapped.f1 == pytest.approx(forward.f1)
+
+
+def test_equations_4_and_5_by_hand():
+    truth = as_scene(tower(3))
+    graph = tower(2)
+    wrong = SceneObject("o9", 9, Sphere(at(x=0.4, z=0.8), 0.05))
+    graph = SupportGraph((*graph.objects, wrong), (*graph.supports, Support("o2", "o9", certain=False)))
+    result = score(graph, truth, np.random.default_rng(0))
+    assert result.precision == pytest.approx((3 + 2) / (4 + 3))
+    assert result.recall == pytest.approx((3 + 2) / (4 + 3))
+    assert result.vertex_precision == pytest.approx(3 / 4)
+    assert result.vertex_recall == pytest.approx(3 / 4)
+    assert result.edge_precision == pytest.approx(2 / 3)
+    assert result.edge_recall == pytest.approx(2 / 3)
+    assert result.mean_iou == pytest.approx(1.0)
+    assert result.matches == {"o0": "o0", "o1": "o1", "o2": "o2"}
+
+
+def test_an_edge_the_wrong_way_round_is_false_and_its_kind_does_not_matter():
+    truth = as_scene(tower(2))
+    right, above = tower(2).supports
+    lean = Support(above.supporter, above.supported, kind="lean")
+    turned = Support(above.supported, above.supporter)
+    assert score(SupportGraph(tower(2).objects, (right, lean)), truth, np.random.default_rng(0)).f1 == 1.0
+    result = score(SupportGraph(tower(2).objects, (right, turned)), truth, np.random.default_rng(0))
+    assert result.edge_precision == result.edge_recall == 0.5
+
+
+@pytest.mark.parametrize(
+    ("offset", "found"), [(0.019, True), (-0.019, True), (0.021, False), (-0.021, False)]
+)
+def test_the_table_is_found_within_two_centimetres(offset, found):
+    result = score(tower(2, table_height=0.75 + offset), as_scene(tower(2)), np.random.default_rng(0))
+    assert ("o0" in result.matches) == found
+    assert result.edge_recall == (1.0 if found else 0.5)
+
+
+@pytest.mark.parametrize(("shift", "found"), [(0.030, True), (0.037, False)])
+def test_an_object_is_found_at_half_overlap(shift, found):
+    """A cube of 10 cm shifted by s overlaps its old place by (0.1 - s) / (0.1 + s): 0.5 at 3.33 cm."""
+    moved = SupportGraph((SceneObject("o1", 1, Box(at(x=shift), np.full(3, 0.1))),))
+    truth = as_scene(SupportGraph((SceneObject("o1", 1, Box(at(), np.full(3, 0.1))),)))
+    result = score(moved, truth, np.random.default_rng(3))
+    assert (result.vertex_recall == 1.0) == found
+    if found:
+        assert result.mean_iou == pytest.approx((0.1 - shift) / (0.1 + shift), abs=0.02)
+
+
+def test_one_true_object_is_matched_once():
+    cube = Box(at(), np.full(3, 0.1))
+    twice = SupportGraph((SceneObject("o1", 1, cube), SceneObject("o2", 2, Box(at(x=0.01), np.full(3, 0.1)))))
+    result = score(twice, as_scene(SupportGraph((SceneObject("o7", 7, cube),))), np.random.default_rng(0))
+    assert result.matches == {"o1": "o7"}
+    assert result.vertex_precision == 0.5
+
+
+def test_empty_graphs():
+    empty, some = SupportGraph(), tower(1)
+    assert score(empty, as_scene(empty), np.random.default_rng(0)).f1 == 1.0
+    against = score(empty, as_scene(some), np.random.default_rng(0))
+    assert (against.precision, against.recall, against.f1, against.mean_iou) == (0.0, 0.0, 0.0, 0.0)
+    assert score(some, as_scene(empty), np.random.default_rng(0)).f1 == 0.0
+
+
+def test_a_true_object_without_a_solid_costs_recall():
+    truth = TrueScene(("a", "b"), frozenset(), as_scene(tower(1)).objects)
+    truth = TrueScene(("o1", "b"), frozenset(), truth.objects)
+    result = score(SupportGraph(tower(1).objects[1:]), truth, np.random.default_rng(0))
+    assert (result.precision, result.recall) == (1.0, 0.5)
+
+
+def test_volume_iou_of_concentric_balls_is_the_ratio_of_volumes():
+    def ball(radius):
+        return as_scene(SupportGraph((SceneObject("o1", 1, Sphere(at(), radius)),))).objects
+
+    iou = volume_ious(ball(0.08), ball(0.1), 40_000, np.random.default_rng(0))
+    assert iou[0, 0] == pytest.approx(0.8**3, abs=0.01)
+
+
+def test_solids_whose_boxes_are_apart_are_not_sampled():
+    def never(points_world):
+        raise AssertionError("asked")
+
+    box = np.array([[0.0, 0, 0], [1, 1, 1]])
+    iou = volume_ious(
+        [TrueObject("a", never, box)], [TrueObject("b", never, box + 2.0)], 10, np.random.default_rng(0)
+    )
+    assert iou.tolist() == [[0.0]]
+
+
+def test_assignment_is_one_to_one_and_drops_poor_pairs():
+    iou = np.array([[0.9, 0.8, 0.0], [0.7, 0.0, 0.0], [0.0, 0.0, 0.4]])
+    assert assign(iou, 0.5) == [(0, 1), (1, 0)]
+    assert assign(np.zeros((0, 4)), 0.5) == []
+
+
+def test_the_top_of_a_tilted_table_is_measured_in_its_middle():
+    tilt = frames.rotation_from_vector((np.deg2rad(2.0), 0, 0))
+    box = Box(frames.rigid(tilt, (0, 0, 0.7)), np.array([1.0, 1.0, 0.04]))
+    assert top_height(box) == pytest.approx(0.72, abs=1e-4)
+    assert top_height(Sphere(at(z=1.0), 0.1)) == pytest.approx(1.1)
+    lying = frames.rotation_from_vector((0, np.deg2rad(90.0), 0))
+    assert top_height(Box(frames.rigid(lying, (0, 0, 0.7)), np.array([0.04, 1.0, 1.0]))) == pytest.approx(
+        0.72
+    )
+
+
+def test_the_same_seed_gives_the_same_score():
+    a, b = random_scene(1), as_scene(random_scene(1))
+    shifted = SupportGraph(
+        tuple(SceneObject(o.id, o.label, o.shape.moved(at(x=0.004)), o.role) for o in a.objects), a.supports
+    )
+    first, second = (score(shifted, b, np.random.default_rng(5)) for _ in range(2))
+    assert first == second
+    assert first.mean_iou < 1.0
+
+
+def mask_graph(labels=(1, 2)):
+    objects = [table(), *(SceneObject(f"o{k}", k, Sphere(at(), 0.1)) for k in labels)]
+    return SupportGraph(tuple(objects), (Support("o0", "o1"), Support("o1", "o2")))
+
+
+TRUE_LABELS = np.zeros((20, 20), np.int32)
+TRUE_LABELS[2:8, 2:12] = 5
+TRUE_LABELS[10:18, 3:9] = 7
+VERTICES = ("table", "object5", "object7")
+EDGES = frozenset({("table", "object5"), ("object5", "object7")})
+
+
+def test_masks_match_objects_in_real_frames():
+    labels = np.where(TRUE_LABELS == 5, 1, 0) + np.where(TRUE_LABELS == 7, 2, 0)
+    labels[0] = SUPPORT_LABEL
+    result = score_masks(mask_graph(), [labels], [TRUE_LABELS], VERTICES, EDGES)
+    assert (result.f1, result.mean_iou) == (1.0, 1.0)
+    assert result.matches == {"o0": "table", "o1": "object5", "o2": "object7"}
+    half = labels.copy()
+    half[2:5] = 0
+    at_half = score_masks(mask_graph(), [half], [TRUE_LABELS], VERTICES, EDGES)
+    assert at_half.ious["o1"] == 0.5
+    less = half.copy()
+    less[5, 2] = 0
+    below = score_masks(mask_graph(), [less], [TRUE_LABELS], VERTICES, EDGES)
+    assert set(below.matches) == {"o0", "o2"}
+    assert below.edge_recall == 0.0
+
+
+def test_without_a_true_table_the_extracted_one_is_wrong():
+    labels = np.where(TRUE_LABELS == 5, 1, 0) + np.where(TRUE_LABELS == 7, 2, 0)
+    result = score_masks(
+        mask_graph(), [labels], [TRUE_LABELS], VERTICES[1:], frozenset({("object5", "object7")})
+    )
+    assert result.vertex_precision == pytest.approx(2 / 3)
+    assert result.edge_precision == 0.5
+
+
+def test_vertices_that_are_not_in_the_frame_cost_recall():
+    labels = np.where(TRUE_LABELS == 5, 1, 0) + np.where(TRUE_LABELS == 7, 2, 0)
+    result = score_masks(mask_graph(), [labels], [TRUE_LABELS], (*VERTICES, "object9", "wall"), EDGES)
+    assert result.vertex_recall == pytest.approx(3 / 5)
+    assert result.vertex_precision == 1.0
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=40, deadline=None)
+def test_mask_iou_is_what_sets_say(seed):
+    rng = np.random.default_rng(seed)
+    mine, theirs = ([rng.integers(0, 5, shape) for shape in ((6, 7), (4, 3))] for _ in range(2))
+    iou = mask_ious(mine, theirs, [1, 2, 3], [4, 1])
+    a, b = (np.concatenate([image.ravel() for image in images]) for images in (mine, theirs))
+    for i, k in enumerate((1, 2, 3)):
+        for j, m in enumerate((4, 1)):
+            union = ((a == k) | (b == m)).sum()
+            assert iou[i, j] == pytest.approx(((a == k) & (b == m)).sum() / max(union, 1))
+
+
+def test_masks_of_other_sizes_are_refused():
+    with pytest.raises(InputError, match="label images of"):
+        score_masks(mask_graph(), [np.zeros((3, 3), np.int32)], [TRUE_LABELS], VERTICES, EDGES)
+
+
+SCENE = """<mujoco><worldbody>
+  <body name="table"><geom type="box" size="0.4 0.4 0.02" pos="0 0 0.73"/></body>
+  <body name="lower" pos="0 0 0.8"><joint type="free"/><geom type="box" size="0.06 0.06 0.05"/></body>
+  <body name="upper" pos="0 0 0.88"><joint type="free"/><geom type="cylinder" size="0.04 0.03"/></body>
+</worldbody></mujoco>"""
+GT = {
+    "vertices": ["table", "lower", "upper"],
+    "edges": [
+        {"supporter": "table", "supported": "lower", "kind": "bottom-up"},
+        {"supporter": "lower", "supported": "upper"},
+    ],
+}
+
+
+@pytest.fixture
+def scene_folder(tmp_path):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "scene.xml").write_text(SCENE)
+    (folder / "gt.json").write_text(json.dumps(GT))
+    return folder
+
+
+def scene_graph(objects):
+    table_ = SceneObject("o0", SUPPORT_LABEL, Box(at(z=0.73), np.array([0.8, 0.8, 0.04])), "support_surface")
+    lower = SceneObject("o1", 1, Box(at(z=0.8), np.array([0.12, 0.12, 0.1])))
+    upper = SceneObject("o2", 2, Cylinder(at(z=0.88), 0.04, 0.06))
+    supports = (Support("o0", "o1"), Support("o1", "o2"))
+    return SupportGraph((table_, lower, upper)[: objects + 1], supports[:objects])
+
+
+def write_run(folder, graphs, labels=None, names=None):
+    with RunWriter(folder) as run:
+        for index, graph in enumerate(graphs):
+            image = np.zeros((4, 4), np.int32) if labels is None else labels[index]
+            run.add_view(graph, image, name=f"view {index}" if names is None else names[index])
+        run.finish(graphs[-1], {})
+
+
+def test_a_run_is_scored_view_by_view_against_its_scene(tmp_path, scene_folder):
+    write_run(tmp_path / "RUN", [scene_graph(1), scene_graph(2)])
+    first, second = evaluate_run(tmp_path / "RUN", scene_folder)
+    assert (first.view, second.view) == (0, 1)
+    assert first.score.f1 == pytest.approx(2 * 1.0 * (3 / 5) / (1.0 + 3 / 5))
+    assert second.score.f1 == 1.0
+    assert second.score.mean_iou > 0.98
+    assert second.score.matches == {"o0": "table", "o1": "lower", "o2": "upper"}
+    assert {"view", "precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou"} <= set(
+        first.to_json()
+    )
+    assert first.to_json()["f1"] == first.score.f1
+    assert evaluate_run(tmp_path / "RUN", scene_folder) == (first, second)
+
+
+def record(folder, count):
+    poses = [frames.look_at((1.0, 0.2 * k, 1.0), (0, 0, 0)) for k in range(count)]
+    K = np.array([[20.0, 0, 9.5], [0, 20.0, 9.5], [0, 0, 1]])
+    depth = np.ones((20, 20), np.float32)
+    write_recording(
+        folder, [View(depth, K, T, labels=np.roll(TRUE_LABELS, k, axis=1)) for k, T in enumerate(poses)]
+    )
+    edges = [{"supporter": a, "supported": b} for a, b in sorted(EDGES)]
+    (folder / "gt.json").write_text(json.dumps({"vertices": VERTICES, "edges": edges}))
+
+
+def test_a_run_is_scored_against_the_frames_it_was_made_from(tmp_path):
+    record(tmp_path / "rec", 2)
+    mine = [
+        np.where(t == 5, 1, np.where(t == 7, 2, 0)) for t in (np.roll(TRUE_LABELS, 1, axis=1), TRUE_LABELS)
+    ]
+    write_run(tmp_path / "RUN", [mask_graph()] * 2, mine, ["rec/000001", "rec/000000"])
+    assert [v.score.f1 for v in evaluate_run(tmp_path / "RUN", tmp_path / "rec")] == [1.0, 1.0]
+    assert evaluate_run(tmp_path / "RUN", tmp_path / "rec")[1].score.mean_iou == 1.0
+    write_run(tmp_path / "RUN", [mask_graph()] * 2, mine, ["rec/000001", "rec/000007"])
+    with pytest.raises(InputError, match="000007"):
+        evaluate_run(tmp_path / "RUN", tmp_path / "rec")
+
+
+def test_a_view_is_scored_by_the_pixels_seen_up_to_it(tmp_path):
+    record(tmp_path / "rec", 2)
+    mine = np.where(TRUE_LABELS == 5, 1, np.where(TRUE_LABELS == 7, 2, 0))
+    nothing = np.zeros_like(mine)
+    write_run(tmp_path / "RUN", [mask_graph()] * 2, [mine, nothing], ["rec/000000", "rec/000001"])
+    first, second = evaluate_run(tmp_path / "RUN", tmp_path / "rec")
+    assert first.score.mean_iou == 1.0
+    assert second.score.mean_iou == 0.5
+
+
+def test_an_organised_cloud_is_scored_against_the_frame_it_comes_from(tmp_path):
+    record(tmp_path / "rec", 1)
+    mine = np.where(TRUE_LABELS == 5, 1, np.where(TRUE_LABELS == 7, 2, 0)).ravel()
+    write_run(tmp_path / "RUN", [mask_graph()], [mine], ["cloud.pcd"])
+    assert evaluate_run(tmp_path / "RUN", tmp_path / "rec")[0].score.f1 == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("gt.json", None, "missing"),
+        ("gt.json", "{", "broken JSON"),
+        ("gt.json", '{"vertices": ["table"]}', "edges"),
+        ("gt.json", '{"vertices": ["table", "ghost"], "edges": []}', "ghost"),
+        ("gt.json", '{"vertices": ["table"], "edges": [{"supporter": "table", "supported": "x"}]}', "x"),
+        ("scene.xml", "<mujoco", "scene.xml"),
+        ("scene.xml", None, "neither scene.xml nor"),
+    ],
+)
+def test_a_bad_truth_is_refused(tmp_path, scene_folder, name, content, said):
+    write_run(tmp_path / "RUN", [scene_graph(2)])
+    path = scene_folder / name
+    path.unlink() if content is None else path.write_text(content)
+    with pytest.raises(InputError, match=said) as caught:
+        evaluate_run(tmp_path / "RUN", scene_folder)
+    assert str(scene_folder) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_folders_and_truths_are_refused(tmp_path, scene_folder):
+    with pytest.raises(InputError, match="is no folder"):
+        evaluate_run(tmp_path / "nowhere", scene_folder)
+    write_run(tmp_path / "RUN", [scene_graph(2)])
+    with pytest.raises(InputError, match="is no folder"):
+        evaluate_run(tmp_path / "RUN", tmp_path / "nowhere")
+    record(tmp_path / "rec", 1)
+    (tmp_path / "rec/gt.json").unlink()
+    with pytest.raises(InputError, match=r"gt\.json.*missing"):
+        evaluate_run(tmp_path / "RUN", tmp_path / "rec")
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared")
+@pytest.mark.parametrize("name", ["arch", "dense00_10", "ycb02_6", "ycb05_9"])
+def test_a_true_scene_against_itself_is_one(name):
+    truth = read_true_scene(SHARED / "scenes" / name)
+    gt = json.loads((SHARED / "scenes" / name / "gt.json").read_text())
+    result = score_scenes(truth, truth, np.random.default_rng(0))
+    assert (result.precision, result.recall, result.f1, result.mean_iou) == (1.0,) * 4
+    assert len(result.matches) == len(gt["vertices"])
+    assert len(truth.edges) == len(gt["edges"])
+    assert truth.table_top == pytest.approx(0.75)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared")
+@pytest.mark.parametrize("name", ["learn22", "test43"])
+def test_a_true_frame_against_itself_is_one(name):
+    folder = SHARED / "data/mosd" / name
+    truth = read_truth(folder / "gt.json")
+    labels = read_recording(folder).frames[0].load_labels()
+    numbers = [int(vertex.removeprefix("object")) for vertex in truth.vertices[1:]]
+    ids = {"table": "o0"} | {f"object{k}": f"o{k}" for k in numbers}
+    graph = SupportGraph(
+        (table(), *(SceneObject(f"o{k}", k, Sphere(at(), 0.1)) for k in numbers)),
+        tuple(Support(ids[a], ids[b]) for a, b in sorted(truth.pairs)),
+    )
+    result = score_masks(graph, [labels], [labels], truth.vertices, frozenset(truth.pairs))
+    assert (result.f1, result.mean_iou, result.edge_recall) == (1.0, 1.0, 1.0)

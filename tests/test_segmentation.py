@@ -1,0 +1,231 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from raycast import TABLE, K, from_the_side, table_scene
+from scipy.optimize import linear_sum_assignment
+
+from caryatid import frames
+from caryatid.clouds import oriented_points, thin
+from caryatid.config import CloudConfig, SegmentationConfig, SurfaceConfig
+from caryatid.convexity import cluster_by_mean, convex_parts, number_by_appearance
+from caryatid.errors import PerceptionError
+from caryatid.segmentation import find_support_surface, on_surface, segment, segment_cloud
+from caryatid.views import Cloud, View
+
+UP = np.array([0.0, 0.0, 1.0])
+MOSD = Path(__file__).parents[2] / "shared" / "data" / "mosd"
+STACK = [
+    (np.array([0.0, -0.1, TABLE + 0.04]), np.array([0.18, 0.2, 0.08])),
+    (np.array([-0.02, -0.1, TABLE + 0.12]), np.array([0.08, 0.1, 0.08])),
+]
+BALL = (np.array([0.05, 0.18, TABLE + 0.06]), 0.06)
+
+
+def surface_of(view, up=UP, seed=0, stride=2):
+    points, normals, _ = oriented_points(view, CloudConfig(), stride)
+    return find_support_surface(points, normals, up, SurfaceConfig(), np.random.default_rng(seed))
+
+
+def found(labels, truth):
+    """True masks paired one-to-one with a part at IoU ≥ 0.5, all true masks, all parts."""
+    iou = np.zeros((labels.max(), truth.max()))
+    for part in range(1, labels.max() + 1):
+        for mask in range(1, truth.max() + 1):
+            both = np.sum((labels == part) & (truth == mask))
+            iou[part - 1, mask - 1] = both / np.sum((labels == part) | (truth == mask))
+    rows, columns = linear_sum_assignment(-iou)
+    return int(np.sum(iou[rows, columns] >= 0.5)), int(truth.max()), int(labels.max())
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.001])
+def test_the_table_is_found_not_the_floor(sigma):
+    surface = surface_of(table_scene(from_the_side(distance=1.6), STACK, [BALL], sigma))
+    assert abs(surface.point_world[2] - TABLE) < 0.003
+    assert np.degrees(frames.angle_between(surface.normal_world, UP)) < 0.5
+    np.testing.assert_allclose(sorted(surface.shape.extents), [0.04, 0.6, 0.9], atol=0.03)
+
+
+def test_the_surface_box_has_the_table_top_as_its_top_face():
+    surface = surface_of(table_scene(from_the_side(azimuth=33.0)))
+    T = surface.shape.T_world_object
+    top = T[:3, 3] + T[:3, 2] * surface.shape.extents[2] / 2.0
+    assert abs(surface.height(top)) < 1e-9
+    np.testing.assert_allclose(T[:3, 2], surface.normal_world, atol=1e-9)
+    assert surface.shape.signed_distance(surface.outline_world).max() < 1e-6
+    assert np.abs(surface.height(surface.outline_world)).max() < 1e-9
+    turn = np.cross(np.roll(surface.outline_world, -1, axis=0) - surface.outline_world, UP)
+    assert (np.einsum("ij,ij->i", turn, surface.outline_world - surface.point_world) > 0).all()
+
+
+def test_distance_outside_the_outline():
+    surface = surface_of(table_scene(from_the_side()))
+    points = np.array([[0.0, 0.0, 1.0], [0.4, 0.0, 0.8], [0.0, -0.65, 0.7]])
+    np.testing.assert_allclose(surface.distance_outside(points)[1:], [0.1, 0.2], atol=0.02)
+    assert surface.distance_outside(points)[0] < -0.2
+
+
+def test_a_table_partly_behind_a_screen_is_found():
+    screen = (np.array([0.27, 0.1, TABLE + 0.15]), np.array([0.03, 0.3, 0.3]))
+    surface = surface_of(table_scene(from_the_side(elevation=30.0), [screen, *STACK]))
+    assert abs(surface.point_world[2] - TABLE) < 0.001
+    assert surface.distance_outside(np.array([[-0.2, -0.3, TABLE], [-0.2, 0.35, TABLE]])).max() < 0.0
+
+
+def test_without_a_pose_the_table_is_found_in_the_camera_frame():
+    T = from_the_side(distance=1.0)
+    view = replace(table_scene(T, STACK, [BALL], sigma=0.001), T_world_camera=None)
+    surface = surface_of(view, up=None)
+    assert np.degrees(frames.angle_between(frames.rotate(T, surface.normal_world), UP)) < 0.5
+    assert abs(frames.transform(T, surface.point_world)[2] - TABLE) < 0.003
+
+
+def test_same_seed_same_surface():
+    view = table_scene(from_the_side(), STACK, sigma=0.001)
+    first, second = surface_of(view, seed=4), surface_of(view, seed=4)
+    np.testing.assert_array_equal(first.outline_world, second.outline_world)
+    np.testing.assert_array_equal(first.shape.T_world_object, second.shape.T_world_object)
+
+
+@pytest.mark.parametrize("up", [UP, None])
+def test_no_surface_is_an_error_that_says_so(up):
+    rng = np.random.default_rng(0)
+    points, normals = rng.uniform(-1, 1, size=(3000, 3)), frames.unit(rng.normal(size=(3000, 3)))
+    config = SurfaceConfig(min_points=400)
+    with pytest.raises(PerceptionError, match="no support surface"):
+        find_support_surface(points, normals, up, config, rng)
+    with pytest.raises(PerceptionError, match="no support surface"):
+        find_support_surface(np.zeros((0, 3)), np.zeros((0, 3)), up, config, rng)
+
+
+def test_a_wall_is_no_support_surface():
+    y, z = (g.ravel() for g in np.meshgrid(np.linspace(-1, 1, 60), np.linspace(0, 2, 60)))
+    wall = np.stack([np.zeros_like(y), y, z], axis=-1)
+    normals = np.tile((1.0, 0.0, 0.0), (len(wall), 1))
+    with pytest.raises(PerceptionError):
+        find_support_surface(wall, normals, UP, SurfaceConfig(), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("sigma", "azimuth"), [(0.0, 20.0), (0.0, 65.0), (0.0015, 20.0), (0.0015, 65.0)])
+def test_a_stack_and_a_ball_come_apart(sigma, azimuth):
+    view = table_scene(from_the_side(azimuth), STACK, [BALL], sigma)
+    labels = segment(view, surface_of(view), SegmentationConfig())
+    assert labels.shape == view.depth.shape
+    assert labels.dtype == np.int32
+    assert found(labels, view.labels) == (3, 3, 3)
+    assert np.mean(labels[view.labels == 0] > 0) < 0.005
+
+
+def test_one_box_stays_one_part():
+    view = table_scene(from_the_side(), STACK[:1], sigma=0.001)
+    labels = segment(view, surface_of(view), SegmentationConfig())
+    assert found(labels, view.labels) == (1, 1, 1)
+
+
+def test_an_empty_table_has_no_parts():
+    view = table_scene(from_the_side(), sigma=0.0005)
+    assert not segment(view, surface_of(view), SegmentationConfig()).any()
+
+
+def test_segmentation_does_not_need_a_pose():
+    view = table_scene(from_the_side(), STACK, [BALL])
+    lost = replace(view, T_world_camera=None)
+    labels = segment(lost, surface_of(lost, up=None), SegmentationConfig())
+    assert found(labels, view.labels) == (3, 3, 3)
+
+
+def test_only_what_stands_on_the_surface_is_kept():
+    surface = surface_of(table_scene(from_the_side()))
+    points = np.array([[0, 0, 0.8], [0, 0, 0.751], [0, 0, 0.5], [0, 0, 1.6], [0.6, 0, 0.8], [0.32, 0, 0.8]])
+    kept = on_surface(points, surface, SegmentationConfig())
+    assert kept.tolist() == [True, False, False, False, False, True]
+
+
+def test_a_cloud_comes_apart_like_the_view():
+    views = [table_scene(from_the_side(azimuth), STACK, [BALL], sigma=0.001) for azimuth in (0, 120, 240)]
+    points, normals, truth = [], [], []
+    for view in views:
+        p, n, pixels = oriented_points(view, CloudConfig())
+        points.append(p)
+        normals.append(n)
+        truth.append(view.labels.ravel()[pixels])
+    index = thin(np.concatenate(points), 0.005)
+    cloud = Cloud(np.concatenate(points)[index], np.concatenate(normals)[index])
+    labels = segment_cloud(cloud, surface_of(views[0]), SegmentationConfig())
+    assert found(labels, np.concatenate(truth)[index]) == (3, 3, 3)
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+def test_a_cloud_of_almost_nothing_has_no_parts(count):
+    surface = surface_of(table_scene(from_the_side()))
+    points = np.tile((0.0, 0.0, 0.8), (count, 1))
+    cloud = Cloud(points, np.tile(UP, (count, 1)))
+    assert segment_cloud(cloud, surface, SegmentationConfig()).tolist() == [0] * count
+
+
+def bent_sheet(angle: float):
+    """Two square sheets that meet along x = 0 under an angle [deg]; positive = a valley seen from above."""
+    side = np.arange(0.0, 0.1, 0.005)
+    s, y = (g.ravel() for g in np.meshgrid(side, side, indexing="ij"))
+    rise = np.radians(angle / 2.0)
+    right = np.stack([s * np.cos(rise), y, s * np.sin(rise)], axis=-1)
+    right = right + np.array([0.0025, 0.0, 0.0])
+    points = np.concatenate([right, right * (-1, 1, 1)])
+    normal = np.array([-np.sin(rise), 0.0, np.cos(rise)])
+    normals = np.repeat([normal, normal * (-1, 1, 1)], len(right), axis=0)
+    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    edges = np.argwhere(np.triu(distance <= 0.0075, k=1))
+    return points, normals, edges
+
+
+@pytest.mark.parametrize(("angle", "parts"), [(-90.0, 1), (-20.0, 1), (0.0, 1), (40.0, 2), (90.0, 2)])
+def test_sheets_part_where_they_are_concave(angle, parts):
+    points, normals, edges = bent_sheet(angle)
+    config = SegmentationConfig()
+    labels = convex_parts(points, normals, edges, config)
+    assert len(np.unique(labels)) == parts
+    assert labels.min() == 1
+    assert len(np.unique(labels[: len(labels) // 2])) == 1
+    T = frames.rigid(frames.random_rotation(np.random.default_rng(1)), (0.2, 0.1, 0.4))
+    moved = convex_parts(frames.transform(T, points), frames.rotate(T, normals), edges, config)
+    assert len(np.unique(moved)) == parts
+
+
+def test_clusters_weigh_the_mean_of_their_border():
+    pairs = np.array([[0, 1], [2, 3], [0, 2], [1, 3]])
+    attraction = np.array([1.0, 0.9, 0.5, -0.8])
+    cluster = cluster_by_mean(4, pairs, attraction, np.ones(4))
+    assert cluster[0] == cluster[1] != cluster[2] == cluster[3]
+    joined = cluster_by_mean(4, pairs, attraction, np.array([1.0, 1.0, 3.0, 1.0]))
+    assert len(set(joined.tolist())) == 1
+
+
+def test_parts_are_numbered_by_appearance():
+    assert number_by_appearance(np.array([7, 7, -1, 2, 7, 3])).tolist() == [1, 1, 0, 2, 1, 3]
+    assert number_by_appearance(np.array([5, 1, 5])).tolist() == [1, 2, 1]
+
+
+def test_nothing_in_range_has_no_parts():
+    surface = surface_of(table_scene(from_the_side()))
+    view = View(depth=np.zeros((48, 64), dtype=np.float32), K=K, T_world_camera=from_the_side())
+    assert not segment(view, surface, SegmentationConfig()).any()
+
+
+@pytest.mark.skipif(not MOSD.is_dir(), reason="../shared/data/mosd is absent")
+def test_real_frames_of_stacked_objects():
+    totals = np.zeros(3, dtype=int)
+    for folder in sorted(MOSD.iterdir()):
+        if not folder.is_dir():
+            continue
+        depth = np.asarray(Image.open(folder / "depth" / "000000.png")).astype(np.float32) * 1e-4
+        truth = np.zeros(depth.shape, dtype=np.int32)
+        for number, path in enumerate(sorted((folder / "mask_visib").iterdir()), start=1):
+            truth[np.asarray(Image.open(path)) > 0] = number
+        view = View(depth=depth, K=K)
+        totals += found(segment(view, surface_of(view, up=None), SegmentationConfig()), truth)
+    assert totals[0] >= 0.94 * totals[1]
+    assert totals[2] - totals[0] <= 0.21 * totals[2]

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+from functools import cache
+
+import mujoco
+import numpy as np
+import pytest
+
+from caryatid.errors import InputError
+from caryatid.shapes import Box
+from caryatid.simulation import (
+    SimulatedScene,
+    bounds,
+    generate_dense,
+    generate_pile,
+    ground_truth,
+    list_scenes,
+    load_scene,
+    static_boxes,
+    table_top,
+    true_shapes,
+)
+from caryatid.simulation.designed import DESIGNED
+from caryatid.simulation.scenes import is_builtin
+from caryatid.simulation.world import state_of
+
+dense = cache(generate_dense)
+pile = cache(generate_pile)
+
+INTENDED = {
+    "tower": {("table", 0), (0, 1), (1, 2), (2, 3), ("table", 4)},
+    "bridge": {("table", 0), ("table", 1), ("table", 4), (0, 2), (1, 2), (2, 3)},
+    "counterweight": {("table", 0), (0, 1), (1, 2), (2, 1, "top-down"), ("table", 3)},
+    "leaning_plank": {("table", 0), ("table", 1), (0, 1, "lean"), ("table", 2), (2, 3)},
+    "hidden_stack": {("table", 0), ("table", 1), (1, 2), (2, 3), ("table", 4)},
+    "shelf": {("table", 0), ("table", 1), (0, 2), (1, 2), ("table", 3), (3, 4), (2, 5), (2, 6)},
+    "clutter": {
+        *(("table", k) for k in (0, 3, 4, 5, 7)), (0, 1), (1, 2), (4, 6), (5, 6), (3, 8),
+    },
+}  # fmt: skip
+
+
+def edges_of(scene: SimulatedScene) -> set[tuple[str, str, str]]:
+    return {(e["supporter"], e["supported"], e["kind"]) for e in ground_truth(scene).edges}
+
+
+def named(edge: tuple) -> tuple[str, str, str]:
+    supporter, supported, kind = (*edge, "bottom-up")[:3]
+    return (supporter if supporter == "table" else f"object{supporter}", f"object{supported}", kind)
+
+
+def assert_settled(scene: SimulatedScene) -> None:
+    """At rest, on the table, and still there a second later."""
+    top = table_top(scene)
+    assert scene.at_rest
+    low, high = top.corners_world.min(axis=0), top.corners_world.max(axis=0)
+    for label, shape in true_shapes(scene).items():
+        assert bounds(scene, label)[0][2] > top.height - 0.002
+        centre = shape.T_world_object[:2, 3]
+        assert (centre > low[:2]).all()
+        assert (centre < high[:2]).all()
+    data = state_of(scene)
+    mujoco.mj_step(scene.model, data, nstep=500)
+    assert np.abs(data.xpos - scene.data.xpos).max() < 0.01
+
+
+def test_every_designed_scene_has_its_intended_graph_listed():
+    assert set(INTENDED) == set(DESIGNED)
+    assert len(DESIGNED) >= 6
+
+
+@pytest.mark.parametrize("name", DESIGNED)
+def test_designed_scenes_settle_to_the_intended_graph(name: str):
+    scene = load_scene(name)
+    assert scene.name == name
+    assert_settled(scene)
+    assert edges_of(scene) == {named(edge) for edge in INTENDED[name]}
+
+
+@pytest.mark.parametrize(("size", "seed"), [(1, 0), (4, 1), (8, 3), (12, 0)])
+def test_piles_are_settled_and_of_the_size(size: int, seed: int):
+    scene = pile(size, seed)
+    assert len(scene.object_bodies) == len(true_shapes(scene)) == size
+    assert len(static_boxes(scene)) == 5
+    assert_settled(scene)
+
+
+def test_much_of_a_pile_lies_on_something_else():
+    supports = [edge for seed in range(3, 6) for edge in edges_of(pile(8, seed)) if edge[0] != "table"]
+    assert len(supports) >= 6
+
+
+@pytest.mark.parametrize(("size", "seed"), [(10, 0), (16, 1), (25, 2)])
+def test_dense_scenes_have_screens_a_heap_and_walls(size: int, seed: int):
+    scene = dense(size, seed)
+    shapes = true_shapes(scene)
+    assert len(shapes) == size
+    assert_settled(scene)
+    screens = [
+        label for label, s in shapes.items()
+        if isinstance(s, Box) and s.extents[2] > 0.2 and s.T_world_object[2, 2] > 0.999
+    ]  # fmt: skip
+    assert 2 <= len(screens) <= 4
+    walls = static_boxes(scene)[5:]
+    assert 1 <= len(walls) <= 2
+    for wall in walls:
+        x, y = wall.T_world_object[:2, 3]
+        assert x > 0.5 or abs(y) > 0.7
+
+
+def test_dense_heaps_hold_each_other_up():
+    supports = [e for seed in range(2) for e in edges_of(dense(14, seed)) if e[0] != "table"]
+    assert len(supports) >= 6
+
+
+@pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4"])
+def test_generated_names_repeat_byte_for_byte(name: str):
+    a, b = load_scene(name), load_scene(name)
+    assert a.name == name
+    np.testing.assert_array_equal(a.data.qpos, b.data.qpos)
+    assert a.spec.to_xml() == b.spec.to_xml()
+
+
+def test_another_seed_is_another_scene():
+    assert generate_pile(3, 0).data.qpos[0] != generate_pile(3, 1).data.qpos[0]
+
+
+def test_neighbouring_objects_differ_in_colour():
+    scene = dense(25, 2)
+    colours = np.array([scene.model.geom_rgba[scene.geoms(label)[0], :3] for label in scene.object_bodies])
+    apart = np.abs(colours[:, None] - colours[None]).max(axis=-1) + np.eye(len(colours))
+    assert apart.min() > 0.02
+
+
+def test_the_way_of_the_robot_is_free():
+    for seed in range(6):
+        for box in static_boxes(dense(10, seed))[5:]:
+            low = box.T_world_object[:3, 3] - box.extents / 2.0
+            high = box.T_world_object[:3, 3] + box.extents / 2.0
+            assert not (low[0] < -1.5 < high[0] and low[1] < 0.0 < high[1])
+
+
+@pytest.mark.parametrize("name", ["pile-0-1", "pile-99-1", "dense-3-1", "dense-26-0"])
+def test_sizes_out_of_range_say_the_range(name: str):
+    with pytest.raises(InputError, match=r"ask for \d+ to \d+"):
+        load_scene(name)
+
+
+def test_negative_seed():
+    with pytest.raises(InputError, match="negative"):
+        generate_pile(3, -1)
+
+
+def test_names():
+    assert list_scenes()[: len(DESIGNED)] == list(DESIGNED)
+    assert is_builtin("clutter")
+    assert is_builtin("pile-8-3")
+    assert not is_builtin("scenes/clutter")
+    assert not is_builtin("pile-8")

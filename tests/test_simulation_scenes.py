@@ -1,0 +1,249 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from caryatid import frames
+from caryatid.config import PhysicsConfig
+from caryatid.errors import InputError
+from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.simulation import (
+    bounds,
+    contains,
+    load_scene,
+    static_boxes,
+    table_top,
+    true_shapes,
+    write_scene,
+)
+from caryatid.simulation.truth import ground_truth, read_truth
+from caryatid.simulation.world import scene_from_spec, settle, state_of
+
+SHARED = Path(__file__).parents[2] / "shared" / "scenes"
+
+TABLE = '<body name="table"><geom name="top" type="box" size="0.3 0.45 0.02" pos="0 0 0.73"/></body>'
+CUBE = '<body name="cube" pos="0 0 0.78"><freejoint/><geom type="box" size="0.03 0.02 0.03"/></body>'
+
+SHAPELESS = '<body name="a"><freejoint/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'
+
+
+def mjcf(body: str, asset: str = "") -> str:
+    floor = '<geom name="floor" type="plane" size="5 5 0.1"/>'
+    return f"<mujoco><asset>{asset}</asset><worldbody>{floor}{body}</worldbody></mujoco>"
+
+
+def scene_of(body: str, asset: str = ""):
+    return scene_from_spec(mujoco.MjSpec.from_string(mjcf(body, asset)), "test", "test.xml")
+
+
+def write(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_objects_are_the_free_bodies_in_their_order():
+    ball = '<body name="ball" pos="0.1 0.2 0.78"><freejoint/><geom type="sphere" size="0.03"/></body>'
+    wall = '<geom name="wall" type="box" size="0.03 1 1" pos="0.7 0 1"/>'
+    scene = scene_of(wall + ball + TABLE + CUBE)
+    assert scene.object_bodies == {1: "ball", 2: "cube"}
+    labels = {
+        scene.model.geom(g).name or "unnamed": int(scene.geom_labels[g]) for g in range(scene.model.ngeom)
+    }
+    assert labels["wall"] == labels["top"] == labels["floor"] == 0
+    assert sorted(scene.geom_labels[scene.geom_labels > 0]) == [1, 2]
+
+
+def test_a_body_welded_to_an_object_belongs_to_it():
+    mug = (
+        '<body name="mug" pos="0 0 0.8"><freejoint/><geom type="cylinder" size="0.04 0.05"/>'
+        '<body name="handle" pos="0.05 0 0"><geom type="box" size="0.02 0.005 0.02"/></body></body>'
+    )
+    scene = scene_of(TABLE + mug)
+    assert list(scene.object_bodies.values()) == ["mug"]
+    handle = np.array([[0.065, 0.0, 0.8]])
+    assert contains(scene, 1, handle).all()
+    assert true_shapes(scene) == {}
+
+
+def test_a_scene_at_rest_keeps_its_poses_and_one_in_the_air_falls():
+    resting = scene_of(TABLE + CUBE)
+    again = scene_from_spec(resting.spec, "test", "test.xml")
+    np.testing.assert_array_equal(resting.data.qpos, again.data.qpos)
+    falling = scene_of(TABLE + CUBE.replace("0.78", "0.95"))
+    assert falling.at_rest
+    assert falling.data.body("cube").xpos[2] == pytest.approx(0.78, abs=1e-3)
+    np.testing.assert_array_equal(falling.data.qvel, 0.0)
+
+
+def test_what_never_rests_is_said_to_move():
+    slide = CUBE.replace("<geom", '<geom friction="0 0 0"')
+    spec = mujoco.MjSpec.from_string(mjcf(TABLE.replace("<geom", '<geom friction="0 0 0"') + slide))
+    spec.option.gravity = [0.3, 0.0, -9.81]
+    scene = scene_from_spec(spec, "test", "test.xml", PhysicsConfig(settle_time=0.5))
+    assert not scene.at_rest
+
+
+def test_state_of_is_a_copy():
+    scene = scene_of(TABLE + CUBE)
+    before = scene.data.qpos.copy()
+    data = state_of(scene)
+    data.qpos[2] += 0.2
+    mujoco.mj_step(scene.model, data, nstep=10)
+    np.testing.assert_array_equal(scene.data.qpos, before)
+
+
+def test_solids_agree_with_signed_distances():
+    turned = 'euler="20 30 40"'
+    parts = {
+        "box": f'<geom type="box" size="0.05 0.03 0.02" {turned}/>',
+        "cylinder": f'<geom type="cylinder" size="0.03 0.05" {turned}/>',
+        "sphere": '<geom type="sphere" size="0.04"/>',
+    }
+    bodies = [
+        f'<body name="{kind}" pos="{0.2 * i - 0.2} 0 0.9"><freejoint/>{geom}</body>'
+        for i, (kind, geom) in enumerate(parts.items())
+    ]
+    scene = scene_of(TABLE + "".join(bodies))
+    shapes = true_shapes(scene)
+    assert [type(shapes[label]) for label in (1, 2, 3)] == [Box, Cylinder, Sphere]
+    rng = np.random.default_rng(0)
+    for label, shape in shapes.items():
+        points = shape.T_world_object[:3, 3] + rng.uniform(-0.08, 0.08, (2000, 3))
+        inside = contains(scene, label, points)
+        np.testing.assert_array_equal(inside, shape.signed_distance(points) <= 0.0)
+        assert 0.01 < inside.mean() < 0.9
+        low, high = bounds(scene, label)
+        reach = shape.support(np.eye(3))
+        np.testing.assert_allclose(low, shape.T_world_object[:3, 3] - reach, atol=1e-9)
+        np.testing.assert_allclose(high, shape.T_world_object[:3, 3] + reach, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("geom", "volume"),
+    [
+        ('type="ellipsoid" size="0.05 0.03 0.02"', 4.0 / 3.0 * np.pi * 0.05 * 0.03 * 0.02),
+        ('type="capsule" size="0.02 0.04"', np.pi * 0.02**2 * 0.08 + 4.0 / 3.0 * np.pi * 0.02**3),
+        ('type="mesh" mesh="wedge"', 0.5 * 0.08 * 0.06 * 0.04),
+    ],
+)
+def test_volume_of_other_solids(geom: str, volume: float):
+    wedge = '<mesh name="wedge" vertex="0 0 0 0.08 0 0 0 0.06 0 0.08 0.06 0 0 0 0.04 0 0.06 0.04"/>'
+    body = f'<body name="thing" pos="0 0 0.79"><freejoint/><geom {geom} euler="10 20 30"/></body>'
+    scene = scene_of(TABLE + body, wedge)
+    low, high = bounds(scene, 1)
+    points = np.random.default_rng(0).uniform(low, high, (40_000, 3))
+    measured = contains(scene, 1, points).mean() * np.prod(high - low)
+    assert measured == pytest.approx(volume, rel=0.03)
+    assert not contains(scene, 1, points + (high - low) * [1.0, 0.0, 0.0]).any()
+
+
+def test_static_boxes_and_table_top():
+    leg = TABLE.replace("</body>", '<geom type="cylinder" size="0.02 0.35" pos="0 0 0.35"/></body>')
+    wall = '<geom type="box" size="0.03 1 1" pos="0.7 0 1" euler="0 0 30"/>'
+    scene = scene_of(wall + leg + CUBE)
+    boxes = static_boxes(scene)
+    assert len(boxes) == 3
+    np.testing.assert_allclose(boxes[0].extents, [0.6, 0.9, 0.04])
+    np.testing.assert_allclose(boxes[1].extents, [0.04, 0.04, 0.7])
+    np.testing.assert_allclose(boxes[2].extents, [0.06, 2.0, 2.0])
+    expected = frames.rotation_from_vector((0.0, 0.0, np.deg2rad(30.0)))
+    np.testing.assert_allclose(boxes[2].T_world_object[:3, :3], expected, atol=1e-9)
+    top = table_top(scene)
+    assert top.height == pytest.approx(0.75)
+    np.testing.assert_allclose(np.abs(top.corners_world), np.tile([0.3, 0.45, 0.75], (4, 1)))
+    edges = np.roll(top.corners_world, -1, axis=0) - top.corners_world
+    assert (np.cross(edges, np.roll(edges, -1, axis=0))[:, 2] > 0.0).all()
+
+
+def test_a_table_laid_on_its_side_axis_is_still_level():
+    lying = '<body name="table"><geom type="box" size="0.02 0.45 0.3" pos="0 0 0.73" euler="0 90 0"/></body>'
+    top = table_top(scene_of(lying + CUBE))
+    assert top.height == pytest.approx(0.75)
+    np.testing.assert_allclose(np.sort(top.shape.extents), [0.04, 0.6, 0.9])
+    np.testing.assert_allclose(top.shape.T_world_object[2, :3], [0.0, 0.0, 1.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("<mujoco><worldbody>", "no MJCF"),
+        ("not xml at all", "no MJCF"),
+        (mjcf(CUBE), "no body 'table'"),
+        (mjcf(TABLE), "no objects"),
+        (mjcf(TABLE.replace("<geom", "<freejoint/><geom") + CUBE), "body 'table' can move"),
+        (mjcf('<body name="table"/>' + CUBE), "body 'table' has no geom"),
+        (mjcf(TABLE + CUBE.replace(' name="cube"', "")), "has no name"),
+        (mjcf(TABLE + SHAPELESS), "body 'a' has no geom"),
+        (mjcf(TABLE + CUBE, '<mesh name="m" file="absent.stl"/>'), "absent.stl"),
+        (mjcf(TABLE + CUBE.replace('pos="0 0 0.78"', 'pos="0 nan 0.78"')), "unstable"),
+    ],
+)  # fmt: skip
+def test_bad_scenes_say_what_is_wrong_in_one_line(tmp_path: Path, text: str, reason: str):
+    path = write(tmp_path / "bad.xml", text)
+    with pytest.raises(InputError, match=reason) as error:
+        load_scene(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_missing_files_and_unknown_names_list_what_is_built_in(tmp_path: Path):
+    for source in ("no-such-scene", tmp_path / "absent.xml", tmp_path):
+        with pytest.raises(InputError, match=r"no such scene.*clutter.*pile-SIZE-SEED"):
+            load_scene(source)
+
+
+def test_an_unstable_simulation_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    scene = scene_of(TABLE + CUBE)
+    data = state_of(scene)
+    data.qpos[0] = np.nan
+    with pytest.raises(InputError, match="unstable"):
+        settle(scene.model, data, "test.xml", PhysicsConfig())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_unknown_label_is_refused():
+    scene = scene_of(TABLE + CUBE)
+    with pytest.raises(InputError, match="label 7"):
+        contains(scene, 7, np.zeros((1, 3)))
+
+
+def test_a_scene_folder_can_be_given_and_names_the_scene(tmp_path: Path):
+    folder = tmp_path / "kitchen"
+    folder.mkdir()
+    write(folder / "scene.xml", mjcf(TABLE + CUBE))
+    assert load_scene(folder).name == load_scene(folder / "scene.xml").name == "kitchen"
+
+
+def test_written_scenes_come_back(tmp_path: Path):
+    scene = load_scene("bridge")
+    path = write_scene(scene, tmp_path / "new" / "bridge")
+    back = load_scene(path)
+    assert back.object_bodies == scene.object_bodies
+    for label, shape in true_shapes(scene).items():
+        np.testing.assert_allclose(true_shapes(back)[label].T_world_object, shape.T_world_object, atol=1e-5)
+    assert read_truth(path.with_name("gt.json")) == ground_truth(scene)
+
+
+def test_writing_where_one_cannot_is_an_error(tmp_path: Path):
+    blocked = write(tmp_path / "file", "")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_scene(load_scene("tower"), blocked / "scene")
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is absent: no scanned objects")
+def test_scanned_objects(tmp_path: Path):
+    scene = load_scene(SHARED / "ycb00_4")
+    assert true_shapes(scene) == {}
+    low, high = bounds(scene, 4)
+    np.testing.assert_allclose(high - low, 0.063, atol=0.005)
+    centre = (low + high)[None] / 2.0
+    assert contains(scene, 4, centre).all()
+    assert not contains(scene, 1, centre).any()
+    path = write_scene(scene, tmp_path / "moved")
+    assert (path.parent / "assets" / "tennis_ball_hull_0.stl").is_file()
+    copied = load_scene(path)
+    np.testing.assert_allclose(bounds(copied, 4)[0], low, atol=1e-5)
