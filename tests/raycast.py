@@ -22,7 +22,8 @@ def table_scene(
 ) -> View:
     """Show a floor at 0, a table top at 0.75 m, and boxes and spheres on it labelled 1, 2, … in order.
 
-    Boxes are (centre, extents) along the axes, spheres (centre, radius), all in metres; `sigma` is the noise of inverse depth [1/m].
+    Boxes are (centre, extents) along the axes, spheres (centre, radius), all in metres;
+    `sigma` is the noise of inverse depth [1/m].
     """
     v, u = np.mgrid[0:480, 0:640].astype(np.float64)
     rays_camera = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)

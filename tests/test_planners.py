@@ -43,7 +43,7 @@ def candidates(*walls: tuple[tuple[float, float, float], tuple[float, float, flo
 OPEN = candidates()
 
 
-def known(objects: list[SceneObject], free_below: float = 2.0) -> VoxelMap:
+def known(objects: list[SceneObject]) -> VoxelMap:
     """A map that has seen every voxel: the objects occupied, the rest free."""
     voxels = VoxelMap.around(SPHERE.centre_world, VoxelConfig())
     free = VoxelMap(voxels.origin_world, voxels.hits, np.ones_like(voxels.passes), voxels.config)
@@ -123,8 +123,8 @@ def test_an_unknown_planner_lists_those_there_are():
 
 def test_random_reaches_all_sides():
     rng = np.random.default_rng(0)
-    planner = make_planner("random")
-    indices = [planner.plan(state([CUBE]), rng).index for _ in range(200)]
+    planner, situation = make_planner("random"), state([CUBE])
+    indices = [planner.plan(situation, rng).index for _ in range(200)]
     azimuth = np.arctan2(OPEN.directions[indices, 1], OPEN.directions[indices, 0])
     assert (np.histogram(azimuth, bins=6, range=(-np.pi, np.pi))[0] > 10).all()
 

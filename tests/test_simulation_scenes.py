@@ -178,15 +178,19 @@ def test_a_table_laid_on_its_side_axis_is_still_level():
         (mjcf(TABLE + CUBE.replace(' name="cube"', "")), "has no name"),
         (mjcf(TABLE + SHAPELESS), "body 'a' has no geom"),
         (mjcf(TABLE + CUBE, '<mesh name="m" file="absent.stl"/>'), "absent.stl"),
-        (mjcf(TABLE + CUBE.replace('pos="0 0 0.78"', 'pos="0 nan 0.78"')), "unstable"),
+        (mjcf(TABLE + CUBE.replace('pos="0 0 0.78"', 'pos="0 nan 0.78"')), "NaN"),
     ],
 )  # fmt: skip
-def test_bad_scenes_say_what_is_wrong_in_one_line(tmp_path: Path, text: str, reason: str):
+def test_bad_scenes_say_what_is_wrong_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, reason: str
+):
+    monkeypatch.chdir(tmp_path)
     path = write(tmp_path / "bad.xml", text)
     with pytest.raises(InputError, match=reason) as error:
         load_scene(path)
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_missing_files_and_unknown_names_list_what_is_built_in(tmp_path: Path):

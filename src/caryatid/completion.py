@@ -1,4 +1,4 @@
-"""Hidden extents: how far a shape reaches down where nobody looked, bounded by free space and by what holds it."""
+"""Hidden extents: how far a shape reaches down unseen, bounded by free space and by what holds it."""
 
 from __future__ import annotations
 
@@ -125,14 +125,14 @@ def _face_grid(shape: Box | Cylinder, axis: int, sign: float, spacing: float) ->
 
 
 def _rim(shape: Box | Cylinder, face: Array, axis: int, inset: float) -> Array:
-    """The outermost points of a face grid, drawn in by `inset` [m] so that they lie inside the shape's walls."""
+    """The outermost points of a face grid, drawn in by `inset` [m] to lie inside the shape's walls."""
     local = frames.transform(frames.invert(shape.T_world_object), face)
     across = [k for k in range(3) if k != axis]
     half = shape.extents / 2.0
     if isinstance(shape, Cylinder):
         on_rim = np.hypot(local[:, 0], local[:, 1]) > 0.99 * shape.radius
     else:
-        on_rim = (np.abs(local[:, across]) > 0.99 * half[across]).any(axis=1)
+        on_rim = np.max(np.abs(local[:, across]) / half[across], axis=1) > 0.99
     drawn = local[on_rim]
     drawn[:, across] *= np.maximum(1.0 - inset / half[across], 0.0)
     return frames.transform(shape.T_world_object, drawn)

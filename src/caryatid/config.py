@@ -110,7 +110,7 @@ class SegmentationConfig:
     max_jump: float = 0.009
     """A depth step between samples beyond this parts two surfaces, however steep [m], at 1 m and times z²."""
     surfel: float = 0.015
-    """Size of the patches whose edges are judged convex or concave [m]; five times the noise at 1.5 m."""
+    """Size of the patches whose edges are judged convex or concave [m]; four times the noise at 1.5 m."""
     crease: float = 4.0
     """What a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at edges."""
     step: float = 0.005
@@ -120,7 +120,7 @@ class SegmentationConfig:
     reach: float = 0.012
     """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
     concavity: float = 15.0
-    """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's usual value."""
+    """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's 10 and noise."""
     min_size: int = 40
     """Samples a part needs to be an object [points]."""
     min_width: float = 0.015

@@ -94,7 +94,7 @@ def surfel_borders(surfels: Surfels, edges: Index) -> tuple[Index, Array]:
 
 
 def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
-    """Attraction (B,) of surfels over each border: 1 flat or convex, 0 at the limit, to −2 concave or a step."""
+    """Attraction (B,) of surfels over each border: 1 flat or convex, 0 at the limit, down to −2 beyond it."""
     i, j = pairs.T
     between = surfels.centres[j] - surfels.centres[i]
     rise_j = np.einsum("ij,ij->i", surfels.normals[i], between)

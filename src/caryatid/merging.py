@@ -111,7 +111,7 @@ def _merged_sides(
         else:
             merged[side] = ends[:, side].max() if side % 2 else ends[:, side].min()
     low, high = merged[0::2], merged[1::2]
-    any_seen = [bool(s) for s in seen.any(axis=0)]
+    any_seen = [bool(side.any()) for side in seen.T]
     flags6 = (any_seen[0], any_seen[1], any_seen[2], any_seen[3], any_seen[4], any_seen[5])
     if isinstance(best.shape, Cylinder):
         centres = np.array([R.T @ o.shape.T_world_object[:3, 3] for o in same])

@@ -1,4 +1,4 @@
-"""Compiled loops over depth images and sample graphs, each beside the plain reference it is tested against."""
+"""Compiled loops over depth images and sample graphs, each beside the plain reference it is held to."""
 
 from __future__ import annotations
 

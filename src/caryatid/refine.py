@@ -5,20 +5,27 @@ from __future__ import annotations
 import numpy as np
 
 from caryatid import frames
+from caryatid.fit_kernels import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
 from caryatid.frames import Array
 from caryatid.shapes import Box, Cylinder, Sphere
 
 ROBUST_WIDTH = 2.5
 """Residuals beyond this many robust standard deviations lose most of their weight (Geman–McClure)."""
+RIDGE = 1e-3 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
+"""Added to the diagonal, times the damping, so that what no point determines stays where it is."""
 NOISE_FLOOR = 0.0005
 """Least standard deviation the weights assume [m]: keeps exact points from being outliers of one another."""
+
+
+_CODES = {"sphere": SPHERE, "cylinder": CYLINDER, "box": BOX}
+_SIZE_COLUMNS = {"sphere": (6,), "cylinder": (6, 8), "box": (6, 7, 8)}
 
 
 def linearise(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Array, Array]:
     """Signed distances (N,) [m] of points (N, 3) and their derivatives (N, 6 + sizes).
 
     The columns are a translation [m] and a rotation [rad] of the shape in its own frame, then its sizes [m]:
-    three extents of a box, radius and height of a cylinder, the radius of a sphere.
+    three half extents of a box, radius and half height of a cylinder, the radius of a sphere.
     """
     T = shape.T_world_object
     p = (points_world - T[:3, 3]) @ T[:3, :3]
@@ -32,9 +39,9 @@ def linearise(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Arra
         distance, share = _corner_distance(q)
         outward = p[:, :2] / np.maximum(ring, 1e-12)[:, None]
         gradient = np.concatenate([share[:, :1] * outward, share[:, 1:] * np.sign(p[:, 2:])], axis=1)
-        return distance, _jacobian(p, gradient, -share * (1.0, 0.5))
+        return distance, _jacobian(p, gradient, -share)
     distance, share = _corner_distance(np.abs(p) - shape.extents / 2.0)
-    return distance, _jacobian(p, share * np.sign(p), -0.5 * share)
+    return distance, _jacobian(p, share * np.sign(p), -share)
 
 
 def stepped(shape: Box | Cylinder | Sphere, step: Array, min_extent: float) -> Box | Cylinder | Sphere:
@@ -44,8 +51,8 @@ def stepped(shape: Box | Cylinder | Sphere, step: Array, min_extent: float) -> B
         return Sphere(T, max(shape.radius + float(step[6]), min_extent / 2.0))
     if isinstance(shape, Cylinder):
         radius = max(shape.radius + float(step[6]), min_extent / 2.0)
-        return Cylinder(T, radius, max(shape.height + float(step[7]), min_extent))
-    return Box(T, np.maximum(shape.extents + step[6:9], min_extent))
+        return Cylinder(T, radius, max(shape.height + 2.0 * float(step[7]), min_extent))
+    return Box(T, np.maximum(shape.extents + 2.0 * step[6:9], min_extent))
 
 
 def refine(
@@ -63,38 +70,43 @@ def refine(
         points_world: (N, 3) [m].
         steps: Steps at the most.
         min_extent: Least extent [m].
-        shrink: Gradient [m] that pulls every extent inwards, so that sides nobody saw stay small. A face that
-            holds a share s of the points is moved by shrink / (2·s) only.
+        shrink: Gradient [m] that pulls every half extent inwards, so that sides nobody saw stay small. A face
+            that holds a share s of the points is moved by shrink / (2·s) only.
     """
     damping = 1e-3
     best = shape
-    distance, J = linearise(best, points_world)
+    sizes = _SIZE_COLUMNS[shape.kind]
+    columns = np.array([0, 1, 2, 3, 4, 5, *sizes])
+    points = np.ascontiguousarray(points_world)
+    distance = signed_distances(*_arrays(best), points)
     for _ in range(steps):
         scale = ROBUST_WIDTH * max(1.4826 * float(np.median(np.abs(distance))), NOISE_FLOOR)
-        weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2 / len(distance)
-        gradient = J.T @ (weight * distance)
-        pull = np.zeros(J.shape[1])
-        pull[6:] = shrink / 2.0
-        H = J.T @ (weight[:, None] * J)
+        H_all, gradient_all = normal_equations(*_arrays(best), points, scale)
+        H, gradient = H_all[np.ix_(columns, columns)], gradient_all[columns]
+        gradient[6:] += shrink / 2.0
         cost = _cost(distance, scale) + shrink * _sizes(best)
+        ridge = np.diag(H) + RIDGE[: len(columns)]
         for _ in range(6):
-            ridge = damping * (
-                np.diag(H) + 1e-3 * np.concatenate([np.full(3, 1.0), np.full(len(H) - 3, 1e-2)])
-            )
-            step = -np.linalg.solve(H + np.diag(ridge), gradient + pull)
+            step = -np.linalg.solve(H + np.diag(damping * ridge), gradient)
             trial = stepped(best, _limited(step), min_extent)
-            trial_distance, trial_J = linearise(trial, points_world)
+            trial_distance = signed_distances(*_arrays(trial), points)
             trial_cost = _cost(trial_distance, scale) + shrink * _sizes(trial)
             if trial_cost < cost:
                 break
             damping *= 6.0
         else:
             return best
-        best, distance, J = trial, trial_distance, trial_J
+        best, distance = trial, trial_distance
         damping = max(damping / 10.0, 1e-7)
         if cost - trial_cost < 1e-4 * cost:
             break
     return best
+
+
+def _arrays(shape: Box | Cylinder | Sphere) -> tuple[int, Array, Array, Array]:
+    """Code, axes, centre and half extents, as the kernels take them."""
+    T = shape.T_world_object
+    return _CODES[shape.kind], np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), shape.extents / 2.0
 
 
 def _jacobian(p: Array, gradient: Array, sizes: Array) -> Array:
@@ -123,8 +135,8 @@ def _sizes(shape: Box | Cylinder | Sphere) -> float:
     if isinstance(shape, Sphere):
         return shape.radius
     if isinstance(shape, Cylinder):
-        return shape.radius + shape.height
-    return float(np.sum(shape.extents))
+        return shape.radius + shape.height / 2.0
+    return float(np.sum(shape.extents)) / 2.0
 
 
 def _limited(step: Array) -> Array:

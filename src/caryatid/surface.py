@@ -17,6 +17,9 @@ from caryatid.shapes import Box
 
 Mask = NDArray[np.bool_]
 
+MAX_CELLS = 1000
+"""Cells along a plane's grid at the most [1]; bounds memory where a cloud is not in metres."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SupportSurface:
@@ -213,17 +216,19 @@ def _refine(
 def _main_part(points: Array, normal: Array, inliers: Mask, config: SurfaceConfig) -> tuple[Mask, float]:
     """Keep the largest part of a plane that holds together over gaps, and say how much of it is seen [m²]."""
     index = np.flatnonzero(inliers)
-    cells = np.floor(points[index] @ _basis(normal).T / config.cell).astype(np.intp)
+    flat = points[index] @ _basis(normal).T
+    cell = max(config.cell, float(np.ptp(flat, axis=0).max()) / MAX_CELLS)
+    cells = np.floor(flat / cell).astype(np.intp)
     cells -= cells.min(axis=0)
     count = np.zeros(cells.max(axis=0) + 1, dtype=np.intp)
     np.add.at(count, (cells[:, 0], cells[:, 1]), 1)
-    reach = int(np.ceil(config.gap / config.cell / 2.0))
+    reach = int(np.ceil(config.gap / cell / 2.0))
     near = ndimage.distance_transform_edt(np.pad(count == 0, reach))[reach:-reach, reach:-reach] <= reach
     part, _ = ndimage.label(near)
     main = int(np.argmax(np.bincount(part.ravel(), weights=count.ravel())))
     kept = np.zeros_like(inliers)
     kept[index[part[cells[:, 0], cells[:, 1]] == main]] = True
-    return kept, float(np.count_nonzero((count > 0) & (part == main))) * config.cell**2
+    return kept, float(np.count_nonzero((count > 0) & (part == main))) * cell**2
 
 
 def _surface(points: Array, plane: _Plane, config: SurfaceConfig) -> SupportSurface:

@@ -60,7 +60,7 @@ class VoxelMap:
         outweighed = np.arange(256) * hit + np.arange(256)[:, None] * miss <= 0.0
         table = np.where(outweighed, FREE, OCCUPIED).astype(np.int8)
         table[0, 0] = UNKNOWN
-        return table[self.passes, self.hits]
+        return np.take(table.ravel(), self.passes.astype(np.uint16) * np.uint16(256) + self.hits)
 
     @property
     def end_world(self) -> Array:

@@ -94,6 +94,7 @@ class Extract(Modelling):
             graph = scene.update(view)
             assert scene.labels is not None
             pose = scene.T_world_camera
+            assert pose is not None
             writer.add_view(graph, scene.labels, name=view.name, T_world_camera=pose, K=view.K)
             timings.append(scene.timings)
             progress.say(f"view {index + 1} of {len(recording)}: {summary(graph)}")

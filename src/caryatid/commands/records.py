@@ -67,7 +67,12 @@ def view_record(step: Step) -> dict[str, Any]:
             "score": d.score,
             "why": d.why,
             "points_of_interest": [
-                {"position": p.position_world, "saliency": p.saliency, "subject": list(p.subject), "why": p.why}
+                {
+                    "position": p.position_world,
+                    "saliency": p.saliency,
+                    "subject": list(p.subject),
+                    "why": p.why,
+                }
                 for p in d.points_of_interest
             ],
         }

@@ -15,7 +15,13 @@ from caryatid.simulation.designed import DESIGNED, designed_scene
 from caryatid.simulation.generate import DENSE_SIZES, PILE_SIZES, generate_dense, generate_pile
 from caryatid.simulation.mjcf import quaternion
 from caryatid.simulation.truth import ground_truth, write_truth
-from caryatid.simulation.world import SimulatedScene, body_pose, one_line, scene_from_spec
+from caryatid.simulation.world import (
+    SimulatedScene,
+    body_pose,
+    mujoco_warnings_ignored,
+    one_line,
+    scene_from_spec,
+)
 
 SCENE_FILE = "scene.xml"
 """Name of the MJCF file in a scene folder."""
@@ -104,7 +110,8 @@ def _load_file(source: str, config: PhysicsConfig | None) -> SimulatedScene:
     if not path.is_file():
         raise InputError(path, "is no file", "give an MJCF file")
     try:
-        spec = mujoco.MjSpec.from_file(str(path))
+        with mujoco_warnings_ignored():
+            spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         raise InputError(path, f"is no MJCF ({one_line(error)})", "mend the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem

@@ -96,9 +96,12 @@ def scene_from_spec(
         InputError: It does not compile, has no static body `table`, no object, or its simulation is unstable.
     """
     try:
-        model = spec.compile()
+        with mujoco_warnings_ignored():
+            model = spec.compile()
     except ValueError as error:
         raise InputError(source, f"MuJoCo refuses it: {one_line(error)}", "mend the MJCF") from None
+    if not np.isfinite(model.qpos0).all():
+        raise InputError(source, "a body's pose holds NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
     if table < 0:
         raise InputError(source, f"has no body '{TABLE}'", f"name the static support surface '{TABLE}'")
@@ -145,7 +148,7 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
     Raises:
         InputError: The simulation blew up.
     """
-    with _mujoco_warnings_ignored():
+    with mujoco_warnings_ignored():
         at_rest = _run_to_rest(model, data, source, config, least)
     data.qvel[:] = 0.0
     data.qacc_warmstart[:] = 0.0
@@ -224,7 +227,7 @@ def _subtree(model: Any, body: int) -> set[int]:
 
 
 @contextmanager
-def _mujoco_warnings_ignored() -> Iterator[None]:
+def mujoco_warnings_ignored() -> Iterator[None]:
     """Keep MuJoCo from printing and from writing a log where the user is; the state counts its warnings."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
