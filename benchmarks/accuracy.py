@@ -1,4 +1,4 @@
-"""How well the loop finds support graphs: F1 per view over scenes, planners and seeds, in simulation and on frames.
+"""How well the loop finds support graphs: F1 per view over scenes, planners, seeds, and on real frames.
 
     python benchmarks/accuracy.py explore SCENES… --noise carmine --views 5
     python benchmarks/accuracy.py extract FRAMES… --segmentation labels
@@ -17,6 +17,7 @@ from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import product
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -25,12 +26,12 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-for _threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(_threads, "1")
-
 from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import CaryatidError
 from caryatid.settings import read_settings
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
+"""Set to 1 in the processes, unless set already: the jobs share the cores."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +125,19 @@ def explore_one(task: tuple[Path, str, int, Explore]) -> list[Row]:
         seconds = sum(v for k, v in step.timings.items() if k != "capture")
         rows.append(
             Row(
-                folder.name, planner, seed, step.index, s.f1, s.edge_precision, s.edge_recall, s.vertex_recall,
-                s.mean_iou, step.angle_travelled, step.path_travelled, seconds,
-            )  # fmt: skip
+                folder.name,
+                planner,
+                seed,
+                step.index,
+                s.f1,
+                s.edge_precision,
+                s.edge_recall,
+                s.vertex_recall,
+                s.mean_iou,
+                step.angle_travelled,
+                step.path_travelled,
+                seconds,
+            )
         )
     rows += [replace(rows[-1], view=v) for v in range(len(rows), args.views)]
     return rows
@@ -151,9 +162,19 @@ def extract_one(task: tuple[Path, Extract]) -> list[Row]:
     s = score_masks(graph, [scene.labels], [frame.load_labels()], truth.vertices, frozenset(truth.pairs))
     return [
         Row(
-            folder.name, args.segmentation, 0, 0, s.f1, s.edge_precision, s.edge_recall, s.vertex_recall,
-            s.mean_iou, 0.0, 0.0, seconds,
-        )  # fmt: skip
+            folder.name,
+            args.segmentation,
+            0,
+            0,
+            s.f1,
+            s.edge_precision,
+            s.edge_recall,
+            s.vertex_recall,
+            s.mean_iou,
+            0.0,
+            0.0,
+            seconds,
+        )
     ]
 
 
@@ -167,7 +188,17 @@ def show(rows: list[Row], console: Console) -> None:
     """Print F1 per view, one line a family and planner, and the worst scenes."""
     last = max(r.view for r in rows)
     table = Table(title=f"mean over scenes and seeds, views 1…{last + 1}")
-    for column in ("scenes", "planner", "F1 by view", "edge P / R", "vertex R", "IoU", "angle [rad]", "path [m]", "s/view"):
+    for column in (
+        "scenes",
+        "planner",
+        "F1 by view",
+        "edge P / R",
+        "vertex R",
+        "IoU",
+        "angle [rad]",
+        "path [m]",
+        "s/view",
+    ):
         table.add_column(column)
     groups: dict[tuple[str, str], list[Row]] = defaultdict(list)
     for row in rows:
@@ -177,13 +208,16 @@ def show(rows: list[Row], console: Console) -> None:
         by_view = [[r for r in part if r.view == v] for v in range(last + 1)]
         end = by_view[-1]
         table.add_row(
-            f"{name} ({len({r.scene for r in part})})", planner,
+            f"{name} ({len({r.scene for r in part})})",
+            planner,
             " ".join(f"{np.mean([r.f1 for r in view]):.3f}" for view in by_view),
             f"{np.mean([r.edge_precision for r in end]):.3f} / {np.mean([r.edge_recall for r in end]):.3f}",
-            f"{np.mean([r.vertex_recall for r in end]):.3f}", f"{np.mean([r.mean_iou for r in end]):.3f}",
-            f"{np.mean([r.angle for r in end]):.2f}", f"{np.mean([r.path for r in end]):.2f}",
+            f"{np.mean([r.vertex_recall for r in end]):.3f}",
+            f"{np.mean([r.mean_iou for r in end]):.3f}",
+            f"{np.mean([r.angle for r in end]):.2f}",
+            f"{np.mean([r.path for r in end]):.2f}",
             f"{np.mean([r.seconds for r in part]):.2f}",
-        )  # fmt: skip
+        )
     console.print(table)
     worst = sorted((r for r in rows if r.view == last), key=lambda r: r.f1)[:6]
     console.print("lowest: " + ", ".join(f"{r.scene} ({r.planner}, seed {r.seed}) {r.f1:.3f}" for r in worst))
@@ -193,9 +227,12 @@ def main() -> int:
     """Run the measurement."""
     args = tyro.extras.subcommand_cli_from_dict({"explore": Explore, "extract": Extract})
     console = Console(width=160)
-    with ProcessPoolExecutor(args.jobs) as pool:
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
+    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
         if isinstance(args, Explore):
-            tasks = [(s, p, seed, args) for s, p, seed in product(args.scenes, args.planner or ("support",), range(args.seeds))]
+            episodes = product(args.scenes, args.planner or ("support",), range(args.seeds))
+            tasks = [(scene, planner, seed, args) for scene, planner, seed in episodes]
             rows = [row for episode in pool.map(explore_one, tasks) for row in episode]
         else:
             rows = [row for frame in pool.map(extract_one, [(f, args) for f in args.frames]) for row in frame]

@@ -61,7 +61,7 @@ class SurfaceConfig:
     max_points: int = 20_000
     """Points of a view the surface is looked for in [1]; spread evenly, they give its height to 0.1 mm."""
     search: float = 0.05
-    """Once known, the surface is looked for within this height of itself [m]; 5σ of registration error, and tilt."""
+    """Once known, the table is looked for within this height of itself [m]; 5σ of registration and tilt."""
     spacing: float = 0.02
     """Spacing its points are kept at for later views [m]."""
     thickness: float = 0.04
@@ -132,7 +132,7 @@ class SegmentationConfig:
     max_height: float = 0.6
     """Points higher above the table belong to no object on it [m]; table-top sizes."""
     overlap: float = 0.3
-    """Share of a part's points that must lie at an object's known points or shape for it to be that object [1]."""
+    """Share of a part's points that must lie at an object's points or shape for it to be that object [1]."""
     overlap_reach: float = 0.02
     """Distance within which a point lies at an object [m]; 2σ of registration error of both views."""
     same_share: float = 0.7
@@ -164,9 +164,9 @@ class FitConfig:
     max_radius: float = 0.15
     """Largest radius of cylinder and sphere [m]."""
     size_penalty: float = 0.0125
-    """Added to the mean residual [m] for each square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
+    """Added to the mean residual [m] per square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
     shrink: float = 2e-5
-    """Pull on every extent [m]: a face that holds a share s of the points is moved inwards by shrink / (2·s)."""
+    """Pull on every extent [m]: a face that holds a share s of the points is moved in by shrink / (2·s)."""
     trim: float = 0.005
     """Share of the points beyond each end of an extent that count as noise [1]."""
     side_share: float = 0.02
@@ -176,7 +176,7 @@ class FitConfig:
     bare_weight: float = 0.003
     """What seen sides without any point near them cost in model choice [m]; a share of them in proportion."""
     bare_spacing: float = 0.008
-    """Spacing of the samples that look for points near a side [m]; 2 to 3 times the pixel spacing at 1.5 m."""
+    """Spacing of the samples that look for points near a side [m]; 2 to 3 pixels at 1.5 m."""
     max_residual: float = 0.008
     """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
 
@@ -192,13 +192,13 @@ class CompletionConfig:
     spacing: float = 0.015
     """Spacing of the points tested on the moving side [m]."""
     inset: float = 0.01
-    """How far inside the walls free space is looked for [m]; a voxel, so that a wall's own noise says nothing."""
+    """How far inside the walls free space is looked for [m]; a voxel, so that a wall's noise says nothing."""
     overlap: float = 0.004
     """How deep the moving side may enter another shape [m]; the fits' uncertainty."""
     least: float = 0.0005
     """Gaps below this are none [m]."""
     max_free: float = 0.15
-    """The extension ends where a greater share of its rim lies in voxels seen free [1]; half of one side of four."""
+    """The extension ends where more of its rim lies in voxels seen free [1]; half of one side of four."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,7 +242,7 @@ class FusionConfig:
     max_ratio: float = 1.6
     """Sorted extents that differ by more than this factor are two objects."""
     settled: float = 0.005
-    """A shape that moves, grows or turns by less than this has not changed [m]; σ of the registration error."""
+    """A shape that moves, grows or turns by less than this has not changed [m]; σ of registration error."""
     keep_share: float = 0.5
     """A support is kept while occurrences / opportunities is at least this."""
 
@@ -298,7 +298,7 @@ class ActiveVisionConfig:
     surface_samples: int = 400
     """Points on the fitted shapes the planner `support` tests for being seen [1]."""
     sample_clearance: float = 0.025
-    """Length of a surface point's line of sight that does not count [m]; its own surface, 2 voxels and a half."""
+    """Length of a surface point's line of sight that does not count [m]; its own surface, 2½ voxels."""
     good_incidence: float = 60.0
     """A surface met at less than this from its normal is seen as well as can be [deg]."""
     space_spacing: float = 0.04
@@ -336,7 +336,7 @@ class RobotConfig:
     step: float = 0.02
     """Anything on the floor lower than this is no obstacle to the platform [m]."""
     head_room: float = 0.15
-    """What the head needs above the highest camera centre [m]; higher obstacles do not hinder the platform."""
+    """What the head needs above the highest camera centre [m]; higher obstacles do not hinder."""
     table_margin: float = 0.1
     """Obstacles met this near to the sphere's centre are the table, not a wall in the line of sight [m]."""
     home: tuple[float, float] = (180.0, 35.0)
@@ -374,7 +374,7 @@ class PhysicsConfig:
     settle_time: float = 6.0
     """After this long a scene is taken as it is, at rest or not [s]."""
     force_window: float = 0.2
-    """Contact forces are averaged over this long [s]; soft contacts creep, and shares drift in longer ones."""
+    """Contact forces are averaged over this long [s]; soft contacts creep, longer ones drift."""
     force_share: float = 0.03
     """Least upward part of a contact force on an object that supports it, as a share of its weight [1]."""
     removal_time: float = 1.0
@@ -453,7 +453,7 @@ class NoiseConfig:
     axial: tuple[float, float, float] = (0.0012, 0.0019, 0.4)
     """(a, b, z0) of σ(z) = a + b·(z − z0)² [m]."""
     disparity_step: float = 0.00285
-    """Depth is quantised in equal steps of 1/z [1/m]: 1/8 px of disparity at f = 580 px and 75 mm baseline."""
+    """Depth is quantised in equal steps of 1/z [1/m]: 1/8 px of disparity, f = 580 px, baseline 75 mm."""
     grazing: float = 80.0
     """No return where the surface is turned away by more than this [deg]."""
     range: tuple[float, float] = (0.35, 3.0)

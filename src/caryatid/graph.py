@@ -28,7 +28,7 @@ class SceneObject:
         opportunities: In how many views it could have been.
         residual: Mean absolute distance of its points to the shape [m].
         poor_fit: None of the three shapes explains its points within the configured error.
-        seen: Extents (along the object's axes, both sides of each: -x, +x, -y, +y, -z, +z) that points bear out.
+        seen: Which sides (-x, +x, -y, +y, -z, +z along the object's axes) points bear out.
         why: How the shape came about, for a person to read.
     """
 

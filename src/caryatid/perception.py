@@ -1,4 +1,4 @@
-"""From one view or cloud to labelled, oriented points in the world frame, and the support surface among them."""
+"""From one view or cloud to labelled, oriented points in the world, and the support surface among them."""
 
 from __future__ import annotations
 

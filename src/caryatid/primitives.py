@@ -70,7 +70,7 @@ def fit(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Gene
 
 
 def candidates(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Generator) -> list[Fit]:
-    """Return the best fit of each shape that could be fitted, the least cost first (arguments as of `fit`)."""
+    """Return the best fit of each shape that could be fitted, least cost first (arguments as of `fit`)."""
     keep = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
     points, normals = points[keep], normals[keep]
     if len(points) < config.min_points:
@@ -239,7 +239,7 @@ def _main_normal(normals: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _slab(heights: Array, on_face: NDArray[np.bool_], config: FitConfig) -> tuple[float, float]:
-    """Bottom and top [m] along a face's normal: the face where its points are, the bottom where the points end."""
+    """Bottom and top [m] along a face's normal: top at the face's points, bottom where all points end."""
     top = float(np.median(heights[on_face]))
     return min(float(np.quantile(heights, config.trim)), top - config.min_extent), top
 

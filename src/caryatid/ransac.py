@@ -16,20 +16,19 @@ BATCH = 25
 
 
 class Model(Protocol[H]):
-    """What RANSAC needs to know of a model; `H` holds many hypotheses at once.
+    """What RANSAC needs to know of a model; `H` holds many hypotheses at once."""
 
-    Attributes:
-        sample_size: Oriented points that determine a hypothesis.
-    """
-
-    sample_size: int
+    @property
+    def sample_size(self) -> int:
+        """Oriented points that determine a hypothesis."""
+        ...
 
     def estimate(self, samples: NDArray[np.intp], points: Array, normals: Array) -> H:
         """Make hypotheses from samples (B, sample_size) of indices into points (N, 3), normals (N, 3)."""
         ...
 
     def distances(self, hypotheses: H, points: Array) -> Array:
-        """Unsigned distance (B, N) [m] of points (N, 3) to each hypothesis; infinite for one that is not valid."""
+        """Unsigned distance (B, N) [m] of points (N, 3) to each hypothesis; infinite for an invalid one."""
         ...
 
 

@@ -30,7 +30,5 @@ class RecordingCamera:
     def capture(self, T_world_camera: Array) -> View:
         """Return the frame recorded nearest to a pose (4, 4)."""
         poses = [f.T_world_camera for f in self._recording.frames]
-        distances = [
-            0.0 if T is None else np.abs(T[:3] - T_world_camera[:3]).max() for T in poses
-        ]
+        distances = [0.0 if T is None else np.abs(T[:3] - T_world_camera[:3]).max() for T in poses]
         return self._recording.frames[int(np.argmin(distances))].load()

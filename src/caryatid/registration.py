@@ -1,4 +1,4 @@
-"""Refining a view's pose against the map: point-to-plane ICP with the expected registration error as prior."""
+"""Refining a view's pose against the map: point-to-plane ICP, the expected registration error as prior."""
 
 from __future__ import annotations
 
@@ -88,6 +88,6 @@ def align(cloud: Cloud, known: Cloud, pivot_world: Array, config: RegistrationCo
 
 
 def twist_transform(twist: Array, pivot_world: Array) -> Array:
-    """The rigid transform (4, 4) that turns about a pivot (3,) [m] and moves: twist = [m, m, m, rad, rad, rad]."""
+    """The rigid transform (4, 4) that turns about a pivot (3,) [m] and moves: twist = [3 × m, 3 × rad]."""
     R = frames.rotation_from_vector(twist[3:])
     return frames.rigid(R, pivot_world - R @ pivot_world + twist[:3])

@@ -37,7 +37,7 @@ class Scene:
 
     Attributes:
         graph: The fused support graph.
-        labels: Label image (H, W) of the newest view, or labels (N,) of a cloud; 65535 is the support surface.
+        labels: Label image (H, W) of the newest view, or labels (N,) of a cloud; 65535 = support surface.
         surface: The support surface, or None before the first view.
         voxels: Free, occupied and unknown space, or None before the first view.
         sphere: The view sphere around the table top, or None before the first view.

@@ -23,7 +23,7 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
         base: What to start from.
 
     Raises:
-        InputError: The file cannot be read, or a name or value is not valid; the message lists those that are.
+        InputError: The file cannot be read, or a name or value is not valid; the message lists what is.
     """
     config = base or Config()
     if file is not None:

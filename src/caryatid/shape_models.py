@@ -33,13 +33,22 @@ class Hypotheses:
 class ShapeModel(Protocol):
     """A RANSAC model whose hypotheses become shapes."""
 
-    sample_size: int
+    @property
+    def sample_size(self) -> int:
+        """Oriented points that determine a hypothesis."""
+        ...
 
-    def estimate(self, samples: NDArray[np.intp], points: Array, normals: Array) -> Hypotheses: ...
+    def estimate(self, samples: NDArray[np.intp], points: Array, normals: Array) -> Hypotheses:
+        """Make hypotheses from samples (B, sample_size) of indices into points (N, 3), normals (N, 3)."""
+        ...
 
-    def distances(self, hypotheses: Hypotheses, points: Array) -> Array: ...
+    def distances(self, hypotheses: Hypotheses, points: Array) -> Array:
+        """Unsigned distance (B, N) [m] of points (N, 3) to each hypothesis; infinite for an invalid one."""
+        ...
 
-    def shape(self, hypotheses: Hypotheses, index: int) -> Box | Cylinder | Sphere: ...
+    def shape(self, hypotheses: Hypotheses, index: int) -> Box | Cylinder | Sphere:
+        """One hypothesis as a shape."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +105,7 @@ class CylinderModel:
     sample_size: int = 2
 
     def estimate(self, samples: NDArray[np.intp], points: Array, normals: Array) -> Hypotheses:
-        """Axis along the cross product of the normals, through the point where the normal lines come closest."""
+        """Axis along the cross product of the normals, through where the normal lines come closest."""
         n1, n2 = normals[samples[:, 0]], normals[samples[:, 1]]
         p1, p2 = points[samples[:, 0]], points[samples[:, 1]]
         cross = np.cross(n1, n2)

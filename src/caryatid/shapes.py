@@ -25,7 +25,9 @@ class Shape(Protocol):
     kind: ClassVar[str]
 
     @property
-    def T_world_object(self) -> Array: ...
+    def T_world_object(self) -> Array:
+        """Pose (4, 4) of the centre."""
+        ...
 
     @property
     def extents(self) -> Array:

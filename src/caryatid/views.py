@@ -14,7 +14,7 @@ from caryatid.errors import InputError
 from caryatid.frames import Array
 
 SUPPORT_LABEL = 65535
-"""The label of the support surface in label images: the last of 16 bits, so that given labels stay as they are."""
+"""The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class Camera(Protocol):
         """Take a view.
 
         Args:
-            T_world_camera: Where the camera is to be (4, 4). The view's own pose says where it believes it was.
+            T_world_camera: Where the camera is to be (4, 4); the view says where it believes it was.
         """
         ...
 

@@ -11,7 +11,7 @@ from caryatid.views import View
 SPACING = 0.01
 """Spacing of the samples on the surface [m]."""
 MARGIN = 0.02
-"""How far behind the surface a reading must lie to contradict it [m]; 2σ of registration and depth together."""
+"""How far behind the surface a reading must lie to contradict it [m]; 2σ of registration and depth."""
 
 
 def seen_through(shape: Shape, view: View) -> bool:

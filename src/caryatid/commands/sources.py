@@ -62,9 +62,7 @@ def open_source(source: str, config: Config, *, noise: NoiseModel, seed: int) ->
     known = read_truth(truth_file) if truth_file.is_file() else None
     truth = ground_truth(scene) if known is None else known
     stage = set_stage(scene, config, noise=noise, seed=seed)
-    return Source(
-        scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None
-    )
+    return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
 
 
 def check_labels(source: str, recording: Recording, segmentation: SegmentationMethod | None) -> None:
