@@ -2,11 +2,12 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from importlib.metadata import EntryPoint
 
 import numpy as np
 import pytest
 
-from caryatid import frames
+from caryatid import frames, planners
 from caryatid.config import ActiveVisionConfig, RobotConfig, VoxelConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.floor import FloorGrid
@@ -118,6 +119,14 @@ class TestEveryPlanner:
 
 def test_an_unknown_planner_lists_those_there_are():
     with pytest.raises(InputError, match=r"no planner 'best'.*support, paper, random"):
+        make_planner("best")
+
+
+def test_other_packages_offer_planners_by_entry_point(monkeypatch: pytest.MonkeyPatch):
+    offer = EntryPoint("ring", "caryatid.planners.random:RandomPlanner", planners.ENTRY_POINTS)
+    monkeypatch.setattr(planners, "entry_points", lambda group: [offer] if group == offer.group else [])
+    assert isinstance(make_planner("ring"), planners.RandomPlanner)
+    with pytest.raises(InputError, match="support, paper, random, ring"):
         make_planner("best")
 
 

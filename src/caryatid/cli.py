@@ -2,16 +2,33 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
-
-from rich.console import Console
 
 from caryatid.errors import CaryatidError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status: 0 done, 1 bad input or failed work, 2 usage."""
+    """Run one command and return its exit status.
+
+    Args:
+        arguments: The command and its options; None takes them from the command line.
+
+    Returns:
+        0 done, 1 the input is bad, the work failed or nobody reads the result, 130 interrupted.
+
+    Raises:
+        SystemExit: After --help, with 0; where options are wrong, with 2.
+    """
+    try:
+        return _run(sys.argv[1:] if arguments is None else arguments)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+
+
+def _run(arguments: Sequence[str]) -> int:
     import tyro
 
     from caryatid.commands.demo import Demo
@@ -20,7 +37,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from caryatid.commands.extract import Extract
     from caryatid.commands.show_config import ShowConfig
 
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
     command = tyro.extras.subcommand_cli_from_dict(
         {
             "demo": Demo,
@@ -31,19 +47,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
         },
         prog="caryatid",
         description="Look around a cluttered table until it is known what holds up what.",
-        args=arguments,
-        config=(tyro.conf.FlagCreatePairsOff,),
+        args=list(arguments),
+        config=(tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff),
     )
     try:
         status: int = command()
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
     except KeyboardInterrupt:
+        sys.stderr.write("interrupted: nothing was written\n")
         return 130
-    except (CaryatidError, OSError) as error:
-        if command.debug:
+    except Exception as error:
+        if command.general.debug:
             raise
-        Console(stderr=True, highlight=False, soft_wrap=True).print(f"error: {error}", markup=False)
+        sys.stderr.write(f"error: {_in_one_line(error)}\n")
         return 1
     return status
+
+
+def _in_one_line(error: Exception) -> str:
+    """Say what failed, and where, in one line."""
+    match error:
+        case CaryatidError():
+            text = str(error)
+        case OSError(filename=str() as name, strerror=str() as reason):
+            text = f"{name}: {reason.lower()}"
+        case OSError():
+            text = str(error)
+        case MemoryError():
+            text = f"out of memory: {error}"
+        case _:
+            text = f"a fault in caryatid, {type(error).__name__}: {error}; --debug shows where"
+    return " ".join(text.splitlines())
 
 
 if __name__ == "__main__":

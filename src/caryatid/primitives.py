@@ -199,7 +199,7 @@ def _starts(
 def _flat_boxes(points: Array, normals: Array, config: FitConfig) -> list[Box | Cylinder | Sphere]:
     """Boxes for points of one face: the main normal, and the least rectangle around the points along it."""
     axis, agree = _main_normal(normals)
-    x = frames.perpendicular(axis)
+    x = _across(points, axis)
     y = np.cross(axis, x)
     plane = points @ np.stack([x, y], axis=1)
     angles = np.radians(np.arange(0.0, 90.0, 3.0))
@@ -220,7 +220,7 @@ def _flat_boxes(points: Array, normals: Array, config: FitConfig) -> list[Box | 
 def _discs(points: Array, normals: Array, config: FitConfig) -> list[Box | Cylinder | Sphere]:
     """Cylinders for points of one end: the main normal, and the circle that holds the points along it."""
     axis, agree = _main_normal(normals)
-    x = frames.perpendicular(axis)
+    x = _across(points, axis)
     R = np.stack([x, np.cross(axis, x), axis], axis=1)
     local = points @ R
     low, high = np.quantile(local, (config.trim, 1.0 - config.trim), axis=0)
@@ -236,6 +236,16 @@ def _main_normal(normals: Array) -> tuple[Array, NDArray[np.bool_]]:
     agree = normals @ normals.T > np.cos(np.radians(25.0))
     largest = agree[int(np.argmax(agree.sum(axis=1)))]
     return frames.unit(normals[largest].mean(axis=0)), largest
+
+
+def _across(points: Array, axis: Array) -> Array:
+    """A direction (3,) across an axis that turns with the points: to the first one well off their middle."""
+    offsets = points - points.mean(axis=0)
+    offsets = offsets - (offsets @ axis)[:, None] * axis
+    reach = np.linalg.norm(offsets, axis=1)
+    if reach.max() < 1e-6:
+        return frames.perpendicular(axis)
+    return frames.unit(offsets[int(np.argmax(reach > 0.5 * reach.max()))])
 
 
 def _slab(heights: Array, on_face: NDArray[np.bool_], config: FitConfig) -> tuple[float, float]:

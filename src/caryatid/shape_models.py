@@ -112,8 +112,7 @@ class CylinderModel:
         valid = np.linalg.norm(cross, axis=1) > 0.3
         axis = frames.unit(np.where(valid[:, None], cross, (0.0, 0.0, 1.0)))
         radius, on_axis = _meeting_of_normals(p1, n1, p2, n2, axis)
-        x = frames.perpendicular(axis)
-        R = np.stack([x, np.cross(axis, x), axis], axis=-1)
+        R = _axes(axis, n1)
         low, high = _trimmed_range((axis @ points.T)[:, :, None], self.trim)
         height = np.maximum(high - low, 1e-4)[:, 0]
         along = (low + high)[:, 0] / 2.0 - np.sum(on_axis * axis, axis=1)
@@ -157,8 +156,7 @@ class SphereModel:
         radius, centre = _meeting_of_normals(p1, n1, p2, n2, axis)
         centre = centre + 0.5 * np.sum((p1 + p2 - 2.0 * centre) * axis, axis=1, keepdims=True) * axis
         valid &= (radius > 1e-3) & (radius <= self.max_radius)
-        R = np.broadcast_to(np.eye(3), (len(radius), 3, 3))
-        return Hypotheses(R, centre, np.repeat(2.0 * radius[:, None], 3, axis=1), valid)
+        return Hypotheses(_axes(axis, n1), centre, np.repeat(2.0 * radius[:, None], 3, axis=1), valid)
 
     def distances(self, hypotheses: Hypotheses, points: Array) -> Array:
         """Unsigned distance (B, N) [m] to the spheres."""
@@ -167,7 +165,7 @@ class SphereModel:
 
     def shape(self, hypotheses: Hypotheses, index: int) -> Sphere:
         """One hypothesis as a shape."""
-        T = frames.rigid(np.eye(3), hypotheses.centre[index])
+        T = frames.rigid(hypotheses.R[index], hypotheses.centre[index])
         return Sphere(T, float(hypotheses.extents[index, 0] / 2.0))
 
 
@@ -179,6 +177,14 @@ def _meeting_of_normals(p1: Array, n1: Array, p2: Array, n2: Array, axis: Array)
     radius = np.sum(gap * -turn, axis=1) / np.maximum(np.sum(turn * turn, axis=1), 1e-12)
     meeting = (p1 - radius[:, None] * n1 + p2 - radius[:, None] * n2) / 2.0
     return radius, meeting
+
+
+def _axes(z: Array, towards: Array) -> Array:
+    """Axes (B, 3, 3) with this z (B, 3) and x on the side of `towards`, so that they turn with the points."""
+    across = towards - np.sum(towards * z, axis=1, keepdims=True) * z
+    short = np.linalg.norm(across, axis=1, keepdims=True) < 1e-6
+    x = frames.unit(np.where(short, frames.perpendicular(z), across))
+    return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def _local(hypotheses: Hypotheses, points: Array) -> Array:

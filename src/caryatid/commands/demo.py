@@ -2,39 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from caryatid.commands.explore import Explore, run_exploration
-from caryatid.commands.options import Modelling
+from caryatid.commands.options import DEFAULTS, ModellingCommand, OutPath, Views, defaults_to, with_views
 
 SCENE = "clutter"
 VIEWS = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Modelling):
-    """Explore a built-in cluttered table in simulation and say, view by view, what was found."""
+class Demo(ModellingCommand):
+    """Explore a built-in cluttered table in simulation and say, view by view, what was found.
 
-    out: Path = Path("demo-run")
+    To try:
+      caryatid demo --out run
+    """
+
+    out: OutPath = Path("demo-run")
     """Run folder to write; a run already there is replaced."""
-    scene: str = SCENE
-    """Which built-in scene."""
-    views: int = VIEWS
+    scene: Annotated[str, tyro.conf.arg(metavar="NAME")] = SCENE
+    """A built-in scene, say tower, bridge or dense-12-0."""
+    views: Annotated[Views, defaults_to(VIEWS)] = None
     """Views at the most, the first one too."""
 
     def __call__(self) -> int:
         """Run the command."""
-        config = self.settings()
-        config = replace(config, active=replace(config.active, max_views=self.views))
+        config = with_views(self.modelling.settings(with_views(DEFAULTS, VIEWS)), self.views)
         options = Explore(
-            source=self.scene,
-            out=self.out,
-            noise="carmine",
-            segmentation="labels",
-            seed=self.seed,
-            json=self.json,
-            quiet=self.quiet,
-            debug=self.debug,
+            source=self.scene, out=self.out, noise="carmine", modelling=self.modelling, general=self.general
         )
         return run_exploration(options, config)

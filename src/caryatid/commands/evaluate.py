@@ -3,38 +3,41 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
-from caryatid.commands.options import Common
+from caryatid.commands.options import General
 from caryatid.evaluation.truths import evaluate_run
 from caryatid.formats.json_files import json_text
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Common):
+class Evaluate:
     """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU.
 
-    Example: `caryatid evaluate run scenes/tower`.
+    To try:
+      caryatid evaluate run scenes/tower
     """
 
-    run: Annotated[Path, tyro.conf.Positional]
-    """Run folder."""
-    truth: Annotated[Path, tyro.conf.Positional]
+    run: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+    """Run folder, as explore and extract write it."""
+    truth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GT")]
     """Scene folder (scene.xml and gt.json), or recording with masks and gt.json."""
+    general: tyro.conf.OmitArgPrefixes[General] = field(default_factory=General)
 
     def __call__(self) -> int:
         """Run the command."""
         scores = evaluate_run(self.run, self.truth)
-        if self.json:
-            sys.stdout.write(json_text({"views": [s.to_json() for s in scores]}) + "\n")
+        if self.general.json:
+            sys.stdout.write(json_text({"views": [s.to_json() for s in scores]}))
             return 0
-        table = Table(title=f"{self.run} against {self.truth}", title_justify="left")
+        table = Table(title=Text(f"{self.run} against {self.truth}"), title_justify="left")
         for column in ("view", "precision", "recall", "F1", "edge precision", "edge recall", "mean IoU"):
             table.add_column(column, justify="right")
         for view in scores:

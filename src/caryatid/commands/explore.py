@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
-from caryatid.commands.options import Modelling
+from caryatid.commands.options import SAID, ModellingCommand, OutPath, Views, defaults_to, with_views
+from caryatid.commands.planner_names import PlannerName
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record, step_record, view_record
 from caryatid.commands.sources import Source, open_source
@@ -20,52 +20,55 @@ from caryatid.exploration import Step, explore
 from caryatid.formats.graph_json import graph_to_json
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
-from caryatid.planners import make_planner
 from caryatid.report import ViewPage, draw_view, render_report
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explore(Modelling):
+class Explore(ModellingCommand):
     """Look around a scene until it is known what holds up what.
 
-    SOURCE is an MJCF scene (.xml: simulated robot and camera), the name of a built-in scene, or a recording
-    (folder in the BOP format: the camera can only be where a recorded view is).
+    SOURCE is one of
+      an MJCF scene: an .xml file, or the folder of a scene.xml; robot and camera are simulated
+      the name of a built-in scene: tower, clutter, pile-8-0, dense-12-0, …
+      a recording: a folder in the BOP format; the camera can only be where a recorded view is
 
-    Examples: `caryatid explore scene.xml --out run`, `caryatid explore tower --noise carmine --out run`.
+    To try:
+      caryatid explore tower --noise carmine --out run
+      caryatid explore scene.xml --views 5 --out run
+      caryatid explore recording/ --segmentation auto --out run
     """
 
-    source: Annotated[str, tyro.conf.Positional]
-    """What to explore."""
-    out: Path
+    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    """Scene or recording."""
+    out: OutPath
     """Run folder to write; a run already there is replaced."""
-    views: int | None = None
-    """Views at the most, the first one too. [default: 10]"""
-    planner: str = "support"
-    """Who chooses the next view: support, paper or random."""
-    segmentation: SegmentationMethod | None = None
-    """Where parts come from: given labels, or automatic. [default: labels where the source has them]"""
+    views: Annotated[Views, defaults_to(10)] = None
+    """Views at the most, the first one too."""
+    planner: PlannerName = "support"
+    """Who chooses the next view."""
+    segmentation: Annotated[
+        SegmentationMethod | None, tyro.conf.DisallowNone, defaults_to("labels where the source has them")
+    ] = None
+    """Where parts come from: the masks that are given, or automatic."""
     noise: NoiseModel = "none"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
-    early_stop: bool = True
-    """Look on until the views are used up, also when one changed nothing."""
-    report: bool = True
-    """Write no report.html."""
+    no_early_stop: Annotated[bool, SAID] = False
+    """Go on until the views are used up; without this the loop ends when a view changes nothing."""
+    no_report: Annotated[bool, SAID] = False
+    """Leave report.html out."""
 
     def __call__(self) -> int:
         """Run the command."""
-        config = self.settings()
-        if self.views is not None:
-            config = replace(config, active=replace(config.active, max_views=self.views))
-        return run_exploration(self, config)
+        return run_exploration(self, with_views(self.modelling.settings(), self.views))
 
 
 def run_exploration(options: Explore, config: Config) -> int:
     """Explore and write the run folder; Ctrl-C ends it with the views done so far."""
-    progress = Progress(options.quiet or options.json)
-    make_planner(options.planner)
+    progress = Progress(options.general.quiet or options.general.json)
+    seed = options.modelling.seed
     with RunWriter(options.out) as writer:
         with progress.working("opening"):
-            source = open_source(options.source, config, noise=options.noise, seed=options.seed)
+            source = open_source(options.source, config, noise=options.noise, seed=seed)
         pages: list[ViewPage] = []
         steps: list[dict[str, Any]] = []
         scores: list[Score] = []
@@ -77,11 +80,11 @@ def run_exploration(options: Explore, config: Config) -> int:
                 planner=options.planner,
                 config=config,
                 segmentation=options.segmentation,
-                seed=options.seed,
-                early_stop=options.early_stop,
+                seed=seed,
+                early_stop=not options.no_early_stop,
             ):
-                last = step
-                scores += _scored(step, source)
+                scored = _scored(step, source)
+                page = [] if options.no_report else [draw_view(step, config.report)]
                 writer.add_view(
                     step.graph,
                     step.labels,
@@ -90,38 +93,40 @@ def run_exploration(options: Explore, config: Config) -> int:
                     K=step.view.K,
                     record=view_record(step),
                 )
+                before, last = last, step
                 steps.append(step_record(step))
-                if options.report:
-                    pages.append(draw_view(step, config.report))
-                progress.step(step, scores[-1].f1 if scores else None)
+                pages += page
+                scores += scored
+                progress.step(step, None if before is None else before.graph, scores)
         except KeyboardInterrupt:
-            progress.say("interrupted: keeping the views done so far")
             if last is None:
                 raise
-        assert last is not None
+            progress.say("interrupted: keeping the views done so far")
+        if last is None:
+            raise RuntimeError("an exploration that ends has taken a view")
         told = {
-            "source": options.source,
             "planner": options.planner,
             "segmentation": options.segmentation,
             "noise": options.noise,
-            "seed": options.seed,
-            "early_stop": options.early_stop,
+            "early_stop": not options.no_early_stop,
         }
         report = None
-        if options.report:
-            count = len(pages)
+        if not options.no_report:
             report = render_report(
                 pages,
                 title=f"caryatid: {source.name}",
-                settings=told | {"fusion": config.fusion.method, "views": config.active.max_views},
-                scores=scores[:count] if len(scores) >= count > 0 and scores else None,
+                settings={"source": options.source, "seed": seed}
+                | told
+                | {"fusion": config.fusion.method, "views": config.active.max_views},
+                scores=scores or None,
             )
-        writer.finish(last.graph, run_record(config, told, steps, scores), report)
-    if options.json:
-        sys.stdout.write(json_text({"run": str(options.out), "graph": graph_to_json(last.graph)}) + "\n")
-    progress.say(f"{source.name}: {summary(last.graph)} after {len(steps)} views")
-    if options.report:
-        progress.say(f"report: {options.out / 'report.html'}")
+        record = run_record("explore", options.source, seed, told, config, steps, scores)
+        writer.finish(last.graph, record, report)
+    if options.general.json:
+        sys.stdout.write(json_text({"run": str(options.out), "graph": graph_to_json(last.graph)}))
+    count = "1 view" if len(steps) == 1 else f"{len(steps)} views"
+    progress.say(f"{source.name}: {summary(last.graph)} after {count}")
+    progress.say(f"run: {options.out}" + ("" if options.no_report else ", open its report.html"))
     return 0
 
 

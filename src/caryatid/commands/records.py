@@ -10,29 +10,45 @@ from typing import Any
 
 import numpy as np
 
+import caryatid
 from caryatid.config import Config
 from caryatid.evaluation.scores import Score
 from caryatid.exploration import Step
 
-PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
-"""Whose versions a run records."""
+PACKAGES = ("mujoco", "numpy", "scipy", "numba", "shapely")
+"""Whose versions a run records beside caryatid's and Python's."""
 
 
 def run_record(
-    config: Config, options: Mapping[str, Any], steps: Sequence[Mapping[str, Any]], scores: Sequence[Score]
+    command: str,
+    source: str,
+    seed: int,
+    options: Mapping[str, Any],
+    config: Config,
+    steps: Sequence[Mapping[str, Any]],
+    scores: Sequence[Score],
 ) -> dict[str, Any]:
     """What run.json holds.
 
     Args:
+        command: Which command made the run.
+        source: What it was made from.
+        seed: Seed of every random choice.
+        options: Planner, noise, segmentation and so on.
         config: All settings.
-        options: Source, planner, noise, seed and so on.
-        steps: `step_record` of each view.
+        steps: Of each view its number, its timings [s], angle [rad] and path [m] travelled up to it.
         scores: Score after each view, where the truth is known.
     """
+    packages = {name: version(name) for name in PACKAGES}
     record: dict[str, Any] = {
-        "command": dict(options),
+        "command": command,
+        "source": source,
+        "seed": seed,
+        "options": dict(options),
         "settings": asdict(config),
-        "versions": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "versions": {"caryatid": caryatid.__version__, "python": platform.python_version()} | packages,
+        "angle_travelled": steps[-1]["angle_travelled"] if steps else 0.0,
+        "path_travelled": steps[-1]["path_travelled"] if steps else 0.0,
         "steps": list(steps),
     }
     if scores:
