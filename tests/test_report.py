@@ -18,7 +18,7 @@ from caryatid.graph import SceneObject, Stability, Support, SupportGraph
 from caryatid.interest import PointOfInterest
 from caryatid.planners import Decision
 from caryatid.report import draw_model, draw_view, render_report
-from caryatid.report.charts import Line, line_chart
+from caryatid.report.charts import Line, bar_chart, line_chart
 from caryatid.report.colours import PALETTE, object_colour
 from caryatid.report.graphs import draw_graph
 from caryatid.report.images import draw_image
@@ -193,19 +193,82 @@ def test_charts_appear_with_scores_and_travel_only() -> None:
     with_scores = render_report(pages, title="t", settings={}, scores=[good(0.5), good(0.9)])
     without = render_report(pages, title="t", settings={})
     assert "F1 over travelled path" in with_scores
-    assert "Score over views" in with_scores
-    assert "Score over views" not in without
+    assert "F1 over views" in with_scores
+    assert "F1 over views" not in without
     assert "travelled path" not in without
     still = [replace(page, path_travelled=0.0, angle_travelled=0.0) for page in pages]
     assert "travelled path" not in render_report(still, title="t", settings={}, scores=[good(0.5), good(0.9)])
 
 
+def chart_words(chart: str) -> list[str]:
+    return [word for word in read(chart).words if word.strip()]
+
+
+def numbers(words: list[str]) -> list[float]:
+    return [float(word) for word in words if re.fullmatch(r"-?[\d.]+", word)]
+
+
 def test_counts_have_whole_ticks_and_gaps_stay_gaps() -> None:
-    chart = line_chart([0.0, 1.0, 2.0], [Line("found", [9.0, math.nan, 11.0])], title="t", x_name="view")
-    ticks = [float(t) for t in re.findall(r'class="small (?:end|middle)">([\d.]+)<', chart)]
+    found = Line("found", [9.0, math.nan, 11.0])
+    chart = line_chart([0.0, 1.0, 2.0], [found], title="t", x_name="view", y_name="number")
+    words = chart_words(chart)
+    ticks = numbers(words)
+    assert {0.0, 1.0, 2.0} <= set(ticks)
     assert max(ticks) >= 11.0
     assert all(tick.is_integer() for tick in ticks)
-    assert chart.count("<circle") == 2
+    assert [word for word in words if word.startswith("found")] == ["found 9", "found 11"]
+    assert len(re.findall("<use", chart)) == 2
+
+
+def test_axes_are_named_and_f1_runs_from_0_to_1() -> None:
+    low = Line("F1", [0.62, 0.64])
+    words = chart_words(line_chart([0.0, 3.7], [low], title="t", x_name="m", y_name="F1", y_range=(0.0, 1.0)))
+    assert {"t", "m", "F1"} <= set(words)
+    assert numbers(words)[-6:] == [0.0, 0.2, 0.4, 0.6, 0.8, 1.0]
+
+
+def test_each_view_has_a_bar_with_its_parts_and_a_whole_tick() -> None:
+    bars = [{"fit": 0.25}, {"fit": 0.5, "plan": 0.125}] + [{"plan": 0.75}] * 8
+    words = chart_words(bar_chart(bars, title="t", x_name="view", y_name="time [s]"))
+    assert numbers(words)[:10] == [float(k) for k in range(10)]
+    assert {"fit 0.25", "fit 0.5", "plan 0.125", "plan 0.75", "time [s]"} <= set(words)
+    assert {"fit", "plan"} <= set(words)
+    alone = chart_words(bar_chart(bars[:1], title="t", x_name="view", y_name="time [s]"))
+    assert alone[:2] == ["0", "view"]
+
+
+def test_charts_are_the_same_whatever_the_user_set_and_leave_it_alone() -> None:
+    import matplotlib as mpl
+
+    def draw() -> str:
+        lines = [Line("a", [1.0, 2.0]), Line("b", [2.0, 2.0])]
+        return line_chart([0.0, 1.0], lines, title="t", x_name="view", y_name="number")
+
+    usual = draw()
+    with mpl.rc_context({"font.size": 30.0, "axes.facecolor": "red", "svg.fonttype": "path"}):
+        assert draw() == usual
+        assert mpl.rcParams["font.size"] == 30.0
+    assert draw() == usual
+    assert "var(--soft)" in usual
+    assert not re.search(r"xmlns|url\(|<style|<metadata|<\?xml", usual)
+
+
+def test_ids_in_charts_are_found_once(html: str) -> None:
+    ids = re.findall(r'\bid="([^"]+)"', html)
+    assert len(ids) == len(set(ids))
+    charts = re.findall(r'<svg [^>]*class="chart".*?</svg>', html, re.DOTALL)
+    assert len(charts) == 4
+    used = set(re.findall(r'href="#([^"]+)"', "".join(charts)))
+    assert used
+    assert used <= set(ids)
+
+
+def test_views_are_numbered_like_the_folders_of_the_run(html: str) -> None:
+    headings = re.findall(r"<h2>(.*?)</h2>", html)
+    for number, heading in zip(("00", "01"), headings, strict=False):
+        assert re.sub("<[^>]+>", "", heading) == f"View {number} (views/{number})"
+        assert f'<a href="#view{number}"' in html
+        assert f'id="view{number}"' in html
 
 
 def test_scores_must_match_the_pages() -> None:
@@ -420,9 +483,9 @@ def test_sizes_stability_and_unseen_sides_are_said() -> None:
 
 
 def test_nothing_drawn_is_not_a_number(html: str) -> None:
-    numbers = re.findall(r'\b(?:x|y|cx|cy|r|width|height)="([^"]+)"', html)
-    assert numbers
-    assert all(math.isfinite(float(n)) for n in numbers)
+    places = re.findall(r'\b(?:x|y|cx|cy|r|width|height)="([^"]+)"', html)
+    assert places
+    assert all(math.isfinite(float(n)) for n in places)
 
 
 def test_drawing_is_reproducible_and_leaves_the_step_alone() -> None:

@@ -19,6 +19,7 @@ def associate(
     known_points: Mapping[int, Array],
     known_shapes: Mapping[int, Shape],
     config: SegmentationConfig,
+    labels_used: int = 0,
 ) -> dict[int, int]:
     """Give each new part the label of the object it belongs to, or a label never used before.
 
@@ -28,13 +29,14 @@ def associate(
         known_points: Points (M, 3) [m] of each known object.
         known_shapes: Fitted shape of each known object that has one.
         config: Share that must overlap, and the distance that counts as overlap.
+        labels_used: Highest label ever given; new objects are numbered from the next one.
 
     Returns:
         Label of the part → label of the object.
     """
     parts = [int(k) for k in np.unique(labels) if k != 0]
     names: dict[int, int] = {}
-    fresh = max(known_points, default=0)
+    fresh = max(labels_used, *known_points, 0)
     trees = {k: cKDTree(p) for k, p in known_points.items()}
     for part in parts:
         points = points_world[labels == part]

@@ -1,4 +1,4 @@
-"""Hidden extents: how far a shape reaches down unseen, bounded by free space and by what holds it."""
+"""Hidden extents: how far a shape reaches where nobody looked, bounded by free space and by what is there."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ def complete(
     objects: Sequence[SceneObject], surface: SupportSurface, voxels: VoxelMap, config: CompletionConfig
 ) -> list[SceneObject]:
     """Extend the unseen lower side of each object until it meets free space, another shape or the table.
+
+    An object of which one side alone was seen is taken to be as deep as it is wide, in the same bounds.
 
     Objects are taken from the lowest up, so that each finds what lies below it already completed.
 
@@ -48,32 +50,71 @@ def _extended(
         return candidate
     axis, sign = _downward_side(shape)
     down_world = sign * shape.T_world_object[:3, axis]
-    if candidate.seen[2 * axis + (sign > 0)] or -down_world[2] < np.cos(np.radians(config.max_tilt)):
+    upright = -down_world[2] >= np.cos(np.radians(config.max_tilt))
+    if upright and not candidate.seen[2 * axis + (sign > 0)]:
+        bottom = _face_grid(shape, axis, sign, config.spacing)
+        to_table = float(np.min(surface.height(bottom) / -(down_world @ surface.normal_world)))
+        if to_table <= 0.0:
+            candidate = replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
+        else:
+            candidate = _moved_out(candidate, axis, sign, to_table, "down to the table", others, voxels, config)
+    hidden = _depth_side(candidate, config)
+    if hidden is None or (upright and hidden[0] == axis):
         return candidate
-    bottom = _face_grid(shape, axis, sign, config.spacing)
-    to_table = float(np.min(surface.height(bottom) / -(down_world @ surface.normal_world)))
-    if to_table <= 0.0:
-        return replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
-    length, reason = to_table, "reaches down to the table"
-    to_object = _gap_below(bottom, down_world, others, to_table, config)
+    guess = float(np.delete(candidate.shape.extents, hidden[0]).min()) - float(candidate.shape.extents[hidden[0]])
+    return _moved_out(candidate, *hidden, guess, "as deep as it is wide", others, voxels, config)
+
+
+def _moved_out(
+    candidate: SceneObject,
+    axis: int,
+    sign: float,
+    limit: float,
+    aim: str,
+    others: Sequence[Shape],
+    voxels: VoxelMap,
+    config: CompletionConfig,
+) -> SceneObject:
+    """Move one side outwards up to a limit [m], another shape or free space, whichever comes first."""
+    shape = candidate.shape
+    if isinstance(shape, Sphere):
+        return candidate
+    outward_world = sign * shape.T_world_object[:3, axis]
+    face = _face_grid(shape, axis, sign, config.spacing)
+    length, reason = limit, f"is taken to reach {aim}"
+    to_object = _gap_before(face, outward_world, others, limit, config)
     if to_object < length:
-        length, reason = to_object, "reaches down to the object below"
-    to_free = _free_below(shape, bottom, axis, down_world, length, voxels, config)
+        length, reason = to_object, "ends at the next object"
+    to_free = _free_before(shape, face, axis, outward_world, length, voxels, config)
     if to_free < length:
-        length, reason = to_free, "ends where free space was seen below it"
+        length, reason = to_free, "ends where free space was seen"
     if length < config.least:
         return candidate
-    why = f"its lower side was not seen and {reason}, {1000 * length:.0f} mm further"
+    why = f"a side that was not seen {reason}, {1000 * length:.0f} mm further"
+    why = f"{candidate.why}; {why}" if candidate.why else why
     return replace(candidate, shape=_lengthened(shape, axis, sign, length), why=why)
 
 
-def _gap_below(
-    face: Array, down_world: Array, others: Sequence[Shape], limit: float, config: CompletionConfig
+def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, float] | None:
+    """The hidden side (axis, sign) opposite the only one seen, where the points say nothing of the depth."""
+    seen = np.flatnonzero(candidate.seen)
+    if len(seen) != 1:
+        return None
+    axis, side = divmod(int(seen[0]), 2)
+    if isinstance(candidate.shape, Cylinder) and axis != 2:
+        return None
+    if candidate.shape.extents[axis] > config.flat:
+        return None
+    return axis, -1.0 if side else 1.0
+
+
+def _gap_before(
+    face: Array, outward_world: Array, others: Sequence[Shape], limit: float, config: CompletionConfig
 ) -> float:
     """How far [m] a face can move before it meets another shape, by sphere tracing."""
     length = 0.0
     while others and length < limit:
-        moved = face + length * down_world
+        moved = face + length * outward_world
         nearest = min(float(o.signed_distance(moved).min()) for o in others) + config.overlap
         if nearest < config.least:
             return max(length - config.overlap, 0.0)
@@ -81,11 +122,11 @@ def _gap_below(
     return limit
 
 
-def _free_below(
+def _free_before(
     shape: Box | Cylinder,
     face: Array,
     axis: int,
-    down_world: Array,
+    outward_world: Array,
     limit: float,
     voxels: VoxelMap,
     config: CompletionConfig,
@@ -94,7 +135,7 @@ def _free_below(
     ring = _rim(shape, face, axis, config.inset)
     length = 0.0
     while limit - length > config.step:
-        free = voxels.state_at(ring + (length + config.step / 2.0) * down_world) == FREE
+        free = voxels.state_at(ring + (length + config.step / 2.0) * outward_world) == FREE
         if float(free.mean()) > config.max_free:
             return length
         length += config.step

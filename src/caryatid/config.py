@@ -195,6 +195,8 @@ class CompletionConfig:
     """How far inside the walls free space is looked for [m]; a voxel, so that a wall's noise says nothing."""
     overlap: float = 0.004
     """How deep the moving side may enter another shape [m]; the fits' uncertainty."""
+    flat: float = 0.02
+    """Extent below which a single side's points say nothing of the depth behind it [m]; their noise."""
     least: float = 0.0005
     """Gaps below this are none [m]."""
     max_free: float = 0.15

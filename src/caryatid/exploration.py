@@ -28,7 +28,7 @@ class Step:
 
     Attributes:
         index: Number of the view, 0 the first.
-        view: What the camera gave.
+        view: What the camera gave; a view without a pose has the one the table gave it.
         labels: Label image (H, W) of the view.
         graph: The fused graph after this view.
         cloud: All points so far, thinned, with labels.
@@ -98,6 +98,8 @@ def explore(
         sphere, labels = scene.sphere, scene.labels
         if sphere is None or labels is None:
             raise RuntimeError("an updated scene has a sphere and labels")
+        if view.T_world_camera is None and scene.T_world_camera is not None:
+            view = view.with_pose(scene.T_world_camera)
         visited.append(sphere.direction_of(robot.T_world_camera))
         if len(visited) > 1:
             angle += float(frames.angle_between(visited[-2], visited[-1]))
@@ -151,9 +153,7 @@ def next_best_view(
     if visited is None:
         visited = scene.sphere.direction_of(robot.T_world_camera)[None]
     candidates = robot.candidates(scene.sphere)
-    state = PlanningState(
-        scene.graph, scene.sphere, scene.voxels, visited, candidates, scene.config.active
-    )
+    state = PlanningState(scene.graph, scene.sphere, scene.voxels, visited, candidates, scene.config.active)
     rng = np.random.default_rng([seed, len(visited)])
     return chooser.plan(state, rng), candidates
 

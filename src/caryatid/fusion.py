@@ -55,13 +55,33 @@ def fuse(
     sightings = {i: dict(seen) for i, seen in evidence.sightings.items()}
     for o in graph.objects:
         new_id = names[o.id]
-        label = o.label if new_id == o.id else int(new_id[1:])
-        sightings.setdefault(new_id, {})[evidence.views] = replace(o, id=new_id, label=label)
+        sightings.setdefault(new_id, {})[evidence.views] = _named(o, new_id)
     supports = {pair: dict(seen) for pair, seen in evidence.supports.items()}
     for s in graph.supports:
         renamed = replace(s, supporter=names[s.supporter], supported=names[s.supported])
         supports.setdefault(renamed.pair, {})[evidence.views] = renamed
     return Evidence(sightings, supports, evidence.views + 1), names
+
+
+def absorbed(evidence: Evidence, names: Mapping[str, str]) -> Evidence:
+    """Return the evidence with some objects taken for others: what was said of the old id counts for the new.
+
+    Args:
+        evidence: All views so far.
+        names: Id to give up → id that takes its place; a support between the two is dropped.
+    """
+    sightings: dict[str, dict[int, SceneObject]] = {}
+    for i, seen in evidence.sightings.items():
+        new_id = names.get(i, i)
+        merged = sightings.setdefault(new_id, {})
+        merged.update({v: _named(o, new_id) for v, o in seen.items() if v not in merged})
+    supports: dict[Pair, dict[int, Support]] = {}
+    for (a, b), found in evidence.supports.items():
+        pair = names.get(a, a), names.get(b, b)
+        if pair[0] != pair[1]:
+            renamed = {v: replace(s, supporter=pair[0], supported=pair[1]) for v, s in found.items()}
+            supports.setdefault(pair, {}).update(renamed)
+    return Evidence(sightings, supports, evidence.views)
 
 
 def fused_graph(
@@ -164,6 +184,10 @@ def _is_round(shape: Shape) -> bool:
 
 def _vertex(sightings: list[SceneObject], config: FusionConfig) -> SceneObject:
     return merge(sightings) if config.method == "sg" else sightings[-1]
+
+
+def _named(o: SceneObject, new_id: str) -> SceneObject:
+    return o if new_id == o.id else replace(o, id=new_id, label=int(new_id[1:]))
 
 
 def _fresh_id(o: SceneObject, taken: set[str]) -> str:

@@ -13,7 +13,7 @@ from caryatid.clouds import thin
 from caryatid.completion import complete
 from caryatid.config import Config, SegmentationMethod
 from caryatid.frames import Array
-from caryatid.fusion import Evidence, fuse, fused_graph
+from caryatid.fusion import Evidence, absorbed, fuse, fused_graph
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.perception import UP, Percept, label_image, perceive
 from caryatid.primitives import FitFailure, fit
@@ -64,6 +64,7 @@ class Scene:
         self._fits: dict[int, SceneObject] = {}
         self._evidence = Evidence()
         self._contradicted: dict[str, int] = {}
+        self._labels_used = 0
 
     @property
     def supports(self) -> nx.DiGraph:
@@ -92,7 +93,8 @@ class Scene:
         self._keep(percept)
         self._map_space(percept)
         watch.lap("map")
-        fitted = self._fitted(percept)
+        fitted, merged = self._fitted(percept)
+        percept = percept.relabelled(merged)
         watch.lap("fit")
         if self.surface is None or self.voxels is None:
             raise RuntimeError("a percept brings a surface and a map")
@@ -127,8 +129,9 @@ class Scene:
         known = {k: c.points_world for k, c in self._pooled().items()}
         shapes = {k: o.shape for k, o in self._fits.items()}
         names = association.associate(
-            percept.cloud.points_world, labels, known, shapes, self.config.segmentation
+            percept.cloud.points_world, labels, known, shapes, self.config.segmentation, self._labels_used
         )
+        self._labels_used = max(self._labels_used, *names.values(), 0)
         return percept.relabelled(names)
 
     def _keep(self, percept: Percept) -> None:
@@ -156,8 +159,13 @@ class Scene:
         if percept.view is not None:
             self.voxels = self.voxels.integrate(percept.view, self.config.cloud.max_depth)
 
-    def _fitted(self, percept: Percept) -> list[SceneObject]:
-        """Fit what this view changed; with `sg` from this view alone, else from all points so far."""
+    def _fitted(self, percept: Percept) -> tuple[list[SceneObject], dict[int, int]]:
+        """Fit what this view changed; with `sg` from this view alone, else from all points so far.
+
+        Returns:
+            All objects, and labels that turned out to be another object's: old → new.
+        """
+        given_up: dict[int, int] = {}
         changed = {int(k) for k in np.unique(percept.labels)} - {0, SUPPORT_LABEL}
         pooled = self._pooled()
         if self.config.fusion.method == "sg":
@@ -172,7 +180,9 @@ class Scene:
                 self._points[new] = [*self._points[new], *self._points.pop(old)]
                 del self._fits[old]
             self._fit_labels(sorted(set(given_up.values())), self._pooled())
-        return [self._fits[k] for k in sorted(self._fits)]
+            names = {object_id(old): object_id(new) for old, new in given_up.items()}
+            self._evidence = absorbed(self._evidence, names)
+        return [self._fits[k] for k in sorted(self._fits)], given_up
 
     def _fit_labels(self, labels: list[int], pooled: dict[int, Cloud]) -> None:
         for label in labels:

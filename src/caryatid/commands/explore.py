@@ -68,7 +68,9 @@ def run_exploration(options: Explore, config: Config) -> int:
     seed = options.modelling.seed
     with RunWriter(options.out) as writer:
         with progress.working("opening"):
-            source = open_source(options.source, config, noise=options.noise, seed=seed)
+            source = open_source(
+                options.source, config, noise=options.noise, segmentation=options.segmentation, seed=seed
+            )
         pages: list[ViewPage] = []
         steps: list[dict[str, Any]] = []
         scores: list[Score] = []

@@ -14,10 +14,9 @@ from caryatid import frames
 from caryatid.commands.options import SAID, ModellingCommand, OutPath, defaults_to, whole_number
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record
-from caryatid.commands.sources import CLOUD_SUFFIXES, check_labels
+from caryatid.commands.sources import CLOUD_SUFFIXES, open_recording
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError
-from caryatid.formats.bop import read_recording
 from caryatid.formats.graph_json import graph_to_json
 from caryatid.formats.json_files import json_text
 from caryatid.formats.point_clouds import read_stored_cloud
@@ -96,8 +95,8 @@ class Extract(ModellingCommand):
     def _extract_recording(
         self, scene: Scene, writer: RunWriter, config: Config, progress: Progress
     ) -> tuple[list[dict[str, Any]], list[ViewPage]]:
-        recording = read_recording(self.source)
-        check_labels(self.source, recording, self.segmentation)
+        with progress.working("reading the recording"):
+            recording = open_recording(self.source, self.segmentation)
         steps: list[dict[str, Any]] = []
         pages: list[ViewPage] = []
         angle, path = 0.0, 0.0

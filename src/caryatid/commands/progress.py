@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from rich.console import Console
 
@@ -25,7 +26,7 @@ class Progress:
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
         """Show a spinner while something takes its time, on a terminal."""
-        with self._console.status(what):
+        with self._console.status(what) if sys.stderr.isatty() else nullcontext():
             yield
 
     def say(self, text: str) -> None:

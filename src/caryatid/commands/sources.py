@@ -47,16 +47,25 @@ def is_recording(source: str) -> bool:
     return (Path(source) / "scene_camera.json").is_file() or (Path(source) / "depth").is_dir()
 
 
-def open_source(source: str, config: Config, *, noise: NoiseModel, seed: int) -> Source:
+def open_source(
+    source: str, config: Config, *, noise: NoiseModel, segmentation: SegmentationMethod | None, seed: int
+) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
+    Args:
+        source: What the user gave.
+        config: All settings.
+        noise: Noise of the simulated camera.
+        segmentation: Where parts are to come from.
+        seed: Seed of the noise.
+
     Raises:
-        InputError: It is none of them, or broken.
+        InputError: It is none of them, or broken, or lacks the labels that are demanded.
     """
     if Path(source).suffix.lower() in CLOUD_SUFFIXES:
         raise InputError(source, "is a single cloud, and there is nowhere to go", "use `caryatid extract`")
     if is_recording(source):
-        return _open_recording(read_recording(source))
+        return _open_recording(open_recording(source, segmentation))
     scene = load_scene(source)
     truth_file = Path(scene.source).parent / "gt.json"
     known = read_truth(truth_file) if truth_file.is_file() else None
@@ -65,14 +74,18 @@ def open_source(source: str, config: Config, *, noise: NoiseModel, seed: int) ->
     return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
 
 
-def check_labels(source: str, recording: Recording, segmentation: SegmentationMethod | None) -> None:
-    """Refuse `labels` for a recording without masks before any work is done.
+def open_recording(folder: str, segmentation: SegmentationMethod | None) -> Recording:
+    """Read a recording and decode every frame once, so that what is broken is said before any work is done.
 
     Raises:
-        InputError: Labels are demanded and there are none.
+        InputError: It is broken, or labels are demanded and there are none.
     """
+    recording = read_recording(folder)
     if segmentation == "labels" and not recording.has_labels:
-        raise InputError(source, "has no masks", "add mask_visib/, or use --segmentation auto")
+        raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
+    for frame in recording.frames:
+        frame.load()
+    return recording
 
 
 def _open_recording(recording: Recording) -> Source:

@@ -1,25 +1,60 @@
-"""Small charts as SVG: lines over views or path, and bars of time."""
+"""Charts of the summary, drawn by matplotlib and put into the page as SVG: lines, and stacked bars."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
-from caryatid.report import svg
+from caryatid.report.colours import SERIES
 
-WIDTH, HEIGHT = 320.0, 222.0
-"""Size of a chart [px]."""
-LEFT, RIGHT, TOP, BOTTOM = 40.0, 14.0, 34.0, 44.0
+WIDTH, HEIGHT = 320.0, 150.0
+"""Width of a chart, and height of its axes [px]."""
+LEFT, RIGHT, TOP, BOTTOM = 50.0, 14.0, 34.0, 40.0
 """Free space around the axes [px]."""
-TEXT = 12.0
-"""Height of letters [px]."""
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999933", "#882255")
-"""Colours of lines and of bars' parts, none of which means an object."""
-
-Place = Callable[[float, float], tuple[float, float]]
-"""From a value on both axes to pixels."""
+LEGEND_COLUMNS, LEGEND_ROW = 4, 17.0
+"""Names side by side in the legend, and height of a row of it [px]."""
+MOST_TICKS, FEW_TICKS = 12, 5
+"""Steps of an axis at the most: of views, and of anything else."""
+SOFT, LINE = "#5d666f", "#dcdfe2"
+"""Colours in place of which the page's own are put, which change with light and dark; black becomes ink."""
+NOTE = "note:"
+"""What the ids of elements begin with that say something when the pointer rests on them."""
+STYLE = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 11.0,
+    "axes.autolimit_mode": "round_numbers",
+    "axes.axisbelow": True,
+    "axes.labelcolor": SOFT,
+    "axes.xmargin": 0.0,
+    "axes.ymargin": 0.0,
+    "axes.spines.left": False,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.spines.bottom": False,
+    "grid.color": LINE,
+    "grid.linewidth": 1.0,
+    "xtick.labelcolor": SOFT,
+    "ytick.labelcolor": SOFT,
+    "xtick.major.size": 0.0,
+    "xtick.major.pad": 8.0,
+    "ytick.major.size": 0.0,
+    "ytick.major.pad": 7.0,
+    "legend.frameon": False,
+    "legend.labelcolor": SOFT,
+    "legend.handlelength": 1.0,
+    "legend.handleheight": 1.0,
+    "legend.handletextpad": 0.5,
+    "legend.columnspacing": 1.2,
+    "lines.solid_capstyle": "round",
+    "svg.fonttype": "none",
+}
+"""matplotlib's settings that differ from its defaults; what users set for themselves has no effect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,114 +71,124 @@ def line_chart(
     *,
     title: str,
     x_name: str,
+    y_name: str,
     y_range: tuple[float, float] | None = None,
 ) -> str:
-    """Draw lines over x; without a range the y axis begins at 0 and ends at a round number.
+    """Draw lines over x, the first on top and the others' points wider, so that all are seen where they meet.
 
     Args:
         x: Abscissae, ascending.
         lines: The lines, each as long as x; NaN leaves a gap.
-        title: What the chart shows, with the unit.
+        title: What the chart shows.
         x_name: Name and unit of the x axis.
-        y_range: Ends of the y axis.
+        y_name: Name and unit of the y axis.
+        y_range: Ends of the y axis; None for 0 and a round number.
     """
-    values = np.array([line.values for line in lines], dtype=np.float64)
-    if y_range is None:
-        finite = values[np.isfinite(values)]
-        top = max(float(finite.max(initial=0.0)), 1.0)
-        ticks_y = _ticks(0.0, top, whole=bool((finite == finite.round()).all()))
-    else:
-        ticks_y = _ticks(*y_range)
-    last = max(x) if max(x) > min(x) else min(x) + 1.0
-    ticks_x = _ticks(min(x), last, whole=all(float(v).is_integer() for v in x))
-    low_x, high_x = min(ticks_x[0], min(x)), max(ticks_x[-1], max(x))
-    low_y, high_y = ticks_y[0], ticks_y[-1]
 
-    def at(px: float, py: float) -> tuple[float, float]:
-        return (
-            LEFT + (px - low_x) / (high_x - low_x) * (WIDTH - LEFT - RIGHT),
-            HEIGHT - BOTTOM - (py - low_y) / (high_y - low_y) * (HEIGHT - TOP - BOTTOM),
-        )
+    def plot(axes: Any) -> None:
+        for k, line in enumerate(lines):
+            look = {"color": SERIES[k % len(SERIES)], "zorder": 3.0 - 0.1 * k, "clip_on": False}
+            axes.plot(x, line.values, linewidth=2.0, label=line.name, **look)
+            for px, py in zip(x, line.values, strict=True):
+                if np.isfinite(py):
+                    note = f"{NOTE}{line.name} {py:.3g}"
+                    axes.plot([px], [py], "o", markersize=6.2 + 2.2 * k, markeredgewidth=0, gid=note, **look)
+        last = x[-1] if x[-1] > x[0] else x[0] + 1.0
+        axes.update_datalim([(x[0], 0.0), (last, 1.0)])
+        axes.autoscale_view()
+        if y_range is not None:
+            axes.set_ylim(*y_range)
 
-    drawn = [svg.text(6, 16, title, class_="heading"), _axis_y(ticks_y, at, low_x, high_x)]
-    drawn += [
-        svg.text(at(v, low_y)[0], HEIGHT - BOTTOM + 17, f"{v:g}", class_="small middle") for v in ticks_x
-    ]
-    drawn.append(svg.text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, x_name, class_="small middle"))
-    names = []
-    for line, row, colour in zip(lines, values, COLOURS, strict=False):
-        points = np.array([at(px, py) for px, py in zip(x, row, strict=True) if np.isfinite(py)]).reshape(
-            -1, 2
-        )
-        if len(points) == 0:
-            continue
-        drawn.append(svg.element("path", d=svg.path(points), class_="line", stroke=colour))
-        for (cx, cy), value in zip(points, row[np.isfinite(row)], strict=True):
-            note = svg.tooltip(f"{line.name} {value:.3g}")
-            drawn.append(svg.element("circle", note, cx=cx, cy=cy, r=3.4, fill=colour))
-        names.append((line.name, colour))
-    return _framed(drawn, names, title)
+    values = [value for line in lines for value in line.values if np.isfinite(value)]
+    whole = (_whole(x), y_range is None and _whole(values))
+    return _chart(plot, whole, len(lines), title=title, x_name=x_name, y_name=y_name)
 
 
-def bar_chart(bars: Sequence[Mapping[str, float]], *, title: str, x_name: str) -> str:
+def bar_chart(bars: Sequence[Mapping[str, float]], *, title: str, x_name: str, y_name: str) -> str:
     """Draw stacked bars, one for each mapping of part to height, numbered from 0."""
     parts = list(dict.fromkeys(name for bar in bars for name in bar))
-    top = max((sum(bar.values()) for bar in bars), default=0.0)
-    ticks_y = _ticks(0.0, max(top, 1e-3))
-    pitch = (WIDTH - LEFT - RIGHT) / max(len(bars), 1)
-    thickness = min(0.66 * pitch, 44.0)
 
-    def at(px: float, py: float) -> tuple[float, float]:
-        return LEFT + px * pitch, HEIGHT - BOTTOM - py / ticks_y[-1] * (HEIGHT - TOP - BOTTOM)
-
-    drawn = [svg.text(6, 16, title, class_="heading"), _axis_y(ticks_y, at, 0.0, float(len(bars)))]
-    for number, bar in enumerate(bars):
-        base, middle = 0.0, at(number + 0.5, 0.0)[0]
+    def plot(axes: Any) -> None:
+        base, width = np.zeros(len(bars)), 0.66 * min(1.0, len(bars) / 3.0)
         for k, name in enumerate(parts):
-            height = bar.get(name, 0.0)
-            y = at(0.0, base + height)[1]
-            note = svg.tooltip(f"{name}: {height:.3g}")
-            drawn.append(
-                svg.element(
-                    "rect", note, x=middle - thickness / 2, y=y, width=thickness, height=at(0.0, base)[1] - y,
-                    fill=COLOURS[k % len(COLOURS)],
-                )
-            )  # fmt: skip
-            base += height
-        drawn.append(svg.text(middle, HEIGHT - BOTTOM + 17, str(number), class_="small middle"))
-    drawn.append(svg.text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, x_name, class_="small middle"))
-    return _framed(drawn, [(name, COLOURS[k % len(COLOURS)]) for k, name in enumerate(parts)], title)
+            heights = [bar.get(name, 0.0) for bar in bars]
+            look = {"label": name, "color": SERIES[k % len(SERIES)], "clip_on": False}
+            drawn = axes.bar(range(len(bars)), heights, width, base, **look)
+            for patch, height in zip(drawn, heights, strict=True):
+                patch.set_gid(f"{NOTE}{name} {height:.3g}")
+            base += heights
+        axes.autoscale_view()
+        axes.set_xlim(-0.5, len(bars) - 0.5)
+
+    return _chart(plot, (True, False), len(parts), title=title, x_name=x_name, y_name=y_name)
 
 
-def _axis_y(ticks: Sequence[float], at: Place, low_x: float, high_x: float) -> str:
-    drawn = []
-    for value in ticks:
-        (x0, y), (x1, _) = at(low_x, value), at(high_x, value)
-        drawn.append(svg.element("path", d=f"M{x0:.1f} {y:.1f}H{x1:.1f}", class_="grid"))
-        drawn.append(svg.text(x0 - 7, y + 4, f"{value:g}", class_="small end"))
-    return "".join(drawn)
+def _chart(
+    plot: Callable[[Any], None], whole: tuple[bool, bool], names: int, *, title: str, x_name: str, y_name: str
+) -> str:
+    """Draw one chart.
+
+    Args:
+        plot: Draws into matplotlib's axes.
+        whole: Whether the ticks of x and of y are whole numbers.
+        names: How many names the legend has; one needs no legend.
+        title: What the chart shows; no two charts of a page have the same.
+        x_name: Name and unit of the x axis.
+        y_name: Name and unit of the y axis.
+    """
+    from matplotlib import style
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
+
+    rows = -(-names // LEGEND_COLUMNS) if names > 1 else 0
+    height = TOP + HEIGHT + BOTTOM + rows * LEGEND_ROW
+    place = (LEFT / WIDTH, 1.0 - (TOP + HEIGHT) / height, 1.0 - (LEFT + RIGHT) / WIDTH, HEIGHT / height)
+    with style.context(["default", STYLE | {"svg.hashsalt": title}]):
+        figure = Figure(figsize=(WIDTH / 72.0, height / 72.0))
+        axes = figure.add_axes(place)
+        axes.grid(axis="y", clip_on=False)
+        for axis, integer in zip((axes.xaxis, axes.yaxis), whole, strict=True):
+            count = MOST_TICKS if integer and axis is axes.xaxis else FEW_TICKS
+            locator = MaxNLocator(count, integer=integer, steps=(1, 2, 2.5, 5, 10), min_n_ticks=1)
+            axis.set_major_locator(locator)
+            axis.set_major_formatter("{x:g}")
+        plot(axes)
+        axes.set_xlabel(x_name)
+        axes.set_ylabel(y_name)
+        figure.text(6.0 / WIDTH, 1.0 - 16.0 / height, title, fontsize=12.0, fontweight="bold")
+        if rows:
+            corner = (0.0, (rows * LEGEND_ROW + 4.0) / height)
+            figure.legend(
+                loc="upper left", bbox_to_anchor=corner, ncols=min(names, LEGEND_COLUMNS), borderpad=0.2
+            )
+        markup = io.BytesIO()
+        figure.savefig(markup, format="svg", transparent=True, metadata={"Date": None})
+    return _inline(markup.getvalue(), title)
 
 
-def _framed(drawn: Sequence[str], names: Sequence[tuple[str, str]], title: str) -> str:
-    """Put a chart together, the names of its colours in rows below the axes."""
-    legend, x, y = [], 8.0, HEIGHT + 10.0
-    for name, colour in names:
-        width = 22.0 + len(name) * svg.GLYPH_WIDTH * TEXT + 8.0
-        if x > 8.0 and x + width > WIDTH:
-            x, y = 8.0, y + 18.0
-        legend.append(svg.element("rect", x=x, y=y - 9, width=11, height=11, rx=2, fill=colour))
-        legend.append(svg.text(x + 17, y, name, class_="small"))
-        x += width
-    return svg.picture(WIDTH, y + 8.0, *drawn, *legend, name=title, text_size=TEXT)
+def _inline(markup: bytes, name: str) -> str:
+    """Make an SVG file part of a page: no names but its own, no addresses, the page's colours and notes."""
+    root = ElementTree.fromstring(markup)
+    for child in list(root):
+        if child.tag.endswith(("metadata", "defs")):
+            root.remove(child)
+    size = root.attrib["viewBox"]
+    root.attrib.clear()
+    root.attrib.update({"viewBox": size, "class": "chart", "role": "img", "aria-label": name})
+    for node in list(root.iter()):
+        node.tag = node.tag.rpartition("}")[2]
+        node.attrib = {key.rpartition("}")[2]: " ".join(said.split()) for key, said in node.attrib.items()}
+        node.tail = None
+        if node.tag == "g":
+            node.text = None
+            note = node.attrib.pop("id", "")
+            if note.startswith(NOTE):
+                title = ElementTree.Element("title")
+                title.text = note.removeprefix(NOTE)
+                node.insert(0, title)
+    text = ElementTree.tostring(root, encoding="unicode")
+    return text.replace(SOFT, "var(--soft)").replace(LINE, "var(--line)")
 
 
-def _ticks(low: float, high: float, whole: bool = False) -> list[float]:
-    """Round numbers from `low` or below to `high` or above, about five; whole ones if asked."""
-    raw = (high - low) / 5.0
-    power = 10.0 ** np.floor(np.log10(raw))
-    step = float(next(m for m in (1.0, 2.0, 2.5, 5.0, 10.0) if m * power >= raw - 1e-12) * power)
-    if whole:
-        step = float(max(1, np.ceil(step)))
-    first = np.floor(low / step + 1e-9)
-    last = np.ceil(high / step - 1e-9)
-    return [float(np.round(k * step, 10)) for k in np.arange(first, last + 1)]
+def _whole(values: Sequence[float]) -> bool:
+    return all(float(value).is_integer() for value in values)

@@ -15,6 +15,8 @@ PALETTE = (
     "#882255", "#44aa99", "#999933", "#aa4499", "#332288", "#ddcc77", "#117733",
 )  # fmt: skip
 """Colours for objects 1, 2, …: first the seven of Okabe and Ito, then seven of Tol's muted set."""
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999933", "#8a8f96")
+"""Colours of a chart's lines and of its bars' parts, on light and dark; none of them means an object."""
 SURFACE_COLOUR = "#9c9184"
 """The support surface."""
 NOTHING_COLOUR = "#b9bec4"

@@ -75,6 +75,11 @@ class ViewPage:
     path_travelled: float = 0.0
     stop: str | None = None
 
+    @property
+    def number(self) -> str:
+        """The view's number as its folder in the run has it."""
+        return f"{self.index:02d}"
+
 
 def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
     """Draw one step of an exploration, so that its images and clouds need not be kept.

@@ -88,17 +88,18 @@ def charts(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[st
     if scores is not None:
         kinds = (("F1", "f1"), ("precision", "precision"), ("recall", "recall"))
         lines = [Line(name, [float(getattr(score, key)) for score in scores]) for name, key in kinds]
-        drawn.append(line_chart(number, lines, title="Score over views", x_name="view", y_range=(0.0, 1.0)))
-        path = [page.path_travelled for page in pages]
-        unit = "path over the floor [m]"
-        if path[-1] == 0.0 and pages[-1].angle_travelled > 0.0:
-            path, unit = (
-                [float(np.rad2deg(page.angle_travelled)) for page in pages],
-                "angle around the scene [°]",
-            )
+        names = ", ".join(line.name for line in lines)
+        drawn.append(
+            line_chart(number, lines, title="F1 over views", x_name="view", y_name=names, y_range=(0.0, 1.0))
+        )
+        path, unit = [page.path_travelled for page in pages], "path over the floor [m]"
+        if path[-1] == 0.0:
+            path = [float(np.rad2deg(page.angle_travelled)) for page in pages]
+            unit = "angle around the scene [°]"
         if path[-1] > path[0]:
+            title = "F1 over travelled path"
             drawn.append(
-                line_chart(path, lines[:1], title="F1 over travelled path", x_name=unit, y_range=(0.0, 1.0))
+                line_chart(path, lines[:1], title=title, x_name=unit, y_name="F1", y_range=(0.0, 1.0))
             )
     if len(pages) > 1:
         found = [
@@ -106,9 +107,8 @@ def charts(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[st
             Line("supports", [len(page.supports) for page in pages]),
             Line("uncertain supports", [sum(not s.certain for s in page.supports) for page in pages]),
         ]
-        drawn.append(line_chart(number, found, title="Found so far", x_name="view"))
+        drawn.append(line_chart(number, found, title="Found so far", x_name="view", y_name="number"))
     if any(page.timings for page in pages):
-        drawn.append(
-            bar_chart([page.timings for page in pages], title="Time of each view [s]", x_name="view")
-        )
+        times = [page.timings for page in pages]
+        drawn.append(bar_chart(times, title="Time of each stage", x_name="view", y_name="time [s]"))
     return drawn

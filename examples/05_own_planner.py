@@ -1,0 +1,55 @@
+"""A planner of your own: any object with `plan(state, rng) -> Decision`.
+
+To use it on the command line as `--planner opposite`, a package offers it as an entry point:
+
+    [project.entry-points."caryatid.planners"]
+    opposite = "my_package:OppositePlanner"
+"""
+
+import numpy as np
+
+import caryatid as ct
+from caryatid import frames
+from caryatid.planners import Decision, PlanningState
+from caryatid.planners.decision import check_candidates, path_cost
+from caryatid.simulation import load_scene
+from caryatid.simulation.stage import set_stage
+
+
+class OppositePlanner:
+    """Goes where it is farthest from every view so far."""
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Take the candidate whose nearest earlier view is farthest away."""
+        check_candidates(state)
+        angle = frames.angle_between(state.candidates.directions[:, None], state.visited[None]).min(axis=1)
+        best = int(np.argmax(angle))
+        cost = path_cost(state)[best]
+        return Decision(
+            T_world_camera=state.candidates.T_world_camera[best],
+            index=best,
+            saliency=float(angle[best]),
+            cost=float(cost),
+            score=float(angle[best] - cost),
+            why=f"{np.degrees(angle[best]):.0f}° from the nearest earlier view",
+        )
+
+
+def main() -> None:
+    """Let it look behind a box, beside the planner that comes with caryatid."""
+    for planner in (OppositePlanner(), "support"):
+        stage = set_stage(load_scene("hidden_stack"), ct.Config(), noise="none", seed=0)
+        name = planner if isinstance(planner, str) else type(planner).__name__
+        print(name)
+        for step in ct.explore(stage.camera, stage.robot, planner=planner, early_stop=False):
+            print(f"  view {step.index + 1}: {len(step.graph.objects) - 1} objects", end="")
+            print(f", next {step.decision.why}" if step.decision else "")
+            if step.index == 2:
+                break
+        # Behind the big box stand a stack of three and a ball: five objects in all.
+        assert len(step.graph.objects) - 1 == 5
+        assert np.degrees(step.angle_travelled) > 90.0
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""Small scenes and recordings, made anew for every test that changes them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from caryatid import cli, frames
+from caryatid.config import Config, SensorConfig
+from caryatid.formats import write_recording
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.truth import ground_truth, write_truth
+
+SMALL_SENSOR = SensorConfig(width=160, height=120, focal=131.25)
+"""A quarter of the usual image: what tests of the commands need, in a tenth of the time."""
+
+SMALL = [
+    f"--set=sensor.width={SMALL_SENSOR.width}",
+    f"--set=sensor.height={SMALL_SENSOR.height}",
+    f"--set=sensor.focal={SMALL_SENSOR.focal}",
+]
+
+TWO_ON_A_TABLE = """
+<mujoco>
+  <worldbody>
+    <body name="table" pos="0 0 0.35">
+      <geom type="box" size="0.4 0.5 0.35"/>
+    </body>
+    <body name="crate" pos="0 0 0.75">
+      <freejoint/>
+      <geom type="box" size="0.08 0.09 0.05"/>
+    </body>
+    <body name="can" pos="0.01 0 0.85">
+      <freejoint/>
+      <geom type="cylinder" size="0.035 0.05"/>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""The table holds a crate, label 1, and the crate a can, label 2."""
+
+
+def capture(scene_file: Path, azimuths_deg: tuple[float, ...]):
+    """Small noise-free views of a scene from around the table, 40° up."""
+    camera = SimulatedCamera(load_scene(scene_file), sensor=SMALL_SENSOR)
+    centre_world = np.array([0.0, 0.0, 0.7])
+    views = []
+    for azimuth in np.radians(azimuths_deg):
+        up, out = np.sin(np.radians(40.0)), np.cos(np.radians(40.0))
+        eye_world = centre_world + 1.2 * np.array([out * np.cos(azimuth), out * np.sin(azimuth), up])
+        view = camera.capture(frames.look_at(eye_world, centre_world))
+        views.append(replace(view, normals_camera=None))
+    return views
+
+
+def without_poses(views):
+    return [replace(view, T_world_camera=None) for view in views]
+
+
+def without_labels(views):
+    return [replace(view, labels=None) for view in views]
+
+
+def run_command(*arguments: object) -> int:
+    """Run one command in this process, as the shell would, and return its exit status."""
+    try:
+        return cli.main([str(a) for a in arguments])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+@pytest.fixture(scope="session")
+def scene_file(tmp_path_factory) -> Path:
+    """`scene.xml` of two objects on a table, with its gt.json."""
+    folder = tmp_path_factory.mktemp("scenes") / "two"
+    folder.mkdir()
+    path = folder / "scene.xml"
+    path.write_text(TWO_ON_A_TABLE)
+    write_truth(ground_truth(load_scene(path)), folder / "gt.json")
+    return path
+
+
+@pytest.fixture(scope="session")
+def views(scene_file):
+    """Three views of the two objects, with poses and labels."""
+    return capture(scene_file, (180.0, 60.0, -60.0))
+
+
+@pytest.fixture(scope="session")
+def kept_recording(tmp_path_factory, views) -> Path:
+    folder = tmp_path_factory.mktemp("recordings") / "two"
+    write_recording(folder, views)
+    return folder
+
+
+@pytest.fixture
+def recording(tmp_path, kept_recording) -> Path:
+    """A recording of three frames with poses and masks, to be changed at will."""
+    return Path(shutil.copytree(kept_recording, tmp_path / "recording"))
+
+
+@pytest.fixture
+def single(tmp_path, views) -> Path:
+    """A recording of one frame, with masks and without a pose."""
+    write_recording(tmp_path / "single", without_poses(views[:1]))
+    return tmp_path / "single"
+
+
+@pytest.fixture(scope="session")
+def points(views):
+    """Points (N, 3) of the first view in the camera's frame [m], and their labels (N,)."""
+    seen = views[0].valid
+    return views[0].points_camera[seen], views[0].labels[seen]
+
+
+@pytest.fixture
+def write_pcd(tmp_path):
+    """Write an ascii PCD, `count` points promised in its header."""
+
+    def write(points, labels=None, name="cloud.pcd", count=None):
+        table = points if labels is None else np.column_stack([points, labels])
+        count = len(points) if count is None else count
+        label = "" if labels is None else " label"
+        header = (
+            f"VERSION .7\nFIELDS x y z{label}\nSIZE 4 4 4{' 4' if label else ''}\n"
+            f"TYPE F F F{' U' if label else ''}\nCOUNT 1 1 1{' 1' if label else ''}\n"
+            f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA ascii\n"
+        )
+        path = tmp_path / name
+        path.write_text(header + "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in table))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def write_ply(tmp_path):
+    """Write an ascii PLY."""
+
+    def write(points, name="cloud.ply"):
+        header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
+        header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
+        path = tmp_path / name
+        path.write_text(header + "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in points))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def leftovers(tmp_path):
+    """Names in the test's folder, hidden ones too, that were not there when this was asked for."""
+    before = set(os.listdir(tmp_path))
+    return lambda: set(os.listdir(tmp_path)) - before
+
+
+@pytest.fixture(scope="session")
+def settings() -> Config:
+    """The settings with the small sensor."""
+    return replace(Config(), sensor=SMALL_SENSOR)

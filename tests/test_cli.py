@@ -1,0 +1,467 @@
+"""The command line end to end: what it writes, what it says, and how it ends."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+import tomllib
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SMALL, SMALL_SENSOR, run_command
+from PIL import Image
+
+from caryatid.config import Config
+from caryatid.formats import read_run
+from caryatid.formats.bop import read_recording
+from caryatid.planners import BUILT_IN, SupportPlanner
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.truth import ground_truth
+from caryatid.views import SUPPORT_LABEL
+
+ESCAPE = "\x1b"
+COLOUR = r"\x1b\[(?:\d+;)*3\d"
+
+
+def explored(source, out, *options):
+    """Explore with the small camera; the run as read back."""
+    assert run_command("explore", source, "--out", out, *SMALL, *options) == 0
+    return read_run(out)
+
+
+def graph_files(run):
+    return {str(p.relative_to(run)): p.read_bytes() for p in sorted(run.rglob("graph.json"))}
+
+
+@pytest.fixture(scope="session")
+def kept_run(tmp_path_factory, scene_file):
+    """Two views of the two objects, with a report; not to be changed."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    explored(scene_file, folder, "--views", 2, "--seed", 5)
+    return folder
+
+
+# What a run folder holds
+
+
+def test_a_run_folder_holds_what_the_interfaces_say(kept_run, scene_file):
+    files = {str(p.relative_to(kept_run)) for p in kept_run.rglob("*") if p.is_file()}
+    views = {f"views/{k:02d}/{name}" for k in (0, 1) for name in ("graph.json", "labels.png", "view.json")}
+    assert files == {"run.json", "graph.json", "report.html"} | views
+
+    record = json.loads((kept_run / "run.json").read_text())
+    assert record["source"] == str(scene_file)
+    assert record["seed"] == 5
+    assert record["settings"]["sensor"]["width"] == SMALL_SENSOR.width
+    assert record["settings"]["active"]["max_views"] == 2
+    assert record["versions"].keys() >= {"caryatid", "python", "mujoco", "numpy"}
+    first, second = record["steps"]
+    assert all(seconds >= 0.0 for seconds in first["timings"].values())
+    assert {"capture", "fit", "fuse", "plan"} <= first["timings"].keys()
+    assert first["angle_travelled"] == first["path_travelled"] == 0.0
+    assert 0.0 < second["angle_travelled"] <= np.pi
+    assert second["path_travelled"] > 0.1
+    assert record["angle_travelled"] == second["angle_travelled"]
+    assert record["path_travelled"] == second["path_travelled"]
+    assert len(record["scores"]) == 2
+
+
+def test_every_view_has_its_graph_labels_pose_and_choice(kept_run):
+    run = read_run(kept_run)
+    assert (kept_run / "graph.json").read_bytes() == (kept_run / "views/01/graph.json").read_bytes()
+    for view in run.views:
+        with Image.open(view.labels_path) as image:
+            assert image.mode == "I;16"
+        labels = view.load_labels()
+        assert labels.shape == (SMALL_SENSOR.height, SMALL_SENSOR.width)
+        assert set(np.unique(labels)) <= {0, 1, 2, SUPPORT_LABEL}
+        assert {o.label for o in view.graph.objects if o.role == "object"} == {1, 2}
+        assert view.K[0, 0] == SMALL_SENSOR.focal
+    choice = run.views[0].record["next"]
+    assert choice.keys() >= {"T_world_camera", "saliency", "cost", "score", "why"}
+    assert choice["score"] == pytest.approx(choice["saliency"] - choice["cost"], abs=1e-6)
+    assert np.allclose(choice["T_world_camera"], run.views[1].T_world_camera, atol=1e-6)
+    assert run.views[0].record["candidates"]["reachable"] > 100
+    assert "next" not in run.views[1].record
+
+
+def test_the_report_is_one_file_that_needs_no_network(kept_run):
+    text = (kept_run / "report.html").read_text()
+    assert text.lstrip().lower().startswith("<!doctype html>")
+    assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", text)
+
+
+def test_without_a_report_there_is_none(tmp_path, scene_file):
+    explored(scene_file, tmp_path / "run", "--views", 1, "--no-report")
+    assert not (tmp_path / "run/report.html").exists()
+
+
+# Sources
+
+
+def test_a_built_in_scene_is_explored_by_name(tmp_path):
+    """The tower without noise: every support of the settled scene, and nothing else."""
+    run = explored("tower", tmp_path / "run", "--views", 3, "--no-report")
+    golden = json.loads((Path(__file__).parent / "golden" / "tower.json").read_text())
+    found = {(s.supporter, s.supported, s.kind) for s in run.graph.supports}
+    assert found == {(s["supporter"], s["supported"], s["kind"]) for s in golden["supports"]}
+    assert {o.id: o.shape.kind for o in run.graph.objects} == golden["shapes"]
+
+    scene = load_scene("tower")
+    labels = {"table": "o0"} | {body: f"o{k}" for k, body in scene.object_bodies.items()}
+    truth = {(labels[e["supporter"]], labels[e["supported"]]) for e in ground_truth(scene).edges}
+    assert {(a, b) for a, b, _ in found} == truth
+
+
+def test_a_scene_folder_is_explored_like_its_file(tmp_path, scene_file):
+    a = explored(scene_file, tmp_path / "a", "--views", 1, "--no-report")
+    b = explored(scene_file.parent, tmp_path / "b", "--views", 1, "--no-report")
+    assert graph_files(a.folder) == graph_files(b.folder)
+
+
+def test_a_recording_is_explored_where_it_was_recorded(tmp_path, recording):
+    run = explored(recording, tmp_path / "run", "--no-early-stop", "--no-report")
+    poses = [f.T_world_camera for f in read_recording(recording).frames]
+    assert sorted(v.name for v in run.views) == [f"recording/{k:06d}" for k in range(3)]
+    for view in run.views:
+        assert min(np.abs(view.T_world_camera - T).max() for T in poses) < 1e-9
+    assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
+    assert run.record["steps"][-1]["stop"].startswith("no view is left")
+
+
+def test_all_views_of_a_recording_are_extracted(tmp_path, recording):
+    assert run_command("extract", recording, "--out", tmp_path / "run") == 0
+    run = read_run(tmp_path / "run")
+    assert [v.name for v in run.views] == [f"recording/{k:06d}" for k in range(3)]
+    assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
+    assert run.record["source"] == str(recording)
+    assert run.record.keys() >= {"settings", "seed", "versions", "angle_travelled", "path_travelled"}
+    assert run.record["steps"][2]["angle_travelled"] > run.record["steps"][1]["angle_travelled"] > 0.0
+    assert (tmp_path / "run/report.html").is_file()
+
+
+@pytest.mark.parametrize("command", ["extract", "explore"])
+def test_a_single_frame_without_a_pose_gets_its_world_from_the_table(tmp_path, single, command):
+    assert run_command(command, single, "--out", tmp_path / "run") == 0
+    run = read_run(tmp_path / "run")
+    assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
+    crate, can = run.graph["o1"], run.graph["o2"]
+    assert can.centre_world[2] - crate.centre_world[2] == pytest.approx(0.1, abs=0.01)
+    assert run.views[0].T_world_camera is not None
+    assert run.views[0].T_world_camera[2, 3] > 0.5
+
+
+def test_a_cloud_with_labels_is_extracted(tmp_path, points, write_pcd):
+    cloud = write_pcd(*points)
+    assert run_command("extract", cloud, "--out", tmp_path / "run") == 0
+    run = read_run(tmp_path / "run")
+    labels = run.views[0].load_labels()
+    assert run.views[0].labels_path.suffix == ".npy"
+    assert labels.shape == points[1].shape
+    assert (labels[points[1] > 0] == points[1][points[1] > 0]).all()
+    assert (labels == SUPPORT_LABEL).sum() > 1000
+    assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
+
+
+def test_labels_that_number_parts_are_divided(tmp_path, points, write_pcd):
+    cloud = write_pcd(points[0], points[1] * 10 + (points[1] > 0) * 3)
+    assert run_command("extract", cloud, "--label-divisor", 10, "--out", tmp_path / "run") == 0
+    assert {o.id for o in read_run(tmp_path / "run").graph.objects} == {"o0", "o1", "o2"}
+
+
+def test_a_ply_cloud_is_extracted_without_labels(tmp_path, points, write_ply):
+    assert run_command("extract", write_ply(points[0]), "--out", tmp_path / "run") == 0
+    run = read_run(tmp_path / "run")
+    assert run.graph.support_surface is not None
+    assert len(run.views[0].load_labels()) == len(points[0])
+
+
+# evaluate, demo, config
+
+
+def test_a_run_is_scored_against_its_scene(kept_run, scene_file, capsys):
+    assert run_command("evaluate", kept_run, scene_file.parent, "--json") == 0
+    views = json.loads(capsys.readouterr().out)["views"]
+    assert [v["view"] for v in views] == [0, 1]
+    keys = {"view", "precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou"}
+    assert all(v.keys() >= keys for v in views)
+    told = json.loads((kept_run / "run.json").read_text())["scores"]
+    assert [v["f1"] for v in views] == [s["f1"] for s in told]
+    assert views[1]["f1"] == 1.0
+
+    assert run_command("evaluate", kept_run, scene_file.parent) == 0
+    table = capsys.readouterr().out
+    assert "F1" in table
+    assert f"{views[1]['mean_iou']:.3f}" in table
+    assert ESCAPE not in table
+
+
+def test_a_run_is_scored_against_the_masks_of_its_recording(tmp_path, recording, capsys):
+    assert run_command("extract", recording, "--out", tmp_path / "run", "--no-report") == 0
+    capsys.readouterr()
+    edges = [{"supporter": "table", "supported": "object1"}, {"supporter": "object1", "supported": "object2"}]
+    truth = {"vertices": ["table", "object1", "object2"], "edges": edges}
+    (recording / "gt.json").write_text(json.dumps(truth))
+    assert run_command("evaluate", tmp_path / "run", recording, "--json") == 0
+    assert [v["f1"] for v in json.loads(capsys.readouterr().out)["views"]] == [1.0, 1.0, 1.0]
+
+
+def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
+    assert run_command("demo", "--scene", "tower", "--views", 2, "--out", tmp_path / "run", *SMALL) == 0
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert re.search(r"^view 1: \d+ objects, \d+ supports", said.err, re.M)
+    assert re.search(r"^view 2: ", said.err, re.M)
+    assert re.search(r"^  found: o1 \(\w+\) held by ", said.err, re.M)
+    assert str(tmp_path / "run") in said.err
+    assert (tmp_path / "run/report.html").is_file()
+
+
+def test_the_demo_takes_its_views_from_flag_then_file_then_default(tmp_path):
+    file = tmp_path / "settings.toml"
+    file.write_text("[active]\nmax_views = 1\n")
+    common = ["demo", "--scene", "tower", *SMALL, "--quiet", "--out", tmp_path / "run"]
+    assert run_command(*common, "--config", file) == 0
+    assert len(read_run(tmp_path / "run").views) == 1
+    assert run_command(*common, "--config", file, "--views", 2) == 0
+    assert len(read_run(tmp_path / "run").views) == 2
+
+
+def test_config_writes_settings_that_read_back_as_they_are(tmp_path, capsys):
+    assert run_command("config", "--set", "fit.hypotheses=77") == 0
+    text = capsys.readouterr().out
+    assert tomllib.loads(text)["fit"]["hypotheses"] == 77
+    assert tomllib.loads(text).keys() == asdict(Config()).keys()
+    (tmp_path / "settings.toml").write_text(text)
+    assert run_command("config", "--config", tmp_path / "settings.toml") == 0
+    assert capsys.readouterr().out == text
+    assert run_command("config", "--json", "--fusion", "sg") == 0
+    assert json.loads(capsys.readouterr().out)["fusion"]["method"] == "sg"
+
+
+def test_flag_goes_before_file_before_default(tmp_path, scene_file):
+    file = tmp_path / "settings.toml"
+    file.write_text('[active]\nmax_views = 1\n[fusion]\nmethod = "sg"\n[noise]\ntranslation = 0.002\n')
+    base = ["--config", file, "--no-report", "--no-early-stop"]
+    by_file = explored(scene_file, tmp_path / "file", *base)
+    by_flag = explored(
+        scene_file,
+        tmp_path / "flag",
+        *base,
+        "--views",
+        2,
+        "--fusion",
+        "pc",
+        "--set",
+        "noise.translation=0.003",
+    )
+    by_default = explored(scene_file, tmp_path / "default", "--no-report", "--views", 1)
+    assert [len(r.views) for r in (by_file, by_flag)] == [1, 2]
+    methods = [r.record["settings"]["fusion"]["method"] for r in (by_file, by_flag, by_default)]
+    assert methods == ["sg", "pc", Config().fusion.method]
+    sigmas = [r.record["settings"]["noise"]["translation"] for r in (by_file, by_flag, by_default)]
+    assert sigmas == [0.002, 0.003, Config().noise.translation]
+
+
+# How often it looks
+
+
+def test_views_count_the_first_one(tmp_path, scene_file):
+    assert len(explored(scene_file, tmp_path / "run", "--views", 1, "--no-report").views) == 1
+
+
+def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recording):
+    stops, goes_on = (
+        explored(recording, tmp_path / name, "--no-report", "--set=fusion.settled=0.1", *options)
+        for name, options in (("stops", ()), ("goes-on", ("--no-early-stop",)))
+    )
+    assert len(stops.views) == 2
+    assert stops.record["steps"][-1]["stop"] == "the last view changed nothing"
+    assert len(goes_on.views) == 3
+
+
+@pytest.mark.parametrize("planner", BUILT_IN)
+def test_the_same_seed_gives_the_same_graphs_byte_for_byte(tmp_path, scene_file, planner):
+    options = ["--views", 2, "--no-report", "--noise", "carmine", "--planner", planner, "--seed"]
+    first, again, other = (
+        graph_files(explored(scene_file, tmp_path / name, *options, seed).folder)
+        for name, seed in (("first", 3), ("again", 3), ("other", 4))
+    )
+    assert len(first) == 3
+    assert first == again
+    assert first != other
+
+
+# What it says
+
+
+def test_with_json_stdout_holds_one_document_and_nothing_else(tmp_path, scene_file, recording, capsys):
+    for command in (["explore", scene_file, "--views", 1, *SMALL], ["extract", recording]):
+        assert run_command(*command, "--out", tmp_path / "run", "--json", "--no-report") == 0
+        said = capsys.readouterr()
+        document = json.loads(said.out)
+        assert document["run"] == str(tmp_path / "run")
+        assert document["graph"] == json.loads((tmp_path / "run/graph.json").read_text())
+        assert said.err == ""
+
+
+def test_quiet_says_nothing(tmp_path, scene_file, recording, capsys):
+    explored(scene_file, tmp_path / "a", "--views", 1, "--quiet")
+    assert run_command("extract", recording, "--out", tmp_path / "b", "--quiet") == 0
+    said = capsys.readouterr()
+    assert said.out == said.err == ""
+
+
+def test_progress_names_new_objects_and_what_holds_them(tmp_path, scene_file, capsys):
+    explored(scene_file, tmp_path / "run", "--views", 2, "--no-report")
+    lines = capsys.readouterr().err.splitlines()
+    assert re.fullmatch(r"view 1: 2 objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
+    assert lines[1].startswith("  found: o1 (")
+    assert lines[2].startswith("  next view: ")
+    assert "  done: 2 views were asked for" in lines
+    assert not any(ESCAPE in line for line in lines)
+
+
+@pytest.mark.parametrize("command", ["", "demo", "explore", "extract", "evaluate", "config"])
+def test_help_is_clean(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run_command(*command.split(), "--help") == 0
+    text = capsys.readouterr().out
+    assert "None" not in text
+    assert "default: False" not in text
+    assert "default: True" not in text
+    assert not re.search(r"default: .*default: [^│]*\)\s*│", text)
+    assert not re.search(r"\b(STR|INT|PATH)\b", text)
+
+
+def test_options_that_do_not_exist_are_usage_errors(tmp_path, capsys, scene_file, leftovers):
+    for wrong in (
+        ["--planner", "clever"],
+        ["--fusion", "cloud"],
+        ["--segmentation", "magic"],
+        ["--noise", "loud"],
+        ["--views", "0"],
+        ["--views", "many"],
+        ["--seed", "-1"],
+        ["--colour"],
+    ):
+        assert run_command("explore", scene_file, "--out", tmp_path / "run", *wrong) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert wrong[-1].lstrip("-") in said.err
+    assert run_command("explore", scene_file) == 2
+    assert run_command("juggle") == 2
+    assert run_command() == 2
+    assert not leftovers()
+
+
+def test_an_unknown_planner_is_answered_with_those_there_are(tmp_path, scene_file, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    run_command("explore", scene_file, "--out", tmp_path / "run", "--planner", "clever")
+    said = capsys.readouterr().err
+    assert all(name in said for name in BUILT_IN)
+
+
+# Interrupts and older runs
+
+
+@pytest.mark.parametrize("at", ["camera", "planner"])
+def test_an_interrupt_keeps_a_whole_run_of_the_views_done(tmp_path, scene_file, capsys, monkeypatch, at):
+    owner, name = {"camera": (SimulatedCamera, "capture"), "planner": (SupportPlanner, "plan")}[at]
+    work, calls = getattr(owner, name), []
+
+    def interrupted(self, *arguments):
+        calls.append(name)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return work(self, *arguments)
+
+    monkeypatch.setattr(owner, name, interrupted)
+    run = explored(scene_file, tmp_path / "run", "--no-early-stop")
+    assert len(run.views) == len(run.record["steps"]) == len(run.record["scores"]) == 1
+    assert (tmp_path / "run/graph.json").read_bytes() == (tmp_path / "run/views/00/graph.json").read_bytes()
+    assert (tmp_path / "run/report.html").is_file()
+    assert "interrupted: keeping the views done so far" in capsys.readouterr().err
+
+
+def test_an_interrupt_before_the_first_view_leaves_nothing(tmp_path, scene_file, monkeypatch, leftovers):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(SimulatedCamera, "capture", interrupted)
+    assert run_command("explore", scene_file, "--out", tmp_path / "new/run", *SMALL) == 130
+    assert not leftovers()
+
+
+def test_an_older_run_is_replaced_and_other_folders_are_not(tmp_path, scene_file, capsys):
+    explored(scene_file, tmp_path / "run", "--views", 2, "--no-report")
+    explored(scene_file, tmp_path / "run", "--views", 1, "--no-report")
+    assert not (tmp_path / "run/views/01").exists()
+    capsys.readouterr()
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes/dear.txt").write_text("mine")
+    assert run_command("explore", scene_file, "--out", tmp_path / "notes", *SMALL) == 1
+    assert "holds other files" in capsys.readouterr().err
+    assert (tmp_path / "notes/dear.txt").read_text() == "mine"
+
+
+# As the shell runs it
+
+
+def shell(*arguments, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "caryatid", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env=os.environ | environment,
+        check=False,
+    )
+
+
+def test_the_command_runs_from_a_shell_without_escape_codes(tmp_path, scene_file):
+    done = shell("explore", scene_file, "--out", tmp_path / "run", "--views", 1, *SMALL, "--json")
+    assert done.returncode == 0
+    assert json.loads(done.stdout)["graph"]["format"] == "caryatid/graph"
+    assert done.stderr == ""
+    said = shell("extract", tmp_path / "nowhere", "--out", tmp_path / "other")
+    assert said.returncode == 1
+    assert said.stderr.count("\n") == 1
+    assert "Traceback" not in said.stderr
+    assert ESCAPE not in said.stdout + said.stderr
+
+
+def on_a_terminal(*arguments, **environment):
+    """What a command writes to stderr where that is a terminal."""
+    ours, theirs = pty.openpty()
+    with open(ours, "rb", buffering=0) as terminal:
+        subprocess.run(
+            [sys.executable, "-m", "caryatid", *map(str, arguments)],
+            stdout=subprocess.DEVNULL,
+            stderr=theirs,
+            timeout=60,
+            env=os.environ | {"TERM": "xterm"} | environment,
+            check=False,
+        )
+        os.write(theirs, b"\0")
+        os.close(theirs)
+        said = b""
+        while not said.endswith(b"\0"):
+            said += terminal.read(4096)
+    return said.decode()
+
+
+def test_no_color_is_respected_on_a_terminal(tmp_path):
+    coloured, plain = (
+        on_a_terminal("explore", "nowhere", "--out", tmp_path / "run", NO_COLOR=no) for no in ("", "1")
+    )
+    assert re.search(COLOUR, coloured)
+    assert not re.search(COLOUR, plain)
+    assert "error: nowhere" in plain
