@@ -1,9 +1,10 @@
 """How well the loop finds support graphs: F1 per view over scenes, planners, seeds, and on real frames.
 
-    python benchmarks/accuracy.py explore SCENES… --noise carmine --views 5
+    python benchmarks/accuracy.py explore [SCENES…] --noise carmine --views 5 [--gate]
     python benchmarks/accuracy.py extract FRAMES… --segmentation labels
 
-SCENES are folders with scene.xml and gt.json, FRAMES BOP folders with gt.json.
+SCENES are folders with scene.xml and gt.json or names of built-in scenes, FRAMES BOP folders with gt.json.
+Without SCENES the built-in suite is explored, the one the committed baseline is of.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from multiprocessing import get_context
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
@@ -29,9 +31,19 @@ from rich.table import Table
 from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import CaryatidError
 from caryatid.settings import read_settings
+from measures import Measure, gate, write_baseline
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Set to 1 in the processes, unless set already: the jobs share the cores."""
+
+
+SUITE = (
+    *("tower", "bridge", "counterweight", "leaning_plank", "hidden_stack", "shelf", "clutter"),
+    *(f"pile-{size}-{seed}" for seed, size in enumerate(range(4, 16, 2), start=1)),
+    *(f"dense-{size}-{seed}" for seed, size in enumerate(range(10, 18, 2), start=1)),
+)
+"""Built-in scenes the committed baseline is of."""
+BASELINE = Path(__file__).with_name("accuracy_baseline.json")
 
 
 @dataclass(frozen=True)
@@ -56,8 +68,8 @@ class Row:
 class Explore:
     """Explore scenes and score every view."""
 
-    scenes: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Scene folders."""
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = SUITE
+    """Scene folders or names of built-in scenes."""
     noise: NoiseModel = "carmine"
     """Noise of the camera."""
     segmentation: SegmentationMethod = "labels"
@@ -78,6 +90,10 @@ class Explore:
     """Processes."""
     out: Path | None = None
     """JSON file for all rows."""
+    gate: bool = False
+    """Fail where a figure is worse than the committed baseline."""
+    update: bool = False
+    """Make the figures the committed baseline."""
 
 
 @dataclass(frozen=True)
@@ -94,50 +110,39 @@ class Extract:
     """JSON file for all rows."""
 
 
-def explore_one(task: tuple[Path, str, int, Explore]) -> list[Row]:
+def explore_one(task: tuple[str, str, int, Explore]) -> list[Row]:
     """Run one episode."""
+    from caryatid.commands.sources import open_source
     from caryatid.evaluation.scores import score
-    from caryatid.evaluation.truths import read_true_scene
     from caryatid.exploration import explore
-    from caryatid.simulation.scenes import load_scene
-    from caryatid.simulation.stage import set_stage
 
-    folder, planner, seed, args = task
+    scene, planner, seed, args = task
     config = read_settings(None, args.set)
     config = replace(
         config,
         fusion=replace(config.fusion, method=args.fusion),
         active=replace(config.active, max_views=args.views),
     )
-    truth = read_true_scene(folder)
-    stage = set_stage(load_scene(folder), config, noise=args.noise, seed=seed)
+    source = open_source(scene, config, noise=args.noise, segmentation=args.segmentation, seed=seed)
+    if source.truth is None:
+        raise CaryatidError(f"{scene}: has no truth to score against")
     rows: list[Row] = []
     for step in explore(
-        stage.camera,
-        stage.robot,
+        source.camera,
+        source.robot,
         planner=planner,
         config=config,
         segmentation=args.segmentation,
         seed=seed,
         early_stop=args.early_stop,
     ):
-        s = score(step.graph, truth, np.random.default_rng(0))
+        s = score(step.graph, source.truth, np.random.default_rng(0))
         seconds = sum(v for k, v in step.timings.items() if k != "capture")
         rows.append(
             Row(
-                folder.name,
-                planner,
-                seed,
-                step.index,
-                s.f1,
-                s.edge_precision,
-                s.edge_recall,
-                s.vertex_recall,
-                s.mean_iou,
-                step.angle_travelled,
-                step.path_travelled,
-                seconds,
-            )
+                source.name, planner, seed, step.index, s.f1, s.edge_precision, s.edge_recall, s.vertex_recall,
+                s.mean_iou, step.angle_travelled, step.path_travelled, seconds,
+            )  # fmt: skip
         )
     rows += [replace(rows[-1], view=v) for v in range(len(rows), args.views)]
     return rows
@@ -223,6 +228,18 @@ def show(rows: list[Row], console: Console) -> None:
     console.print("lowest: " + ", ".join(f"{r.scene} ({r.planner}, seed {r.seed}) {r.f1:.3f}" for r in worst))
 
 
+def measures(rows: list[Row]) -> list[Measure]:
+    """Mean F1, edge recall and IoU of each family at the last view."""
+    last = max(r.view for r in rows)
+    found = []
+    for name in sorted({family(r.scene) for r in rows}):
+        end = [r for r in rows if family(r.scene) == name and r.view == last]
+        for field in ("f1", "edge_recall", "mean_iou"):
+            value = float(np.mean([getattr(r, field) for r in end]))
+            found.append(Measure(f"{name}.{field}", value, "1", "higher", 0.02))
+    return found
+
+
 def main() -> int:
     """Run the measurement."""
     args = tyro.extras.subcommand_cli_from_dict({"explore": Explore, "extract": Extract})
@@ -239,6 +256,10 @@ def main() -> int:
     show(rows, console)
     if args.out is not None:
         args.out.write_text(json.dumps([asdict(r) for r in rows], indent=1) + "\n", encoding="utf-8")
+    if isinstance(args, Explore) and args.update:
+        write_baseline(measures(rows), BASELINE)
+    if isinstance(args, Explore) and args.gate:
+        return gate(measures(rows), BASELINE, console)
     return 0
 
 

@@ -6,15 +6,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import caryatid as ct
-from caryatid.evaluation import score_masks
+from caryatid.evaluation import Score, score_masks
 from caryatid.formats import read_recording, write_recording
 from caryatid.simulation import ground_truth, load_scene, read_truth
 from caryatid.simulation.stage import set_stage
 
 
 def render_a_frame(folder: Path) -> None:
-    """Write what a Carmine would see of the built-in clutter, and forget where the camera was."""
-    scene = load_scene("clutter")
+    """Write what a Carmine would see of the built-in tower, and forget where the camera was."""
+    scene = load_scene("tower")
     stage = set_stage(scene, ct.Config(), noise="carmine", seed=0)
     seen = stage.camera.capture(stage.robot.T_world_camera)
     write_recording(folder, [ct.View(seen.depth, seen.K, rgb=seen.rgb, labels=seen.labels)])
@@ -24,8 +24,8 @@ def render_a_frame(folder: Path) -> None:
     (folder / "gt.json").write_text(json.dumps({"vertices": list(names.values()), "edges": edges}))
 
 
-def main(folder: Path) -> None:
-    """Say what the first frame of a recording shows, and how that compares with its gt.json."""
+def main(folder: Path) -> Score | None:
+    """Say what the first frame of a recording shows, and how that compares with its gt.json if it has one."""
     view = read_recording(folder)[0]
     print(f"{view.name}: {view.depth.shape[1]}×{view.depth.shape[0]}, {view.valid.mean():.0%} with a reading")
 
@@ -38,18 +38,21 @@ def main(folder: Path) -> None:
         print(f"  {o.id}: {o.shape.kind} of {size} cm, held by {holders}")
     assert graph.support_surface is not None
 
-    if view.labels is not None and scene.labels is not None and (folder / "gt.json").is_file():
-        truth = read_truth(folder / "gt.json")
-        score = score_masks(graph, [scene.labels], [view.labels], truth.vertices, frozenset(truth.pairs))
-        print(f"of the true graph: precision {score.precision:.2f}, recall {score.recall:.2f}")
-        assert score.f1 > 0.8
+    if view.labels is None or scene.labels is None or not (folder / "gt.json").is_file():
+        return None
+    truth = read_truth(folder / "gt.json")
+    score = score_masks(graph, [scene.labels], [view.labels], truth.vertices, frozenset(truth.pairs))
+    print(f"of the true graph: precision {score.precision:.2f}, recall {score.recall:.2f}")
+    return score
 
 
 if __name__ == "__main__":
     if len(sys.argv) > 1:
         main(Path(sys.argv[1]))
     else:
-        print("no folder given: rendering a frame of the built-in scene clutter instead")
+        print("no folder given: rendering a frame of the built-in scene tower instead")
         with TemporaryDirectory() as temporary:
-            render_a_frame(Path(temporary) / "clutter")
-            main(Path(temporary) / "clutter")
+            render_a_frame(Path(temporary) / "tower")
+            score = main(Path(temporary) / "tower")
+        assert score is not None
+        assert score.f1 > 0.8

@@ -20,8 +20,7 @@ def main() -> None:
     f1 = []
     for step in ct.explore(stage.camera, stage.robot, seed=0):
         f1.append(score(step.graph, truth, np.random.default_rng(0)).f1)
-        turned = np.degrees(step.angle_travelled)
-        print(f"view {step.index + 1}: F1 {f1[-1]:.2f}, {step.path_travelled:.1f} m walked, {turned:.0f}° turned")
+        print(f"view {step.index + 1}: F1 {f1[-1]:.2f} after {step.path_travelled:.1f} m over the floor")
         if step.decision is not None:
             print(f"  next: {step.decision.why}")
         if len(f1) == VIEWS:

@@ -357,6 +357,7 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
         ("[fit\n", "is no TOML"),
         ("[fit]\nhypothesis = 3\n", "there is no setting 'fit.hypothesis'"),
         ("[fit]\nhypotheses = 'many'\n", "give a whole number"),
+        ("[fit]\nthreshold = nan\n", "give a finite number"),
         ("[fusion]\nmethod = 'all'\n", "one of pc, sg, pc+sg"),
     ],
 )
@@ -364,6 +365,11 @@ def test_settings_that_are_not_valid(tmp_path, scene_file, refused, content, say
     file = tmp_path / "settings.toml"
     file.write_text(content)
     refused("explore", scene_file, "--config", file, names=file, says=says)
+
+
+def test_settings_that_are_not_there(tmp_path, scene_file, refused):
+    file = tmp_path / "settings.toml"
+    refused("explore", scene_file, "--config", file, names=file, says="cannot be read")
 
 
 def test_a_setting_that_does_not_exist(scene_file, refused):

@@ -18,6 +18,7 @@ from caryatid.planners import Decision, Planner, PlanningState, make_planner
 from caryatid.robot import Candidates, Robot
 from caryatid.scene import Scene
 from caryatid.stopwatch import Stopwatch
+from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from caryatid.views import Camera, Cloud, View
 
@@ -124,6 +125,7 @@ def explore(
         path += robot.move_to(decision.T_world_camera)
 
 
+@one_blas_thread
 def next_best_view(
     scene: Scene,
     robot: Robot,

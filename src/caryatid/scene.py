@@ -19,8 +19,9 @@ from caryatid.perception import UP, Percept, label_image, perceive
 from caryatid.primitives import FitFailure, fit
 from caryatid.registration import align
 from caryatid.stopwatch import Stopwatch
-from caryatid.support import infer
+from caryatid.support import explain, infer
 from caryatid.surface import SupportSurface, find_support_surface
+from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from caryatid.views import SUPPORT_LABEL, Cloud, View
 from caryatid.visibility import seen_through
@@ -76,6 +77,16 @@ class Scene:
         """All points so far, thinned view by view, with the labels of their objects."""
         return _joined([c for _, clouds in sorted(self._points.items()) for c in clouds])
 
+    def explain(self, supporter: str, supported: str) -> str:
+        """Say why one object is, or is not, taken to support another; with figures.
+
+        Args:
+            supporter: Id of an object, such as `o1`.
+            supported: Id of an object.
+        """
+        return explain(self.graph, supporter, supported, self.config.support)
+
+    @one_blas_thread
     def update(self, source: View | Cloud) -> SupportGraph:
         """Take in one view, or one cloud with z up, and return the fused graph.
 

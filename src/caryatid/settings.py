@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
@@ -91,9 +92,9 @@ def _typed(value: Any, current: Any, choices: tuple[Any, ...], source: str, name
             return value
         wanted = "true or false" if isinstance(current, bool) else "a number"
     elif isinstance(current, float):
-        if isinstance(value, int | float):
+        if isinstance(value, int | float) and math.isfinite(value):
             return float(value)
-        wanted = "a number"
+        wanted = "a finite number"
     elif isinstance(current, tuple):
         if isinstance(value, list) and len(value) == len(current):
             pairs = zip(value, current, strict=True)

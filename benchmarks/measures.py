@@ -1,0 +1,58 @@
+"""A measure: name, value, unit, direction and tolerance; and the comparison with a committed baseline."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One figure of a benchmark.
+
+    Attributes:
+        name: What was measured.
+        value: Its value.
+        unit: `1` for shares, `s` for seconds.
+        better: Which way is better, `higher` or `lower`.
+        tolerance: How much worse than the baseline it may be, in its unit.
+    """
+
+    name: str
+    value: float
+    unit: str
+    better: str
+    tolerance: float
+
+    def worse_than(self, baseline: float) -> bool:
+        """Whether it is worse than the baseline by more than the tolerance."""
+        loss = baseline - self.value if self.better == "higher" else self.value - baseline
+        return loss > self.tolerance
+
+
+def write_baseline(measures: Iterable[Measure], path: Path) -> None:
+    """Write measures as the baseline to compare with from now on."""
+    document = {m.name: asdict(m) for m in measures}
+    path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
+    """Compare with a baseline; returns the exit status, 1 where a measure is worse than it may be."""
+    baseline = json.loads(path.read_text(encoding="utf-8"))
+    failed = 0
+    for measure in measures:
+        known = baseline.get(measure.name)
+        if known is None:
+            console.print(f"new: {measure.name} = {measure.value:.4g} {measure.unit}")
+        elif measure.worse_than(known["value"]):
+            failed += 1
+            console.print(
+                f"worse: {measure.name} = {measure.value:.4g} {measure.unit}, "
+                f"was {known['value']:.4g} ± {measure.tolerance:g}"
+            )
+    console.print("gate: " + (f"{failed} measures are worse" if failed else "nothing is worse"))
+    return min(failed, 1)

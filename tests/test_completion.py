@@ -1,0 +1,166 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import TABLE_TOP, box, cylinder, hausdorff, sphere, thing
+
+from caryatid import frames
+from caryatid.completion import complete
+from caryatid.config import CompletionConfig, VoxelConfig
+from caryatid.shapes import Box, Cylinder
+from caryatid.surface import SupportSurface
+from caryatid.voxels import VoxelMap
+
+CONFIG = CompletionConfig()
+SIDES_AND_TOP = (True, True, True, True, False, True)
+"""All but the lower side of an upright shape."""
+CENTRE = (0.0, 0.0, TABLE_TOP)
+UNKNOWN = VoxelMap.around(CENTRE, VoxelConfig())
+
+
+def surface_at(height=TABLE_TOP):
+    corners = np.array([[-0.35, -0.5, height], [0.35, -0.5, height], [0.35, 0.5, height], [-0.35, 0.5, height]])
+    top = box((0.0, 0.0, height - 0.02), (0.7, 1.0, 0.04))
+    return SupportSurface(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, height]), corners, top)
+
+
+def seen_free(where):
+    """A map in which the voxels whose centres satisfy a predicate have been looked through."""
+    index = np.indices(UNKNOWN.passes.shape).reshape(3, -1).T
+    free = where(UNKNOWN.centres_world(index)).reshape(UNKNOWN.passes.shape)
+    return VoxelMap(UNKNOWN.origin_world, UNKNOWN.hits, free.astype(np.uint8), UNKNOWN.config)
+
+
+def completed(*objects, voxels=UNKNOWN, surface=None):
+    return complete(objects, surface or surface_at(), voxels, CONFIG)
+
+
+def lowest(shape):
+    return shape.T_world_object[2, 3] - shape.support(np.array([[0.0, 0.0, -1.0]]))[0]
+
+
+def highest(shape):
+    return shape.T_world_object[2, 3] + shape.support(np.array([[0.0, 0.0, 1.0]]))[0]
+
+
+def upside_down(shape):
+    """The same solid with its z axis downwards."""
+    T = shape.T_world_object @ frames.rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    return Box(T, shape.extents) if isinstance(shape, Box) else Cylinder(T, shape.radius, shape.height)
+
+
+HOVERING = [
+    box((0.1, 0.0, TABLE_TOP + 0.08), (0.06, 0.08, 0.04), turn_deg=25.0),
+    cylinder((0.1, 0.0, TABLE_TOP + 0.08), 0.03, 0.04),
+]
+
+each = pytest.mark.parametrize("shape", HOVERING, ids=lambda s: s.kind)
+
+
+@each
+def test_what_hovers_over_unseen_space_reaches_down_to_the_table(shape):
+    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP))
+    assert lowest(done.shape) == pytest.approx(TABLE_TOP)
+    assert highest(done.shape) == pytest.approx(highest(shape))
+    np.testing.assert_allclose(done.shape.extents[:2], shape.extents[:2])
+    assert "table" in done.why
+    assert "60 mm" in done.why
+
+
+@each
+def test_which_way_its_axes_point_makes_no_difference(shape):
+    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP))
+    turned = thing(1, upside_down(shape), seen=(True, True, True, True, True, False))
+    assert hausdorff(completed(turned)[0].shape, done.shape) < 1e-9
+
+
+@each
+def test_a_lower_side_that_was_seen_stays_where_it_is(shape):
+    (done,) = completed(thing(1, shape))
+    assert hausdorff(done.shape, shape) == 0.0
+    assert done.why == ""
+
+
+@each
+def test_nothing_reaches_into_space_that_was_seen_free(shape):
+    limit = TABLE_TOP + 0.03
+    voxels = seen_free(lambda p: p[:, 2] < limit)
+    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP), voxels=voxels)
+    assert limit - 0.5 * CONFIG.step <= lowest(done.shape) <= limit + 1.5 * CONFIG.step
+    assert "free" in done.why
+
+
+@each
+def test_free_space_right_below_leaves_it_as_it_is(shape):
+    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP), voxels=seen_free(lambda p: p[:, 2] < 2.0))
+    assert hausdorff(done.shape, shape) < 1e-9
+
+
+@each
+def test_free_space_beside_it_does_not_matter(shape):
+    beside = seen_free(lambda p: np.hypot(p[:, 0] - 0.1, p[:, 1]) > 0.07)
+    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP), voxels=beside)
+    assert lowest(done.shape) == pytest.approx(TABLE_TOP)
+
+
+@each
+def test_what_hovers_over_an_object_reaches_down_to_it(shape):
+    below = thing(2, box((0.1, 0.0, TABLE_TOP + 0.02), (0.15, 0.15, 0.04)))
+    upper, kept = completed(thing(1, shape, seen=SIDES_AND_TOP), below)
+    assert abs(lowest(upper.shape) - (TABLE_TOP + 0.04)) <= CONFIG.overlap
+    assert hausdorff(kept.shape, below.shape) == 0.0
+    assert (upper.id, kept.id) == ("o1", "o2")
+
+
+def test_objects_find_those_below_already_completed():
+    middle = thing(1, box((0.0, 0.0, TABLE_TOP + 0.08), (0.1, 0.1, 0.02)), seen=SIDES_AND_TOP)
+    top = thing(2, box((0.0, 0.0, TABLE_TOP + 0.13), (0.08, 0.08, 0.02)), seen=SIDES_AND_TOP)
+    for order in ((middle, top), (top, middle)):
+        done = {o.id: o.shape for o in completed(*order)}
+        assert lowest(done["o1"]) == pytest.approx(TABLE_TOP)
+        assert abs(lowest(done["o2"]) - highest(done["o1"])) <= CONFIG.overlap
+
+
+def test_what_sticks_in_the_table_is_cut_off_at_its_top():
+    sunk = box((0.0, 0.0, TABLE_TOP + 0.02), (0.1, 0.1, 0.06))
+    (done,) = completed(thing(1, sunk, seen=SIDES_AND_TOP))
+    assert lowest(done.shape) == pytest.approx(TABLE_TOP)
+    assert highest(done.shape) == pytest.approx(highest(sunk))
+
+
+def test_a_ball_is_known_whole_from_any_side():
+    ball = sphere((0.0, 0.0, TABLE_TOP + 0.1), 0.04)
+    (done,) = completed(thing(1, ball, seen=SIDES_AND_TOP))
+    assert hausdorff(done.shape, ball) == 0.0
+
+
+@pytest.mark.parametrize(("tilt_deg", "extended"), [(15.0, True), (45.0, False)])
+def test_only_a_side_that_faces_down_is_one_to_rest_on(tilt_deg, extended):
+    R = frames.rotation_from_vector((np.radians(tilt_deg), 0.0, 0.0))
+    tilted = cylinder((0.0, 0.0, 0.0), 0.02, 0.06).moved(frames.rigid(R, (0.0, 0.0, TABLE_TOP + 0.1)))
+    (done,) = completed(thing(1, tilted, seen=SIDES_AND_TOP))
+    assert (done.shape.height > tilted.height) == extended
+    assert lowest(done.shape) >= TABLE_TOP - 1e-9
+
+
+def test_the_table_is_where_it_was_found_not_where_it_is_in_the_examples():
+    hovering = box((0.0, 0.0, 0.3), (0.1, 0.1, 0.1))
+    (done,) = completed(thing(1, hovering, seen=SIDES_AND_TOP), surface=surface_at(0.2))
+    assert lowest(done.shape) == pytest.approx(0.2)
+
+
+def test_nothing_to_complete_is_no_error():
+    assert completed() == []
+
+
+def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():
+    front = box((0.0, 0.0, TABLE_TOP + 0.05), (0.01, 0.08, 0.1))
+    flat = thing(1, front, seen=(True, False, False, False, False, False))
+    (deep,) = completed(flat)
+    assert deep.shape.extents[0] == pytest.approx(0.08)
+    towards_unseen = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    ends = deep.centre_world[0] + np.array([1.0, -1.0]) * deep.shape.support(towards_unseen)
+    np.testing.assert_allclose(ends, (-0.005 + 0.08, -0.005))
+    behind_is_free = seen_free(lambda p: p[:, 0] > 0.04)
+    (bounded,) = completed(flat, voxels=behind_is_free)
+    assert bounded.shape.extents[0] == pytest.approx(0.045, abs=1.5 * CONFIG.step)

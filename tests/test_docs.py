@@ -1,0 +1,80 @@
+"""What README and docs show works: their Python runs, their commands do, their links lead somewhere."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shlex
+import shutil
+import tomllib
+from pathlib import Path
+
+import pytest
+from conftest import SMALL, run_command
+
+import caryatid as ct
+from caryatid.settings import write_settings
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+NAMED = [path.name for path in PAGES]
+
+
+def blocks(path, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.M | re.S)
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch, kept_recording, scene_file, points, write_pcd):
+    """The files the pages speak of, in the current folder."""
+    write_pcd(*points, name="table.pcd")
+    shutil.copytree(kept_recording, tmp_path / "recording")
+    shutil.copytree(scene_file.parent, tmp_path / "my-scene")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMED)
+def test_python_blocks_run(page, workplace, capsys):
+    for block in blocks(page, "python"):
+        exec(compile(block, str(page), "exec"), {"__name__": "__main__"})
+
+
+def test_commands_run(workplace, capsys):
+    lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
+    commands = [shlex.split(line)[1:] for line in lines if line.startswith("caryatid ")]
+    assert {command[0] for command in commands} == {"explore", "extract", "evaluate", "config"}
+    for command in commands:
+        redirected = command[command.index(">") + 1] if ">" in command else None
+        arguments = command[: command.index(">")] if redirected else command
+        small = [*SMALL, "--views=2"] if arguments[0] in ("explore", "demo") else []
+        capsys.readouterr()
+        assert run_command(*arguments, *small) == 0, command
+        if redirected:
+            Path(redirected).write_text(capsys.readouterr().out)
+    assert (workplace / "run/report.html").is_file()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMED)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text()):
+        assert (page.parent / target).exists(), target
+
+
+def test_the_settings_the_method_page_names_exist():
+    settings = tomllib.loads(write_settings(ct.Config()))
+    text = (ROOT / "docs/method.md").read_text()
+    named = set(re.findall(r"`([a-z]+)\.([a-z_]+)(?: = [^`]+)?`", text))
+    known = {(stage, name) for stage in settings for name in settings[stage]}
+    assert len(named & known) > 5
+    for module, name in named - known:
+        assert hasattr(importlib.import_module(f"caryatid.{module}"), name), f"{module}.{name}"
+
+
+def test_the_modules_the_method_page_names_exist():
+    text = (ROOT / "docs/method.md").read_text()
+    groups = re.findall(r"^(?:\*\*[^*]+\*\*|#+ [^(\n]+) \(([^)]+)\)", text, re.M)
+    modules = [name for group in groups for name in re.findall(r"`([a-z_.]+)`", group)]
+    assert len(modules) > 15
+    for name in modules:
+        assert importlib.import_module(f"caryatid.{name}")

@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import box, cylinder, hausdorff, sphere, surface_points
+
+from caryatid import frames
+from caryatid.config import FitConfig
+from caryatid.primitives import Fit, FitFailure, candidates, draw_in, fit
+from caryatid.shapes import Box, Cylinder
+
+CONFIG = FitConfig()
+EYE = (-1.1, 0.35, 0.95)
+"""40° up and 1.5 m away, turned so that two walls and the top of an upright box are seen."""
+SHAPES = [
+    box((0.0, 0.0, 0.0), (0.06, 0.1, 0.14), turn_deg=20.0),
+    box((0.02, 0.0, 0.0), (0.12, 0.11, 0.05)),
+    cylinder((0.0, 0.0, 0.0), 0.04, 0.12),
+    cylinder((0.0, 0.03, 0.0), 0.03, 0.08),
+    sphere((0.0, 0.0, 0.0), 0.04),
+    sphere((0.01, 0.0, 0.0), 0.03),
+]
+
+each = pytest.mark.parametrize("shape", SHAPES, ids=lambda s: f"{s.kind} {s.extents.max():.2f}")
+
+
+def fit_of(points, normals, config=CONFIG, seed=0):
+    result = fit(points, normals, config=config, rng=np.random.default_rng(seed))
+    assert isinstance(result, Fit)
+    return result
+
+
+def noisy_normals(normals, rng, degrees=5.0):
+    return frames.unit(normals + np.radians(degrees) * rng.normal(size=normals.shape))
+
+
+@each
+@pytest.mark.parametrize("seed", range(2))
+def test_sizes_are_recovered_from_half_a_view_with_a_sensors_noise(shape, seed):
+    rng = np.random.default_rng(seed)
+    points, normals = surface_points(shape, rng, eye=EYE, sigma=0.002)
+    result = fit_of(points, noisy_normals(normals, rng), seed=seed)
+    assert result.shape.kind == shape.kind
+    # Points stop up to half their spacing (2.5 mm) and 2σ (4 mm) from the ends of unseen sides.
+    tolerance = 0.008 if shape.kind != "sphere" else 0.002
+    assert hausdorff(result.shape, shape) < tolerance
+    # σ · √(2/π) is the mean distance to the true surface.
+    assert result.residual == pytest.approx(0.002 * np.sqrt(2.0 / np.pi), rel=0.15)
+    assert result.inliers > 0.98
+    assert not result.poor
+
+
+@each
+def test_all_of_the_surface_gives_the_size_to_a_fraction_of_the_noise(shape):
+    rng = np.random.default_rng(0)
+    points, normals = surface_points(shape, rng, sigma=0.002)
+    assert hausdorff(fit_of(points, normals).shape, shape) < 0.0015
+
+
+@each
+def test_hundreds_of_points_do_not_hide_an_outlier_or_two(shape):
+    rng = np.random.default_rng(0)
+    points, normals = surface_points(shape, rng, eye=EYE, sigma=0.001)
+    count = len(points) // 20
+    stray = rng.uniform(-0.12, 0.12, (count, 3))
+    points = np.concatenate([points, stray])
+    normals = np.concatenate([normals, frames.unit(rng.normal(size=(count, 3)))])
+    assert fit_of(points, normals).shape.kind == shape.kind
+
+
+def test_the_sides_that_points_bear_out_are_the_ones_seen():
+    shape = box((0.0, 0.0, 0.0), (0.08, 0.1, 0.12))
+    points, normals = surface_points(shape, np.random.default_rng(0), eye=EYE, sigma=0.001)
+    result = fit_of(points, normals)
+    R = result.shape.T_world_object[:3, :3]
+    seen = {
+        tuple(np.round(sign * R[:, axis]).astype(int))
+        for axis in range(3)
+        for k, sign in enumerate((-1.0, 1.0))
+        if result.seen[2 * axis + k]
+    }
+    assert seen == {(-1, 0, 0), (0, 1, 0), (0, 0, 1)}
+
+
+def test_a_side_nobody_saw_is_drawn_in_to_where_the_points_end():
+    shape = box((0.0, 0.0, 0.0), (0.08, 0.1, 0.12))
+    points, normals = surface_points(shape, np.random.default_rng(0), eye=EYE, sigma=0.0)
+    upper = points[:, 2] > -0.02
+    too_tall = box((0.0, 0.0, -0.05), (0.08, 0.1, 0.22))
+    drawn, seen = draw_in(too_tall, points[upper], normals[upper], CONFIG)
+    assert seen == (True, False, False, True, False, True)
+    top = drawn.T_world_object[2, 3] + drawn.extents[2] / 2.0
+    assert top == pytest.approx(0.06)
+    assert drawn.extents[2] == pytest.approx(0.08, abs=0.005)
+
+
+def test_a_side_that_was_seen_stays_where_it_is():
+    shape = box((0.0, 0.0, 0.0), (0.08, 0.1, 0.12))
+    points, normals = surface_points(shape, np.random.default_rng(0), sigma=0.0)
+    drawn, seen = draw_in(shape, points, normals, CONFIG)
+    assert seen == (True,) * 6
+    np.testing.assert_allclose(drawn.extents, shape.extents)
+
+
+def test_one_face_alone_makes_a_slab_behind_it():
+    shape = box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1), turn_deg=30.0)
+    points, normals = surface_points(shape, np.random.default_rng(0), sigma=0.001)
+    top = normals[:, 2] > 0.9
+    result = fit_of(points[top], normals[top])
+    assert isinstance(result.shape, Box)
+    np.testing.assert_allclose(np.sort(result.shape.extents)[1:], (0.08, 0.12), atol=0.006)
+    assert np.sort(result.shape.extents)[0] < 0.02
+    height = result.shape.T_world_object[2, 3] + result.shape.support(np.array([[0.0, 0.0, 1.0]]))[0]
+    assert height == pytest.approx(0.05, abs=0.001)
+    assert sum(result.seen) == 1
+
+
+def test_a_round_end_alone_makes_a_disc():
+    shape = cylinder((0.0, 0.0, 0.0), 0.05, 0.1)
+    points, normals = surface_points(shape, np.random.default_rng(0), spacing=0.003, sigma=0.001)
+    top = normals[:, 2] > 0.9
+    result = fit_of(points[top], normals[top])
+    assert isinstance(result.shape, Cylinder)
+    assert result.shape.radius == pytest.approx(0.05, abs=0.003)
+    assert abs(result.shape.T_world_object[2, 2]) > 0.999
+
+
+def test_a_small_box_is_preferred_to_a_big_one_that_explains_no_more():
+    shape = SHAPES[0]
+    points, normals = surface_points(shape, np.random.default_rng(0), eye=EYE, sigma=0.001)
+    assert fit_of(points, normals).shape.volume <= 1.05 * shape.volume
+
+
+def test_the_candidates_are_one_of_each_kind_the_cheapest_first():
+    points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE, sigma=0.001)
+    fits = candidates(points, normals, config=CONFIG, rng=np.random.default_rng(0))
+    assert [f.cost for f in fits] == sorted(f.cost for f in fits)
+    assert len({f.shape.kind for f in fits}) == len(fits) >= 2
+    assert fits[0].shape.kind == "box"
+
+
+def test_what_is_no_single_shape_is_called_a_poor_fit():
+    rng = np.random.default_rng(0)
+    bars = [box((0.0, 0.0, 0.0), (0.2, 0.02, 0.02)), box((0.09, 0.09, 0.06), (0.02, 0.2, 0.02))]
+    parts = [surface_points(b, rng, sigma=0.001) for b in bars]
+    result = fit_of(np.concatenate([p for p, _ in parts]), np.concatenate([n for _, n in parts]))
+    strict = replace(CONFIG, max_residual=result.residual / 2.0)
+    assert fit_of(*map(np.concatenate, zip(*parts, strict=True)), config=strict).poor
+    assert result.residual > 0.002
+    one = surface_points(bars[0], rng, sigma=0.001)
+    assert fit_of(*one).residual < 0.0015
+
+
+@pytest.mark.parametrize("count", [0, 3, CONFIG.min_points - 1])
+def test_too_few_points_are_a_failure_that_says_so(count):
+    points, normals = surface_points(SHAPES[0], np.random.default_rng(0))
+    result = fit(points[:count], normals[:count], config=CONFIG, rng=np.random.default_rng(0))
+    assert isinstance(result, FitFailure)
+    assert result.reason == f"{count} points are fewer than the {CONFIG.min_points} a shape needs"
+
+
+def test_nothing_is_bigger_than_what_stands_on_a_table():
+    points, normals = surface_points(box((0, 0, 0), (0.9, 0.8, 0.7)), np.random.default_rng(0), spacing=0.03)
+    result = fit(points, normals, config=CONFIG, rng=np.random.default_rng(0))
+    assert isinstance(result, FitFailure)
+    assert "0.5 m" in result.reason
+
+
+def test_points_that_are_no_numbers_are_passed_over():
+    points, normals = surface_points(SHAPES[2], np.random.default_rng(0), eye=EYE, sigma=0.001)
+    clean = fit_of(points, normals).shape
+    spoilt = np.concatenate([points, np.full((30, 3), np.nan)])
+    result = fit_of(spoilt, np.concatenate([normals, np.full((30, 3), np.nan)]))
+    assert hausdorff(result.shape, clean) == 0.0
+
+
+@pytest.mark.parametrize("degenerate", ["a spot", "a line"])
+def test_points_without_extent_do_not_break_it(degenerate):
+    rng = np.random.default_rng(0)
+    points = np.zeros((40, 3))
+    if degenerate == "a line":
+        points[:, 0] = np.linspace(0.0, 0.1, 40)
+    normals = np.tile((0.0, 0.0, 1.0), (40, 1))
+    result = fit(points, normals, config=CONFIG, rng=rng)
+    if isinstance(result, Fit):
+        assert np.isfinite(result.shape.T_world_object).all()
+        assert (result.shape.extents >= 0.9 * CONFIG.min_extent).all()
+
+
+def test_the_same_seed_gives_the_same_shape_to_the_last_bit():
+    points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE, sigma=0.003, spacing=0.003)
+    assert len(points) > CONFIG.max_points
+    first, again, other = (fit_of(points, normals, seed=s).shape for s in (4, 4, 5))
+    np.testing.assert_array_equal(first.T_world_object, again.T_world_object)
+    np.testing.assert_array_equal(first.extents, again.extents)
+    assert not np.array_equal(first.extents, other.extents)
+
+
+def test_points_handed_in_stay_as_they_are():
+    points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE)
+    kept = points.copy(), normals.copy()
+    fit_of(points, normals)
+    np.testing.assert_array_equal(points, kept[0])
+    np.testing.assert_array_equal(normals, kept[1])
