@@ -19,19 +19,19 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from multiprocessing import get_context
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
+from measures import Measure, gate, write_baseline
 from rich.console import Console
 from rich.table import Table
 
 from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import CaryatidError
+from caryatid.evaluation.scores import Score, score, score_masks
 from caryatid.settings import read_settings
-from measures import Measure, gate, write_baseline
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Set to 1 in the processes, unless set already: the jobs share the cores."""
@@ -62,6 +62,22 @@ class Row:
     angle: float
     path: float
     seconds: float
+
+    @classmethod
+    def of(
+        cls,
+        scene: str,
+        planner: str,
+        seed: int,
+        view: int,
+        s: Score,
+        angle: float,
+        path: float,
+        seconds: float,
+    ) -> Row:
+        """Put a score and what it cost together."""
+        figures = (s.f1, s.edge_precision, s.edge_recall, s.vertex_recall, s.mean_iou)
+        return cls(scene, planner, seed, view, *figures, angle, path, time)
 
 
 @dataclass(frozen=True)
@@ -113,7 +129,6 @@ class Extract:
 def explore_one(task: tuple[str, str, int, Explore]) -> list[Row]:
     """Run one episode."""
     from caryatid.commands.sources import open_source
-    from caryatid.evaluation.scores import score
     from caryatid.exploration import explore
 
     scene, planner, seed, args = task
@@ -139,10 +154,9 @@ def explore_one(task: tuple[str, str, int, Explore]) -> list[Row]:
         s = score(step.graph, source.truth, np.random.default_rng(0))
         seconds = sum(v for k, v in step.timings.items() if k != "capture")
         rows.append(
-            Row(
-                source.name, planner, seed, step.index, s.f1, s.edge_precision, s.edge_recall, s.vertex_recall,
-                s.mean_iou, step.angle_travelled, step.path_travelled, seconds,
-            )  # fmt: skip
+            Row.of(
+                source.name, planner, seed, step.index, s, step.angle_travelled, step.path_travelled, seconds
+            )
         )
     rows += [replace(rows[-1], view=v) for v in range(len(rows), args.views)]
     return rows
@@ -150,7 +164,6 @@ def explore_one(task: tuple[str, str, int, Explore]) -> list[Row]:
 
 def extract_one(task: tuple[Path, Extract]) -> list[Row]:
     """Extract one frame's graph."""
-    from caryatid.evaluation.scores import score_masks
     from caryatid.formats.bop import read_recording
     from caryatid.scene import Scene
     from caryatid.simulation.truth import read_truth

@@ -93,9 +93,9 @@ def surface_points(
     return points + sigma * rng.normal(size=(len(points), 1)) * normals, normals
 
 
-def hausdorff(a: Shape, b: Shape) -> float:
-    """Hausdorff distance [m] of two convex shapes: blind to names of axes and to symmetry."""
-    reach = [DIRECTIONS @ s.T_world_object[:3, 3] + s.support(DIRECTIONS) for s in (a, b)]
+def hausdorff(a: Shape, b: Shape, directions: Array = DIRECTIONS) -> float:
+    """Hausdorff distance [m] of two convex shapes, in these directions: blind to axes' names and symmetry."""
+    reach = [directions @ s.T_world_object[:3, 3] + s.support(directions) for s in (a, b)]
     return float(np.abs(reach[0] - reach[1]).max())
 
 

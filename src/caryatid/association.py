@@ -20,8 +20,10 @@ def associate(
     known_shapes: Mapping[int, Shape],
     config: SegmentationConfig,
     labels_used: int = 0,
-) -> dict[int, int]:
-    """Give each new part the label of the object it belongs to, or a label never used before.
+) -> NDArray[np.int32]:
+    """Give the points of each new part the label of the object they belong to, or one never used before.
+
+    A part that lies at several known objects is divided among them: each point goes to the nearest.
 
     Args:
         points_world: (N, 3) [m].
@@ -32,26 +34,25 @@ def associate(
         labels_used: Highest label ever given; new objects are numbered from the next one.
 
     Returns:
-        Label of the part → label of the object.
+        Label of the object (N,) of each point; 0 where there was no part.
     """
-    parts = [int(k) for k in np.unique(labels) if k != 0]
-    names: dict[int, int] = {}
+    result = np.zeros_like(labels)
     fresh = max(labels_used, *known_points, 0)
     trees = {k: cKDTree(p) for k, p in known_points.items()}
-    for part in parts:
-        points = points_world[labels == part]
-        points = points[:: max(1, len(points) // 500)]
-        shares = {
-            k: float(_belongs(points, trees[k], known_shapes.get(k), config.overlap_reach).mean())
-            for k in trees
-        }
-        best = max(shares, key=lambda k: shares[k], default=None)
-        if best is not None and shares[best] >= config.overlap:
-            names[part] = best
-        else:
+    for part in (int(k) for k in np.unique(labels) if k != 0):
+        index = np.flatnonzero(labels == part)
+        points = points_world[index]
+        gaps = np.array([_gaps(points, trees[k], known_shapes.get(k)) for k in trees])
+        near = gaps < config.overlap_reach
+        if not trees or near.any(axis=0).mean() < config.overlap:
             fresh += 1
-            names[part] = fresh
-    return names
+            result[index] = fresh
+            continue
+        nearest = np.where(near.any(axis=0), np.argmin(gaps, axis=0), -1)
+        shares = np.bincount(nearest[nearest >= 0], minlength=len(trees)) / len(points)
+        owners = np.flatnonzero(shares >= min(config.divide_share, shares.max()))
+        result[index] = np.array(list(trees))[owners[np.argmin(gaps[owners], axis=0)]]
+    return result
 
 
 def duplicates(
@@ -74,7 +75,9 @@ def duplicates(
     return given_up
 
 
-def _belongs(points: Array, tree: cKDTree, shape: Shape | None, reach: float) -> NDArray[np.bool_]:
-    gap, _ = tree.query(points, distance_upper_bound=reach)
-    near: NDArray[np.bool_] = np.isfinite(gap)
-    return near if shape is None else near | (np.abs(shape.signed_distance(points)) < reach / 2.0)
+def _gaps(points: Array, tree: cKDTree, shape: Shape | None) -> Array:
+    """Distance (N,) [m] of points to an object: to its points, or its shape's surface if nearer."""
+    gap, _ = tree.query(points)
+    if shape is None:
+        return np.asarray(gap)
+    return np.minimum(gap, np.abs(shape.signed_distance(points)))

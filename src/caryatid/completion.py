@@ -57,11 +57,15 @@ def _extended(
         if to_table <= 0.0:
             candidate = replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
         else:
-            candidate = _moved_out(candidate, axis, sign, to_table, "down to the table", others, voxels, config)
+            candidate = _moved_out(
+                candidate, axis, sign, to_table, "down to the table", others, voxels, config
+            )
     hidden = _depth_side(candidate, config)
     if hidden is None or (upright and hidden[0] == axis):
         return candidate
-    guess = float(np.delete(candidate.shape.extents, hidden[0]).min()) - float(candidate.shape.extents[hidden[0]])
+    guess = float(np.delete(candidate.shape.extents, hidden[0]).min()) - float(
+        candidate.shape.extents[hidden[0]]
+    )
     return _moved_out(candidate, *hidden, guess, "as deep as it is wide", others, voxels, config)
 
 

@@ -133,6 +133,8 @@ class SegmentationConfig:
     """Points higher above the table belong to no object on it [m]; table-top sizes."""
     overlap: float = 0.3
     """Share of a part's points that must lie at an object's points or shape for it to be that object [1]."""
+    divide_share: float = 0.1
+    """A part is divided among the known objects at which at least this share of its points lies [1]."""
     overlap_reach: float = 0.02
     """Distance within which a point lies at an object [m]; 2σ of registration error of both views."""
     same_share: float = 0.7
@@ -179,6 +181,24 @@ class FitConfig:
     """Spacing of the samples that look for points near a side [m]; 2 to 3 pixels at 1.5 m."""
     max_residual: float = 0.008
     """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SplitConfig:
+    """Parting what automatic segmentation took for one object."""
+
+    min_residual: float = 0.003
+    """Mean distance to the best single shape from which on a cut is tried [m]; noise alone leaves 2 mm."""
+    gain: float = 0.6
+    """A cut must bring the mean distance below this share of the single shape's [1]."""
+    cuts: int = 7
+    """Cuts tried along each direction [1]; an eighth of the points apart."""
+    sample: int = 250
+    """Points of a side a cut is first judged by [1]."""
+    min_points: int = 40
+    """Points a side needs [1]; three times what a shape needs."""
+    reach: float = 0.02
+    """Points further apart are not connected [m]; four times their spacing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -509,6 +529,7 @@ class Config:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     fit: FitConfig = field(default_factory=FitConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
     completion: CompletionConfig = field(default_factory=CompletionConfig)
     support: SupportConfig = field(default_factory=SupportConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)

@@ -109,9 +109,8 @@ def explore(
         decision, candidates = None, None
         if stop is None:
             try:
-                decision, candidates = next_best_view(
-                    scene, robot, np.array(visited), planner=chooser, seed=seed
-                )
+                candidates = robot.candidates(sphere)
+                decision = _decided(scene, candidates, np.array(visited), chooser, seed)
             except PlanningError as error:
                 stop = str(error)
         watch.lap("plan")
@@ -125,7 +124,6 @@ def explore(
         path += robot.move_to(decision.T_world_camera)
 
 
-@one_blas_thread
 def next_best_view(
     scene: Scene,
     robot: Robot,
@@ -133,31 +131,37 @@ def next_best_view(
     *,
     planner: Planner | str = "support",
     seed: int = 0,
-) -> tuple[Decision, Candidates]:
+) -> Decision:
     """Choose where to look next (Algorithm 2).
 
     Args:
         scene: What is known, of at least one view.
         robot: Says which views it can reach.
-        visited: Unit directions (V, 3) of earlier views from the sphere's centre; None = where the robot is.
+        visited: Unit directions (V, 3) of earlier views from the sphere's centre, the current one last;
+            None = where the robot is.
         planner: Chooses among them, or the name of one that does.
         seed: Seed of random planners.
 
     Returns:
-        The decision, whose `T_world_camera` is the view and whose `why` is the reason, and the candidates.
+        The decision: `T_world_camera` is the view, `why` the reason.
 
     Raises:
         PlanningError: No view is known yet, or none can be reached.
     """
-    if scene.sphere is None or scene.voxels is None:
+    if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
     chooser = make_planner(planner) if isinstance(planner, str) else planner
     if visited is None:
         visited = scene.sphere.direction_of(robot.T_world_camera)[None]
-    candidates = robot.candidates(scene.sphere)
+    return _decided(scene, robot.candidates(scene.sphere), visited, chooser, seed)
+
+
+@one_blas_thread
+def _decided(scene: Scene, candidates: Candidates, visited: Array, planner: Planner, seed: int) -> Decision:
+    if scene.sphere is None or scene.voxels is None:
+        raise PlanningError("nothing has been seen yet; update the scene with a first view")
     state = PlanningState(scene.graph, scene.sphere, scene.voxels, visited, candidates, scene.config.active)
-    rng = np.random.default_rng([seed, len(visited)])
-    return chooser.plan(state, rng), candidates
+    return planner.plan(state, np.random.default_rng([seed, len(visited)]))
 
 
 def _reason_to_stop(

@@ -17,7 +17,11 @@ SPHERE, CYLINDER, BOX = 0, 1, 2
 
 @njit(cache=True)
 def signed_distances(
-    kind: int, R: NDArray[np.float64], centre: NDArray[np.float64], half: NDArray[np.float64], points: NDArray[np.float64]
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
 ) -> Array:
     """Distance (N,) [m] of points (N, 3) to a shape's surface, negative inside.
 

@@ -47,6 +47,10 @@ class Percept:
         labels = self.labels.copy()
         for old, new in names.items():
             labels[self.labels == old] = new
+        return self.with_labels(labels)
+
+    def with_labels(self, labels: NDArray[np.int32]) -> Percept:
+        """Return the percept with other labels (N,)."""
         return replace(self, cloud=replace(self.cloud, labels=labels))
 
     def moved(self, T: Array) -> Percept:

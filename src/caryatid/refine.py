@@ -45,7 +45,7 @@ def linearise(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Arra
 
 
 def stepped(shape: Box | Cylinder | Sphere, step: Array, min_extent: float) -> Box | Cylinder | Sphere:
-    """Return the shape changed by a step (6 + sizes,) as `linearise` orders it, no extent below `min_extent`."""
+    """Change a shape by a step (6 + sizes,), ordered as by `linearise`, no size below `min_extent`."""
     T = shape.T_world_object @ frames.rigid(frames.rotation_from_vector(step[3:6]), step[:3])
     if isinstance(shape, Sphere):
         return Sphere(T, max(shape.radius + float(step[6]), min_extent / 2.0))

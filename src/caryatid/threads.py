@@ -1,4 +1,4 @@
-"""BLAS on one thread: our matrices are small, and threads that wait for one another cost more than they bring."""
+"""BLAS on one thread: our matrices are small, and waiting threads cost more than they bring."""
 
 from __future__ import annotations
 

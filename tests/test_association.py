@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import box, sphere, surface_points
+
+from caryatid.association import associate, duplicates
+from caryatid.config import SegmentationConfig
+
+CONFIG = SegmentationConfig()
+CRATE, BALL = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1)), sphere((0.3, 0.0, 0.79), 0.04)
+
+
+def seen(shape, eye=None, seed=0):
+    return surface_points(shape, np.random.default_rng(seed), eye=eye, sigma=0.001)[0]
+
+
+KNOWN = {3: seen(CRATE, eye=(-1.0, 0.0, 1.5)), 7: seen(BALL, eye=(-1.0, 0.0, 1.5))}
+SHAPES = {3: CRATE, 7: BALL}
+
+
+def names_of(*parts, known=KNOWN, shapes=SHAPES, config=CONFIG, **options):
+    """Names given to parts numbered 1, 2, …; between them lie points of no part."""
+    points = np.concatenate([*parts, np.zeros((5, 3))])
+    labels = np.concatenate([np.full(len(p), k) for k, p in enumerate(parts, start=1)] + [np.zeros(5)])
+    return associate(points, labels.astype(np.int32), known, shapes, config, **options)
+
+
+def test_a_part_is_the_object_in_whose_points_it_lies():
+    assert names_of(seen(BALL, seed=1), seen(CRATE, seed=1)) == {1: 7, 2: 3}
+
+
+def test_a_part_of_a_side_never_seen_is_the_object_in_whose_shape_it_lies():
+    front = KNOWN[3][KNOWN[3][:, 0] < -0.045]
+    behind = seen(CRATE)
+    behind = behind[behind[:, 0] > 0.045]
+    assert names_of(behind, known={3: front}) == {1: 3}
+    assert names_of(behind, known={3: front}, shapes={}) == {1: 4}
+
+
+def test_what_lies_elsewhere_is_a_new_object_with_a_new_label():
+    elsewhere = seen(box((0.0, 0.4, 0.8), (0.1, 0.1, 0.1)))
+    farther = seen(box((0.0, -0.4, 0.8), (0.1, 0.1, 0.1)))
+    assert names_of(elsewhere, farther) == {1: 8, 2: 9}
+    assert names_of(elsewhere, known={}, shapes={}) == {1: 1}
+
+
+def test_a_label_once_given_is_not_given_again():
+    elsewhere = seen(box((0.0, 0.4, 0.8), (0.1, 0.1, 0.1)))
+    assert names_of(elsewhere, labels_used=20) == {1: 21}
+    assert names_of(elsewhere, labels_used=2) == {1: 8}
+
+
+def test_two_parts_of_one_object_get_the_same_name():
+    crate = seen(CRATE, seed=1)
+    left = crate[:, 1] < 0.0
+    assert names_of(crate[left], crate[~left]) == {1: 3, 2: 3}
+
+
+@pytest.mark.parametrize(("share", "name"), [(0.2, 8), (0.5, 3)])
+def test_how_much_must_overlap_is_a_setting(share, name):
+    at_object, elsewhere = seen(CRATE, seed=1), seen(box((0.0, 0.4, 0.8), (0.1, 0.1, 0.1)))
+    count = 400
+    mixed = np.concatenate([at_object[: int(share * count)], elsewhere[: int((1 - share) * count)]])
+    # A rest of the points is passed over; a fine shuffle keeps the share.
+    mixed = np.random.default_rng(0).permutation(mixed)
+    assert names_of(mixed) == {1: name}
+    assert names_of(mixed, config=replace(CONFIG, overlap=0.1)) == {1: 3}
+
+
+def test_of_two_the_one_that_fits_better():
+    beside = seen(box((0.0, 0.1, 0.8), (0.1, 0.08, 0.1)))
+    both = {3: KNOWN[3], 5: beside}
+    assert names_of(seen(CRATE, seed=2), known=both, shapes={}) == {1: 3}
+
+
+def test_no_parts_no_names():
+    assert names_of() == {}
+
+
+def test_an_object_inside_anothers_shape_is_the_same_object():
+    half = KNOWN[3][KNOWN[3][:, 1] > 0.0]
+    shapes = {3: CRATE, 4: box((0.0, 0.03, 0.8), (0.1, 0.06, 0.1)), 7: BALL}
+    assert duplicates(KNOWN | {4: half}, shapes, CONFIG) == {4: 3}
+    # The smaller is given up, whatever the labels.
+    swapped = {3: half, 4: KNOWN[3]}
+    assert duplicates(swapped, {3: shapes[4], 4: CRATE}, CONFIG) == {3: 4}
+
+
+def test_neighbours_that_touch_are_two_objects():
+    beside = box((0.0, 0.11, 0.8), (0.1, 0.1, 0.1))
+    assert duplicates(KNOWN | {4: seen(beside)}, SHAPES | {4: beside}, CONFIG) == {}
+
+
+def test_what_was_given_up_takes_no_points_of_others():
+    middle, small = box((0.0, 0.0, 0.8), (0.09, 0.11, 0.09)), box((0.0, 0.0, 0.8), (0.08, 0.1, 0.08))
+    points = {3: seen(CRATE), 4: seen(middle), 5: seen(small)}
+    given_up = duplicates(points, {3: CRATE, 4: middle, 5: small}, CONFIG)
+    assert given_up == {4: 3, 5: 3}

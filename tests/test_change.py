@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import box, cylinder, sphere, table_object, thing
+
+from caryatid import frames
+from caryatid.change import changed, reshaped
+from caryatid.config import FusionConfig
+from caryatid.graph import Support, SupportGraph
+from caryatid.shapes import Box
+
+CONFIG = FusionConfig()
+CRATE = thing(1, box((0.0, 0.0, 0.8), (0.1, 0.2, 0.3)))
+CAN = thing(2, cylinder((0.0, 0.0, 1.0), 0.03, 0.1))
+BEFORE = SupportGraph((table_object(), CRATE, CAN), (Support("o0", "o1"), Support("o1", "o2")))
+LITTLE, MUCH = 0.8 * CONFIG.settled, 1.2 * CONFIG.settled
+
+
+def with_crate(crate):
+    return replace(BEFORE, objects=(table_object(), crate, CAN))
+
+
+def shifted(o, by):
+    return replace(o, shape=o.shape.moved(frames.rigid(np.eye(3), (by, 0.0, 0.0))))
+
+
+def grown(o, by):
+    return replace(o, shape=Box(o.shape.T_world_object, o.shape.extents + (0.0, 0.0, by)))
+
+
+def turned(o, by):
+    """Turned so that the ends of the longest edge move by this much."""
+    angle = by / (o.shape.extents.max() / 2.0)
+    T = o.shape.T_world_object @ frames.rigid(frames.rotation_from_vector((angle, 0.0, 0.0)), np.zeros(3))
+    return replace(o, shape=replace(o.shape, T_world_object=T))
+
+
+def test_the_same_graph_has_not_changed():
+    assert not changed(BEFORE, BEFORE, CONFIG)
+    assert not changed(SupportGraph(), SupportGraph(), CONFIG)
+
+
+@pytest.mark.parametrize("change", [shifted, grown, turned])
+def test_a_shape_changes_only_beyond_the_tolerance(change):
+    assert not changed(BEFORE, with_crate(change(CRATE, LITTLE)), CONFIG)
+    assert changed(BEFORE, with_crate(change(CRATE, MUCH)), CONFIG)
+    assert not changed(BEFORE, with_crate(change(CRATE, MUCH)), replace(CONFIG, settled=2.0 * MUCH))
+
+
+def test_another_kind_of_shape_is_a_change():
+    assert changed(BEFORE, with_crate(thing(1, cylinder((0.0, 0.0, 0.8), 0.05, 0.3))), CONFIG)
+
+
+def test_other_names_for_the_axes_are_no_change():
+    x, y, z = np.eye(3)
+    T = CRATE.shape.T_world_object @ frames.rigid(np.stack([y, z, x], axis=1), np.zeros(3))
+    renamed = Box(T, CRATE.shape.extents[[1, 2, 0]])
+    assert not changed(BEFORE, with_crate(replace(CRATE, shape=renamed)), CONFIG)
+
+
+def test_a_ball_that_turned_is_the_same_ball():
+    ball = thing(3, sphere((0.0, 0.0, 0.0), 0.05))
+    assert not reshaped(ball, turned(ball, 0.05), CONFIG)
+
+
+def test_objects_that_come_or_go_are_a_change():
+    fewer = SupportGraph((table_object(), CRATE), (Support("o0", "o1"),))
+    assert changed(BEFORE, fewer, CONFIG)
+    assert changed(fewer, BEFORE, CONFIG)
+
+
+def test_edges_that_come_or_go_or_turn_round_are_a_change():
+    fewer = replace(BEFORE, supports=BEFORE.supports[:1])
+    turned_round = replace(BEFORE, supports=(BEFORE.supports[0], Support("o2", "o1")))
+    for after in (fewer, turned_round):
+        assert changed(BEFORE, after, CONFIG)
+        assert changed(after, BEFORE, CONFIG)
+
+
+def test_evidence_that_grows_is_no_change():
+    counted = tuple(replace(s, occurrences=5, opportunities=7, certain=False) for s in BEFORE.supports)
+    assert not changed(BEFORE, replace(BEFORE, supports=counted), CONFIG)
+
+
+def test_a_table_of_which_more_is_seen_is_no_change():
+    wider = replace(table_object(), shape=box((0.0, 0.0, 0.73), (0.9, 1.3, 0.04)))
+    assert not changed(BEFORE, replace(BEFORE, objects=(wider, CRATE, CAN)), CONFIG)

@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import box, cylinder, random_motion, table_object, thing
+
+from caryatid import frames
+from caryatid.graph import SUPPORT_SURFACE_ID, Stability, Support, SupportGraph, object_id
+
+CONTACT = np.array([0.01, 0.02, 0.85])
+GRAPH = SupportGraph(
+    (
+        table_object(),
+        thing(1, box((0.0, 0.0, 0.8), (0.1, 0.1, 0.1))),
+        thing(2, cylinder((0.0, 0.0, 0.9), 0.03, 0.1)),
+    ),
+    (
+        Support("o0", "o1"),
+        Support("o1", "o2", contact_world=CONTACT, normal_world=np.array([0.0, 0.0, 1.0])),
+        Support("o2", "o1", "top-down", certain=False),
+    ),
+    {"o1": Stability(0.05, -0.01, True, False)},
+)
+
+
+def test_objects_are_found_by_id():
+    assert GRAPH["o2"].label == 2
+    with pytest.raises(KeyError, match="no object 'o9'; there are o0, o1, o2"):
+        GRAPH["o9"]
+
+
+def test_the_support_surface_is_found_by_its_role():
+    assert GRAPH.support_surface.id == SUPPORT_SURFACE_ID
+    assert SupportGraph(GRAPH.objects[1:]).support_surface is None
+    assert SupportGraph().support_surface is None
+
+
+def test_edges_are_found_by_their_ends_and_have_a_direction():
+    assert GRAPH.support("o1", "o2").kind == "bottom-up"
+    assert GRAPH.support("o2", "o1").kind == "top-down"
+    assert GRAPH.support("o0", "o2") is None
+    assert [s.supporter for s in GRAPH.supporters("o1")] == ["o0", "o2"]
+    assert GRAPH.supporters("o0") == []
+    assert GRAPH.supports[1].pair == ("o1", "o2")
+
+
+def test_a_moved_graph_is_the_same_graph_elsewhere():
+    T = random_motion(np.random.default_rng(0))
+    there = GRAPH.moved(T)
+    assert [o.id for o in there.objects] == [o.id for o in GRAPH.objects]
+    for before, after in zip(GRAPH.objects, there.objects, strict=True):
+        np.testing.assert_allclose(after.centre_world, frames.transform(T, before.centre_world))
+    edge = there.support("o1", "o2")
+    np.testing.assert_allclose(edge.contact_world, frames.transform(T, CONTACT))
+    np.testing.assert_allclose(edge.normal_world, T[:3, 2])
+    assert there.support("o0", "o1").contact_world is None
+    assert there.stability == GRAPH.stability
+    np.testing.assert_array_equal(GRAPH.supports[1].contact_world, CONTACT)
+
+
+def test_as_a_networkx_graph_it_points_from_supporter_to_supported():
+    directed = GRAPH.to_networkx()
+    assert set(directed.nodes) == {"o0", "o1", "o2"}
+    assert set(directed.edges) == {("o0", "o1"), ("o1", "o2"), ("o2", "o1")}
+    assert directed.nodes["o2"]["data"] is GRAPH["o2"]
+    assert directed.nodes["o2"]["shape"] == "cylinder"
+    assert directed.nodes["o0"]["role"] == "support_surface"
+    assert directed.edges["o2", "o1"]["certain"] is False
+    assert directed.edges["o2", "o1"]["kind"] == "top-down"
+    assert directed.edges["o1", "o2"]["data"] is GRAPH.supports[1]
+
+
+@pytest.mark.parametrize(
+    ("small_area", "tips", "stable"),
+    [(False, False, True), (True, False, False), (False, True, False), (True, True, False)],
+)
+def test_what_no_test_doubts_is_stable(small_area, tips, stable):
+    assert Stability(0.5, 0.0, small_area, tips).stable == stable
+
+
+def test_ids_are_made_of_labels():
+    assert object_id(12) == "o12"

@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import pytest
+
+from caryatid.config import Config, FitConfig
+from caryatid.errors import InputError
+from caryatid.settings import read_settings, write_settings
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text):
+        path = tmp_path / "settings.toml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def test_without_file_and_flags_all_is_default():
+    assert read_settings(None, []) == Config()
+
+
+def test_a_flag_beats_the_file_and_the_file_the_default(file):
+    path = file("[fit]\nhypotheses = 50\nthreshold = 0.02\n")
+    config = read_settings(path, ["fit.hypotheses=70"])
+    assert config.fit.hypotheses == 70
+    assert config.fit.threshold == 0.02
+    assert config.fit.steps == FitConfig().steps
+    assert replace(config, fit=FitConfig()) == Config()
+
+
+def test_of_two_flags_the_later_one_holds():
+    assert read_settings(None, ["fit.steps=3", "fit.steps=4"]).fit.steps == 4
+
+
+def test_what_was_there_is_started_from_and_stays():
+    base = replace(Config(), fit=replace(FitConfig(), steps=7))
+    config = read_settings(None, ["fit.polish=1"], base)
+    assert (config.fit.steps, config.fit.polish) == (7, 1)
+    assert base.fit.polish == FitConfig().polish
+
+
+@pytest.mark.parametrize(
+    ("flag", "stage", "name", "value"),
+    [
+        ("fusion.method=sg", "fusion", "method", "sg"),
+        ('fusion.method="pc+sg"', "fusion", "method", "pc+sg"),
+        ("fusion.method=pc+sg", "fusion", "method", "pc+sg"),
+        ("active.occlusion=false", "active", "occlusion", False),
+        ("fit.threshold=1", "fit", "threshold", 1.0),
+        ("fit.threshold=1e-3", "fit", "threshold", 0.001),
+        ("robot.pitch=[-50, 10]", "robot", "pitch", (-50.0, 10.0)),
+        ("generation", None, None, None),
+    ],
+)
+def test_values_are_written_as_toml_does_or_as_bare_words(flag, stage, name, value):
+    if stage is None:
+        with pytest.raises(InputError, match=r"stage\.name=value"):
+            read_settings(None, [flag])
+        return
+    found = getattr(getattr(read_settings(None, [flag]), stage), name)
+    assert found == value
+    assert type(found) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("flag", "listed"),
+    [
+        ("fits.steps=3", ["fit", "fusion", "voxels"]),
+        ("fit.step=3", ["steps", "hypotheses", "threshold"]),
+    ],
+)
+def test_an_unknown_name_lists_the_valid_ones(flag, listed):
+    with pytest.raises(InputError, match="there is no setting") as caught:
+        read_settings(None, [flag])
+    assert f"--set {flag}" in str(caught.value)
+    assert all(name in caught.value.remedy.split("there are ")[1].split(", ") for name in listed)
+
+
+@pytest.mark.parametrize(
+    ("flag", "wanted"),
+    [
+        ("fit.steps=2.5", "a whole number"),
+        ("fit.steps=true", "a number"),
+        ("fit.threshold=thick", "a number"),
+        ("fit.threshold=false", "a number"),
+        ("active.occlusion=1", "true or false"),
+        ("fusion.method=mean", "one of pc, sg, pc+sg"),
+        ("active.saliency=3", "one of paper, decreasing"),
+        ("robot.pitch=[1, 2, 3]", "a list of 2 numbers"),
+        ("robot.pitch=5", "a list of 2 numbers"),
+        ("robot.pitch=[low, 2]", "a list of 2 numbers"),
+    ],
+)
+def test_a_value_of_the_wrong_type_says_what_is_wanted(flag, wanted):
+    with pytest.raises(InputError, match=flag.split("=")[0].replace(".", r"\.")) as caught:
+        read_settings(None, [flag])
+    assert caught.value.remedy == f"give {wanted}"
+
+
+@pytest.mark.parametrize("flag", ["fit", "fit.steps", "steps=3", "a.b.c=3", "=3"])
+def test_a_flag_without_stage_name_or_value_is_refused(flag):
+    with pytest.raises(InputError, match=r"stage\.name=value"):
+        read_settings(None, [flag])
+
+
+def test_a_file_is_named_when_something_in_it_is_wrong(file):
+    for text, reason in [
+        ("[fit]\nstep = 3\n", "fit.step"),
+        ("[fit]\nsteps = 'three'\n", "fit.steps"),
+        ("fit = 3\n", "is a table of settings"),
+        ("[fit\n", "is no TOML"),
+    ]:
+        path = file(text)
+        with pytest.raises(InputError, match="settings.toml") as caught:
+            read_settings(path, [])
+        assert reason in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_settings(tmp_path / "none.toml", [])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_settings(tmp_path, [])
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match="is no TOML"):
+        read_settings(binary, [])
+
+
+def test_what_is_written_is_read_back_as_it_was(file):
+    flags = ["fusion.method=sg", "active.occlusion=false", "robot.pitch=[-50.5, 10]", "fit.threshold=0.00123"]
+    config = read_settings(None, flags)
+    path = file(write_settings(config))
+    assert read_settings(path, []) == config
+    text = path.read_text()
+    assert all(f"[{stage.name}]" in text for stage in fields(Config))
+    assert read_settings(file(write_settings(Config())), []) == Config()
