@@ -77,7 +77,7 @@ class Row:
     ) -> Row:
         """Put a score and what it cost together."""
         figures = (s.f1, s.edge_precision, s.edge_recall, s.vertex_recall, s.mean_iou)
-        return cls(scene, planner, seed, view, *figures, angle, path, time)
+        return cls(scene, planner, seed, view, *figures, angle, path, seconds)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from caryatid import frames
 from caryatid.clouds import estimate_normals, normals_from_depth, oriented_points, thin
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
-from caryatid.perception_kernels import (
+from caryatid.kernels.images import (
     inverse_depth_normals,
     inverse_depth_normals_reference,
     nearest_seeds,

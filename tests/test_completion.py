@@ -19,7 +19,9 @@ UNKNOWN = VoxelMap.around(CENTRE, VoxelConfig())
 
 
 def surface_at(height=TABLE_TOP):
-    corners = np.array([[-0.35, -0.5, height], [0.35, -0.5, height], [0.35, 0.5, height], [-0.35, 0.5, height]])
+    corners = np.array(
+        [[-0.35, -0.5, height], [0.35, -0.5, height], [0.35, 0.5, height], [-0.35, 0.5, height]]
+    )
     top = box((0.0, 0.0, height - 0.02), (0.7, 1.0, 0.04))
     return SupportSurface(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, height]), corners, top)
 

@@ -127,7 +127,9 @@ def test_looking_straight_down_or_up_has_a_roll_all_the_same(target):
 
 
 def test_looking_along_a_given_up_works_too():
-    T_world_camera = frames.as_rigid(frames.look_at((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), up_world=(1.0, 0.0, 0.0)))
+    T_world_camera = frames.as_rigid(
+        frames.look_at((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), up_world=(1.0, 0.0, 0.0))
+    )
     np.testing.assert_allclose(T_world_camera[:3, 2], (1.0, 0.0, 0.0))
 
 

@@ -44,8 +44,8 @@ def test_one_sighting_is_kept_as_it_is():
 @pytest.mark.parametrize("seed", range(3))
 def test_a_box_seen_from_two_sides_becomes_better_than_each(seed):
     truth = box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1), turn_deg=10.0)
-    one = fitted(truth, (-1.1, -0.4, 0.9), seed)
-    two = fitted(truth, (1.0, 0.5, 0.9), seed + 10)
+    one = fitted(truth, (-0.85, -0.7, 0.9), seed)
+    two = fitted(truth, (0.7, 0.9, 0.9), seed + 10)
     merged = merge([one, two])
     errors = [hausdorff(o.shape, truth) for o in (one, two)]
     assert hausdorff(merged.shape, truth) < min(errors)
@@ -122,7 +122,9 @@ def test_the_order_of_sightings_makes_no_difference_but_for_rounding():
     rng = np.random.default_rng(1)
     truth = box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1))
     sightings = [
-        thing(1, truth.moved(frames.rigid(np.eye(3), 0.004 * rng.normal(size=3))), residual=0.001 * k, seen=seen)
+        thing(
+            1, truth.moved(frames.rigid(np.eye(3), 0.004 * rng.normal(size=3))), residual=0.001 * k, seen=seen
+        )
         for k, seen in enumerate([ALL, (True, False) * 3, (False, True) * 3], start=1)
     ]
     merged = merge(sightings)
@@ -163,4 +165,9 @@ def test_a_cylinder_has_an_axis_and_no_ends_to_tell_apart():
 
 
 def test_a_ball_has_no_attitude():
-    assert axes_rotation(sphere((0, 0, 0), 0.1).moved(random_motion(np.random.default_rng(0))), sphere((0, 0, 0), 0.1))[1] == 0.0
+    assert (
+        axes_rotation(
+            sphere((0, 0, 0), 0.1).moved(random_motion(np.random.default_rng(0))), sphere((0, 0, 0), 0.1)
+        )[1]
+        == 0.0
+    )

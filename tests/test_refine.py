@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 from synthetic import hausdorff, random_motion, surface_points
 
-from caryatid.fit_kernels import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
+from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
 from caryatid.refine import NOISE_FLOOR, ROBUST_WIDTH, linearise, refine, stepped
 from caryatid.shapes import Box, Cylinder, Sphere
 
 T = random_motion(np.random.default_rng(1))
 SHAPES = [Box(T, np.array([0.06, 0.1, 0.14])), Cylinder(T, 0.04, 0.11), Sphere(T, 0.05)]
 CODES = {"box": BOX, "cylinder": CYLINDER, "sphere": SPHERE}
-COLUMNS = {"box": (0, 1, 2, 3, 4, 5, 6, 7, 8), "cylinder": (0, 1, 2, 3, 4, 5, 6, 8), "sphere": (0, 1, 2, 3, 4, 5, 6)}
+COLUMNS = {
+    "box": (0, 1, 2, 3, 4, 5, 6, 7, 8),
+    "cylinder": (0, 1, 2, 3, 4, 5, 6, 8),
+    "sphere": (0, 1, 2, 3, 4, 5, 6),
+}
 OPTIONS = {"steps": 25, "min_extent": 0.008, "shrink": 2e-5}
 
 each = pytest.mark.parametrize("shape", SHAPES, ids=lambda s: s.kind)
@@ -83,7 +87,9 @@ def test_derivatives_are_those_of_finite_differences(shape):
 @each
 def test_compiled_distances_are_those_of_the_reference(shape):
     points = points_about(shape)
-    np.testing.assert_allclose(signed_distances(*arrays(shape), points), linearise(shape, points)[0], atol=1e-12)
+    np.testing.assert_allclose(
+        signed_distances(*arrays(shape), points), linearise(shape, points)[0], atol=1e-12
+    )
 
 
 @each

@@ -16,7 +16,9 @@ CONFIG = RegistrationConfig()
 PIVOT = np.array([0.0, 0.0, TABLE_TOP])
 
 
-def cloud_of(*shapes, spacing=0.006, sigma=1e-4, seed=0, keep=lambda normals: np.ones(len(normals), dtype=bool)):
+def cloud_of(
+    *shapes, spacing=0.006, sigma=1e-4, seed=0, keep=lambda normals: np.ones(len(normals), dtype=bool)
+):
     rng = np.random.default_rng(seed)
     points, normals, labels = [], [], []
     for label, shape in enumerate(shapes, start=1):
@@ -88,7 +90,9 @@ def test_a_plane_alone_leaves_what_it_does_not_show_as_reported():
     error = motion(translation_mm=(4.0, -3.0, 6.0), rotation_deg=(0.3, 0.3, 0.4))
     found = align(moved(new, error), known, PIVOT, CONFIG)
     # Height and tilt are seen; sliding on the plane and turning about its normal are not.
-    np.testing.assert_allclose(found.twist[[2, 3, 4]], [-0.006, *-np.radians((0.3, 0.3))], rtol=0.1, atol=2e-4)
+    np.testing.assert_allclose(
+        found.twist[[2, 3, 4]], [-0.006, *-np.radians((0.3, 0.3))], rtol=0.1, atol=2e-4
+    )
     np.testing.assert_allclose(found.twist[[0, 1]], 0.0, atol=2e-4)
     assert abs(found.twist[5]) < np.radians(0.02)
 

@@ -85,7 +85,9 @@ def test_an_unknown_name_lists_the_valid_ones(flag, listed):
     [
         ("fit.steps=2.5", "a whole number"),
         ("fit.steps=true", "a number"),
-        ("fit.threshold=thick", "a number"),
+        ("fit.threshold=thick", "a finite number"),
+        ("fit.threshold=nan", "a finite number"),
+        ("fit.threshold=inf", "a finite number"),
         ("fit.threshold=false", "a number"),
         ("active.occlusion=1", "true or false"),
         ("fusion.method=mean", "one of pc, sg, pc+sg"),
@@ -115,7 +117,7 @@ def test_a_file_is_named_when_something_in_it_is_wrong(file):
         ("[fit\n", "is no TOML"),
     ]:
         path = file(text)
-        with pytest.raises(InputError, match="settings.toml") as caught:
+        with pytest.raises(InputError, match=r"settings\.toml") as caught:
             read_settings(path, [])
         assert reason in str(caught.value)
 

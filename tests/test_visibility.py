@@ -54,7 +54,7 @@ def test_an_error_of_registration_is_no_contradiction():
     view = view_of(CRATE)
     forward = EYE[:3, 2]
     for share, contradicted in ((0.8, False), (1.6, True)):
-        nearer = CRATE.moved(frames.rigid(np.eye(3), -share * MARGIN / np.cos(np.radians(40.0)) * forward))
+        nearer = CRATE.moved(frames.rigid(np.eye(3), -share * MARGIN * forward))
         assert seen_through(nearer, view) == contradicted
 
 

@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caryatid import frames, kernels
+from caryatid import frames
 from caryatid.config import VoxelConfig
+from caryatid.kernels import rays
 from caryatid.shapes import Box, Sphere
 from caryatid.views import View
 from caryatid.voxels import FREE, OCCUPIED, UNKNOWN, VoxelMap
@@ -32,8 +33,8 @@ def test_carve_agrees_with_its_reference():
     origin = np.array([-0.3, -0.4, -0.2])
     for start in (np.array([0.011, 0.013, 0.017]), np.array([-0.9, 0.2, 0.5])):
         compiled, reference = np.zeros((2, 13, 17, 11), dtype=np.uint8)
-        kernels.carve(compiled, start, ends, t_to, origin, 0.05)
-        kernels.carve_reference(reference, start, ends, t_to, origin, 0.05)
+        rays.carve(compiled, start, ends, t_to, origin, 0.05)
+        rays.carve_reference(reference, start, ends, t_to, origin, 0.05)
         assert reference.sum() > 100
         np.testing.assert_array_equal(compiled, reference)
 
@@ -47,7 +48,7 @@ def test_blocked_agrees_with_its_reference():
     origin = np.array([-0.3, -0.4, -0.2])
     for clearance in (0.0, 0.4):
         args = (occupied, points, targets, asked, clearance, origin, 0.05)
-        compiled, reference = kernels.blocked(*args), kernels.blocked_reference(*args)
+        compiled, reference = rays.blocked(*args), rays.blocked_reference(*args)
         assert 20 < reference.sum() < 605
         np.testing.assert_array_equal(compiled, reference)
         assert not compiled[~asked].any()

@@ -10,7 +10,7 @@ from caryatid import frames
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.frames import Array
-from caryatid.perception_kernels import inverse_depth_normals
+from caryatid.kernels.images import inverse_depth_normals
 from caryatid.views import View
 
 CHUNK = 100_000

@@ -12,7 +12,7 @@ from caryatid import frames
 from caryatid.clouds import thin
 from caryatid.config import SegmentationConfig
 from caryatid.frames import Array
-from caryatid.perception_kernels import nearest_seeds
+from caryatid.kernels.images import nearest_seeds
 
 Index = NDArray[np.intp]
 

@@ -61,11 +61,12 @@ def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
     """Turn of a shape's axes, within its symmetry, that brings them nearest to a reference's.
 
     Returns:
-        The turn (3, 3), to be applied on the right of the shape's rotation, and the angle left [rad].
+        The turn (3, 3), to be applied on the right of the shape's rotation, and the angle left [rad]; of a
+        sphere, to which no turn matters, the identity and 0.
     """
     R, R_reference = shape.T_world_object[:3, :3], reference.T_world_object[:3, :3]
     if isinstance(shape, Sphere):
-        return R.T @ R_reference, 0.0
+        return np.eye(3), 0.0
     if isinstance(shape, Cylinder):
         flip = np.diag([1.0, -1.0, -1.0]) if R[:, 2] @ R_reference[:, 2] < 0.0 else np.eye(3)
         return flip, float(frames.angle_between((R @ flip)[:, 2], R_reference[:, 2]))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from caryatid import frames
-from caryatid.fit_kernels import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
 from caryatid.frames import Array
+from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
 from caryatid.shapes import Box, Cylinder, Sphere
 
 ROBUST_WIDTH = 2.5

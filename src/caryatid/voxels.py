@@ -17,9 +17,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from caryatid import frames, kernels
+from caryatid import frames
 from caryatid.config import VoxelConfig
 from caryatid.frames import Array
+from caryatid.kernels import rays
 from caryatid.shapes import Shape
 from caryatid.views import View
 
@@ -85,7 +86,7 @@ class VoxelMap:
         share = np.where(near, 1.0 - self.config.margin / length, max_depth / depth)
         passed = np.zeros(self.hits.shape, dtype=np.uint8)
         eye_world = np.ascontiguousarray(T_world_camera[:3, 3])
-        kernels.carve(passed, eye_world, ends_world, share, self.origin_world, self.config.size)
+        rays.carve(passed, eye_world, ends_world, share, self.origin_world, self.config.size)
         hit = np.zeros(self.hits.shape, dtype=np.uint8)
         index, inside = self._index(ends_world[near])
         hit[tuple(index[inside].T)] = 1
@@ -147,7 +148,7 @@ class VoxelMap:
         points, targets = (np.ascontiguousarray(a, dtype=np.float64) for a in (points_world, targets_world))
         if asked is None:
             asked = np.ones((len(points), len(targets)), dtype=np.bool_)
-        return kernels.blocked(grid, points, targets, asked, float(clearance), origin_world, self.config.size)
+        return rays.blocked(grid, points, targets, asked, float(clearance), origin_world, self.config.size)
 
     @cached_property
     def _occupied(self) -> tuple[NDArray[np.uint8], Array]:

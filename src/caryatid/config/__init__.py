@@ -1,0 +1,88 @@
+"""Every tunable number of caryatid, one frozen dataclass a stage; the paper's values where it gives them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from caryatid.config.choices import (
+    FusionMethod,
+    NoiseModel,
+    SegmentationMethod,
+)
+from caryatid.config.modelling import (
+    CompletionConfig,
+    FitConfig,
+    FusionConfig,
+    SplitConfig,
+    SupportConfig,
+)
+from caryatid.config.perception import (
+    CloudConfig,
+    RegistrationConfig,
+    SegmentationConfig,
+    SurfaceConfig,
+)
+from caryatid.config.planning import (
+    ActiveVisionConfig,
+    RobotConfig,
+    VoxelConfig,
+)
+from caryatid.config.reporting import (
+    EvaluationConfig,
+    ReportConfig,
+)
+from caryatid.config.simulation import (
+    GenerationConfig,
+    NoiseConfig,
+    PhysicsConfig,
+    SensorConfig,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """All stages."""
+
+    cloud: CloudConfig = field(default_factory=CloudConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
+    completion: CompletionConfig = field(default_factory=CompletionConfig)
+    support: SupportConfig = field(default_factory=SupportConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    voxels: VoxelConfig = field(default_factory=VoxelConfig)
+    active: ActiveVisionConfig = field(default_factory=ActiveVisionConfig)
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+__all__ = [
+    "ActiveVisionConfig",
+    "CloudConfig",
+    "CompletionConfig",
+    "Config",
+    "EvaluationConfig",
+    "FitConfig",
+    "FusionConfig",
+    "FusionMethod",
+    "GenerationConfig",
+    "NoiseConfig",
+    "NoiseModel",
+    "PhysicsConfig",
+    "RegistrationConfig",
+    "ReportConfig",
+    "RobotConfig",
+    "SegmentationConfig",
+    "SegmentationMethod",
+    "SensorConfig",
+    "SplitConfig",
+    "SupportConfig",
+    "SurfaceConfig",
+    "VoxelConfig",
+]

@@ -1,0 +1,136 @@
+"""Settings of the scene model: shapes, supports and their fusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from caryatid.config.choices import FusionMethod
+
+
+@dataclass(frozen=True, slots=True)
+class FitConfig:
+    """Primitive fitting."""
+
+    hypotheses: int = 100
+    """RANSAC hypotheses a shape at the most [1]; the predecessor's iterations."""
+    confidence: float = 0.99
+    """RANSAC stops when a better sample is less likely than 1 − confidence."""
+    max_points: int = 800
+    """Points a fit looks at [1]; more change sizes by less than the noise and cost time in proportion."""
+    min_points: int = 12
+    """Fewer points are no object [1]; a box has nine parameters."""
+    threshold: float = 0.01
+    """MSAC truncation of the distance to the surface [m]; 2σ of registration error."""
+    polish: int = 3
+    """Best hypotheses of each shape that are refined by least squares."""
+    steps: int = 25
+    """Least-squares steps at the most."""
+    max_extent: float = 0.5
+    """Longest extent of an object on a table [m]."""
+    min_extent: float = 0.008
+    """Shortest extent [m]; below the sensor's resolution."""
+    max_radius: float = 0.15
+    """Largest radius of cylinder and sphere [m]."""
+    size_penalty: float = 0.0125
+    """Added to the mean residual [m] per square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
+    shrink: float = 2e-5
+    """Pull on every extent [m]: a face that holds a share s of the points is moved in by shrink / (2·s)."""
+    trim: float = 0.005
+    """Share of the points beyond each end of an extent that count as noise [1]."""
+    side_share: float = 0.02
+    """Share of the points that must lie on a side for it to count as seen [1]."""
+    normal_weight: float = 0.004
+    """What a normal turned by 90° costs in model choice [m]: as much as half the registration error."""
+    bare_weight: float = 0.003
+    """What seen sides without any point near them cost in model choice [m]; a share of them in proportion."""
+    bare_spacing: float = 0.008
+    """Spacing of the samples that look for points near a side [m]; 2 to 3 pixels at 1.5 m."""
+    max_residual: float = 0.008
+    """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
+
+
+@dataclass(frozen=True, slots=True)
+class SplitConfig:
+    """Parting what automatic segmentation took for one object."""
+
+    min_residual: float = 0.003
+    """Mean distance to the best single shape from which on a cut is tried [m]; noise alone leaves 2 mm."""
+    gain: float = 0.75
+    """A cut must bring the mean distance below this share of the single shape's [1]."""
+    cuts: int = 7
+    """Cuts tried along each direction [1]; an eighth of the points apart."""
+    sample: int = 250
+    """Points of a side a cut is first judged by [1]."""
+    min_points: int = 40
+    """Points a side needs [1]; three times what a shape needs."""
+    reach: float = 0.02
+    """Points further apart are not connected [m]; four times their spacing."""
+
+
+@dataclass(frozen=True, slots=True)
+class CompletionConfig:
+    """How far shapes reach down where nobody looked."""
+
+    max_tilt: float = 30.0
+    """An unseen side that faces down within this angle may be extended [deg]; what rests on a face does."""
+    step: float = 0.01
+    """Step of the extension [m]; a voxel."""
+    spacing: float = 0.015
+    """Spacing of the points tested on the moving side [m]."""
+    inset: float = 0.01
+    """How far inside the walls free space is looked for [m]; a voxel, so that a wall's noise says nothing."""
+    overlap: float = 0.004
+    """How deep the moving side may enter another shape [m]; the fits' uncertainty."""
+    flat: float = 0.02
+    """Extent below which a single side's points say nothing of the depth behind it [m]; their noise."""
+    least: float = 0.0005
+    """Gaps below this are none [m]."""
+    max_free: float = 0.15
+    """The extension ends where more of its rim lies in voxels seen free [1]; half of one side of four."""
+
+
+@dataclass(frozen=True, slots=True)
+class SupportConfig:
+    """Support relations, section III-A."""
+
+    contact_margin: float = 0.005
+    """Gap up to which two shapes are in contact [m]; 1σ of the gap between two fits each 3 mm off."""
+    reach: float = 0.012
+    """Gap up to which a contact is believed where an object would tip without it [m]; 2.5σ of the same."""
+    gentle_tilt: float = 25.0
+    """Planes steeper than this, where nothing overlaps, carry only what would tip without them [deg]."""
+    max_tilt: float = 75.0
+    """Separating planes steeper than this carry nothing [deg]: the normal is too near the horizontal."""
+    patch_depth: float = 0.003
+    """Surface this near to the first contact counts as touching [m]; the noise of one reading at 1.5 m."""
+    patch_tilt: float = 1.0
+    """The same for faces that a fit turned against each other [deg]; a ball has none."""
+    min_area_ratio: float = 0.1
+    """r_s,min of eq. 1."""
+    overhang: float = 0.003
+    """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
+    lean_angle: float = 75.0
+    """Widest angle between a sideways push and the direction straight against an object's tipping [deg]."""
+    top_down: Literal["paper", "balance"] = "balance"
+    """All that rests on an unstable object holds it (`paper`), or only what weighs against its tipping."""
+    max_drop: float = 0.04
+    """How far below an unsupported object its supporter may lie, hidden gap between them [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class FusionConfig:
+    """Fusing graphs over views, section III-B."""
+
+    method: FusionMethod = "pc+sg"
+    """What is fused: points (`pc`), graphs (`sg`) or both (Table I)."""
+    max_distance: float = 0.05
+    """Centres further apart are two objects [m], beside half the smaller object's size."""
+    max_angle: float = 20.0
+    """Axes further apart are two orientations [deg], up to the shape's symmetry."""
+    max_ratio: float = 1.6
+    """Sorted extents that differ by more than this factor are two objects."""
+    settled: float = 0.005
+    """A shape that moves, grows or turns by less than this has not changed [m]; σ of registration error."""
+    keep_share: float = 0.5
+    """A support is kept while occurrences / opportunities is at least this."""

@@ -1,0 +1,136 @@
+"""Settings of perception: from images to labelled points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class CloudConfig:
+    """From depth image to oriented points."""
+
+    max_depth: float = 3.0
+    """Readings beyond this are dropped [m]; the paper's working range."""
+    min_depth: float = 0.35
+    """Readings nearer than the sensor's near limit are dropped [m]."""
+    normal_window: int = 7
+    """Side of the square window normals are estimated over [px]; 7 px is 2 cm at 1.5 m with f = 525 px."""
+    edge_jump: float = 0.01
+    """A depth step between neighbours beyond this, at 1 m and growing with z², parts two surfaces [m]."""
+    max_slope: float = 0.004
+    """Change of inverse depth within one surface beyond edge_jump [1/m per px]; a tilt of 80° at 2.7 m."""
+    voxel: float = 0.005
+    """Spacing the pooled points of an object are thinned to [m]; about the noise of one reading at 1.5 m."""
+    neighbours: int = 16
+    """Neighbours a normal of an unorganised cloud is estimated from."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceConfig:
+    """The support surface (table top)."""
+
+    iterations: int = 400
+    """RANSAC hypotheses a plane [1]; 400 find a plane of 20 % of the points with confidence 0.96."""
+    sample: int = 4000
+    """Points the hypotheses are scored on [1]; spread evenly over the cloud."""
+    tolerance: float = 0.01
+    """Distance within which a point belongs to the plane [m]; 3σ of the sensor at 1.8 m."""
+    max_tilt: float = 10.0
+    """How far the normal may lean from the vertical where the view has a pose [deg]."""
+    max_deviation: float = 25.0
+    """How far a point's normal may lean from its plane's [deg]; 3σ of normals from depth."""
+    planes: int = 6
+    """Horizontal planes looked at, largest first, before the table is chosen [1]."""
+    cell: float = 0.03
+    """Grid on a plane its area is measured by [m]; above the points' spacing at 3 m."""
+    gap: float = 0.3
+    """Parts of one plane further apart than this are two surfaces [m]; shadows of objects are narrower."""
+    min_area: float = 0.05
+    """Seen area a table has at least [m²]; more than most objects' tops."""
+    storey: float = 0.3
+    """A plane that has a table this far above it is the floor [m]."""
+    storey_share: float = 0.05
+    """Points the table above a floor has at least, as a share of the floor's; less is a shelf far behind."""
+    min_points: int = 200
+    """Fewer inliers are no table [points]."""
+    max_points: int = 20_000
+    """Points of a view the surface is looked for in [1]; spread evenly, they give its height to 0.1 mm."""
+    search: float = 0.05
+    """Once known, the table is looked for within this height of itself [m]; 5σ of registration and tilt."""
+    spacing: float = 0.02
+    """Spacing its points are kept at for later views [m]."""
+    thickness: float = 0.04
+    """Thickness of the box the table top is modelled by [m]; only its top counts."""
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationConfig:
+    """Refining the reported pose of a view against what is known."""
+
+    enabled: bool = True
+    """Refine at all."""
+    iterations: int = 12
+    """Rounds of matching at the most [1]."""
+    translation: float = 0.01
+    """Expected error of a reported pose at the table [m]: 5 mm, and 0.3° over the 1.5 m to the camera."""
+    rotation: float = 0.4
+    """Expected error of a reported orientation, per axis [deg]."""
+    noise: float = 0.02
+    """Expected distance of one matched point to its partner's plane [m]; neighbouring points err alike, so it
+    stands for about 40 of them with 3 mm each."""
+    reach: float = 0.03
+    """Partners further away are none [m]; 3σ of the expected error."""
+    min_cosine: float = 0.8
+    """Cosine of the angle between the normals of partners at least [1]."""
+    outlier: float = 0.01
+    """Distances beyond this lose their weight [m]."""
+    min_points: int = 150
+    """Fewer matched points determine no pose [1]."""
+    max_translation: float = 0.05
+    """A longer move is refused [m]; 5σ."""
+    max_rotation: float = 2.0
+    """A larger turn is refused [deg]; 5σ."""
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentationConfig:
+    """Automatic parts by local convexity."""
+
+    stride: int = 2
+    """Pixels between samples of the organised image; 2 keeps 6 mm at 1.5 m."""
+    margin: float = 0.05
+    """Points further than this outside the support surface's outline belong to no object on it [m]."""
+    edge_jump: float = 0.006
+    """A sample further than this from its neighbour's plane is another surface's [m], at 1 m and times z²."""
+    max_jump: float = 0.009
+    """A depth step between samples beyond this parts two surfaces, however steep [m], at 1 m and times z²."""
+    surfel: float = 0.015
+    """Size of the patches whose edges are judged convex or concave [m]; four times the noise at 1.5 m."""
+    crease: float = 4.0
+    """What a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at edges."""
+    step: float = 0.005
+    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]."""
+    neighbours: int = 10
+    """Nearest points a point of an unorganised cloud is joined to [1]."""
+    reach: float = 0.012
+    """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
+    concavity: float = 15.0
+    """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's 10 and noise."""
+    min_size: int = 40
+    """Samples a part needs to be an object [points]."""
+    min_width: float = 0.015
+    """A part narrower than this beside a larger one belongs to it [m]; normals are blurred so far."""
+    normal_size: float = 0.013
+    """Side of the window normals are estimated over, at the objects' median distance [m]."""
+    clearance: float = 0.008
+    """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
+    max_height: float = 0.6
+    """Points higher above the table belong to no object on it [m]; table-top sizes."""
+    overlap: float = 0.3
+    """Share of a part's points that must lie at an object's points or shape for it to be that object [1]."""
+    divide_share: float = 0.1
+    """A part is divided among the known objects at which at least this share of its points lies [1]."""
+    overlap_reach: float = 0.02
+    """Distance within which a point lies at an object [m]; 2σ of registration error of both views."""
+    same_share: float = 0.7
+    """Share of an object's points that must lie inside another's shape for the two to be one [1]."""

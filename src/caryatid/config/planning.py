@@ -1,0 +1,102 @@
+"""Settings of active vision: voxels, view sphere, points of interest, robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class VoxelConfig:
+    """The voxel map for the occlusion test."""
+
+    size: float = 0.01
+    """Edge of a voxel [m]; the paper's leaf size."""
+    extent: tuple[float, float, float] = (1.6, 1.6, 1.0)
+    """Size of the map around the view sphere's centre [m]: a table with its margin."""
+    below: float = 0.1
+    """How far the map reaches below the sphere's centre [m]."""
+    stride: int = 2
+    """Pixels between the rays that are followed; 2 is 6 mm at 1.5 m, below the voxel's size."""
+    margin: float = 0.01
+    """Length before a reading that a ray does not clear [m]; depth noise within it carves no surface."""
+    hit: float = 0.7
+    """Occupancy one view with a reading in a voxel speaks for [1]; the usual sensor model."""
+    miss: float = 0.4
+    """Occupancy one view that looks through a voxel speaks for [1]; the usual sensor model."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveVisionConfig:
+    """Points of interest, view sphere and the choice of the next view, section IV."""
+
+    sphere_points: int = 40_000
+    """Points the view sphere is discretised to; the paper's."""
+    sphere_radius: float = 1.5
+    """Radius of the view sphere [m]; the paper's."""
+    saliency_weight: float = 0.75
+    """λ_s of eq. 2; the paper's."""
+    saliency: Literal["paper", "decreasing"] = "decreasing"
+    """Eq. 2 with 2π as printed, or with π so that relations seen often matter less."""
+    edge_point: Literal["midpoint", "contact"] = "contact"
+    """Where a relation's point of interest lies: the middle of the centres, or the contact patch."""
+    spread: float = 20.0
+    """Angle on the sphere at which saliency has fallen to exp(−½) [deg]."""
+    occlusion: bool = True
+    """Invert the saliency of a candidate from which the point of interest is hidden."""
+    inhibition: float = 1.0
+    """Depth of the negative bump at every visited view [1]."""
+    path_cost: Literal["angle", "path", "none"] = "angle"
+    """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing."""
+    max_views: int = 10
+    """Views at the most, the first one too; the paper's."""
+    clearance: float = 0.05
+    """Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
+    look_directions: int = 1200
+    """Directions on the whole sphere the planner `support` looks in [1]; about 6° apart."""
+    surface_samples: int = 400
+    """Points on the fitted shapes the planner `support` tests for being seen [1]."""
+    sample_clearance: float = 0.025
+    """Length of a surface point's line of sight that does not count [m]; its own surface, 2½ voxels."""
+    good_incidence: float = 60.0
+    """A surface met at less than this from its normal is seen as well as can be [deg]."""
+    space_spacing: float = 0.04
+    """Spacing of the points in unseen space the planner `support` tests for being seen [m]."""
+    space_weight: float = 1.0
+    """Worth of all the space on the table against all the objects' surfaces [1]."""
+    relation_weight: float = 0.1
+    """Worth of all relations' points of interest against all the objects' surfaces [1]."""
+    view_cone: float = 30.0
+    """Angle from the optical axis within which a point is in the image [deg]; 57° × 43° sensor."""
+
+
+@dataclass(frozen=True, slots=True)
+class RobotConfig:
+    """The simulated humanoid: holonomic platform, torso lift, head with yaw and pitch."""
+
+    footprint: float = 0.35
+    """Radius of the platform's disc [m]."""
+    camera_height: tuple[float, float] = (1.30, 1.90)
+    """Lowest and highest camera centre over the floor [m], by the torso lift."""
+    pitch: tuple[float, float] = (-60.0, 20.0)
+    """Head pitch, down to up [deg]."""
+    yaw: tuple[float, float] = (-80.0, 80.0)
+    """Head yaw against the platform [deg]."""
+    camera_forward: float = 0.1
+    """How far the camera stands before the platform's centre [m]."""
+    cell: float = 0.05
+    """Edge of a cell of the floor grid [m]."""
+    floor: float = 3.0
+    """Half the side of the square of floor the robot may use, around the table [m]."""
+    head_yaws: int = 9
+    """Head yaws tried within the limits, straight ahead first, to stand clear of an obstacle."""
+    max_roll: float = 0.5
+    """Camera roll beyond this cannot be reached, the head has no third joint [deg]."""
+    step: float = 0.02
+    """Anything on the floor lower than this is no obstacle to the platform [m]."""
+    head_room: float = 0.15
+    """What the head needs above the highest camera centre [m]; higher obstacles do not hinder."""
+    table_margin: float = 0.1
+    """Obstacles met this near to the sphere's centre are the table, not a wall in the line of sight [m]."""
+    home: tuple[float, float] = (180.0, 35.0)
+    """Azimuth and elevation on the view sphere of the first view [deg]."""

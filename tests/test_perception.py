@@ -1,0 +1,188 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic import TABLE_TOP, motion_about_vertical, moved, random_motion, simulated_cloud, simulated_views
+
+from caryatid import frames
+from caryatid.config import Config
+from caryatid.errors import InputError, PerceptionError
+from caryatid.perception import label_image, level_cloud, perceive
+from caryatid.views import SUPPORT_LABEL, Cloud, View
+
+CONFIG = Config()
+VIEW = simulated_views("tower")[0]
+
+
+def percept_of(source, segmentation=None, known=None, config=CONFIG):
+    return perceive(source, config, segmentation=segmentation, known=known, rng=np.random.default_rng(0))
+
+
+def without_pose(view):
+    return replace(view, T_world_camera=None)
+
+
+def test_given_labels_stay_and_the_table_gets_its_own():
+    percept = percept_of(VIEW, "labels")
+    given = VIEW.labels.ravel()[percept.pixels]
+    np.testing.assert_array_equal(percept.labels[given > 0], given[given > 0])
+    table = percept.cloud.points_world[percept.labels == SUPPORT_LABEL]
+    assert (np.abs(table[:, 2] - TABLE_TOP) < CONFIG.surface.tolerance).all()
+    assert np.abs(table[:, 2] - TABLE_TOP).mean() < 0.001
+    on_table = (np.abs(percept.cloud.points_world[:, 2] - TABLE_TOP) < 0.001) & (given == 0)
+    assert (percept.labels[on_table] == SUPPORT_LABEL).mean() > 0.98
+
+
+def test_the_floor_belongs_to_nothing():
+    percept = percept_of(VIEW)
+    floor = percept.cloud.points_world[:, 2] < 0.1
+    assert floor.sum() > 100
+    assert (percept.labels[floor] == 0).all()
+
+
+def test_points_are_where_their_pixels_see_them():
+    percept = percept_of(VIEW)
+    expected = frames.transform(VIEW.pose, VIEW.points_camera.reshape(-1, 3)[percept.pixels])
+    np.testing.assert_allclose(percept.cloud.points_world, expected)
+    np.testing.assert_array_equal(percept.cloud.rgb, VIEW.rgb.reshape(-1, 3)[percept.pixels])
+    np.testing.assert_array_equal(percept.cloud.viewpoint_world, VIEW.pose[:3, 3])
+
+
+def test_a_view_without_a_pose_gets_a_level_world_on_the_table():
+    percept = percept_of(without_pose(VIEW))
+    T_world_camera = percept.view.pose
+    on_objects = VIEW.labels > 0
+    heights = frames.transform(T_world_camera, VIEW.points_camera)[on_objects][:, 2]
+    true = frames.transform(VIEW.pose, VIEW.points_camera)[on_objects][:, 2] - TABLE_TOP
+    np.testing.assert_allclose(heights, true, atol=0.002)
+    np.testing.assert_allclose(T_world_camera[:2, 3], 0.0, atol=1e-12)
+    assert percept.surface.point_world[2] == pytest.approx(0.0, abs=0.001)
+
+
+def test_automatic_parts_are_the_objects_without_their_labels():
+    percept = percept_of(replace(VIEW, labels=None), "auto")
+    given = VIEW.labels.ravel()[percept.pixels]
+    for label in (1, 2, 5):
+        own = percept.labels[given == label]
+        best = np.bincount(own[own != SUPPORT_LABEL]).argmax()
+        assert best != 0
+        union = ((percept.labels == best) | (given == label)).sum()
+        assert ((percept.labels == best) & (given == label)).sum() / union > 0.5
+
+
+def test_auto_looks_at_no_labels():
+    blind = percept_of(replace(VIEW, labels=None), "auto")
+    seeing = percept_of(VIEW, "auto")
+    np.testing.assert_array_equal(blind.labels, seeing.labels)
+
+
+@pytest.mark.parametrize("source", [VIEW, simulated_cloud("tower")], ids=["view", "cloud"])
+def test_labels_that_are_demanded_and_missing_are_an_error(source):
+    with pytest.raises(InputError, match="has no labels") as caught:
+        percept_of(replace(source, labels=None), "labels")
+    assert source.name in str(caught.value)
+    assert "auto" in caught.value.remedy
+
+
+def test_only_the_first_view_may_lack_a_pose():
+    known = percept_of(VIEW).surface
+    with pytest.raises(InputError, match="no camera pose"):
+        percept_of(without_pose(VIEW), known=known)
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_an_empty_frame_is_an_error_that_names_it(posed):
+    empty = View(np.zeros((60, 80)), VIEW.K, VIEW.T_world_camera if posed else None, name="frame 7")
+    with pytest.raises(PerceptionError, match="frame 7: holds no depth readings"):
+        percept_of(empty)
+
+
+def test_an_empty_cloud_is_an_error_that_names_it():
+    nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3)), name="cloud 7")
+    with pytest.raises(PerceptionError, match="cloud 7: holds no points"):
+        percept_of(nothing)
+    with pytest.raises(PerceptionError, match="cloud 7: holds no points"):
+        level_cloud(nothing, CONFIG, segmentation=None, rng=np.random.default_rng(0))
+
+
+def test_a_view_of_a_wall_has_no_support_surface():
+    wall = View(
+        np.full((120, 160), 1.0), np.array([[131.0, 0, 79.5], [0, 131.0, 59.5], [0, 0, 1]]), name="wall"
+    )
+    level = frames.look_at((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
+    with pytest.raises(PerceptionError, match="wall: no support surface"):
+        percept_of(wall.with_pose(level))
+
+
+def test_a_view_in_which_the_table_is_not_seen_keeps_the_one_known():
+    known = percept_of(VIEW).surface
+    T = VIEW.pose.copy()
+    T[2, 3] += 1.0
+    elsewhere = percept_of(replace(VIEW, T_world_camera=T), known=known)
+    assert elsewhere.surface is known
+
+
+def test_the_table_is_looked_for_near_where_it_was():
+    known = percept_of(VIEW).surface
+    T = VIEW.pose.copy()
+    T[2, 3] += 0.01
+    shifted = percept_of(replace(VIEW, T_world_camera=T), known=known)
+    assert shifted.surface.point_world[2] == pytest.approx(TABLE_TOP + 0.01, abs=0.001)
+
+
+def test_new_names_replace_old_ones_all_at_once():
+    percept = percept_of(VIEW, "labels")
+    swapped = percept.relabelled({1: 2, 2: 1, 5: 9})
+    for old, new in ((1, 2), (2, 1), (3, 3), (5, 9), (SUPPORT_LABEL, SUPPORT_LABEL)):
+        np.testing.assert_array_equal(swapped.labels == new, percept.labels == old)
+    assert not (percept.labels == 9).any()
+
+
+def test_a_moved_percept_is_moved_in_all_its_parts():
+    percept = percept_of(VIEW)
+    T = motion_about_vertical(np.random.default_rng(0))
+    there = percept.moved(T)
+    np.testing.assert_allclose(
+        there.cloud.points_world, frames.transform(T, percept.cloud.points_world), atol=1e-12
+    )
+    np.testing.assert_allclose(there.view.pose, T @ percept.view.pose)
+    np.testing.assert_allclose(
+        there.surface.height(there.cloud.points_world),
+        percept.surface.height(percept.cloud.points_world),
+        atol=1e-12,
+    )
+    np.testing.assert_array_equal(there.labels, percept.labels)
+
+
+def test_the_label_image_holds_each_label_at_its_pixel():
+    percept = percept_of(VIEW, "labels")
+    image = label_image(percept, VIEW)
+    assert image.shape == VIEW.depth.shape
+    np.testing.assert_array_equal(image.ravel()[percept.pixels], percept.labels)
+    rest = np.ones(image.size, dtype=bool)
+    rest[percept.pixels] = False
+    assert (image.ravel()[rest] == 0).all()
+    cloud = simulated_cloud("tower")
+    assert label_image(percept_of(cloud), cloud).shape == (len(cloud),)
+
+
+def test_a_cloud_in_its_sensors_frame_is_levelled():
+    percept = percept_of(VIEW, "labels")
+    T_camera_world = frames.invert(VIEW.pose)
+    world = replace(percept.cloud, labels=VIEW.labels.ravel()[percept.pixels])
+    stored = moved(world, T_camera_world)
+    level = level_cloud(stored, CONFIG, segmentation=None, rng=np.random.default_rng(0))
+    above = world.points_world[:, 2] - TABLE_TOP
+    np.testing.assert_allclose(level.points_world[:, 2], above, atol=0.003)
+    np.testing.assert_allclose(level.normals_world[:, 2], world.normals_world[:, 2], atol=0.005)
+    assert level.viewpoint_world[2] == pytest.approx(VIEW.pose[2, 3] - TABLE_TOP, abs=0.003)
+    assert np.array_equal(level.labels, stored.labels)
+
+
+def test_levelling_finds_no_table_where_there_is_none():
+    rng = np.random.default_rng(0)
+    noise = Cloud(rng.normal(size=(500, 3)), frames.unit(rng.normal(size=(500, 3))), name="noise")
+    with pytest.raises(PerceptionError, match="noise: "):
+        level_cloud(moved(noise, random_motion(rng)), CONFIG, segmentation=None, rng=rng)

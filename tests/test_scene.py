@@ -1,0 +1,242 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from raycast import table_scene
+from synthetic import (
+    SENSOR,
+    TABLE_TOP,
+    box,
+    config_for,
+    edges,
+    look_from,
+    model_of,
+    simulated_cloud,
+    simulated_scene,
+    simulated_views,
+    vertices,
+)
+
+from caryatid import frames
+from caryatid.config import Config, RegistrationConfig
+from caryatid.errors import InputError, PerceptionError
+from caryatid.evaluation.scores import score
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.scene import Scene
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.truth import ground_truth
+from caryatid.views import SUPPORT_LABEL
+
+METHODS = ("pc", "sg", "pc+sg")
+
+
+def f1_of(graph, name):
+    scene = simulated_scene(name)
+    truth = true_scene_from_simulation(scene, ground_truth(scene))
+    return score(graph, truth, np.random.default_rng(0)).f1
+
+
+@pytest.fixture(scope="module")
+def tower():
+    return model_of(simulated_views("tower"))
+
+
+def test_a_tower_is_known_after_a_walk_around_it(tower):
+    assert edges(tower.graph) == {("o0", "o1"), ("o1", "o2"), ("o2", "o3"), ("o3", "o4"), ("o0", "o5")}
+    assert [o.shape.kind for o in tower.graph.objects[1:]] == ["box", "cylinder", "box", "cylinder", "sphere"]
+    assert tower.views == 3
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", ["tower", "bridge", "clutter"])
+def test_every_method_finds_the_truth_without_noise(name, method):
+    model = model_of(simulated_views(name), config_for(method))
+    assert f1_of(model.graph, name) >= 0.95
+
+
+@pytest.mark.parametrize("name", ["tower", "clutter"])
+def test_a_carmines_noise_is_borne(name):
+    assert f1_of(model_of(simulated_views(name, noise="carmine")).graph, name) >= 0.9
+
+
+def test_without_labels_the_tower_is_found_as_well():
+    views = [replace(v, labels=None) for v in simulated_views("tower")]
+    assert f1_of(model_of(views, segmentation="auto").graph, "tower") >= 0.9
+
+
+def test_more_views_make_it_better():
+    f1 = []
+    scene = Scene(segmentation="labels")
+    for view in simulated_views("bridge"):
+        f1.append(f1_of(scene.update(view), "bridge"))
+    assert f1[0] < f1[-1]
+
+
+def test_the_shape_of_an_object_gets_better_and_is_not_merely_kept():
+    views = simulated_views("clutter", noise="carmine")
+    scene = simulated_scene("clutter")
+    truth = true_scene_from_simulation(scene, ground_truth(scene))
+    ious = []
+    model = Scene(segmentation="labels")
+    for view in views:
+        result = score(model.update(view), truth, np.random.default_rng(0))
+        ious.append(result.mean_iou * len(result.ious))
+    assert ious[0] < ious[1] < ious[2]
+
+
+def test_labels_are_those_of_the_vertices_and_of_the_table(tower):
+    view = simulated_views("tower")[-1]
+    assert tower.labels.shape == view.depth.shape
+    assert set(np.unique(tower.labels)) == {0, *(o.label for o in tower.graph.objects)}
+    on_objects = (tower.labels != 0) & (tower.labels != SUPPORT_LABEL)
+    np.testing.assert_array_equal(tower.labels[on_objects], view.labels[on_objects])
+
+
+def test_automatic_labels_are_those_of_the_vertices_too():
+    views = [replace(v, labels=None) for v in simulated_views("tower")]
+    for method in METHODS:
+        scene = Scene(config_for(method), segmentation="auto")
+        for view in views:
+            graph = scene.update(view)
+            shown = {int(k) for k in np.unique(scene.labels)} - {0, SUPPORT_LABEL}
+            named = {o.label for o in graph.objects}
+            # A part too small for a shape has a label and no vertex.
+            assert len(shown & named) >= len(shown) - 1
+            assert len(shown & named) >= 4
+
+
+def test_the_graph_is_there_for_networkx_too(tower):
+    assert set(tower.supports.edges) == edges(tower.graph)
+    assert set(tower.supports.nodes) == vertices(tower.graph)
+
+
+def test_why_an_edge_is_there_or_not_can_be_asked(tower):
+    assert "o1" in tower.explain("o1", "o2")
+    assert "does not support" in tower.explain("o5", "o2")
+    with pytest.raises(InputError, match="o77"):
+        tower.explain("o77", "o2")
+
+
+def test_time_is_taken_of_every_stage(tower):
+    assert set(tower.timings) == {"segment", "register", "map", "fit", "infer", "fuse"}
+    assert all(seconds >= 0.0 for seconds in tower.timings.values())
+
+
+def test_the_cloud_holds_the_points_of_all_views_with_labels(tower):
+    cloud = tower.cloud
+    assert set(np.unique(cloud.labels)) == {1, 2, 3, 4, 5, SUPPORT_LABEL}
+    for o in tower.graph.objects[1:]:
+        mine = cloud.points_world[cloud.labels == o.label]
+        assert np.abs(o.shape.signed_distance(mine)).mean() < 0.002
+    first = model_of(simulated_views("tower")[:1])
+    assert len(first.cloud) < len(cloud)
+
+
+def test_before_the_first_view_nothing_is_known():
+    scene = Scene()
+    assert (scene.surface, scene.voxels, scene.sphere, scene.labels, scene.T_world_camera) == (None,) * 5
+    assert (len(scene.graph.objects), len(scene.cloud), scene.views) == (0, 0, 0)
+
+
+def test_the_view_sphere_stays_where_the_first_view_put_it():
+    scene = Scene(segmentation="labels")
+    views = simulated_views("tower")
+    scene.update(views[0])
+    sphere = scene.sphere
+    scene.update(views[1])
+    assert scene.sphere is sphere
+    assert sphere.centre_world[2] == pytest.approx(TABLE_TOP, abs=0.002)
+
+
+def test_registration_brings_views_nearer_to_where_they_were_taken():
+    azimuths = (180.0, 130.0, 80.0)
+    noisy = simulated_views("clutter", azimuths, "carmine")
+    exact = simulated_views("clutter", azimuths)
+
+    def errors(config):
+        scene, found = Scene(config, segmentation="labels"), []
+        for reported, true in zip(noisy, exact, strict=True):
+            scene.update(reported)
+            points = reported.points_camera[reported.labels > 0]
+            gap = frames.transform(scene.T_world_camera, points) - frames.transform(true.pose, points)
+            found.append(np.linalg.norm(gap, axis=1).mean())
+        return np.array(found)
+
+    without = errors(Config(registration=RegistrationConfig(enabled=False)))
+    refined = errors(Config())
+    assert refined[0] == 0.0
+    assert (refined[1:] < 0.5 * without[1:]).all()
+
+
+def test_a_first_view_without_a_pose_gets_one_and_a_second_is_refused():
+    view = replace(simulated_views("tower")[0], T_world_camera=None)
+    scene = Scene(segmentation="labels")
+    graph = scene.update(view)
+    assert ("o1", "o2") in edges(graph)
+    assert scene.T_world_camera is not None
+    kept = scene.graph, scene.views, len(scene.cloud)
+    with pytest.raises(InputError, match="no camera pose"):
+        scene.update(view)
+    assert (scene.graph, scene.views, len(scene.cloud)) == kept
+
+
+def test_a_view_of_nothing_leaves_the_model_as_it_was():
+    scene = model_of(simulated_views("tower")[:1])
+    kept = scene.graph, scene.views, len(scene.cloud)
+    empty = replace(simulated_views("tower")[1], depth=np.zeros((180, 240)), normals_camera=None)
+    with pytest.raises(PerceptionError):
+        scene.update(empty)
+    assert (scene.graph, scene.views, len(scene.cloud)) == kept
+
+
+def test_a_segment_of_three_points_is_no_object_and_no_obstacle():
+    view = simulated_views("tower")[0]
+    labels = view.labels.copy()
+    table = np.argwhere((labels == 0) & (view.depth > 0.0))[2000:2003]
+    labels[tuple(table.T)] = 9
+    scene = Scene(segmentation="labels")
+    graph = scene.update(replace(view, labels=labels))
+    assert "o9" not in vertices(graph)
+    assert {"o1", "o2", "o5"} <= vertices(graph)
+
+
+def test_a_cloud_is_taken_in_like_a_view():
+    scene = Scene(segmentation="labels")
+    graph = scene.update(simulated_cloud("tower"))
+    assert f1_of(graph, "tower") == 1.0
+    assert scene.labels.shape == (len(simulated_cloud("tower")),)
+    assert scene.T_world_camera is None
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_an_object_taken_away_vanishes_once_views_look_through_where_it_was(method):
+    crate, can = box((0.0, -0.15, 0.8), (0.1, 0.1, 0.1)), box((0.0, 0.15, 0.82), (0.08, 0.08, 0.14))
+    both = [(s.T_world_object[:3, 3], s.extents) for s in (crate, can)]
+    scene = Scene(config_for(method), segmentation="labels")
+    first = scene.update(table_scene(look_from(180.0), both))
+    assert vertices(first) == {"o0", "o1", "o2"}
+    for azimuth in (120.0, 240.0):
+        graph = scene.update(table_scene(look_from(azimuth), both[:1]))
+    if method == "sg":
+        assert vertices(graph) == {"o0", "o1"}
+        assert edges(graph) == {("o0", "o1")}
+    else:
+        # The pooled points still bear it out; that views look through it is counted all the same.
+        assert scene._contradicted.get("o2", 0) == 0
+
+
+def test_inputs_are_not_changed():
+    view = simulated_views("tower")[0]
+    kept = view.depth.copy(), view.labels.copy(), view.T_world_camera.copy()
+    model_of([view])
+    for before, after in zip(kept, (view.depth, view.labels, view.T_world_camera), strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+def test_the_sensor_of_these_tests_is_the_carmine_made_smaller():
+    ratio = SENSOR.width / 640.0
+    assert SENSOR.focal == pytest.approx(525.0 * ratio, rel=0.01)
+    view = SimulatedCamera(simulated_scene("tower"), sensor=SENSOR).capture(look_from(0.0))
+    assert view.depth.shape == (180, 240)
