@@ -125,9 +125,12 @@ def simulated_scene(name: str):
 
 
 @cache
-def simulated_views(name: str, azimuths: tuple[float, ...] = AROUND, noise: str = "none") -> tuple[View, ...]:
+def simulated_views(
+    name: str, azimuths: tuple[float, ...] = AROUND, noise: str = "none", *, vga: bool = False
+) -> tuple[View, ...]:
     """Views of a built-in scene from around the table."""
-    camera = SimulatedCamera(simulated_scene(name), noise, rng=np.random.default_rng(0), sensor=SENSOR)
+    sensor = SensorConfig() if vga else SENSOR
+    camera = SimulatedCamera(simulated_scene(name), noise, rng=np.random.default_rng(0), sensor=sensor)
     return tuple(camera.capture(look_from(a)) for a in azimuths)
 
 

@@ -61,21 +61,19 @@ def test_a_view_without_a_pose_gets_a_level_world_on_the_table():
     assert percept.surface.point_world[2] == pytest.approx(0.0, abs=0.001)
 
 
-def test_automatic_parts_are_the_objects_without_their_labels():
-    percept = percept_of(replace(VIEW, labels=None), "auto")
-    given = VIEW.labels.ravel()[percept.pixels]
-    for label in (1, 2, 5):
+def test_automatic_parts_are_found_without_looking_at_labels():
+    (view,) = simulated_views("hidden_stack", (0.0,), vga=True)
+    percept = percept_of(replace(view, labels=None), "auto")
+    np.testing.assert_array_equal(percept.labels, percept_of(view, "auto").labels)
+    given = view.labels.ravel()[percept.pixels]
+    found = 0
+    for label in range(1, 6):
         own = percept.labels[given == label]
         best = np.bincount(own[own != SUPPORT_LABEL]).argmax()
-        assert best != 0
-        union = ((percept.labels == best) | (given == label)).sum()
-        assert ((percept.labels == best) & (given == label)).sum() / union > 0.5
-
-
-def test_auto_looks_at_no_labels():
-    blind = percept_of(replace(VIEW, labels=None), "auto")
-    seeing = percept_of(VIEW, "auto")
-    np.testing.assert_array_equal(blind.labels, seeing.labels)
+        both = ((percept.labels == best) & (given == label)).sum()
+        either = ((percept.labels == best) | (given == label)).sum()
+        found += best != 0 and both / either > 0.5
+    assert found >= 4
 
 
 @pytest.mark.parametrize("source", [VIEW, simulated_cloud("tower")], ids=["view", "cloud"])

@@ -69,7 +69,8 @@ class ObjectModels:
     def fit_all(self, labels: set[int]) -> None:
         """Fit objects to all their points so far (`pc`, `pc+sg`)."""
         for label in sorted(labels):
-            self._fit(label, self.points.of(label))
+            cloud = self.points.of(label)
+            self._fit(label, cloud.select(thin(cloud.points_world, self._config.cloud.voxel)))
 
     def divide(self, labels: set[int]) -> set[int]:
         """Part objects that no single shape explains and several do; returns the labels that changed."""

@@ -42,7 +42,7 @@ def align(cloud: Cloud, known: Cloud, pivot_world: Array, config: RegistrationCo
 
     Maximum a posteriori: squared point-to-plane distances against the expected registration error, so that
     what the overlap does not determine stays as reported. Refused, that is zero, where too few points
-    match, where the move is beyond the limits, or where it makes the fit worse.
+    match, where the move is beyond the limits or betters nothing, or where the view fits as reported.
 
     Args:
         cloud: The new view, in the world as reported; with labels, only equal labels are matched.
@@ -73,6 +73,8 @@ def align(cloud: Cloud, known: Cloud, pivot_world: Array, config: RegistrationCo
         last = float(np.minimum(np.abs(residual), config.outlier).mean())
         if iteration == 0:
             first, count = last, len(matched)
+            if first < config.exact:
+                return Alignment(np.zeros(6), pivot_world, first, first, count)
         weight = 1.0 / (1.0 + (residual / config.outlier) ** 2) ** 2 / config.noise**2
         J = np.concatenate([n, np.cross(points[matched] - pivot_world, n)], axis=1)
         H = J.T @ (weight[:, None] * J) + prior

@@ -101,8 +101,8 @@ class Scene:
         if not given and self.config.fusion.method != "sg":
             percept = self._models.associate(percept)
         shown = self._models.add(percept)
-        self.surface = surface = self._fused_surface(percept)
-        voxels = self._mapped(percept)
+        self.surface = self._fused_surface(percept)
+        surface, voxels = self._bounds(percept)
         watch.lap("map")
         percept = self._fitted(percept, shown, given)
         watch.lap("fit")
@@ -137,15 +137,20 @@ class Scene:
         rng = np.random.default_rng(self.seed)
         return find_support_surface(table.points_world, table.normals_world, UP, self.config.surface, rng)
 
-    def _mapped(self, percept: Percept) -> VoxelMap:
-        """Build view sphere and voxel map around the first view's table, and enter the view."""
+    def _bounds(self, percept: Percept) -> tuple[SupportSurface, VoxelMap]:
+        """Enter the view into the voxel map; return what bounds hidden extents: of this view alone with `sg`."""
         if self.sphere is None or self.voxels is None:
             centre = percept.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
             self.voxels = VoxelMap.around(centre, self.config.voxels)
+        nothing = VoxelMap.around(self.sphere.centre_world, self.config.voxels)
         if percept.view is not None:
             self.voxels = self.voxels.integrate(percept.view, self.config.cloud.max_depth)
-        return self.voxels
+        if self.config.fusion.method != "sg":
+            return self.surface or percept.surface, self.voxels
+        if percept.view is None:
+            return percept.surface, nothing
+        return percept.surface, nothing.integrate(percept.view, self.config.cloud.max_depth)
 
     def _fitted(self, percept: Percept, shown: set[int], given: bool) -> Percept:
         """Fit what this view changed; automatic parts are divided and united as the shapes suggest."""

@@ -110,7 +110,7 @@ class CylinderModel:
         p1, p2 = points[samples[:, 0]], points[samples[:, 1]]
         cross = np.cross(n1, n2)
         valid = np.linalg.norm(cross, axis=1) > 0.3
-        axis = frames.unit(np.where(valid[:, None], cross, (0.0, 0.0, 1.0)))
+        axis = frames.unit(np.where(valid[:, None], cross, frames.perpendicular(n1)))
         radius, on_axis = _meeting_of_normals(p1, n1, p2, n2, axis)
         R = _axes(axis, n1)
         low, high = _trimmed_range((axis @ points.T)[:, :, None], self.trim)
@@ -152,7 +152,7 @@ class SphereModel:
         p1, p2 = points[samples[:, 0]], points[samples[:, 1]]
         axis = np.cross(n1, n2)
         valid = np.linalg.norm(axis, axis=1) > 0.1
-        axis = frames.unit(np.where(valid[:, None], axis, (0.0, 0.0, 1.0)))
+        axis = frames.unit(np.where(valid[:, None], axis, frames.perpendicular(n1)))
         radius, centre = _meeting_of_normals(p1, n1, p2, n2, axis)
         centre = centre + 0.5 * np.sum((p1 + p2 - 2.0 * centre) * axis, axis=1, keepdims=True) * axis
         valid &= (radius > 1e-3) & (radius <= self.max_radius)

@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+from dataclasses import FrozenInstanceError, replace
+
+import numpy as np
+import pytest
+from synthetic import SENSOR, model_of, simulated_scene, simulated_views
+
+from caryatid import frames
+from caryatid.config import ActiveVisionConfig, Config
+from caryatid.errors import InputError, PlanningError
+from caryatid.exploration import Step, explore, next_best_view
+from caryatid.formats.graph_json import graph_text
+from caryatid.planners import RandomPlanner
+from caryatid.recording_robot import RecordingRobot
+from caryatid.scene import Scene
+from caryatid.simulation.stage import set_stage
+
+CONFIG = Config(sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3))
+
+
+def stage(config=CONFIG, noise="none"):
+    return set_stage(simulated_scene("tower"), config, noise=noise, seed=0)
+
+
+def exploration(config=CONFIG, noise="none", robot=None, **options):
+    set_up = stage(config, noise)
+    return list(explore(set_up.camera, robot or set_up.robot, config=config, **options))
+
+
+@pytest.fixture(scope="module")
+def steps():
+    return exploration(early_stop=False)
+
+
+def test_it_looks_until_the_views_are_used_up(steps):
+    assert [s.index for s in steps] == [0, 1, 2]
+    assert [s.stop for s in steps] == [None, None, "3 views were asked for"]
+    assert [s.decision is None for s in steps] == [False, False, True]
+    assert [s.candidates is None for s in steps] == [False, False, True]
+
+
+def test_it_ends_where_a_view_changes_nothing():
+    config = replace(CONFIG, active=replace(CONFIG.active, max_views=8))
+    config = replace(config, fusion=replace(config.fusion, settled=1.0))
+    steps = exploration(config)
+    assert len(steps) < 8
+    assert steps[-1].stop == "the last view changed nothing"
+    last, before = steps[-1].graph, steps[-2].graph
+    assert {s.pair for s in last.supports} == {s.pair for s in before.supports}
+    assert {o.id for o in last.objects} == {o.id for o in before.objects}
+    # A first view has nothing to change.
+    assert steps[0].stop is None
+
+
+def test_each_view_is_taken_where_the_one_before_decided(steps):
+    for before, after in zip(steps, steps[1:], strict=False):
+        np.testing.assert_array_equal(after.view.pose, before.decision.T_world_camera)
+        chosen = before.sphere.direction_of(before.decision.T_world_camera)
+        np.testing.assert_allclose(after.visited[-1], chosen)
+
+
+def test_the_way_travelled_is_counted(steps):
+    assert steps[0].angle_travelled == steps[0].path_travelled == 0.0
+    angle = 0.0
+    for before, after in zip(steps, steps[1:], strict=False):
+        np.testing.assert_array_equal(after.visited[:-1], before.visited)
+        angle += frames.angle_between(after.visited[-2], after.visited[-1])
+        assert after.angle_travelled == pytest.approx(angle)
+        straight = np.linalg.norm(after.view.pose[:2, 3] - before.view.pose[:2, 3])
+        # The platform stands up to 0.1 m from its camera, and on a grid of 5 cm.
+        assert after.path_travelled - before.path_travelled > straight - 0.35
+    assert angle > 0.5
+
+
+def test_a_step_tells_all_of_a_turn_and_cannot_be_changed(steps):
+    for step in steps:
+        assert isinstance(step, Step)
+        assert step.labels.shape == step.view.depth.shape
+        assert len(step.visited) == step.index + 1
+        assert len(step.cloud) > 0
+        assert {"capture", "segment", "fit", "plan"} <= set(step.timings)
+    assert len(steps[0].cloud) < len(steps[-1].cloud)
+    with pytest.raises(FrozenInstanceError):
+        steps[0].index = 7
+
+
+def test_the_reason_of_a_choice_is_told(steps):
+    for step in steps[:-1]:
+        assert step.decision.why
+        poses = step.candidates.T_world_camera
+        np.testing.assert_array_equal(poses[step.decision.index], step.decision.T_world_camera)
+
+
+@pytest.mark.parametrize("planner", ["support", "paper", "random"])
+def test_every_planner_goes_by_its_name(planner):
+    steps = exploration(planner=planner, early_stop=False)
+    assert len(steps) == 3
+    assert frames.angle_between(steps[0].visited[-1], steps[1].visited[-1]) > 0.05
+
+
+def test_a_planner_that_does_not_exist_is_refused_with_those_that_do():
+    with pytest.raises(InputError, match="no planner 'clever'") as caught:
+        exploration(planner="clever")
+    assert "support, paper, random" in caught.value.remedy
+
+
+def test_anyone_can_bring_a_planner():
+    class Farthest:
+        def plan(self, state, rng):
+            nearness = state.candidates.directions @ state.visited[-1]
+            decision = RandomPlanner().plan(state, rng)
+            index = int(np.argmin(nearness))
+            return replace(decision, index=index, T_world_camera=state.candidates.T_world_camera[index])
+
+    steps = exploration(planner=Farthest(), early_stop=False)
+    directions = steps[0].candidates.directions
+    nearest = (directions @ steps[0].visited[0]).min()
+    assert steps[1].visited[1] @ steps[0].visited[0] == pytest.approx(nearest, abs=1e-6)
+
+
+@pytest.mark.parametrize("noise", ["none", "carmine"])
+def test_the_same_seed_gives_the_same_graphs_byte_for_byte(noise):
+    runs = [exploration(noise=noise, seed=3, early_stop=False) for _ in range(2)]
+    texts = [[graph_text(s.graph) for s in run] for run in runs]
+    assert texts[0] == texts[1]
+    poses = [np.array([s.view.pose for s in run]) for run in runs]
+    np.testing.assert_array_equal(*poses)
+
+
+def test_another_seed_sends_a_random_planner_elsewhere():
+    first, other = (exploration(planner="random", seed=s, early_stop=False)[1].visited[1] for s in (0, 1))
+    assert frames.angle_between(first, other) > 0.01
+
+
+class Playback:
+    """A camera that plays views back by their poses."""
+
+    def __init__(self, views):
+        self._views = views
+
+    def capture(self, T_world_camera):
+        return next(v for v in self._views if np.array_equal(v.pose, T_world_camera))
+
+
+def test_a_recording_is_played_to_its_end_and_no_further():
+    views = simulated_views("tower")
+    robot = RecordingRobot([v.pose for v in views])
+    config = replace(CONFIG, active=replace(CONFIG.active, max_views=10))
+    steps = list(explore(Playback(views), robot, config=config, early_stop=False))
+    assert len(steps) == 3
+    assert {s.view.name for s in steps} == {v.name for v in views}
+    assert steps[-1].stop is not None
+    assert steps[-1].decision is None
+
+
+def test_the_next_view_can_be_asked_for_alone():
+    views = simulated_views("tower")
+    robot = RecordingRobot([v.pose for v in views])
+    decision = next_best_view(model_of(views[:1], CONFIG), robot)
+    assert any(np.array_equal(decision.T_world_camera, v.pose) for v in views[1:])
+    assert decision.why
+
+
+def test_before_the_first_view_there_is_no_next():
+    with pytest.raises(PlanningError, match="nothing has been seen yet"):
+        next_best_view(Scene(), stage().robot)
+
+
+def test_labels_that_are_demanded_and_missing_end_the_loop():
+    views = [replace(v, labels=None) for v in simulated_views("tower")]
+    robot = RecordingRobot([v.pose for v in views])
+    with pytest.raises(InputError, match="has no labels"):
+        next(explore(Playback(views), robot, config=CONFIG, segmentation="labels"))
