@@ -16,7 +16,9 @@ from caryatid.recording_robot import RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.stage import set_stage
 
-CONFIG = Config(sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3))
+CONFIG = Config(
+    sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
+)
 
 
 def stage(config=CONFIG, noise="none"):

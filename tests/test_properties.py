@@ -60,8 +60,12 @@ def random_shape(kind, rng):
 
 
 def half_view(kind, seed, sigma):
+    """What is seen of a shape from one side; normals are 2° off, for exact ones leave equally good samples."""
     rng = np.random.default_rng(seed)
-    return surface_points(random_shape(kind, rng), rng, eye=(0.0, 0.0, 1.5), spacing=0.007, sigma=sigma)
+    points, normals = surface_points(
+        random_shape(kind, rng), rng, eye=(0.0, 0.0, 1.5), spacing=0.007, sigma=sigma
+    )
+    return points, frames.unit(normals + np.radians(2.0) * rng.normal(size=normals.shape))
 
 
 def fit_of(points, normals, seed=0):
@@ -80,9 +84,9 @@ def test_a_fit_moves_with_its_points_under_any_motion(kind, seed, sigma):
     there = fit_of(frames.transform(T, points), frames.rotate(T, normals))
     assert isinstance(here, Fit)
     assert there.shape.kind == here.shape.kind
-    assert hausdorff(there.shape, here.shape.moved(T)) < 1e-5
-    assert there.residual == pytest.approx(here.residual, abs=1e-6)
-    assert sorted(there.seen) == sorted(here.seen)
+    assert hausdorff(there.shape, here.shape.moved(T)) < 1e-6
+    assert there.residual == pytest.approx(here.residual, abs=1e-9)
+    assert there.seen == here.seen
 
 
 @few(15)
@@ -224,7 +228,9 @@ def test_the_truth_against_itself_scores_one(name):
     scene = simulated_scene(name)
     truth = true_scene_from_simulation(scene, ground_truth(scene))
     result = score_scenes(truth, truth, np.random.default_rng(0))
-    assert result.f1 == result.precision == result.recall == result.edge_precision == result.edge_recall == 1.0
+    assert (
+        result.f1 == result.precision == result.recall == result.edge_precision == result.edge_recall == 1.0
+    )
     assert result.mean_iou == 1.0
 
 

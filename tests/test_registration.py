@@ -59,14 +59,15 @@ def worst_error(T: Array, points: Array) -> float:
     ],
 )
 def test_a_small_registration_error_is_undone(error):
-    found = align(moved(NEW, error), KNOWN, PIVOT, CONFIG)
+    eager = replace(CONFIG, exact=0.0)
+    found = align(moved(NEW, error), KNOWN, PIVOT, eager)
     before, after = worst_error(error, NEW.points_world), worst_error(found.T @ error, NEW.points_world)
     assert before > 0.002
     assert after < 0.5 * before
     assert found.residual_after < 0.5 * found.residual_before
     assert found.matched > 1000
     # What stays is the prior's share: it goes where points are trusted more.
-    trusting = align(moved(NEW, error), KNOWN, PIVOT, replace(CONFIG, noise=CONFIG.noise / 5.0))
+    trusting = align(moved(NEW, error), KNOWN, PIVOT, replace(eager, noise=CONFIG.noise / 5.0))
     assert worst_error(trusting.T @ error, NEW.points_world) < 0.1 * before
 
 
@@ -77,7 +78,7 @@ def test_what_lies_right_stays_to_a_fraction_of_a_millimetre():
 
 def test_the_very_points_that_are_known_do_not_move_at_all():
     some = KNOWN.select(np.arange(0, len(KNOWN), 3))
-    found = align(some, KNOWN, PIVOT, CONFIG)
+    found = align(some, KNOWN, PIVOT, replace(CONFIG, exact=0.0))
     np.testing.assert_array_equal(found.T, np.eye(4))
     assert found.residual_after == 0.0
 
@@ -95,6 +96,15 @@ def test_a_plane_alone_leaves_what_it_does_not_show_as_reported():
     )
     np.testing.assert_allclose(found.twist[[0, 1]], 0.0, atol=2e-4)
     assert abs(found.twist[5]) < np.radians(0.02)
+
+
+def test_a_view_that_fits_as_reported_is_not_moved():
+    new = moved(NEW, motion(translation_mm=(0.3, 0.0, 0.2)))
+    eager = align(new, KNOWN, PIVOT, replace(CONFIG, exact=0.0))
+    assert (eager.twist != 0.0).any()
+    fits = eager.residual_before
+    assert_refused(align(new, KNOWN, PIVOT, replace(CONFIG, exact=1.1 * fits)))
+    assert (align(new, KNOWN, PIVOT, replace(CONFIG, exact=0.9 * fits)).twist == eager.twist).all()
 
 
 def assert_refused(found):
