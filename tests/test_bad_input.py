@@ -201,14 +201,11 @@ def three_points_of(view, label):
     return replace(view, labels=labels.astype(np.int32))
 
 
-def test_a_segment_of_three_points_is_no_object_and_the_rest_is_modelled(tmp_path, views):
-    few = [three_points_of(view, 2) for view in views[:1]]
-    write_recording(tmp_path / "few", few)
-    assert run_command("extract", tmp_path / "few", "--out", tmp_path / "run") == 0
-    run = read_run(tmp_path / "run")
-    assert {o.id for o in run.graph.objects} == {"o0", "o1"}
-    assert {s.pair for s in run.graph.supports} == {("o0", "o1")}
-    assert (run.views[0].load_labels() == 2).sum() == 3
+@BOTH
+def test_a_segment_of_three_points(tmp_path, views, refused, command):
+    write_recording(tmp_path / "few", [three_points_of(view, 2) for view in views[:1]])
+    refused(command, tmp_path / "few", says="segment 2 has 3 points with depth, a shape needs 12")
+    assert run_command("extract", tmp_path / "few", "--segmentation", "auto", "--out", tmp_path / "run") == 0
 
 
 def test_a_segment_of_three_points_becomes_an_object_once_more_of_it_is_seen(tmp_path, views):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
@@ -56,7 +57,7 @@ def test_it_ends_where_a_view_changes_nothing():
 
 
 def test_each_view_is_taken_where_the_one_before_decided(steps):
-    for before, after in zip(steps, steps[1:], strict=False):
+    for before, after in itertools.pairwise(steps):
         np.testing.assert_array_equal(after.view.pose, before.decision.T_world_camera)
         chosen = before.sphere.direction_of(before.decision.T_world_camera)
         np.testing.assert_allclose(after.visited[-1], chosen)
@@ -65,7 +66,7 @@ def test_each_view_is_taken_where_the_one_before_decided(steps):
 def test_the_way_travelled_is_counted(steps):
     assert steps[0].angle_travelled == steps[0].path_travelled == 0.0
     angle = 0.0
-    for before, after in zip(steps, steps[1:], strict=False):
+    for before, after in itertools.pairwise(steps):
         np.testing.assert_array_equal(after.visited[:-1], before.visited)
         angle += frames.angle_between(after.visited[-2], after.visited[-1])
         assert after.angle_travelled == pytest.approx(angle)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -294,3 +295,11 @@ def test_json_text_takes_numpy_values(tmp_path):
     path = tmp_path / "x.json"
     path.write_text(json_text({"a": np.float32(0.5), "b": np.arange(3), 4: (True, None, np.int64(7))}))
     assert read_json(path) == {"a": 0.5, "b": [0, 1, 2], "4": [True, None, 7]}
+
+
+def test_an_object_that_nothing_supports_overhangs_without_end():
+    graph = random_graph(3)
+    adrift = replace(graph, stability={graph.objects[-1].id: Stability(0.0, float("inf"), True, True)})
+    document = json.loads(graph_text(adrift))
+    assert document["stability"][graph.objects[-1].id]["overhang"] is None
+    assert graph_from_json(document, "x").stability == adrift.stability

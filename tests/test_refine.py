@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -145,7 +146,7 @@ def test_every_step_lowers_the_cost(shape):
     start = disturbed(shape, 5, metres=0.012)
     iterates = [start, *(refine(start, points, **OPTIONS | {"steps": k}) for k in range(1, 8))]
     moves = 0
-    for before, after in zip(iterates, iterates[1:], strict=False):
+    for before, after in itertools.pairwise(iterates):
         if hausdorff(before, after) == 0.0:
             continue
         moves += 1

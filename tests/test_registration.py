@@ -99,7 +99,7 @@ def test_a_plane_alone_leaves_what_it_does_not_show_as_reported():
 
 
 def test_a_view_that_fits_as_reported_is_not_moved():
-    new = moved(NEW, motion(translation_mm=(0.3, 0.0, 0.2)))
+    new = moved(NEW, motion(translation_mm=(2.0, 0.0, 1.0)))
     eager = align(new, KNOWN, PIVOT, replace(CONFIG, exact=0.0))
     assert (eager.twist != 0.0).any()
     fits = eager.residual_before

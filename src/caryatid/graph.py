@@ -143,7 +143,8 @@ class Stability:
 
     Attributes:
         ratio: Support area ratio r_s in [0, 1], eq. 1.
-        overhang: How far [m] the centre of mass projects outside the support polygon; negative inside.
+        overhang: How far [m] the centre of mass projects outside the support polygon; negative inside,
+            infinite where nothing supports it.
         small_area: r_s < r_s,min fired.
         tips: The centre-of-mass test fired.
     """

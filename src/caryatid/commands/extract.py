@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +15,7 @@ from caryatid import frames
 from caryatid.commands.options import SAID, ModellingCommand, OutPath, defaults_to, whole_number
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record
-from caryatid.commands.sources import CLOUD_SUFFIXES, open_recording
+from caryatid.commands.sources import CLOUD_SUFFIXES, check_segments, open_recording
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError
 from caryatid.formats.graph_json import graph_to_json
@@ -81,6 +82,8 @@ class Extract(ModellingCommand):
             stored = read_stored_cloud(self.source, self.label_divisor)
             if self.segmentation == "labels" and stored.labels is None:
                 raise InputError(self.source, "has no field label", "use --segmentation auto")
+            if self.segmentation != "auto" and stored.labels is not None:
+                check_segments(self.source, Counter(stored.labels[stored.kept].tolist()), config)
             rng = np.random.default_rng(self.modelling.seed)
             cloud = stored.to_cloud(config.cloud)
             cloud = level_cloud(cloud, config, segmentation=self.segmentation, rng=rng)
@@ -96,7 +99,7 @@ class Extract(ModellingCommand):
         self, scene: Scene, writer: RunWriter, config: Config, progress: Progress
     ) -> tuple[list[dict[str, Any]], list[ViewPage]]:
         with progress.working("reading the recording"):
-            recording = open_recording(self.source, self.segmentation)
+            recording = open_recording(self.source, config, self.segmentation)
         steps: list[dict[str, Any]] = []
         pages: list[ViewPage] = []
         angle, path = 0.0, 0.0

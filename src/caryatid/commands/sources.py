@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,7 +67,7 @@ def open_source(
     if Path(source).suffix.lower() in CLOUD_SUFFIXES:
         raise InputError(source, "is a single cloud, and there is nowhere to go", "use `caryatid extract`")
     if is_recording(source):
-        return _open_recording(open_recording(source, segmentation))
+        return _open_recording(open_recording(source, config, segmentation))
     scene = load_scene(source)
     truth_file = Path(scene.source).parent / "gt.json"
     known = read_truth(truth_file) if truth_file.is_file() else None
@@ -74,18 +76,44 @@ def open_source(
     return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
 
 
-def open_recording(folder: str, segmentation: SegmentationMethod | None) -> Recording:
+def open_recording(folder: str, config: Config, segmentation: SegmentationMethod | None) -> Recording:
     """Read a recording and decode every frame once, so that what is broken is said before any work is done.
 
     Raises:
-        InputError: It is broken, or labels are demanded and there are none.
+        InputError: It is broken, has no labels where they are demanded, or a segment too small for a shape.
     """
     recording = read_recording(folder)
     if segmentation == "labels" and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
+    points: Counter[int] = Counter()
     for frame in recording.frames:
-        frame.load()
+        view = frame.load()
+        if view.labels is not None:
+            points.update(view.labels[view.valid].tolist())
+    if segmentation != "auto":
+        check_segments(folder, points, config)
     return recording
+
+
+def check_segments(source: str, points: Mapping[int, int], config: Config) -> None:
+    """Refuse given segments that can never become objects.
+
+    Args:
+        source: What the user gave.
+        points: Points with depth of each label, over all views; 0 is no object.
+        config: All settings.
+
+    Raises:
+        InputError: A segment has fewer points than a shape needs.
+    """
+    least = config.fit.min_points
+    small = sorted(label for label, count in points.items() if label != 0 and count < least)
+    if small:
+        raise InputError(
+            source,
+            f"segment {small[0]} has {points[small[0]]} points with depth, a shape needs {least}",
+            "take it out, show more of it, or use --segmentation auto",
+        )
 
 
 def _open_recording(recording: Recording) -> Source:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -36,7 +37,7 @@ def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
         document["stability"] = {
             id_: {
                 "ratio": verdict.ratio,
-                "overhang": verdict.overhang,
+                "overhang": verdict.overhang if isfinite(verdict.overhang) else None,
                 "small_area": verdict.small_area,
                 "tips": verdict.tips,
             }
@@ -209,7 +210,7 @@ def _stability_from_json(id_: str, item: Any, ids: set[str], source: str) -> Sta
     _must_be_object(item, source)
     return Stability(
         ratio=number(item, "ratio", source),
-        overhang=number(item, "overhang", source),
+        overhang=inf if item.get("overhang", 0.0) is None else number(item, "overhang", source),
         small_area=field(item, "small_area", bool, source),
         tips=field(item, "tips", bool, source),
     )
