@@ -138,7 +138,7 @@ class Scene:
         return find_support_surface(table.points_world, table.normals_world, UP, self.config.surface, rng)
 
     def _bounds(self, percept: Percept) -> tuple[SupportSurface, VoxelMap]:
-        """Enter the view into the voxel map; return what bounds hidden extents: of this view alone with `sg`."""
+        """Enter the view into the map; return what bounds hidden extents: of this view alone with `sg`."""
         if self.sphere is None or self.voxels is None:
             centre = percept.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)

@@ -87,7 +87,7 @@ class RegistrationConfig:
     min_points: int = 150
     """Fewer matched points determine no pose [1]."""
     exact: float = 0.0003
-    """A view that fits better than this as reported is not moved [m]; exact views leave 0.1 mm, noisy 2 mm."""
+    """A view that fits better than this as reported is not moved [m]; exact ones leave 0.1 mm, noisy 2 mm."""
     max_translation: float = 0.05
     """A longer move is refused [m]; 5σ."""
     max_rotation: float = 2.0
