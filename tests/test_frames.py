@@ -85,7 +85,7 @@ def test_perpendicular_vectors_are_perpendicular_units_for_every_axis(rng):
     np.testing.assert_allclose(np.linalg.norm(across, axis=1), 1.0)
 
 
-@pytest.mark.parametrize("length", [0.0, 1e-15, 1e-7, 0.3, 3.0])
+@pytest.mark.parametrize("length", [0.0, 1e-15, 1e-7, 5e-4, 0.3, 3.0])
 def test_rotation_vectors_follow_rodrigues(length, rng):
     vector = length * frames.unit(rng.normal(size=3))
     expected = Rotation.from_rotvec(vector).as_matrix()

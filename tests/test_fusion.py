@@ -70,6 +70,13 @@ def test_a_can_taken_for_a_box_of_its_size_is_still_the_can():
     assert matched(CAN, box((0.0, 0.0, 0.9), (0.06, 0.06, 0.1), turn_deg=45.0))
 
 
+def test_of_two_in_the_same_place_the_one_of_the_same_kind():
+    boxed = box((0.0, 0.0, 0.9), (0.06, 0.06, 0.1))
+    for known in ([thing(1, boxed), thing(2, CAN)], [thing(1, CAN), thing(2, boxed)]):
+        found = match(known, [thing(9, CAN)], SG, same_labels=False)["o9"]
+        assert {o.id: o.shape.kind for o in known}[found] == "cylinder"
+
+
 def test_orientation_says_nothing_of_round_things():
     squat = cylinder((0.0, 0.0, 0.8), 0.05, 0.1)
     on_its_side = replace(squat, T_world_object=squat.T_world_object[:, [2, 0, 1, 3]])

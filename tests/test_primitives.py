@@ -8,7 +8,7 @@ from synthetic import box, cylinder, hausdorff, sphere, surface_points
 
 from caryatid import frames
 from caryatid.config import FitConfig
-from caryatid.primitives import Fit, FitFailure, candidates, draw_in, fit
+from caryatid.primitives import Fit, FitFailure, candidates, draw_in, fit, judge
 from caryatid.shapes import Box, Cylinder
 
 CONFIG = FitConfig()
@@ -139,6 +139,20 @@ def test_the_candidates_are_one_of_each_kind_the_cheapest_first():
     assert [f.cost for f in fits] == sorted(f.cost for f in fits)
     assert len({f.shape.kind for f in fits}) == len(fits) >= 2
     assert fits[0].shape.kind == "box"
+
+
+def test_model_choice_weighs_distance_normals_and_size():
+    ball = sphere((0.0, 0.0, 0.0), 0.05)
+    points, normals = surface_points(ball, np.random.default_rng(0), sigma=0.0)
+    perfect = judge(ball, points, normals, CONFIG)
+    assert perfect.cost == pytest.approx(CONFIG.size_penalty * 0.1**2, abs=1e-9)
+    across = frames.perpendicular(normals)
+    assert judge(ball, points, across, CONFIG).cost - perfect.cost == pytest.approx(CONFIG.normal_weight)
+    wider = judge(sphere((0.0, 0.0, 0.0), 0.054), points, normals, CONFIG)
+    assert wider.residual == pytest.approx(0.004)
+    assert wider.cost == pytest.approx(0.004 + CONFIG.size_penalty * 0.108**2)
+    far = judge(sphere((0.0, 0.0, 0.0), 0.09), points, normals, CONFIG)
+    assert (far.residual, far.inliers, far.poor) == (pytest.approx(CONFIG.threshold), 0.0, True)
 
 
 def test_what_is_no_single_shape_is_called_a_poor_fit():

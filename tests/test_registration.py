@@ -107,6 +107,17 @@ def test_a_view_that_fits_as_reported_is_not_moved():
     assert (align(new, KNOWN, PIVOT, replace(CONFIG, exact=0.9 * fits)).twist == eager.twist).all()
 
 
+def test_the_more_a_reported_pose_is_trusted_the_less_it_is_moved():
+    error = motion(translation_mm=(6.0, -4.0, 5.0))
+    stay = []
+    for sigma in (0.01, 0.001, 0.0001):
+        sure = replace(CONFIG, translation=sigma, rotation=np.degrees(10.0 * sigma))
+        found = align(moved(NEW, error), KNOWN, PIVOT, sure)
+        stay.append(worst_error(found.T @ error, NEW.points_world) / worst_error(error, NEW.points_world))
+    # As often as it is matched anew, the prior pulls towards the reported pose, not towards the last one.
+    assert stay[0] < 0.2 < stay[1] < 0.8 < stay[2]
+
+
 def assert_refused(found):
     np.testing.assert_array_equal(found.T, np.eye(4))
     assert found.residual_after == found.residual_before
