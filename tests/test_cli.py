@@ -217,8 +217,8 @@ def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
     assert run_command("demo", "--scene", "tower", "--views", 2, "--out", tmp_path / "run", *SMALL) == 0
     said = capsys.readouterr()
     assert said.out == ""
-    assert re.search(r"^view 1: \d+ objects, \d+ supports", said.err, re.M)
-    assert re.search(r"^view 2: ", said.err, re.M)
+    assert re.search(r"^view 00: \d+ objects, \d+ supports", said.err, re.M)
+    assert re.search(r"^view 01: ", said.err, re.M)
     assert re.search(r"^  found: o1 \(\w+\) held by ", said.err, re.M)
     assert str(tmp_path / "run") in said.err
     assert (tmp_path / "run/report.html").is_file()
@@ -322,7 +322,7 @@ def test_quiet_says_nothing(tmp_path, scene_file, recording, capsys):
 def test_progress_names_new_objects_and_what_holds_them(tmp_path, scene_file, capsys):
     explored(scene_file, tmp_path / "run", "--views", 2, "--no-report")
     lines = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"view 1: 2 objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
+    assert re.fullmatch(r"view 00: 2 objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
     assert lines[1].startswith("  found: o1 (")
     assert lines[2].startswith("  next view: ")
     assert "  done: 2 views were asked for" in lines

@@ -49,7 +49,7 @@ def test_what_was_there_is_started_from_and_stays():
         ("fusion.method=sg", "fusion", "method", "sg"),
         ('fusion.method="pc+sg"', "fusion", "method", "pc+sg"),
         ("fusion.method=pc+sg", "fusion", "method", "pc+sg"),
-        ("active.occlusion=false", "active", "occlusion", False),
+        ("registration.enabled=false", "registration", "enabled", False),
         ("fit.threshold=1", "fit", "threshold", 1.0),
         ("fit.threshold=1e-3", "fit", "threshold", 0.001),
         ("robot.pitch=[-50, 10]", "robot", "pitch", (-50.0, 10.0)),
@@ -89,7 +89,7 @@ def test_an_unknown_name_lists_the_valid_ones(flag, listed):
         ("fit.threshold=nan", "a finite number"),
         ("fit.threshold=inf", "a finite number"),
         ("fit.threshold=false", "a number"),
-        ("active.occlusion=1", "true or false"),
+        ("registration.enabled=1", "true or false"),
         ("fusion.method=mean", "one of pc, sg, pc+sg"),
         ("active.saliency=3", "one of paper, decreasing"),
         ("robot.pitch=[1, 2, 3]", "a list of 2 numbers"),
@@ -134,7 +134,12 @@ def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
 
 
 def test_what_is_written_is_read_back_as_it_was(file):
-    flags = ["fusion.method=sg", "active.occlusion=false", "robot.pitch=[-50.5, 10]", "fit.threshold=0.00123"]
+    flags = [
+        "fusion.method=sg",
+        "registration.enabled=false",
+        "robot.pitch=[-50.5, 10]",
+        "fit.threshold=0.00123",
+    ]
     config = read_settings(None, flags)
     path = file(write_settings(config))
     assert read_settings(path, []) == config

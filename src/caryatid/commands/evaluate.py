@@ -43,6 +43,6 @@ class Evaluate:
         for view in scores:
             s = view.score
             figures = (s.precision, s.recall, s.f1, s.edge_precision, s.edge_recall, s.mean_iou)
-            table.add_row(str(view.view + 1), *(f"{f:.3f}" for f in figures))
+            table.add_row(f"{view.view:02d}", *(f"{f:.3f}" for f in figures))
         Console().print(table)
         return 0

@@ -124,7 +124,7 @@ class Extract(ModellingCommand):
                     "path_travelled": path,
                 }
             )
-            progress.say(f"view {index + 1} of {len(recording)}: {summary(graph)}")
+            progress.say(f"view {index:02d}: {summary(graph)}")
             if not self.no_report:
                 posed = view.with_pose(T_world_camera)
                 page = draw_model(graph, scene.cloud, view=posed, labels=labels, config=config.report)

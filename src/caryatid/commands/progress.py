@@ -37,7 +37,7 @@ class Progress:
         """Say what a view brought, how good that is where the truth is known, and what comes next."""
         seconds = sum(v for k, v in step.timings.items() if k != "capture")
         score = f", F1 {scores[-1].f1:.3f}" if scores else ""
-        self.say(f"view {step.index + 1}: {summary(step.graph)}{score} ({seconds:.1f} s)")
+        self.say(f"view {step.index:02d}: {summary(step.graph)}{score} ({seconds:.1f} s)")
         for line in news(before or SupportGraph(), step.graph):
             self.say(f"  {line}")
         if step.decision is not None:

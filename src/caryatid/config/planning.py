@@ -42,8 +42,6 @@ class ActiveVisionConfig:
     """Where a relation's point of interest lies: the middle of the centres, or the contact patch."""
     spread: float = 20.0
     """Angle on the sphere at which saliency has fallen to exp(−½) [deg]."""
-    occlusion: bool = True
-    """Invert the saliency of a candidate from which the point of interest is hidden."""
     inhibition: float = 1.0
     """Depth of the negative bump at every visited view [1]."""
     path_cost: Literal["angle", "path", "none"] = "angle"
