@@ -199,15 +199,15 @@ def test_a_vertex_that_views_contradict_vanishes_with_its_edges(config):
     gone = graph(("o0", "o1"), shapes={1: CRATE})
     evidence = evidence_of(FULL, gone, gone, config=config)
     assert "o2" in vertices(fused_graph(evidence, config))
-    assert "o2" in vertices(fused_graph(evidence, config, {"o2": 1}))
-    fused = fused_graph(evidence, config, {"o2": 2})
+    assert "o2" in vertices(fused_graph(evidence, config, contradicted={"o2": 1}))
+    fused = fused_graph(evidence, config, contradicted={"o2": 2})
     assert vertices(fused) == {"o0", "o1"}
     assert edges(fused) == {("o0", "o1")}
 
 
 def test_what_a_view_did_not_contradict_counts_as_hidden():
     gone = graph(("o0", "o1"), shapes={1: CRATE})
-    fused = fused_graph(evidence_of(FULL, gone, gone), SG, {"o2": 1})
+    fused = fused_graph(evidence_of(FULL, gone, gone), SG, contradicted={"o2": 1})
     assert (fused["o2"].occurrences, fused["o2"].opportunities) == (1, 2)
 
 

@@ -212,10 +212,11 @@ def test_a_cloud_is_taken_in_like_a_view():
     assert scene.T_world_camera is None
 
 
-def test_with_sg_an_object_taken_away_vanishes_once_views_look_through_where_it_was():
+@pytest.mark.parametrize("method", METHODS)
+def test_an_object_taken_away_vanishes_once_views_look_through_where_it_was(method):
     crate, can = box((0.0, -0.15, 0.8), (0.1, 0.1, 0.1)), box((0.0, 0.15, 0.82), (0.08, 0.08, 0.14))
     both = [(s.T_world_object[:3, 3], s.extents) for s in (crate, can)]
-    scene = Scene(config_for("sg"), segmentation="labels")
+    scene = Scene(config_for(method), segmentation="labels")
     first = scene.update(table_scene(look_from(180.0), both))
     assert vertices(first) == {"o0", "o1", "o2"}
     for azimuth in (120.0, 240.0):

@@ -85,7 +85,11 @@ def absorbed(evidence: Evidence, names: Mapping[str, str]) -> Evidence:
 
 
 def fused_graph(
-    evidence: Evidence, config: FusionConfig, contradicted: Mapping[str, int] | None = None
+    evidence: Evidence,
+    config: FusionConfig,
+    *,
+    shown: Mapping[str, int] | None = None,
+    contradicted: Mapping[str, int] | None = None,
 ) -> SupportGraph:
     """Read the fused graph off the evidence.
 
@@ -95,18 +99,20 @@ def fused_graph(
     Args:
         evidence: All views.
         config: Method and the share an edge must keep.
+        shown: Per object id, in how many views it was seen; without it, in how many graphs it is.
         contradicted: Per object id, in how many views something behind it was seen instead.
     """
-    contradicted = contradicted or {}
+    shown, contradicted = shown or {}, contradicted or {}
     newest = evidence.views - 1
     objects: dict[str, SceneObject] = {}
     for i, seen in evidence.sightings.items():
         if config.method == "pc" and newest not in seen:
             continue
-        opportunities = len(seen) + contradicted.get(i, 0)
-        if len(seen) >= config.keep_share * opportunities:
+        occurrences = shown.get(i, len(seen))
+        opportunities = occurrences + contradicted.get(i, 0)
+        if occurrences >= config.keep_share * opportunities:
             vertex = _vertex([seen[v] for v in sorted(seen)], config)
-            objects[i] = replace(vertex, occurrences=len(seen), opportunities=opportunities)
+            objects[i] = replace(vertex, occurrences=occurrences, opportunities=opportunities)
     supports = []
     for pair, found in evidence.supports.items():
         if pair[0] not in objects or pair[1] not in objects:

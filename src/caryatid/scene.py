@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import networkx as nx
@@ -62,7 +63,8 @@ class Scene:
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
         self._evidence = Evidence()
-        self._contradicted: dict[str, int] = {}
+        self._shown: Counter[str] = Counter()
+        self._contradicted: Counter[str] = Counter()
 
     @property
     def supports(self) -> nx.DiGraph:
@@ -174,11 +176,15 @@ class Scene:
         config = self.config.fusion
         same_labels = given or config.method != "sg"
         self._evidence, names = fuse(self._evidence, newest, config, same_labels=same_labels)
-        found = set(names.values())
+        percept = percept.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
+        seen = {
+            SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(int(k)) for k in np.unique(percept.labels)
+        }
+        self._shown.update(seen)
         if percept.view is not None:
             for o in self.graph.objects:
-                if o.role == "object" and o.id not in found and seen_through(o.shape, percept.view):
-                    self._contradicted[o.id] = self._contradicted.get(o.id, 0) + 1
-        fused = fused_graph(self._evidence, config, self._contradicted)
+                if o.role == "object" and o.id not in seen and seen_through(o.shape, percept.view):
+                    self._contradicted[o.id] += 1
+        fused = fused_graph(self._evidence, config, shown=self._shown, contradicted=self._contradicted)
         self.graph = replace(fused, stability=newest.stability)
-        return percept.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
+        return percept
