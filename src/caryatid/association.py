@@ -42,16 +42,17 @@ def associate(
     for part in (int(k) for k in np.unique(labels) if k != 0):
         index = np.flatnonzero(labels == part)
         points = points_world[index]
-        gaps = np.array([_gaps(points, trees[k], known_shapes.get(k)) for k in trees])
+        neighbours = [k for k in trees if _may_touch(points, known_points[k], config.overlap_reach)]
+        gaps = np.array([_gaps(points, trees[k], known_shapes.get(k)) for k in neighbours])
         near = gaps < config.overlap_reach
-        if not trees or near.any(axis=0).mean() < config.overlap:
+        if not neighbours or near.any(axis=0).mean() < config.overlap:
             fresh += 1
             result[index] = fresh
             continue
         nearest = np.where(near.any(axis=0), np.argmin(gaps, axis=0), -1)
-        shares = np.bincount(nearest[nearest >= 0], minlength=len(trees)) / len(points)
+        shares = np.bincount(nearest[nearest >= 0], minlength=len(neighbours)) / len(points)
         owners = np.flatnonzero(shares >= min(config.divide_share, shares.max()))
-        result[index] = np.array(list(trees))[owners[np.argmin(gaps[owners], axis=0)]]
+        result[index] = np.array(neighbours)[owners[np.argmin(gaps[owners], axis=0)]]
     return result
 
 
@@ -73,6 +74,12 @@ def duplicates(
             if inside.mean() >= config.same_share:
                 given_up[small] = big
     return given_up
+
+
+def _may_touch(points: Array, others: Array, reach: float) -> bool:
+    """Whether the axis-aligned boxes around two sets of points (N, 3), (M, 3) come within reach [m]."""
+    low = np.maximum(points.min(axis=0), others.min(axis=0)) - reach
+    return bool((low <= np.minimum(points.max(axis=0), others.max(axis=0))).all())
 
 
 def _gaps(points: Array, tree: cKDTree, shape: Shape | None) -> Array:

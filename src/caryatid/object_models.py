@@ -36,6 +36,7 @@ class ObjectModels:
         self.fits: dict[int, SceneObject] = {}
         self._config = config
         self._seed = seed
+        self._undivided: dict[int, int] = {}
 
     def associate(self, percept: Percept) -> Percept:
         """Give a view's automatic parts the labels of the objects they belong to, or new ones."""
@@ -77,6 +78,8 @@ class ObjectModels:
         changed: set[int] = set()
         for label in sorted(labels & self.fits.keys()):
             cloud = self.points.of(label)
+            if len(cloud) < self._config.split.growth * self._undivided.get(label, 0):
+                continue
             groups = split(
                 cloud.points_world,
                 cloud.normals_world,
@@ -86,7 +89,9 @@ class ObjectModels:
                 fit_config=self._config.fit,
                 rng=np.random.default_rng([self._seed, label]),
             )
-            if groups is not None:
+            if groups is None:
+                self._undivided[label] = len(cloud)
+            else:
                 changed |= set(self.points.divide(label, groups))
         self.fit_all(changed)
         return changed

@@ -186,5 +186,7 @@ class Scene:
                 if o.role == "object" and o.id not in seen and seen_through(o.shape, percept.view):
                     self._contradicted[o.id] += 1
         fused = fused_graph(self._evidence, config, shown=self._shown, contradicted=self._contradicted)
-        self.graph = replace(fused, stability=newest.stability)
+        ids = {o.id for o in fused.objects}
+        stability = {names[i]: verdict for i, verdict in newest.stability.items() if names[i] in ids}
+        self.graph = replace(fused, stability=stability)
         return percept

@@ -60,21 +60,28 @@ def split(
     """
     if residual < config.min_residual or len(points) < 2 * config.min_points:
         return None
-    quick = replace(fit_config, hypotheses=50, polish=1, max_points=config.sample)
+    chosen = np.arange(len(points))
+    if len(points) > config.max_points:
+        chosen = np.sort(rng.choice(len(points), config.max_points, replace=False))
+    some, their_normals = points[chosen], normals[chosen]
+    quick = replace(
+        fit_config, hypotheses=config.hypotheses, polish=1, steps=config.steps, max_points=config.sample
+    )
     best: Split | None = None
-    for direction in _directions(normals, up):
-        height = points @ direction
+    for direction in _directions(their_normals, up):
+        height = some @ direction
         for cut in np.quantile(height, np.linspace(0.0, 1.0, config.cuts + 2)[1:-1]):
-            groups = _connected(points, height > cut, config)
-            found = _judged(points, normals, groups, quick, config, rng)
+            groups = _connected(some, height > cut, config)
+            found = _judged(some, their_normals, groups, quick, config, rng)
             if found is not None and (best is None or found.residual < best.residual):
                 best = found
     if best is None:
         return None
-    best = _judged(points, normals, best.groups, fit_config, config, rng)
+    best = _judged(some, their_normals, best.groups, fit_config, config, rng)
     if best is None or best.residual > config.gain * residual:
         return None
-    return best.groups
+    _, nearest = cKDTree(some).query(points)
+    return best.groups[nearest]
 
 
 def _directions(normals: Array, up: Array) -> list[Array]:

@@ -58,10 +58,18 @@ class SplitConfig:
     """Mean distance to the best single shape from which on a cut is tried [m]; noise alone leaves 2 mm."""
     gain: float = 0.75
     """A cut must bring the mean distance below this share of the single shape's [1]."""
+    growth: float = 1.3
+    """An object that was not divided is looked at again when its points have grown by this factor [1]."""
     cuts: int = 7
     """Cuts tried along each direction [1]; an eighth of the points apart."""
-    sample: int = 250
+    max_points: int = 1000
+    """Points a division looks at [1]; the others go with the nearest of them."""
+    sample: int = 200
     """Points of a side a cut is first judged by [1]."""
+    hypotheses: int = 25
+    """RANSAC hypotheses a shape when a cut is first judged [1]; the best cut is judged again in full."""
+    steps: int = 8
+    """Least-squares steps when a cut is first judged [1]."""
     min_points: int = 40
     """Points a side needs [1]; three times what a shape needs."""
     reach: float = 0.02
