@@ -42,7 +42,9 @@ def associate(
     for part in (int(k) for k in np.unique(labels) if k != 0):
         index = np.flatnonzero(labels == part)
         points = points_world[index]
-        neighbours = [k for k in trees if _may_touch(points, known_points[k], config.overlap_reach)]
+        neighbours = [
+            k for k in trees if _may_touch(points, known_points[k], known_shapes.get(k), config.overlap_reach)
+        ]
         gaps = np.array([_gaps(points, trees[k], known_shapes.get(k)) for k in neighbours])
         near = gaps < config.overlap_reach
         if not neighbours or near.any(axis=0).mean() < config.overlap:
@@ -76,10 +78,13 @@ def duplicates(
     return given_up
 
 
-def _may_touch(points: Array, others: Array, reach: float) -> bool:
-    """Whether the axis-aligned boxes around two sets of points (N, 3), (M, 3) come within reach [m]."""
-    low = np.maximum(points.min(axis=0), others.min(axis=0)) - reach
-    return bool((low <= np.minimum(points.max(axis=0), others.max(axis=0))).all())
+def _may_touch(points: Array, others: Array, shape: Shape | None, reach: float) -> bool:
+    """Whether the axis-aligned boxes around points (N, 3) and around an object come within reach [m]."""
+    low, high = others.min(axis=0), others.max(axis=0)
+    if shape is not None:
+        centre, half = shape.T_world_object[:3, 3], shape.support(np.eye(3))
+        low, high = np.minimum(low, centre - half), np.maximum(high, centre + half)
+    return bool(((points.min(axis=0) <= high + reach) & (points.max(axis=0) >= low - reach)).all())
 
 
 def _gaps(points: Array, tree: cKDTree, shape: Shape | None) -> Array:

@@ -33,8 +33,8 @@ def complete(
     """
     done: dict[str, SceneObject] = {}
     for candidate in sorted(objects, key=lambda o: (_lowest(o.shape), o.label)):
-        below = [o.shape for o in done.values()]
-        done[candidate.id] = _extended(candidate, below, surface, voxels, config)
+        others = [done.get(o.id, o).shape for o in objects if o.id != candidate.id]
+        done[candidate.id] = _extended(candidate, others, surface, voxels, config)
     return [done[o.id] for o in objects]
 
 

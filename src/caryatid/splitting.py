@@ -67,14 +67,7 @@ def split(
     quick = replace(
         fit_config, hypotheses=config.hypotheses, polish=1, steps=config.steps, max_points=config.sample
     )
-    best: Split | None = None
-    for direction in _directions(their_normals, up):
-        height = some @ direction
-        for cut in np.quantile(height, np.linspace(0.0, 1.0, config.cuts + 2)[1:-1]):
-            groups = _connected(some, height > cut, config)
-            found = _judged(some, their_normals, groups, quick, config, rng)
-            if found is not None and (best is None or found.residual < best.residual):
-                best = found
+    best = _best_cut(some, their_normals, up, quick, config, rng)
     if best is None:
         return None
     best = _judged(some, their_normals, best.groups, fit_config, config, rng)
@@ -82,6 +75,37 @@ def split(
         return None
     _, nearest = cKDTree(some).query(points)
     return best.groups[nearest]
+
+
+def _best_cut(
+    points: Array,
+    normals: Array,
+    up: Array,
+    fit_config: FitConfig,
+    config: SplitConfig,
+    rng: np.random.Generator,
+) -> Split | None:
+    """Try cuts along each direction, then more of them between the neighbours of the best."""
+    found: list[tuple[float, int, int, Split]] = []
+    directions = _directions(normals, up)
+    shares = np.linspace(0.0, 1.0, config.cuts + 2)
+
+    def try_cut(number: int, share: float, index: int) -> None:
+        height = points @ directions[number]
+        groups = _connected(points, height > np.quantile(height, share), config)
+        judged = _judged(points, normals, groups, fit_config, config, rng)
+        if judged is not None:
+            found.append((judged.residual, number, index, judged))
+
+    for number in range(len(directions)):
+        for index in range(1, len(shares) - 1):
+            try_cut(number, float(shares[index]), index)
+    if not found:
+        return None
+    _, number, index, _ = min(found, key=lambda f: f[0])
+    for share in np.linspace(shares[index - 1], shares[index + 1], config.cuts + 2)[1:-1]:
+        try_cut(number, float(share), index)
+    return min(found, key=lambda f: f[0])[3]
 
 
 def _directions(normals: Array, up: Array) -> list[Array]:

@@ -1,0 +1,84 @@
+"""Dividing what segmentation took for one object: only where several shapes explain it much better."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from synthetic import box, cylinder, motion_about_vertical, sphere, surface_points
+
+from caryatid import frames
+from caryatid.config import FitConfig, SplitConfig
+from caryatid.primitives import fit
+from caryatid.splitting import split
+
+UP = np.array([0.0, 0.0, 1.0])
+STACKED = (box((0.0, 0.0, 0.05), (0.16, 0.12, 0.1)), box((0.03, 0.0, 0.15), (0.06, 0.06, 0.1)))
+SIDE_BY_SIDE = (box((0.0, -0.06, 0.05), (0.1, 0.12, 0.1)), box((0.0, 0.04, 0.1), (0.1, 0.08, 0.2)))
+CAN_ON_BOX = (box((0.0, 0.0, 0.04), (0.14, 0.14, 0.08)), cylinder((0.0, 0.0, 0.14), 0.03, 0.12))
+
+
+def points_of(shapes, sigma=0.001, seed=0):
+    rng = np.random.default_rng(seed)
+    parts = [surface_points(s, rng, eye=(-1.2, -0.6, 1.0), spacing=0.006, sigma=sigma) for s in shapes]
+    points = np.concatenate([p for p, _ in parts])
+    normals = np.concatenate([n for _, n in parts])
+    return points, normals, np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
+
+
+def divided(points, normals):
+    residual = fit(points, normals, config=FitConfig(), rng=np.random.default_rng(0)).residual
+    rng = np.random.default_rng(0)
+    return split(points, normals, residual, up=UP, config=SplitConfig(), fit_config=FitConfig(), rng=rng)
+
+
+def agreement(groups, truth):
+    """Share of the points in the group of most of their shape's points."""
+    return np.mean(
+        [(groups[truth == k] == np.bincount(groups[truth == k]).argmax()).mean() for k in set(truth)]
+    )
+
+
+@pytest.mark.parametrize(
+    "shapes", [STACKED, SIDE_BY_SIDE, CAN_ON_BOX], ids=["stacked", "beside", "can on box"]
+)
+def test_two_shapes_are_parted_where_they_meet(shapes):
+    points, normals, truth = points_of(shapes)
+    groups = divided(points, normals)
+    assert groups is not None
+    assert set(groups) == {0, 1}
+    assert agreement(groups, truth) > 0.9
+    assert np.bincount(groups[truth == 0]).argmax() != np.bincount(groups[truth == 1]).argmax()
+
+
+def test_a_bridge_is_parted_into_all_its_three_shapes():
+    pillars = [box((0.0, y, 0.05), (0.06, 0.06, 0.1)) for y in (-0.09, 0.09)]
+    points, normals, truth = points_of([*pillars, box((0.0, 0.0, 0.115), (0.06, 0.26, 0.03))])
+    groups = divided(points, normals)
+    assert groups is not None
+    assert len(set(groups)) == 3
+    assert agreement(groups, truth) > 0.85
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [STACKED[0], cylinder((0.0, 0.0, 0.06), 0.04, 0.12), sphere((0.0, 0.0, 0.05), 0.05)],
+    ids=["box", "cylinder", "sphere"],
+)
+@pytest.mark.parametrize("sigma", [0.0005, 0.004])
+def test_one_shape_stays_one_whatever_the_noise(shape, sigma):
+    points, normals, _ = points_of([shape], sigma)
+    assert divided(points, normals) is None
+
+
+def test_few_points_are_not_divided():
+    points, normals, _ = points_of(STACKED)
+    few = np.random.default_rng(0).choice(len(points), 2 * SplitConfig().min_points - 1, replace=False)
+    assert divided(points[few], normals[few]) is None
+
+
+def test_the_division_turns_with_the_scene():
+    points, normals, truth = points_of(STACKED)
+    T = motion_about_vertical(np.random.default_rng(5))
+    groups = divided(frames.transform(T, points), frames.rotate(T, normals))
+    assert groups is not None
+    assert agreement(groups, truth) > 0.9
