@@ -8,7 +8,8 @@ from raycast import TABLE, from_the_side, table_scene
 from synthetic import box, sphere
 
 from caryatid import frames
-from caryatid.visibility import MARGIN, seen_through
+from caryatid.config import FusionConfig
+from caryatid.visibility import seen_through as seen_through_with
 
 EYE = from_the_side(azimuth=180.0)
 CRATE = box((0.0, 0.0, TABLE + 0.06), (0.1, 0.1, 0.12))
@@ -24,6 +25,10 @@ def view_of(*boxes, spheres=()):
 
 
 EMPTY = view_of()
+
+
+def seen_through(shape, view):
+    return seen_through_with(shape, view, FusionConfig())
 
 
 def test_what_is_there_is_not_seen_through():
@@ -54,7 +59,7 @@ def test_an_error_of_registration_is_no_contradiction():
     view = view_of(CRATE)
     forward = EYE[:3, 2]
     for share, contradicted in ((0.8, False), (1.6, True)):
-        nearer = CRATE.moved(frames.rigid(np.eye(3), -share * MARGIN * forward))
+        nearer = CRATE.moved(frames.rigid(np.eye(3), -share * FusionConfig().behind * forward))
         assert seen_through(nearer, view) == contradicted
 
 

@@ -189,7 +189,7 @@ def _is_round(shape: Shape) -> bool:
 
 
 def _vertex(sightings: list[SceneObject], config: FusionConfig) -> SceneObject:
-    return merge(sightings) if config.method == "sg" else sightings[-1]
+    return merge(sightings, config) if config.method == "sg" else sightings[-1]
 
 
 def _named(o: SceneObject, new_id: str) -> SceneObject:

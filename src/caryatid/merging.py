@@ -9,6 +9,7 @@ from itertools import permutations, product
 import numpy as np
 
 from caryatid import frames
+from caryatid.config import FusionConfig
 from caryatid.frames import Array
 from caryatid.graph import SceneObject
 from caryatid.shapes import Box, Cylinder, Shape, Sphere
@@ -24,7 +25,7 @@ _TURNS = np.array(
 """The 24 rotations (24, 3, 3) of a cube: ways to name the axes of a box."""
 
 
-def merge(sightings: Sequence[SceneObject]) -> SceneObject:
+def merge(sightings: Sequence[SceneObject], config: FusionConfig) -> SceneObject:
     """Merge sightings of one object into a vertex whose shape is better than each.
 
     The kind is the one with the most evidence. Poses and radii are averaged with the evidence as weight; each
@@ -33,13 +34,14 @@ def merge(sightings: Sequence[SceneObject]) -> SceneObject:
 
     Args:
         sightings: At least one; the first lends id, label and role.
+        config: What a bad residual costs.
     """
-    weights = np.array([_evidence(o) for o in sightings])
+    weights = np.array([_evidence(o, config) for o in sightings])
     kinds = sorted({o.shape.kind for o in sightings})
     votes = [sum(w for w, o in zip(weights, sightings, strict=True) if o.shape.kind == k) for k in kinds]
     kind = kinds[int(np.argmax(votes))]
     same = [o for o in sightings if o.shape.kind == kind]
-    w = np.array([_evidence(o) for o in same])
+    w = np.array([_evidence(o, config) for o in same])
     best = same[int(np.argmax(w))]
     if len(same) == 1:
         shape, seen = best.shape, best.seen
@@ -76,9 +78,9 @@ def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
     return _TURNS[best], float(np.arccos(np.clip((traces[best] - 1.0) / 2.0, -1.0, 1.0)))
 
 
-def _evidence(o: SceneObject) -> float:
-    """Weight of a sighting: its seen sides, and less for a bad residual (1 cm halves it)."""
-    return (0.1 + sum(o.seen)) / (1.0 + (o.residual / 0.01) ** 2)
+def _evidence(o: SceneObject, config: FusionConfig) -> float:
+    """Weight of a sighting: one for the object and one for each side seen, less for a bad residual."""
+    return (1.0 + sum(o.seen)) / (1.0 + (o.residual / config.residual) ** 2)
 
 
 def _merged_sphere(spheres: Sequence[Shape], weights: Array) -> Sphere:

@@ -183,7 +183,7 @@ class Scene:
         self._shown.update(seen)
         if percept.view is not None:
             for o in self.graph.objects:
-                if o.role == "object" and o.id not in seen and seen_through(o.shape, percept.view):
+                if o.role == "object" and o.id not in seen and seen_through(o.shape, percept.view, config):
                     self._contradicted[o.id] += 1
         fused = fused_graph(self._evidence, config, shown=self._shown, contradicted=self._contradicted)
         ids = {o.id for o in fused.objects}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caryatid import frames
+from caryatid.config import FusionConfig
 from caryatid.shapes import Shape
 from caryatid.views import View
 
@@ -14,14 +15,15 @@ MARGIN = 0.02
 """How far behind the surface a reading must lie to contradict it [m]; 2σ of registration and depth."""
 
 
-def seen_through(shape: Shape, view: View) -> bool:
+def seen_through(shape: Shape, view: View, config: FusionConfig) -> bool:
     """Whether a view looks through most of where the shape should be.
 
     Args:
         shape: In the world frame.
         view: A view with a pose.
+        config: How far behind the surface a reading contradicts it, and how many must.
     """
-    points_world, normals_world = shape.surface(SPACING)
+    points_world, normals_world = shape.surface(config.surface_spacing)
     eye_world = view.pose[:3, 3]
     facing = np.sum((eye_world - points_world) * normals_world, axis=1) > 0.0
     p = frames.transform(frames.invert(view.pose), points_world[facing])
@@ -34,4 +36,4 @@ def seen_through(shape: Shape, view: View) -> bool:
     read = depth > 0.0
     if not read.any():
         return False
-    return bool((depth[read] > p[inside, 2][read] + MARGIN).mean() > 0.5)
+    return bool((depth[read] > p[inside, 2][read] + config.behind).mean() > config.contradicting)

@@ -140,5 +140,13 @@ class FusionConfig:
     """Sorted extents that differ by more than this factor are two objects."""
     settled: float = 0.005
     """A shape that moves, grows or turns by less than this has not changed [m]; σ of registration error."""
+    surface_spacing: float = 0.01
+    """Spacing of the points on a shape that are looked for in a view that does not show the object [m]."""
+    behind: float = 0.02
+    """A reading this far behind such a point contradicts it [m]; 2σ of registration and depth together."""
+    contradicting: float = 0.5
+    """Share of the points that must be contradicted for the view to speak against the object [1]."""
+    residual: float = 0.01
+    """Mean distance of its points at which a sighting counts half in the merged shape (`sg`) [m]."""
     keep_share: float = 0.5
     """A support is kept while occurrences / opportunities is at least this."""
