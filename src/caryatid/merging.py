@@ -79,8 +79,8 @@ def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
 
 
 def _evidence(o: SceneObject, config: FusionConfig) -> float:
-    """Weight of a sighting: one for the object and one for each side seen, less for a bad residual."""
-    return (1.0 + sum(o.seen)) / (1.0 + (o.residual / config.residual) ** 2)
+    """Weight of a sighting: the sides seen, less for a bad residual."""
+    return (config.blind + sum(o.seen)) / (1.0 + (o.residual / config.residual) ** 2)
 
 
 def _merged_sphere(spheres: Sequence[Shape], weights: Array) -> Sphere:

@@ -146,6 +146,8 @@ class FusionConfig:
     """A reading this far behind such a point contradicts it [m]; 2σ of registration and depth together."""
     contradicting: float = 0.5
     """Share of the points that must be contradicted for the view to speak against the object [1]."""
+    blind: float = 0.1
+    """Weight, in sides, of a sighting of which no side was seen (`sg`) [1]; small beside any other."""
     residual: float = 0.01
     """Mean distance of its points at which a sighting counts half in the merged shape (`sg`) [m]."""
     keep_share: float = 0.5
