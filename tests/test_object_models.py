@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic import box, cylinder, surface_points
 
-from caryatid.config import Config
+from caryatid.config import Config, SplitConfig
 from caryatid.object_models import ObjectModels
 from caryatid.perception import Percept
 from caryatid.views import Cloud
@@ -27,7 +27,7 @@ def percept_of(labels, shapes=(CRATE, CAN), eye=(-1.2, -0.6, 1.8), seed=0):
 
 @pytest.fixture
 def models():
-    return ObjectModels(Config(), 0)
+    return ObjectModels(Config(split=SplitConfig(min_residual=0.0025)), 0)
 
 
 def test_what_was_taken_for_one_is_divided_and_the_view_relabelled(models):

@@ -28,7 +28,15 @@ def points_of(shapes, sigma=0.001, seed=0):
 def divided(points, normals):
     residual = fit(points, normals, config=FitConfig(), rng=np.random.default_rng(0)).residual
     rng = np.random.default_rng(0)
-    return split(points, normals, residual, up=UP, config=SplitConfig(), fit_config=FitConfig(), rng=rng)
+    return split(
+        points,
+        normals,
+        residual,
+        up=UP,
+        config=SplitConfig(min_residual=0.0025),
+        fit_config=FitConfig(),
+        rng=rng,
+    )
 
 
 def agreement(groups, truth):

@@ -54,9 +54,9 @@ class FitConfig:
 class SplitConfig:
     """Parting what automatic segmentation took for one object."""
 
-    min_residual: float = 0.0025
-    """Mean distance to the best single shape from which on a cut is tried [m]; noise alone leaves 2 mm."""
-    gain: float = 0.7
+    min_residual: float = 0.003
+    """Mean distance to the best single shape from which on a cut is tried [m]; noise leaves 2 mm."""
+    gain: float = 0.6
     """A cut must bring the mean distance below this share of the single shape's [1]."""
     growth: float = 1.3
     """An object that was not divided is looked at again when its points have grown by this factor [1]."""
