@@ -8,7 +8,15 @@ import pytest
 from synthetic import hausdorff, random_motion, surface_points
 
 from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
-from caryatid.refine import NOISE_FLOOR, ROBUST_WIDTH, linearise, refine, stepped
+from caryatid.refine import (
+    NOISE_FLOOR,
+    ROBUST_WIDTH,
+    distances,
+    linearise,
+    refine,
+    refine_reference,
+    stepped,
+)
 from caryatid.shapes import Box, Cylinder, Sphere
 
 T = random_motion(np.random.default_rng(1))
@@ -103,6 +111,26 @@ def test_compiled_normal_equations_are_those_of_the_reference(shape):
     columns = list(COLUMNS[shape.kind])
     np.testing.assert_allclose(H[np.ix_(columns, columns)], J.T @ (weight[:, None] * J), atol=1e-12)
     np.testing.assert_allclose(g[columns], J.T @ (weight * distance), atol=1e-12)
+
+
+@each
+def test_compiled_outward_directions_are_those_of_the_reference(shape):
+    points = points_about(shape)
+    distance, outward = distances(shape, points)
+    np.testing.assert_allclose(distance, shape.signed_distance(points), atol=1e-12)
+    np.testing.assert_allclose(outward, -linearise(shape, points)[1][:, :3], atol=1e-9)
+
+
+@each
+@pytest.mark.parametrize("seed", range(3))
+def test_compiled_refinement_is_that_of_the_reference(shape, seed):
+    points, _ = surface_points(shape, np.random.default_rng(seed), eye=(0.0, -2.0, 1.0), sigma=0.002)
+    start = disturbed(shape, seed)
+    for steps in (1, 6, 25):
+        options = OPTIONS | {"steps": steps}
+        compiled, plain = refine(start, points, **options), refine_reference(start, points, **options)
+        assert hausdorff(compiled, start) > 0.001
+        assert hausdorff(compiled, plain) < 1e-7
 
 
 @each

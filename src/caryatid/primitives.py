@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from caryatid import frames
 from caryatid.config import FitConfig
 from caryatid.frames import Array
+from caryatid.kernels.hypotheses import any_within, count_agreeing
 from caryatid.ransac import ransac
-from caryatid.refine import linearise, refine
+from caryatid.refine import distances, refine
 from caryatid.shape_models import BoxModel, CylinderModel, ShapeModel, SphereModel
 from caryatid.shapes import Box, Cylinder, Sphere
 
@@ -79,7 +79,7 @@ def candidates(points: Array, normals: Array, *, config: FitConfig, rng: np.rand
         chosen = np.sort(rng.choice(len(points), config.max_points, replace=False))
         points, normals = points[chosen], normals[chosen]
     origin = points.mean(axis=0)
-    centred = points - origin
+    centred = np.ascontiguousarray(points - origin)
     fits: list[Fit] = []
     for starts in _starts(centred, normals, config, rng):
         polished = [
@@ -89,8 +89,7 @@ def candidates(points: Array, normals: Array, *, config: FitConfig, rng: np.rand
         judged = [judge(s, centred, normals, config) for s in polished]
         if judged:
             fits.append(min(judged, key=lambda f: f.cost))
-    tree = cKDTree(centred)
-    fits = [replace(f, cost=f.cost + config.bare_weight * bare_share(f, tree, config)) for f in fits]
+    fits = [replace(f, cost=f.cost + config.bare_weight * bare_share(f, centred, config)) for f in fits]
     back = frames.rigid(np.eye(3), origin)
     return [
         replace(f, shape=f.shape.moved(back))
@@ -102,10 +101,10 @@ def candidates(points: Array, normals: Array, *, config: FitConfig, rng: np.rand
 def judge(shape: Box | Cylinder | Sphere, points: Array, normals: Array, config: FitConfig) -> Fit:
     """Say how well a shape explains oriented points, and draw in the sides that no point bears out."""
     shape, seen = draw_in(shape, points, normals, config)
-    distance, J = linearise(shape, points)
+    distance, outward = distances(shape, points)
     absolute = np.minimum(np.abs(distance), config.threshold)
-    outward = -J[:, :3] @ shape.T_world_object[:3, :3].T
-    turned = np.clip(1.0 - np.sum(outward * normals, axis=1), 0.0, 1.0)
+    agreement = np.sum(outward * (normals @ shape.T_world_object[:3, :3]), axis=1)
+    turned = np.clip(1.0 - agreement, 0.0, 1.0)
     residual = float(absolute.mean())
     size = float(np.mean(shape.extents**2))
     cost = residual + config.normal_weight * float(turned.mean()) + config.size_penalty * size
@@ -113,7 +112,7 @@ def judge(shape: Box | Cylinder | Sphere, points: Array, normals: Array, config:
     return Fit(shape, residual, inliers, seen, cost, residual > config.max_residual)
 
 
-def bare_share(fit: Fit, tree: cKDTree, config: FitConfig) -> float:
+def bare_share(fit: Fit, points: Array, config: FitConfig) -> float:
     """Share of the seen sides' area that has no point near it: a side that was seen should be seen whole."""
     samples, outward = fit.shape.surface(config.bare_spacing)
     local = outward @ fit.shape.T_world_object[:3, :3]
@@ -122,22 +121,20 @@ def bare_share(fit: Fit, tree: cKDTree, config: FitConfig) -> float:
     on_seen = np.array(fit.seen)[side]
     if not on_seen.any():
         return 1.0
-    gap, _ = tree.query(samples[on_seen])
-    return float((gap > 2.0 * config.bare_spacing).mean())
+    return 1.0 - float(any_within(samples[on_seen], points, 2.0 * config.bare_spacing).mean())
 
 
 def draw_in(
     shape: Box | Cylinder | Sphere, points: Array, normals: Array, config: FitConfig
 ) -> tuple[Box | Cylinder | Sphere, Seen]:
     """Find the sides that points bear out, and move the others inwards to where the points end."""
-    distance, J = linearise(shape, points)
+    distance, outward = distances(shape, points)
     R = shape.T_world_object[:3, :3]
-    outward = -J[:, :3]
     agree = (np.abs(distance) < config.threshold) & (np.sum((normals @ R) * outward, axis=1) > 0.5)
     least = max(config.min_points / 3.0, config.side_share * len(points))
-    seen = np.array(
-        [(agree & (s * outward[:, a] > 0.7)).sum() >= least for a in range(3) for s in (-1.0, 1.0)]
-    )
+    facing = outward[agree]
+    counts = np.stack([(facing < -0.7).sum(axis=0), (facing > 0.7).sum(axis=0)], axis=1)
+    seen = counts.ravel() >= least
     if not isinstance(shape, Sphere):
         near = points[np.abs(distance) < config.threshold]
         shape = _to_points(shape, near if len(near) else points, seen, config)
@@ -153,6 +150,8 @@ def _to_points(
     local = (points - T[:3, 3]) @ T[:3, :3]
     low, high = -shape.extents / 2.0, shape.extents / 2.0
     for axis in (2,) if isinstance(shape, Cylinder) else (0, 1, 2):
+        if seen[2 * axis] and seen[2 * axis + 1]:
+            continue
         start, end = np.quantile(local[:, axis], (config.trim, 1.0 - config.trim))
         if not seen[2 * axis]:
             low[axis] = min(max(low[axis], start), high[axis] - config.min_extent)
@@ -173,6 +172,7 @@ def _starts(
         CylinderModel(config.max_radius, config.max_extent, config.trim),
         SphereModel(config.max_radius),
     )
+    main = _main_normal(normals)
     starts: list[list[Box | Cylinder | Sphere]] = []
     for model in models:
         ranked = ransac(
@@ -189,16 +189,17 @@ def _starts(
         found = model.estimate(samples, points, normals)
         shapes = [model.shape(found, k) for k in range(len(ranked))]
         if isinstance(model, BoxModel):
-            shapes += _flat_boxes(points, normals, config)
+            shapes += _flat_boxes(points, *main, config)
         if isinstance(model, CylinderModel):
-            shapes += _discs(points, normals, config)
+            shapes += _discs(points, *main, config)
         starts.append(shapes)
     return starts
 
 
-def _flat_boxes(points: Array, normals: Array, config: FitConfig) -> list[Box | Cylinder | Sphere]:
+def _flat_boxes(
+    points: Array, axis: Array, agree: NDArray[np.bool_], config: FitConfig
+) -> list[Box | Cylinder | Sphere]:
     """Boxes for points of one face: the main normal, and the least rectangle around the points along it."""
-    axis, agree = _main_normal(normals)
     x = _across(points, axis)
     y = np.cross(axis, x)
     plane = points @ np.stack([x, y], axis=1)
@@ -217,9 +218,10 @@ def _flat_boxes(points: Array, normals: Array, config: FitConfig) -> list[Box | 
     return [Box(frames.rigid(R, R @ ((low + high) / 2.0)), high - low)]
 
 
-def _discs(points: Array, normals: Array, config: FitConfig) -> list[Box | Cylinder | Sphere]:
+def _discs(
+    points: Array, axis: Array, agree: NDArray[np.bool_], config: FitConfig
+) -> list[Box | Cylinder | Sphere]:
     """Cylinders for points of one end: the main normal, and the circle that holds the points along it."""
-    axis, agree = _main_normal(normals)
     x = _across(points, axis)
     R = np.stack([x, np.cross(axis, x), axis], axis=1)
     local = points @ R
@@ -233,8 +235,9 @@ def _discs(points: Array, normals: Array, config: FitConfig) -> list[Box | Cylin
 
 def _main_normal(normals: Array) -> tuple[Array, NDArray[np.bool_]]:
     """The direction (3,) most normals agree on within 25°, their mean, and which do (N,)."""
-    agree = normals @ normals.T > np.cos(np.radians(25.0))
-    largest = agree[int(np.argmax(agree.sum(axis=1)))]
+    least_cosine = float(np.cos(np.radians(25.0)))
+    count = count_agreeing(np.ascontiguousarray(normals), least_cosine)
+    largest = normals @ normals[int(np.argmax(count))] > least_cosine
     return frames.unit(normals[largest].mean(axis=0)), largest
 
 

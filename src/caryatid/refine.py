@@ -6,7 +6,13 @@ import numpy as np
 
 from caryatid import frames
 from caryatid.frames import Array
-from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
+from caryatid.kernels.fitting import (
+    BOX,
+    CYLINDER,
+    SPHERE,
+    distances_and_gradients,
+    levenberg_marquardt,
+)
 from caryatid.shapes import Box, Cylinder, Sphere
 
 ROBUST_WIDTH = 2.5
@@ -18,7 +24,6 @@ NOISE_FLOOR = 0.0005
 
 
 _CODES = {"sphere": SPHERE, "cylinder": CYLINDER, "box": BOX}
-_SIZE_COLUMNS = {"sphere": (6,), "cylinder": (6, 8), "box": (6, 7, 8)}
 
 
 def linearise(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Array, Array]:
@@ -73,37 +78,71 @@ def refine(
         shrink: Gradient [m] that pulls every half extent inwards, so that sides nobody saw stay small. A face
             that holds a share s of the points is moved by shrink / (2·s) only.
     """
+    kind, R, centre, half = arrays(shape)
+    points = np.ascontiguousarray(points_world)
+    R, centre, half = levenberg_marquardt(
+        kind,
+        R,
+        centre,
+        half,
+        points,
+        steps,
+        min_extent,
+        shrink,
+        ROBUST_WIDTH,
+        NOISE_FLOOR,
+        RIDGE,
+    )
+    T = frames.rigid(R, centre)
+    if isinstance(shape, Sphere):
+        return Sphere(T, float(half[0]))
+    if isinstance(shape, Cylinder):
+        return Cylinder(T, float(half[0]), 2.0 * float(half[2]))
+    return Box(T, 2.0 * half)
+
+
+def refine_reference(
+    shape: Box | Cylinder | Sphere,
+    points_world: Array,
+    *,
+    steps: int,
+    min_extent: float,
+    shrink: float,
+) -> Box | Cylinder | Sphere:
+    """Do the same as `refine` in NumPy, step by step."""
     damping = 1e-3
     best = shape
-    sizes = _SIZE_COLUMNS[shape.kind]
-    columns = np.array([0, 1, 2, 3, 4, 5, *sizes])
-    points = np.ascontiguousarray(points_world)
-    distance = signed_distances(*_arrays(best), points)
+    distance, J = linearise(best, points_world)
     for _ in range(steps):
         scale = ROBUST_WIDTH * max(1.4826 * float(np.median(np.abs(distance))), NOISE_FLOOR)
-        H_all, gradient_all = normal_equations(*_arrays(best), points, scale)
-        H, gradient = H_all[np.ix_(columns, columns)], gradient_all[columns]
+        weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2 / len(distance)
+        H, gradient = J.T @ (weight[:, None] * J), J.T @ (weight * distance)
         gradient[6:] += shrink / 2.0
         cost = _cost(distance, scale) + shrink * _sizes(best)
-        ridge = np.diag(H) + RIDGE[: len(columns)]
+        ridge = np.diag(H) + RIDGE[: len(H)]
         for _ in range(6):
-            step = -np.linalg.solve(H + np.diag(damping * ridge), gradient)
+            step: Array = -np.linalg.solve(H + np.diag(damping * ridge), gradient)
             trial = stepped(best, _limited(step), min_extent)
-            trial_distance = signed_distances(*_arrays(trial), points)
+            trial_distance, trial_J = linearise(trial, points_world)
             trial_cost = _cost(trial_distance, scale) + shrink * _sizes(trial)
             if trial_cost < cost:
                 break
             damping *= 6.0
         else:
             return best
-        best, distance = trial, trial_distance
+        best, distance, J = trial, trial_distance, trial_J
         damping = max(damping / 10.0, 1e-7)
         if cost - trial_cost < 1e-4 * cost:
             break
     return best
 
 
-def _arrays(shape: Box | Cylinder | Sphere) -> tuple[int, Array, Array, Array]:
+def distances(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Array, Array]:
+    """Signed distances (N,) [m] of points (N, 3) and the outward directions (N, 3) there, object frame."""
+    return distances_and_gradients(*arrays(shape), np.ascontiguousarray(points_world))
+
+
+def arrays(shape: Box | Cylinder | Sphere) -> tuple[int, Array, Array, Array]:
     """Code, axes, centre and half extents, as the kernels take them."""
     T = shape.T_world_object
     return _CODES[shape.kind], np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), shape.extents / 2.0

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from caryatid import frames
 from caryatid.frames import Array
+from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE
+from caryatid.kernels.hypotheses import hypothesis_distances, trimmed_ranges
 from caryatid.shapes import Box, Cylinder, Sphere
 
 
@@ -72,16 +74,17 @@ class BoxModel:
         ortho = np.where(valid[:, None], ortho, frames.perpendicular(first))
         y = frames.unit(ortho)
         R = np.stack([np.cross(y, first), y, first], axis=-1)
-        low, high = _trimmed_range(points @ R, self.trim)
+        low, high = (
+            end.reshape(-1, 3)
+            for end in _trimmed_range(points, np.swapaxes(R, 1, 2).reshape(-1, 3), self.trim)
+        )
         extents = np.maximum(high - low, 1e-4)
         centre = np.einsum("bij,bj->bi", R, (low + high) / 2.0)
         return Hypotheses(R, centre, extents, valid & (extents.max(axis=1) <= self.max_extent))
 
     def distances(self, hypotheses: Hypotheses, points: Array) -> Array:
         """Unsigned distance (B, N) [m] to the boxes' surfaces."""
-        q = np.abs(_local(hypotheses, points)) - hypotheses.extents[:, None, :] / 2.0
-        outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(axis=-1))
-        return _masked(outside + np.abs(np.minimum(q.max(axis=-1), 0.0)), hypotheses.valid)
+        return _distances(BOX, hypotheses, points)
 
     def shape(self, hypotheses: Hypotheses, index: int) -> Box:
         """One hypothesis as a shape."""
@@ -113,9 +116,9 @@ class CylinderModel:
         axis = frames.unit(np.where(valid[:, None], cross, frames.perpendicular(n1)))
         radius, on_axis = _meeting_of_normals(p1, n1, p2, n2, axis)
         R = _axes(axis, n1)
-        low, high = _trimmed_range((axis @ points.T)[:, :, None], self.trim)
-        height = np.maximum(high - low, 1e-4)[:, 0]
-        along = (low + high)[:, 0] / 2.0 - np.sum(on_axis * axis, axis=1)
+        low, high = _trimmed_range(points, axis, self.trim)
+        height = np.maximum(high - low, 1e-4)
+        along = (low + high) / 2.0 - np.sum(on_axis * axis, axis=1)
         valid &= (radius > 1e-3) & (radius <= self.max_radius) & (height <= self.max_extent)
         return Hypotheses(
             R, on_axis + along[:, None] * axis, np.stack([2 * radius, 2 * radius, height], axis=-1), valid
@@ -123,11 +126,7 @@ class CylinderModel:
 
     def distances(self, hypotheses: Hypotheses, points: Array) -> Array:
         """Unsigned distance (B, N) [m] to the capped cylinders' surfaces."""
-        p = _local(hypotheses, points)
-        q0 = np.sqrt(p[..., 0] ** 2 + p[..., 1] ** 2) - hypotheses.extents[:, None, 0] / 2.0
-        q1 = np.abs(p[..., 2]) - hypotheses.extents[:, None, 2] / 2.0
-        outside = np.sqrt(np.maximum(q0, 0.0) ** 2 + np.maximum(q1, 0.0) ** 2)
-        return _masked(outside + np.abs(np.minimum(np.maximum(q0, q1), 0.0)), hypotheses.valid)
+        return _distances(CYLINDER, hypotheses, points)
 
     def shape(self, hypotheses: Hypotheses, index: int) -> Cylinder:
         """One hypothesis as a shape."""
@@ -160,8 +159,7 @@ class SphereModel:
 
     def distances(self, hypotheses: Hypotheses, points: Array) -> Array:
         """Unsigned distance (B, N) [m] to the spheres."""
-        gap = np.linalg.norm(points[None] - hypotheses.centre[:, None], axis=-1)
-        return _masked(np.abs(gap - hypotheses.extents[:, None, 0] / 2.0), hypotheses.valid)
+        return _distances(SPHERE, hypotheses, points)
 
     def shape(self, hypotheses: Hypotheses, index: int) -> Sphere:
         """One hypothesis as a shape."""
@@ -187,18 +185,14 @@ def _axes(z: Array, towards: Array) -> Array:
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
-def _local(hypotheses: Hypotheses, points: Array) -> Array:
-    local = points @ hypotheses.R
-    return local - np.einsum("bi,bij->bj", hypotheses.centre, hypotheses.R)[:, None, :]
+def _distances(kind: int, hypotheses: Hypotheses, points: Array) -> Array:
+    return hypothesis_distances(
+        kind, hypotheses.R, hypotheses.centre, hypotheses.extents / 2.0, hypotheses.valid, points
+    )
 
 
-def _trimmed_range(coordinates: Array, trim: float) -> tuple[Array, Array]:
-    """Trimmed least and greatest coordinate (B, 3) of (B, N, 3)."""
-    count = coordinates.shape[1]
-    k = min(int(trim * count), (count - 1) // 2)
-    ordered = np.partition(coordinates, (k, count - 1 - k), axis=1)
-    return ordered[:, k], ordered[:, count - 1 - k]
-
-
-def _masked(distance: Array, valid: NDArray[np.bool_]) -> Array:
-    return np.where(valid[:, None], distance, np.inf)
+def _trimmed_range(points: Array, directions: Array, trim: float) -> tuple[Array, Array]:
+    """Trimmed least and greatest coordinate (B,) [m] of points (N, 3) along each direction (B, 3)."""
+    return trimmed_ranges(
+        points, np.ascontiguousarray(directions), min(int(trim * len(points)), (len(points) - 1) // 2)
+    )

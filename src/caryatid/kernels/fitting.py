@@ -1,6 +1,6 @@
-"""Compiled kernels of the shape fits: signed distances, and the normal equations of one least-squares step.
+"""Compiled kernels of the shape fits: signed distances, and least squares on them from start to end.
 
-`refine.linearise` is the NumPy reference the tests compare them with.
+`refine.linearise` and `refine.refine_reference` are the NumPy references the tests compare them with.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ from caryatid.frames import Array
 
 SPHERE, CYLINDER, BOX = 0, 1, 2
 """Codes of the shapes."""
+Posed = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+"""Axes (3, 3), columns = x, y, z of the object; centre (3,) [m]; half extents (3,) [m] along the axes."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def signed_distances(
     kind: int,
     R: NDArray[np.float64],
@@ -33,14 +35,126 @@ def signed_distances(
         points: (N, 3) [m].
     """
     distance = np.empty(len(points))
-    gradient = np.empty(3)
-    local = np.empty(3)
+    hx, hy, hz = half
     for i in range(len(points)):
-        distance[i] = _distance(kind, R, centre, half, points[i], local, gradient)
+        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
+        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
+        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        distance[i] = signed_distance(kind, x, y, z, hx, hy, hz)
     return distance
 
 
-@njit(cache=True)
+@njit(cache=True, inline="always")
+def signed_distance(kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float) -> float:
+    """Signed distance [m] of one point in the object's frame to a shape with these half extents [m]."""
+    if kind == SPHERE:
+        return np.sqrt(x * x + y * y + z * z) - hx
+    if kind == CYLINDER:
+        q0, q2 = np.sqrt(x * x + y * y) - hx, abs(z) - hz
+        if q0 > 0.0 and q2 > 0.0:
+            return np.sqrt(q0 * q0 + q2 * q2)
+        return max(q0, q2)
+    qx, qy, qz = abs(x) - hx, abs(y) - hy, abs(z) - hz
+    most = max(qx, qy, qz)
+    if most <= 0.0:
+        return most
+    ox, oy, oz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
+    return np.sqrt(ox * ox + oy * oy + oz * oz)
+
+
+@njit(cache=True, error_model="numpy")
+def distances_and_gradients(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+) -> tuple[Array, Array]:
+    """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame."""
+    distance = np.empty(len(points))
+    gradients = np.empty((len(points), 3))
+    hx, hy, hz = half
+    for i in range(len(points)):
+        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
+        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
+        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        distance[i], gradients[i, 0], gradients[i, 1], gradients[i, 2] = _gradient(kind, x, y, z, hx, hy, hz)
+    return distance, gradients
+
+
+@njit(cache=True, error_model="numpy")
+def levenberg_marquardt(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+    steps: int,
+    min_extent: float,
+    shrink: float,
+    robust_width: float,
+    noise_floor: float,
+    ridge: NDArray[np.float64],
+) -> Posed:
+    """Minimise the Geman–McClure cost of signed distances; arguments as of `refine.refine`.
+
+    Args:
+        kind: Code of the shape.
+        R: Axes (3, 3) at the start.
+        centre: (3,) [m] at the start.
+        half: Half extents (3,) [m] at the start.
+        points: (N, 3) [m].
+        steps: Steps at the most.
+        min_extent: Least extent [m].
+        shrink: Pull on the extents [m].
+        robust_width: Residuals beyond this many robust standard deviations lose most of their weight.
+        noise_floor: Least standard deviation the weights assume [m].
+        ridge: Added to the diagonal (9,), times the damping.
+    """
+    columns = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8])
+    if kind == SPHERE:
+        columns = columns[:7]
+    elif kind == CYLINDER:
+        columns = np.array([0, 1, 2, 3, 4, 5, 6, 8])
+    size = len(columns)
+    damping = 1e-3
+    H = np.empty((size, size))
+    g = np.empty(size)
+    distance = signed_distances(kind, R, centre, half, points)
+    for _ in range(steps):
+        scale = robust_width * max(1.4826 * np.median(np.abs(distance)), noise_floor)
+        H_all, g_all = normal_equations(kind, R, centre, half, points, scale)
+        for a in range(size):
+            g[a] = g_all[columns[a]] + (shrink / 2.0 if a >= 6 else 0.0)
+            for b in range(size):
+                H[a, b] = H_all[columns[a], columns[b]]
+        cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
+        improved = False
+        trial_cost = cost
+        for _ in range(6):
+            damped = H.copy()
+            for a in range(size):
+                damped[a, a] += damping * (H[a, a] + ridge[a])
+            step = -np.linalg.solve(damped, g)
+            R_trial, centre_trial, half_trial = _stepped(kind, R, centre, half, step, columns, min_extent)
+            trial = signed_distances(kind, R_trial, centre_trial, half_trial, points)
+            trial_cost = _robust_cost(trial, scale) + shrink * _sum_of_sizes(kind, half_trial)
+            if trial_cost < cost:
+                improved = True
+                R, centre, half, distance = R_trial, centre_trial, half_trial, trial
+                break
+            damping *= 6.0
+        if not improved:
+            break
+        damping = max(damping / 10.0, 1e-7)
+        if cost - trial_cost < 1e-4 * cost:
+            break
+    return R, centre, half
+
+
+@njit(cache=True, error_model="numpy")
 def normal_equations(
     kind: int,
     R: NDArray[np.float64],
@@ -56,81 +170,128 @@ def normal_equations(
     """
     H = np.zeros((9, 9))
     g = np.zeros(9)
-    gradient = np.empty(3)
-    p = np.empty(3)
     J = np.zeros(9)
+    share = 1.0 / len(points)
+    hx, hy, hz = half
     for i in range(len(points)):
-        d = _distance(kind, R, centre, half, points[i], p, gradient)
-        w = 1.0 / (1.0 + (d / scale) ** 2) ** 2 / len(points)
-        for k in range(3):
-            J[k] = -gradient[k]
-            J[6 + k] = 0.0
-        J[3] = -(p[1] * gradient[2] - p[2] * gradient[1])
-        J[4] = -(p[2] * gradient[0] - p[0] * gradient[2])
-        J[5] = -(p[0] * gradient[1] - p[1] * gradient[0])
+        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
+        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
+        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        d, gx, gy, gz = _gradient(kind, x, y, z, hx, hy, hz)
+        weight = share / (1.0 + (d / scale) ** 2) ** 2
+        J[0], J[1], J[2] = -gx, -gy, -gz
+        J[3], J[4], J[5] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
         if kind == BOX:
-            for k in range(3):
-                J[6 + k] = -abs(gradient[k])
+            J[6], J[7], J[8] = -abs(gx), -abs(gy), -abs(gz)
         elif kind == CYLINDER:
-            J[6] = -np.sqrt(gradient[0] ** 2 + gradient[1] ** 2)
-            J[8] = -abs(gradient[2])
+            J[6], J[8] = -np.sqrt(gx * gx + gy * gy), -abs(gz)
         else:
             J[6] = -1.0
         for a in range(9):
-            g[a] += w * d * J[a]
-            for b in range(a + 1):
-                H[a, b] += w * J[a] * J[b]
+            if J[a] != 0.0:
+                weighted = weight * J[a]
+                g[a] += weighted * d
+                for b in range(a + 1):
+                    H[a, b] += weighted * J[b]
     for a in range(9):
         for b in range(a):
             H[b, a] = H[a, b]
     return H, g
 
 
-@njit(cache=True)
-def _distance(
+@njit(cache=True, error_model="numpy", inline="always")
+def _gradient(
+    kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float
+) -> tuple[float, float, float, float]:
+    """Signed distance [m] of one point in the object's frame, and its gradient there."""
+    if kind == SPHERE:
+        length = np.sqrt(x * x + y * y + z * z)
+        inverse = 1.0 / max(length, 1e-12)
+        return length - hx, x * inverse, y * inverse, z * inverse
+    if kind == CYLINDER:
+        ring = np.sqrt(x * x + y * y)
+        inverse = 1.0 / max(ring, 1e-12)
+        q0, q2 = ring - hx, abs(z) - hz
+        if q0 > 0.0 and q2 > 0.0:
+            outside = np.sqrt(q0 * q0 + q2 * q2)
+            s0, s2 = q0 / outside, q2 / outside
+            return outside, s0 * x * inverse, s0 * y * inverse, s2 * np.sign(z)
+        if q0 >= q2:
+            return q0, x * inverse, y * inverse, 0.0
+        return q2, 0.0, 0.0, np.sign(z)
+    qx, qy, qz = abs(x) - hx, abs(y) - hy, abs(z) - hz
+    ox, oy, oz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
+    outside = np.sqrt(ox * ox + oy * oy + oz * oz)
+    if outside > 1e-9:
+        inverse = 1.0 / outside
+        return outside, ox * inverse * np.sign(x), oy * inverse * np.sign(y), oz * inverse * np.sign(z)
+    if qx >= qy and qx >= qz:
+        return qx, np.sign(x), 0.0, 0.0
+    if qy >= qz:
+        return qy, 0.0, np.sign(y), 0.0
+    return qz, 0.0, 0.0, np.sign(z)
+
+
+@njit(cache=True, error_model="numpy")
+def _stepped(
     kind: int,
     R: NDArray[np.float64],
     centre: NDArray[np.float64],
     half: NDArray[np.float64],
-    point: NDArray[np.float64],
-    p: NDArray[np.float64],
-    gradient: NDArray[np.float64],
-) -> float:
-    """Signed distance of one point; fills its local coordinates `p` and the distance's gradient there."""
-    for k in range(3):
-        p[k] = 0.0
-        gradient[k] = 0.0
-        for j in range(3):
-            p[k] += R[j, k] * (point[j] - centre[j])
+    step: NDArray[np.float64],
+    columns: NDArray[np.intp],
+    min_extent: float,
+) -> Posed:
+    """The shape after a step in its own frame, shortened to 3 cm and 0.3 rad; no extent below the least."""
+    longest = 1.0
+    for a in range(len(step)):
+        longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
+    step = step / longest
+    x, y, z = step[3], step[4], step[5]
+    angle = np.sqrt(x * x + y * y + z * z)
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    turn = np.eye(3) + K
+    if angle >= 1e-12:
+        K = K / angle
+        turn = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * _product(K, K)
+    grown = half.copy()
+    for a in range(6, len(step)):
+        grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a], min_extent / 2.0)
     if kind == SPHERE:
-        length = np.sqrt(p[0] ** 2 + p[1] ** 2 + p[2] ** 2)
+        grown[1] = grown[2] = grown[0]
+    elif kind == CYLINDER:
+        grown[1] = grown[0]
+    moved = centre.copy()
+    for i in range(3):
         for k in range(3):
-            gradient[k] = p[k] / max(length, 1e-12)
-        return length - half[0]
+            moved[i] += R[i, k] * step[k]
+    return _product(R, turn), moved, grown
+
+
+@njit(cache=True, error_model="numpy")
+def _product(A: NDArray[np.float64], B: NDArray[np.float64]) -> Array:
+    C = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                C[i, j] += A[i, k] * B[k, j]
+    return C
+
+
+@njit(cache=True, error_model="numpy")
+def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
+    total = 0.0
+    for d in distance:
+        squared = (d / scale) ** 2
+        total += squared / (1.0 + squared)
+    return total / len(distance) * scale**2
+
+
+@njit(cache=True, error_model="numpy")
+def _sum_of_sizes(kind: int, half: NDArray[np.float64]) -> float:
+    if kind == SPHERE:
+        return half[0]
     if kind == CYLINDER:
-        ring = np.sqrt(p[0] ** 2 + p[1] ** 2)
-        q0, q2 = ring - half[0], abs(p[2]) - half[2]
-        outside = np.sqrt(max(q0, 0.0) ** 2 + max(q2, 0.0) ** 2)
-        if outside > 1e-9:
-            s0, s2, d = max(q0, 0.0) / outside, max(q2, 0.0) / outside, outside
-        elif q0 >= q2:
-            s0, s2, d = 1.0, 0.0, q0
-        else:
-            s0, s2, d = 0.0, 1.0, q2
-        gradient[0] = s0 * p[0] / max(ring, 1e-12)
-        gradient[1] = s0 * p[1] / max(ring, 1e-12)
-        gradient[2] = s2 * np.sign(p[2])
-        return d
-    squared, best, nearest = 0.0, -np.inf, 0
-    for k in range(3):
-        q = abs(p[k]) - half[k]
-        squared += max(q, 0.0) ** 2
-        if q > best:
-            best, nearest = q, k
-    outside = np.sqrt(squared)
-    if outside > 1e-9:
-        for k in range(3):
-            gradient[k] = max(abs(p[k]) - half[k], 0.0) / outside * np.sign(p[k])
-        return outside
-    gradient[nearest] = np.sign(p[nearest])
-    return best
+        return half[0] + half[2]
+    return half[0] + half[1] + half[2]
