@@ -121,8 +121,8 @@ def refine_reference(
         cost = _cost(distance, scale) + shrink * _sizes(best)
         ridge = np.diag(H) + RIDGE[: len(H)]
         for _ in range(6):
-            step: Array = -np.linalg.solve(H + np.diag(damping * ridge), gradient)
-            trial = stepped(best, _limited(step), min_extent)
+            step = np.linalg.solve(H + np.diag(damping * ridge), gradient)
+            trial = stepped(best, _limited(-np.asarray(step, dtype=np.float64)), min_extent)
             trial_distance, trial_J = linearise(trial, points_world)
             trial_cost = _cost(trial_distance, scale) + shrink * _sizes(trial)
             if trial_cost < cost:

@@ -52,7 +52,7 @@ def hypothesis_distances(
 def trimmed_ranges(
     points: NDArray[np.float64], directions: NDArray[np.float64], beyond: int
 ) -> tuple[Array, Array]:
-    """Least and greatest coordinate (B,) [m] of points (N, 3) along directions (B, 3), the outermost left out.
+    """Least and greatest coordinate (B,) [m] of points (N, 3) along directions (B, 3), ends left out.
 
     Args:
         points: (N, 3) [m], more than twice `beyond`.
