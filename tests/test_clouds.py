@@ -11,8 +11,8 @@ from caryatid.clouds import estimate_normals, normals_from_depth, oriented_point
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.kernels.images import (
-    inverse_depth_normals,
-    inverse_depth_normals_reference,
+    local_surface,
+    local_surface_reference,
     nearest_seeds,
     nearest_seeds_reference,
 )
@@ -65,15 +65,56 @@ def test_given_normals_are_used():
     np.testing.assert_array_equal(normals_from_depth(view, CONFIG), given)
 
 
-def test_normals_kernel_equals_its_reference():
+def test_local_surface_kernel_equals_its_reference():
     depth = table_scene(from_the_side(), spheres=[SPHERE], sigma=0.001).depth[150:270, 200:360]
     inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
     inverse[::7, ::5] = 0.0
     for radius in (2, 4):
-        fast = inverse_depth_normals(inverse, K, radius, 0.01, 0.004)
-        plain = inverse_depth_normals_reference(inverse, K, radius, 0.01, 0.004)
-        assert (np.linalg.norm(plain, axis=-1) > 0).mean() > 0.9
-        np.testing.assert_allclose(fast, plain, atol=2e-3)
+        fast = local_surface(inverse, K, radius, 0.01, 0.004)
+        plain = local_surface_reference(inverse, K, radius, 0.01, 0.004)
+        assert fast.noise == pytest.approx(plain.noise, rel=1e-3)
+        alike = np.isclose(fast.normals, plain.normals, atol=2e-3).all(axis=-1)
+        alike &= np.isclose(fast.inverse_depth, plain.inverse_depth, atol=1e-5)
+        known = np.linalg.norm(plain.normals, axis=-1) > 0
+        assert known.mean() > 0.9
+        # Two windows that vary alike but for rounding may be chosen differently.
+        assert alike.mean() > 0.999
+
+
+def roof(sigma):
+    """Inverse depth of two planes that meet in a ridge down the middle column, each with its normal."""
+    column = np.arange(80.0) - 40.0
+    true = np.broadcast_to(1.0 - 0.004 * np.abs(column), (60, 80))
+    noise = np.random.default_rng(4).normal(0.0, sigma, true.shape)
+    return true, (true + noise).astype(np.float32)
+
+
+def test_smoothing_takes_noise_off_and_leaves_a_ridge_sharp():
+    sigma = 0.002
+    true, noisy = roof(sigma)
+    surface = local_surface(noisy, K, 3, 0.02, 0.004)
+    inner = (slice(6, -6), slice(6, -6))
+    error = np.abs(surface.inverse_depth - true)[inner]
+    assert surface.noise == pytest.approx(sigma, rel=0.1)
+    assert np.sqrt(np.mean(error**2)) < sigma / 3.0
+    ridge = error[:, 33:36].mean()
+    unguarded = np.abs(true - np.mean([np.roll(true, k, axis=1) for k in range(-3, 4)], axis=0))[6:-6, 39:42]
+    assert ridge < 0.8 * unguarded.mean()
+
+
+def test_smoothed_points_lie_nearer_to_the_surface_than_the_readings():
+    view = table_scene(from_the_side(distance=1.2), half_table=(5.0, 5.0), sigma=0.004)
+    points, _, pixels = oriented_points(view, CONFIG)
+    readings = frames.transform(view.pose, view.points_camera.reshape(-1, 3)[pixels])
+    table = np.median(points[:, 2])
+    assert np.std(points[:, 2] - table) < np.std(readings[:, 2] - table) / 3.0
+
+
+def test_a_view_with_normals_of_its_own_is_taken_as_exact():
+    given = np.tile(np.float32([0.0, 0.0, -1.0]), (48, 64, 1))
+    depth = np.random.default_rng(0).uniform(0.9, 1.1, (48, 64)).astype(np.float32)
+    points, _, _ = oriented_points(View(depth=depth, K=K, normals_camera=given), CONFIG)
+    np.testing.assert_allclose(points[:, 2], depth.ravel(), rtol=1e-6)
 
 
 def test_nearest_seeds_equal_dijkstra():

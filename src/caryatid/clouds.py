@@ -10,7 +10,7 @@ from caryatid import frames
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.frames import Array
-from caryatid.kernels.images import inverse_depth_normals
+from caryatid.kernels.images import LocalSurface, local_surface
 from caryatid.views import View
 
 CHUNK = 100_000
@@ -20,9 +20,7 @@ CHUNK = 100_000
 def normals_from_depth(view: View, config: CloudConfig) -> NDArray[np.float32]:
     """Normals (H, W, 3) of a view in the camera frame, towards the camera, zero where unreliable.
 
-    A plane is linear in inverse depth over the image, and so, nearly, is the noise of a structured-light
-    sensor; hence one small least-squares plane a pixel over its window, from the readings on its side of
-    any depth edge. Given normals (`view.normals_camera`) are passed on.
+    Given normals (`view.normals_camera`) are passed on.
 
     Args:
         view: Depth [m] and intrinsics [px]; no pose needed.
@@ -30,18 +28,35 @@ def normals_from_depth(view: View, config: CloudConfig) -> NDArray[np.float32]:
     """
     if view.normals_camera is not None:
         return view.normals_camera
+    return surface_from_depth(view, config).normals
+
+
+def surface_from_depth(view: View, config: CloudConfig) -> LocalSurface:
+    """Smooth a view's depth by local planes that end at creases and depth edges, and measure its noise.
+
+    A plane is linear in inverse depth over the image, and the noise of a structured-light sensor nearly even
+    in it. Over 7 × 7 readings it falls to a quarter or less.
+
+    Args:
+        view: Depth [m] and intrinsics [px]; no pose needed.
+        config: Window, working range and depth edges.
+    """
     in_range = (view.depth >= config.min_depth) & (view.depth <= config.max_depth)
     inverse_depth = np.zeros_like(view.depth)
     np.divide(np.float32(1.0), view.depth, out=inverse_depth, where=in_range)
-    return inverse_depth_normals(
-        inverse_depth, view.K, config.normal_window // 2, config.edge_jump, config.max_slope
-    )
+    radius = config.normal_window // 2
+    if in_range.any():
+        width = config.normal_size * view.K[0, 0] / float(np.median(view.depth[in_range]))
+        radius = min(radius, max(1, round((width - 1.0) / 2.0)))
+    return local_surface(inverse_depth, view.K, radius, config.edge_jump, config.max_slope)
 
 
 def oriented_points(
     view: View, config: CloudConfig, stride: int = 1
 ) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Oriented points of a view: the readings in working range that have a normal.
+    """Oriented points of a view: the readings in working range that have a normal, smoothed by local planes.
+
+    A view with normals of its own (`view.normals_camera`) is taken as exact.
 
     Args:
         view: The view; without a pose, "world" below is the camera frame.
@@ -51,15 +66,21 @@ def oriented_points(
     Returns:
         Points (N, 3) [m] and unit normals (N, 3) in the world frame, and the flat pixel index (N,) of each.
     """
-    normals = normals_from_depth(view, config)
+    normals, depth = view.normals_camera, view.depth
+    if normals is None:
+        surface = surface_from_depth(view, config)
+        normals = surface.normals
+        known = surface.inverse_depth > 0.0
+        depth = np.where(known, 1.0 / np.where(known, surface.inverse_depth, 1.0), 0.0)
     keep = np.zeros(view.depth.shape, dtype=bool)
-    depth = view.depth[::stride, ::stride]
-    keep[::stride, ::stride] = (depth >= config.min_depth) & (depth <= config.max_depth)
+    sampled = view.depth[::stride, ::stride]
+    keep[::stride, ::stride] = (sampled >= config.min_depth) & (sampled <= config.max_depth)
     pixels = np.flatnonzero(keep)
     normals_camera = normals.reshape(-1, 3)[pixels].astype(np.float64)
     oriented = np.einsum("ij,ij->i", normals_camera, normals_camera) > 0.5
     pixels, normals_camera = pixels[oriented], normals_camera[oriented]
     points_camera = view.points_camera.reshape(-1, 3)[pixels]
+    points_camera = points_camera * (depth.ravel()[pixels] / view.depth.ravel()[pixels])[:, None]
     if view.T_world_camera is None:
         return points_camera, normals_camera, pixels
     T = view.T_world_camera

@@ -9,11 +9,6 @@ from caryatid.config import FusionConfig
 from caryatid.shapes import Shape
 from caryatid.views import View
 
-SPACING = 0.01
-"""Spacing of the samples on the surface [m]."""
-MARGIN = 0.02
-"""How far behind the surface a reading must lie to contradict it [m]; 2σ of registration and depth."""
-
 
 def seen_through(shape: Shape, view: View, config: FusionConfig) -> bool:
     """Whether a view looks through most of where the shape should be.

@@ -14,7 +14,10 @@ class CloudConfig:
     min_depth: float = 0.35
     """Readings nearer than the sensor's near limit are dropped [m]."""
     normal_window: int = 7
-    """Side of the square window normals are estimated over [px]; 7 px is 2 cm at 1.5 m with f = 525 px."""
+    """Side of the square window of the local planes at the most [px]; 7 × 7 take the noise to a quarter."""
+    normal_size: float = 0.02
+    """The same on the surface at the median distance [m]: 7 px at 1.5 m with f = 525 px; fewer in coarse
+    images, where 7 px would be an object."""
     edge_jump: float = 0.01
     """A depth step between neighbours beyond this, at 1 m and growing with z², parts two surfaces [m]."""
     max_slope: float = 0.004

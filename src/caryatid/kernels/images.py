@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -13,12 +15,36 @@ from caryatid.frames import Array
 Image = NDArray[np.float32]
 
 
-def inverse_depth_normals(
-    inverse_depth: Image, K: Array, radius: int, edge_jump: float, max_slope: float
-) -> Image:
-    """Normals (H, W, 3) in the camera frame, towards the camera, zero where too few readings agree.
+CHANCE = 3.0
+"""Standard deviations of a window's variance beyond which its readings scatter more than by chance."""
+TRUSTED = 3.5
+"""Standard deviations of a reading within which another window's plane may speak for it."""
 
-    Fits 1/z = a·du + b·dv + c by least squares to each pixel's window.
+
+@dataclass(frozen=True, eq=False, slots=True)
+class LocalSurface:
+    """What an inverse-depth image says of the surface at each pixel.
+
+    Attributes:
+        inverse_depth: 1/z (H, W) [1/m] of the local plane, 0 where too few readings agree.
+        normals: Unit normals (H, W, 3) in the camera frame, towards the camera, zero there.
+        noise: Standard deviation of one reading [1/m]: the median over all windows.
+    """
+
+    inverse_depth: Image
+    normals: Image
+    noise: float
+
+
+def local_surface(
+    inverse_depth: Image, K: Array, radius: int, edge_jump: float, max_slope: float
+) -> LocalSurface:
+    """Fit a plane to the surface around each pixel, up to its creases but not across them.
+
+    A plane is linear in inverse depth: 1/z = a·du + b·dv + c, by least squares over the window around each
+    pixel. Where the readings of that window scatter more than by chance, the pixel takes the plane of the
+    steadiest of the eight windows that end at it, if this holds for its own reading too (the filter of
+    Kuwahara et al. 1976, with planes in place of means).
 
     Args:
         inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
@@ -28,34 +54,71 @@ def inverse_depth_normals(
         max_slope: Added to it a pixel of distance, so that steep surfaces hold together [1/m per px].
     """
     image = np.ascontiguousarray(inverse_depth, dtype=np.float32)
-    a, b, c = _window_planes(image, radius, np.float32(edge_jump), np.float32(max_slope))
-    return _plane_normals(a, b, c, K)
+    planes = _window_planes(image, radius, np.float32(edge_jump), np.float32(max_slope))
+    noise = _noise(planes)
+    limit = np.float32(_limit(noise, radius))
+    chosen = _steadiest(image, planes, radius, limit, np.float32(TRUSTED * noise))
+    return LocalSurface(chosen[2], _plane_normals(chosen, K), noise)
 
 
-def inverse_depth_normals_reference(
+def local_surface_reference(
     inverse_depth: Image, K: Array, radius: int, edge_jump: float, max_slope: float
-) -> Image:
-    """Do as `inverse_depth_normals` does, by NumPy over all the windows at once in double precision."""
+) -> LocalSurface:
+    """Do as `local_surface` does, by NumPy over all the windows at once in double precision."""
+    own = inverse_depth.astype(np.float64)
+    planes = _window_planes_reference(own, radius, edge_jump, max_slope)
+    noise = _noise(planes)
+    unsteady = (own > 0.0) & ((planes[2] == 0.0) | (planes[3] > _limit(noise, radius)))
+    best = planes.copy()
+    best[3, planes[2] == 0.0] = _limit(noise, radius)
+    padded = np.pad(planes, ((0, 0), (radius, radius), (radius, radius)))
+    height, width = own.shape
+    for dv in (-radius, 0, radius):
+        for du in (-radius, 0, radius):
+            there = padded[:, radius + dv :, radius + du :][:, :height, :width].copy()
+            there[2] = np.where(there[2] > 0.0, there[2] - there[0] * du - there[1] * dv, 0.0)
+            better = unsteady & (there[2] > 0.0) & (there[3] < best[3])
+            better &= np.abs(there[2] - own) <= TRUSTED * noise
+            best = np.where(better, there, best)
+    return LocalSurface(best[2].astype(np.float32), _plane_normals(best.astype(np.float32), K), noise)
+
+
+def _window_planes_reference(own: Array, radius: int, edge_jump: float, max_slope: float) -> Array:
+    """Do as `_window_planes` does."""
     side = 2 * radius + 1
-    padded = np.pad(inverse_depth.astype(np.float64), radius)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (side, side))
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(own, radius), (side, side))
     dv, du = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(np.float64)
-    own = inverse_depth.astype(np.float64)[:, :, None, None]
+    difference = windows - own[:, :, None, None]
     allowed = edge_jump + max_slope * np.maximum(np.abs(du), np.abs(dv))
-    weight = ((windows > 0) & (own > 0) & (np.abs(windows - own) <= allowed)).astype(np.float64)
+    near = (windows > 0) & (own > 0)[:, :, None, None] & (np.abs(difference) <= allowed)
+    weight = near.astype(np.float64)
     terms = np.stack([np.ones_like(du), du, dv])
     moments = np.einsum("hwij,aij,bij->hwab", weight, terms, terms)
-    right = np.einsum("hwij,hwij,aij->hwa", weight, windows, terms)
-    enough = (moments[..., 0, 0] >= side * side / 4.0) & (np.linalg.det(moments) > 0.5)
+    right = np.einsum("hwij,hwij,aij->hwa", weight, difference, terms)
+    count = moments[..., 0, 0].copy()
+    enough = (count >= side * side / 4.0) & (np.linalg.det(moments) > 0.5)
     moments[~enough] = np.eye(3)
     solution = np.linalg.solve(moments, right[..., None])[..., 0]
-    solution[~enough] = 0.0
+    squares = np.einsum("hwij,hwij->hw", weight, difference**2) - np.einsum("hwa,hwa->hw", solution, right)
+    variance = np.maximum(squares, 0.0) / np.maximum(count - 3.0, 1.0)
     c, a, b = np.moveaxis(solution, -1, 0)
-    return _plane_normals(a.astype(np.float32), b.astype(np.float32), c.astype(np.float32), K)
+    return np.where(enough, np.stack([a, b, own + c, variance]), 0.0)
 
 
-def _plane_normals(a: Image, b: Image, c: Image, K: Array) -> Image:
-    """Turn planes of inverse depth into unit normals: n ∝ −(a·fx, b·fy, c − a·(u−cx) − b·(v−cy))."""
+def _noise(planes: NDArray[np.floating]) -> float:
+    """Usual standard deviation [1/m] of readings about their window's plane."""
+    known = planes[2] > 0.0
+    return float(np.sqrt(np.median(planes[3][known]))) if known.any() else 0.0
+
+
+def _limit(noise: float, radius: int) -> float:
+    """Variance [1/m²] of a full window's readings that chance may reach."""
+    return noise**2 * (1.0 + CHANCE * np.sqrt(2.0 / (2 * radius + 1) ** 2))
+
+
+def _plane_normals(planes: Image, K: Array) -> Image:
+    """Turn planes (≥ 3, H, W) into unit normals: n ∝ −(a·fx, b·fy, c − a·(u−cx) − b·(v−cy))."""
+    a, b, c = planes[0], planes[1], planes[2]
     height, width = c.shape
     u = (np.arange(width) - K[0, 2]).astype(np.float32)[None, :]
     v = (np.arange(height) - K[1, 2]).astype(np.float32)[:, None]
@@ -71,16 +134,17 @@ def _plane_normals(a: Image, b: Image, c: Image, K: Array) -> Image:
 
 @njit(cache=True)
 def _window_planes(image, radius, edge_jump, max_slope):  # type: ignore[no-untyped-def]
-    """Coefficients of 1/z = a·du + b·dv + c over each pixel's window; c = 0 where readings are too few."""
+    """1/z = a·du + b·dv + c over each pixel's window: a, b, c and the variance about it (4, H, W).
+
+    All zero where readings are too few.
+    """
     height, width = image.shape
-    a = np.zeros((height, width), np.float32)
-    b = np.zeros((height, width), np.float32)
-    c = np.zeros((height, width), np.float32)
+    planes = np.zeros((4, height, width), np.float32)
     zero, one = np.float32(0.0), np.float32(1.0)
     side = 2 * radius + 1
     enough = np.float32(side * side / 4.0)
     padded = np.zeros(width + 2 * radius, np.float32)
-    sums = np.zeros((9, width), np.float32)
+    sums = np.zeros((10, width), np.float32)
     for row in range(height):
         sums[:] = zero
         own = image[row]
@@ -107,6 +171,7 @@ def _window_planes(image, radius, edge_jump, max_slope):  # type: ignore[no-unty
                     sums[6, col] += weighted
                     sums[7, col] += weighted * fu
                     sums[8, col] += weighted * fv
+                    sums[9, col] += weighted * difference
         for col in range(width):
             n = sums[0, col]
             if own[col] <= zero or n < enough:
@@ -122,10 +187,42 @@ def _window_planes(image, radius, edge_jump, max_slope):  # type: ignore[no-unty
                 continue
             slope_u = (uw * vv - vw * uv) / determinant
             slope_v = (vw * uu - uw * uv) / determinant
-            a[row, col] = slope_u
-            b[row, col] = slope_v
-            c[row, col] = own[col] + mean_w - slope_u * mean_u - slope_v * mean_v
-    return a, b, c
+            squares = sums[9, col] - n * mean_w * mean_w - slope_u * uw - slope_v * vw
+            planes[0, row, col] = slope_u
+            planes[1, row, col] = slope_v
+            planes[2, row, col] = own[col] + mean_w - slope_u * mean_u - slope_v * mean_v
+            planes[3, row, col] = max(squares, zero) / max(n - np.float32(3.0), one)
+    return planes
+
+
+@njit(cache=True)
+def _steadiest(image, planes, radius, limit, trusted):  # type: ignore[no-untyped-def]
+    """For each pixel whose window varies beyond the limit, the plane of the steadiest one next to it."""
+    height, width = image.shape
+    chosen = planes[:3].copy()
+    zero = np.float32(0.0)
+    for row in range(height):
+        for col in range(width):
+            own = image[row, col]
+            known = planes[2, row, col] > zero
+            if own <= zero or (known and planes[3, row, col] <= limit):
+                continue
+            least = planes[3, row, col] if known else limit
+            for dv in (-radius, 0, radius):
+                for du in (-radius, 0, radius):
+                    y, x = row + dv, col + du
+                    if not (0 <= y < height and 0 <= x < width):
+                        continue
+                    if planes[2, y, x] <= zero or planes[3, y, x] >= least:
+                        continue
+                    slope_u, slope_v = planes[0, y, x], planes[1, y, x]
+                    here = planes[2, y, x] - slope_u * np.float32(du) - slope_v * np.float32(dv)
+                    if here > zero and abs(here - own) <= trusted:
+                        least = planes[3, y, x]
+                        chosen[0, row, col] = slope_u
+                        chosen[1, row, col] = slope_v
+                        chosen[2, row, col] = here
+    return chosen
 
 
 def nearest_seeds(
