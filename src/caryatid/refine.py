@@ -20,8 +20,8 @@ ROBUST_WIDTH = 2.5
 RIDGE = 1e-3 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
 """Added to the diagonal, times the damping, so that what no point determines stays where it is."""
 NOISE_FLOOR = 0.001
-"""Least standard deviation the weights assume [m]: what smoothed points of several views err by together. With
-less, faces that hold few of the points would be outliers of the others."""
+"""Least standard deviation the weights assume [m]: what smoothed points of several views err by. With less,
+faces that hold few of the points would be outliers of the others."""
 
 
 _CODES = {"sphere": SPHERE, "cylinder": CYLINDER, "box": BOX}
