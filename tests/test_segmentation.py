@@ -14,6 +14,7 @@ from caryatid.clouds import oriented_points, thin
 from caryatid.config import CloudConfig, SegmentationConfig, SurfaceConfig
 from caryatid.convexity import cluster_by_mean, convex_parts, number_by_appearance
 from caryatid.errors import PerceptionError
+from caryatid.kernels.planes import refine_planes, refine_planes_reference
 from caryatid.segmentation import find_support_surface, on_surface, segment, segment_cloud
 from caryatid.views import Cloud, View
 
@@ -193,6 +194,54 @@ def test_sheets_part_where_they_are_concave(angle, parts):
     T = frames.rigid(frames.random_rotation(np.random.default_rng(1)), (0.2, 0.1, 0.4))
     moved = convex_parts(frames.transform(T, points), frames.rotate(T, normals), edges, config)
     assert len(np.unique(moved)) == parts
+
+
+def test_depth_steps_along_a_border_outweigh_a_short_bridge():
+    points, normals, edges = bent_sheet(0.0)
+    side = points[:, 0] > 0.0
+    across = side[edges[:, 0]] != side[edges[:, 1]]
+    bridge = np.flatnonzero(across)[:6]
+    bridged = np.concatenate([edges[~across], edges[bridge]])
+    steps = edges[np.setdiff1d(np.flatnonzero(across), bridge)]
+    config = SegmentationConfig()
+    assert len(np.unique(convex_parts(points, normals, bridged, config))) == 1
+    parts = convex_parts(points, normals, bridged, config, steps)
+    assert len(np.unique(parts[side])) == len(np.unique(parts[~side])) == 1
+    assert parts[side][0] != parts[~side][0]
+
+
+def test_a_grazing_face_is_cut_into_no_slivers():
+    box = (np.array([0.0, 0.0, TABLE + 0.1]), np.array([0.2, 0.2, 0.2]))
+    view = table_scene(from_the_side(0.0, elevation=29.0, distance=1.0), [box], sigma=0.001)
+    assert found(segment(view, surface_of(view), SegmentationConfig()), view.labels) == (1, 1, 1)
+
+
+def crease(noise: float):
+    """Inverse depth of two planes that meet in column 24, and each pixel's tangent plane before noise."""
+    v, u = np.mgrid[:40, :48].astype(float)
+    inverse = 0.6 + 0.002 * np.abs(u - 24.0) + 0.001 * v
+    planes = np.stack([inverse, 0.002 * np.sign(u - 24.0), np.full_like(u, 0.001)], axis=-1)
+    noisy = inverse + noise * np.random.default_rng(0).standard_normal(inverse.shape)
+    return np.where((u > 40) & (v > 30), 0.0, noisy).astype(np.float32), planes
+
+
+def test_refined_planes_agree_with_their_reference():
+    image, planes = crease(0.0015)
+    pixels = np.argwhere(image > 0.0)[::7]
+    start = planes[tuple(pixels.T)] + np.array([0.001, 0.0003, -0.0003])
+    start[:5, 0] += 10.0
+    ours = refine_planes(image, pixels, start, 4, 0.005, 2)
+    np.testing.assert_allclose(ours, refine_planes_reference(image, pixels, start, 4, 0.005, 2), atol=1e-9)
+    np.testing.assert_array_equal(ours[:5], start[:5])
+
+
+def test_refined_planes_lose_noise_and_keep_creases():
+    image, planes = crease(0.0015)
+    pixels = np.argwhere((image > 0.0) & (np.abs(np.arange(48) - 24.0) > 3.0))
+    truth = planes[tuple(pixels.T)]
+    start = truth + np.array([0.0015, 0.0006, 0.0006]) * np.random.default_rng(1).standard_normal(truth.shape)
+    error = np.abs(refine_planes(image, pixels, start, 5, 0.004, 2) - truth).mean(axis=0)
+    assert (error < np.array([0.0005, 0.0002, 0.0002])).all()
 
 
 def test_clusters_weigh_the_mean_of_their_border():

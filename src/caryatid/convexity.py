@@ -20,6 +20,10 @@ EDGES_ACROSS = 3.0
 """Sample edges that cross a border for each sample along it, on a grid with diagonals."""
 
 
+STEP_ATTRACTION = -1.0
+"""Attraction over a depth step, as strong as that over a flat surface."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Surfels:
     """Patches of samples.
@@ -38,7 +42,7 @@ class Surfels:
 
 
 def convex_parts(
-    points: Array, normals: Array, edges: Index, config: SegmentationConfig
+    points: Array, normals: Array, edges: Index, config: SegmentationConfig, steps: Index | None = None
 ) -> NDArray[np.int32]:
     """Cut a sampled surface where it is concave.
 
@@ -52,6 +56,8 @@ def convex_parts(
         normals: Unit normals (N, 3), all on the sensor's side.
         edges: Pairs of samples (E, 2) that are neighbours on one surface.
         config: Sizes and angles.
+        steps: Pairs of samples (F, 2) that are neighbours in the image, one in front of the other: they
+            repel, for a convex body does not hide itself. None where there is no image.
 
     Returns:
         Part of each sample (N,), 1 … n in the order of their first samples, 0 = none.
@@ -61,7 +67,8 @@ def convex_parts(
     surfels = gather_surfels(points, normals, edges, config)
     pairs, lengths = surfel_borders(surfels, edges)
     attraction = border_attraction(surfels, pairs, config)
-    cluster = cluster_by_mean(len(surfels.sizes), pairs, attraction, lengths)
+    repelled = _with_steps(surfels, pairs, attraction, lengths, steps)
+    cluster = cluster_by_mean(len(surfels.sizes), *repelled)
     min_width = config.min_width / _spacing(points, edges)
     cluster = _absorb_slivers(cluster, surfels.sizes, pairs, lengths, config.min_size, min_width)
     part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
@@ -103,6 +110,20 @@ def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig
     bend = 1.0 - np.maximum(rise_i + rise_j, 0.0) / distance / np.radians(config.concavity)
     step = 1.0 - np.maximum(rise_i, rise_j) / config.step
     return np.clip(np.minimum(bend, step), -2.0, 1.0)
+
+
+def _with_steps(
+    surfels: Surfels, pairs: Index, attraction: Array, lengths: Array, steps: Index | None
+) -> tuple[Index, Array, Array]:
+    """Borders with their mean attraction and length once the depth steps along them repel."""
+    if steps is None or len(steps) == 0:
+        return pairs, attraction, lengths
+    apart, count = surfel_borders(surfels, steps)
+    keys = np.concatenate([pairs, apart]) @ np.array([len(surfels.sizes), 1])
+    keys, inverse = np.unique(keys, return_inverse=True)
+    total = np.bincount(inverse, np.concatenate([attraction * lengths, STEP_ATTRACTION * count]))
+    length = np.bincount(inverse, np.concatenate([lengths, count])).astype(np.float64)
+    return np.stack(np.divmod(keys, len(surfels.sizes)), axis=-1), total / length, length
 
 
 def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array) -> Index:

@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from caryatid import frames
 from caryatid.clouds import normals_from_depth
 from caryatid.config import CloudConfig, SegmentationConfig
-from caryatid.convexity import convex_parts
+from caryatid.convexity import convex_parts, number_by_appearance
 from caryatid.frames import Array
+from caryatid.kernels.planes import refine_planes
 from caryatid.surface import SupportSurface, find_support_surface
 from caryatid.views import Cloud, View
 
@@ -62,10 +64,12 @@ def segment(
     grid = (slice(None, None, config.stride),) * 2
     points_camera, normals = view.points_camera[grid], normals_image[grid].astype(np.float64)
     sampled = foreground[grid] & (np.abs(normals).max(axis=-1) > 0.0)
-    edges = _grid_edges(sampled, points_camera, normals, config)
+    if view.normals_camera is None:
+        points_camera, normals = _evened(view, sampled, points_camera, normals, config)
+    edges, steps = _grid_edges(sampled, points_camera, normals, config)
     coarse = np.zeros(sampled.shape, dtype=np.int32)
-    coarse[sampled] = convex_parts(points_camera[sampled], normals[sampled], edges, config)
-    return _fill(coarse, foreground, view.depth, config)
+    coarse[sampled] = convex_parts(points_camera[sampled], normals[sampled], edges, config, steps)
+    return _fill(_without_slivers(coarse), foreground, view.depth, config)
 
 
 def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationConfig) -> Labels:
@@ -91,13 +95,34 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
     return labels
 
 
+def _evened(
+    view: View, sampled: NDArray[np.bool_], points: Array, normals: Array, config: SegmentationConfig
+) -> tuple[Array, Array]:
+    """Points and normals of the samples from their tangent planes refitted over a wider window."""
+    pixels = np.argwhere(sampled) * config.stride
+    p, n = points[sampled], normals[sampled]
+    rays = p / p[:, 2:]
+    focal = np.array([view.K[0, 0], view.K[1, 1]])
+    slope = n / np.einsum("ij,ij->i", n, p)[:, None]
+    inverse_depth = np.zeros_like(view.depth)
+    np.divide(np.float32(1.0), view.depth, out=inverse_depth, where=view.depth > 0.0)
+    planes = np.concatenate([1.0 / p[:, 2:], slope[:, :2] / focal], axis=-1)
+    planes = refine_planes(inverse_depth, pixels, planes, config.plane_radius, config.plane_tolerance, 2)
+    points, normals = points.copy(), normals.copy()
+    a, b = (planes[:, 1:] * focal).T
+    towards = -np.stack([a, b, planes[:, 0] - a * rays[:, 0] - b * rays[:, 1]], axis=-1)
+    points[sampled], normals[sampled] = rays / planes[:, :1], frames.unit(towards)
+    return points, normals
+
+
 def _grid_edges(
     sampled: NDArray[np.bool_], points: Array, normals: Array, config: SegmentationConfig
-) -> NDArray[np.intp]:
-    """Pairs (E, 2) of samples that are neighbours in the image, diagonals too, with no depth step between.
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Pairs (E, 2) of samples that are neighbours in the image, diagonals too: on one surface, and at a step.
 
     There is a step where neither sample's inverse depth lies near the other's tangent plane: unlike the bare
-    difference this does not grow on steep surfaces.
+    difference this does not grow on steep surfaces. Steps are also looked for across short gaps without
+    readings, which sensors leave there.
     """
     height, width = sampled.shape
     number = np.cumsum(sampled).reshape(sampled.shape) - 1
@@ -105,16 +130,42 @@ def _grid_edges(
     rays = points * inverse_depth[..., None]
     offset = np.einsum("hwi,hwi->hw", normals, points)
     planes = normals / np.where(offset == 0.0, np.inf, offset)[..., None]
-    pairs = []
-    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+    pairs, steps = [], []
+    offsets = [(0, 1), (1, 0), (1, 1), (1, -1)]
+    offsets += [(k * down, k * right) for k in range(2, config.gap + 1) for down, right in ((0, 1), (1, 0))]
+    for down, right in offsets:
         here = (slice(0, height - down), slice(max(-right, 0), width - max(right, 0)))
         there = (slice(down, height), slice(max(right, 0), width + min(right, 0)))
+        both = sampled[here] & sampled[there]
+        across = max(down, right) > 1
+        if across:
+            for k in range(1, max(down, right)):
+                v, u = k * min(down, 1), k * min(right, 1)
+                both &= ~sampled[v : v + height - down, u : u + width - right]
         from_here = np.abs(np.einsum("hwi,hwi->hw", planes[here], rays[there]) - inverse_depth[there])
         from_there = np.abs(np.einsum("hwi,hwi->hw", planes[there], rays[here]) - inverse_depth[here])
-        joined = sampled[here] & sampled[there] & (np.minimum(from_here, from_there) <= config.edge_jump)
+        joined = np.minimum(from_here, from_there) <= config.edge_jump
         joined &= np.abs(inverse_depth[here] - inverse_depth[there]) <= config.max_jump
-        pairs.append(np.stack([number[here][joined], number[there][joined]], axis=-1))
-    return np.concatenate(pairs)
+        ends = np.stack([number[here], number[there]], axis=-1)
+        if not across:
+            pairs.append(ends[both & joined])
+        between = points[there] - points[here]
+        rise = np.maximum(
+            np.einsum("hwi,hwi->hw", normals[here], between),
+            -np.einsum("hwi,hwi->hw", normals[there], between),
+        )
+        steps.append(ends[both & ~joined & (rise > config.min_rise)])
+    return np.concatenate(pairs), np.concatenate(steps)
+
+
+def _without_slivers(coarse: Labels) -> Labels:
+    """Take out the parts that are nowhere three samples wide: strips of grazing faces, flying pixels."""
+    square = np.ones((3, 3), dtype=bool)
+    core = ndimage.minimum_filter(coarse, footprint=square) == ndimage.maximum_filter(
+        coarse, footprint=square
+    )
+    kept = np.unique(coarse[core & (coarse > 0)])
+    return number_by_appearance(np.where(np.isin(coarse, kept), coarse, -1).ravel()).reshape(coarse.shape)
 
 
 def _fill(

@@ -109,12 +109,16 @@ class SegmentationConfig:
     """A sample further than this from its neighbour's plane is another surface's [m], at 1 m and times z²."""
     max_jump: float = 0.009
     """A depth step between samples beyond this parts two surfaces, however steep [m], at 1 m and times z²."""
+    gap: int = 3
+    """Depth steps are looked for across this many samples without a reading [1]; they leave 2 px a side."""
+    min_rise: float = 0.015
+    """Height over a neighbour's plane from which a depth step repels [m]; above staircases on steep faces."""
     surfel: float = 0.015
     """Size of the patches whose edges are judged convex or concave [m]; four times the noise at 1.5 m."""
     crease: float = 4.0
     """What a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at edges."""
-    step: float = 0.005
-    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]."""
+    step: float = 0.0035
+    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]; 2σ evened out."""
     neighbours: int = 10
     """Nearest points a point of an unorganised cloud is joined to [1]."""
     reach: float = 0.012
@@ -127,6 +131,10 @@ class SegmentationConfig:
     """A part narrower than this beside a larger one belongs to it [m]; normals are blurred so far."""
     normal_size: float = 0.013
     """Side of the window normals are estimated over, at the objects' median distance [m]."""
+    plane_radius: int = 5
+    """Radius of the wider window the samples' tangent planes are evened out over [px]."""
+    plane_tolerance: float = 0.004
+    """Readings further from a tangent plane are another surface's [1/m]; 3σ of the sensor at 2 m."""
     clearance: float = 0.008
     """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
     max_height: float = 0.6

@@ -1,0 +1,230 @@
+"""How well automatic segmentation cuts single views into objects: found, invented, split, merged, by family.
+
+    python benchmarks/segmentation.py [SOURCES…] --views 4 [--gate]
+
+SOURCES are folders with scene.xml, names of built-in scenes, or BOP folders with masks. Views of scenes are
+simulated: the robot's first one and others it can reach, far from each other. Without SOURCES the views are
+of the built-in suite, the one the committed baseline is of. What is scored is `segment` alone, at the pixels
+that hold a reading; what the scene model makes of it is for `accuracy.py` to say.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from accuracy import SUITE, THREADS, family
+from measures import Measure, gate, write_baseline
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from caryatid.config import Config, NoiseModel
+from caryatid.errors import CaryatidError
+from caryatid.evaluation.overlaps import assign, mask_ious
+from caryatid.settings import read_settings
+from caryatid.views import View
+
+BASELINE = Path(__file__).with_name("segmentation_baseline.json")
+LEAST_PIXELS = 200
+"""True objects with fewer readings are not asked for, nor are parts of them invented [px]; 2 cm at 1 m."""
+MIN_IOU = 0.5
+"""IoU of masks from which a part is an object [1]; method notes 5."""
+SHARE = 0.2
+"""A part that holds this share of an object's readings is a piece of it [1]."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Segment views and compare with true masks."""
+
+    sources: Annotated[tuple[str, ...], tyro.conf.Positional] = SUITE
+    """Scene folders, names of built-in scenes, or BOP folders."""
+    views: int = 4
+    """Views of each scene; a recording has its own."""
+    noise: NoiseModel = "carmine"
+    """Noise of the simulated camera."""
+    seed: int = 0
+    """Seed of the noise."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Settings, e.g. `--set segmentation.concavity=12`."""
+    jobs: int = 4
+    """Processes."""
+    out: Path | None = None
+    """JSON file for all rows."""
+    gate: bool = False
+    """Fail where a figure is worse than the committed baseline."""
+    update: bool = False
+    """Make the figures the committed baseline."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One view: how many true objects and parts there are, and what became of them."""
+
+    source: str
+    view: int
+    true: int
+    parts: int
+    found: int
+    invented: int
+    split: int
+    merged: int
+    seconds: float
+
+
+def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
+    """The views of a source, with true labels."""
+    from caryatid.commands.sources import is_recording, open_source
+    from caryatid.formats.bop import read_recording
+    from caryatid.view_sphere import ViewSphere
+
+    if is_recording(source):
+        yield from read_recording(source)
+        return
+    opened = open_source(source, config, noise=args.noise, segmentation="labels", seed=args.seed)
+    if opened.truth is None:
+        raise CaryatidError(f"{source}: has no truth to score against")
+    centre = np.array([0.0, 0.0, opened.truth.table_top or 0.0])
+    found = opened.robot.candidates(ViewSphere.around(centre, config.active))
+    T_chosen = [opened.robot.T_world_camera]
+    nearest = np.full(len(found), -np.inf)
+    while True:
+        yield opened.camera.capture(T_chosen[-1])
+        if len(T_chosen) == min(args.views, len(found)):
+            return
+        away = T_chosen[-1][:3, 3] - centre
+        nearest = np.maximum(nearest, found.directions @ away / np.linalg.norm(away))
+        T_chosen.append(found.T_world_camera[int(np.argmin(nearest))])
+
+
+def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> tuple[int, int, int, int, int, int]:
+    """Count true objects, parts, those found, invented, split and merged.
+
+    Args:
+        labels: Parts of the pixels with a reading (N,).
+        truth: Their objects (N,).
+    """
+    objects = [int(k) for k in np.unique(truth) if k > 0]
+    parts = [int(k) for k in np.unique(labels) if k > 0]
+    both = np.array([[np.sum((labels == p) & (truth == t)) for t in objects] for p in parts], dtype=float)
+    both = both.reshape(len(parts), len(objects))
+    sizes = np.array([np.sum(truth == t) for t in objects], dtype=float)
+    part_sizes = np.array([np.sum(labels == p) for p in parts], dtype=float)
+    asked = sizes >= LEAST_PIXELS
+    pairs = assign(mask_ious([labels], [truth], parts, objects), MIN_IOU)
+    paired = {i for i, _ in pairs}
+    crumbs = both[:, ~asked].sum(axis=1) > 0.5 * part_sizes
+    invented = sum(not crumb for i, crumb in enumerate(crumbs) if i not in paired)
+    pieces = (both >= SHARE * sizes) & asked
+    inside = both >= 0.5 * part_sizes[:, None]
+    return (
+        int(asked.sum()),
+        len(paired) + invented,
+        sum(bool(asked[j]) for _, j in pairs),
+        invented,
+        int(((pieces & inside).sum(axis=0) > 1).sum()),
+        int((pieces[pieces.sum(axis=1) > 1].any(axis=0)).sum()),
+    )
+
+
+def measure(task: tuple[str, Args]) -> list[Row]:
+    """Segment the views of one source."""
+    from caryatid.perception import perceive
+    from caryatid.segmentation import segment
+
+    source, args = task
+    config = read_settings(None, args.set)
+    rows = []
+    for number, view in enumerate(views_of(source, args, config)):
+        rng = np.random.default_rng(args.seed)
+        percept = perceive(view, config, segmentation="auto", known=None, rng=rng)
+        if percept.view is None or view.labels is None:
+            raise CaryatidError(f"{view.name}: has no masks to compare with")
+        started = time.perf_counter()
+        labels = segment(percept.view, percept.surface, config.segmentation, config.cloud)
+        seconds = time.perf_counter() - started
+        name = Path(source).name
+        rows.append(Row(name, number, *compare(labels[view.valid], view.labels[view.valid]), seconds))
+    return rows
+
+
+def measures(rows: list[Row]) -> list[Measure]:
+    """Shares found, split and merged of the true objects, and invented of the parts, for each family."""
+    found = []
+    for name in sorted({family(r.source) for r in rows}):
+        group = [r for r in rows if family(r.source) == name]
+        true, parts = sum(r.true for r in group), sum(r.parts for r in group)
+        for field, better, of in (
+            ("found", "higher", true),
+            ("invented", "lower", parts),
+            ("split", "lower", true),
+            ("merged", "lower", true),
+        ):
+            value = sum(getattr(r, field) for r in group) / max(of, 1)
+            found.append(Measure(f"{name}.{field}", value, "1", better, 0.02))
+    return found
+
+
+def show(rows: list[Row], console: Console) -> None:
+    """Print one line a family, and the worst views."""
+    table = Table(title=f"{len(rows)} views, {sum(r.true for r in rows)} objects")
+    columns = ("sources", "views", "objects", "found", "invented", "split", "merged", "ms")
+    for column in columns:
+        table.add_column(column)
+    groups: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        groups[family(row.source)].append(row)
+        groups["all"].append(row)
+    for name, group in groups.items():
+        true, parts = sum(r.true for r in group), sum(r.parts for r in group)
+        table.add_row(
+            f"{name} ({len({r.source for r in group})})",
+            str(len(group)),
+            str(true),
+            *(
+                f"{100 * sum(getattr(r, f) for r in group) / max(n, 1):.1f} %"
+                for f, n in (("found", true), ("invented", parts), ("split", true), ("merged", true))
+            ),
+            f"{1000 * np.median([r.seconds for r in group]):.0f}",
+        )
+    console.print(table)
+    worst = sorted(rows, key=lambda r: r.found - r.true - r.invented)[:8]
+    console.print(
+        "worst: "
+        + ", ".join(f"{r.source} view {r.view}: {r.found} of {r.true}, {r.invented} invented" for r in worst)
+    )
+
+
+def main() -> int:
+    """Run the measurement."""
+    args = tyro.cli(Args)
+    console = Console(width=160)
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
+    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
+        rows = [row for part in pool.map(measure, [(s, args) for s in args.sources]) for row in part]
+    show(rows, console)
+    if args.out is not None:
+        args.out.write_text(json.dumps([asdict(r) for r in rows], indent=1) + "\n", encoding="utf-8")
+    if args.update:
+        write_baseline(measures(rows), BASELINE)
+    return gate(measures(rows), BASELINE, console) if args.gate else 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except CaryatidError as error:
+        sys.exit(f"error: {error}")
