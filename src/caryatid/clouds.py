@@ -28,10 +28,10 @@ def normals_from_depth(view: View, config: CloudConfig) -> NDArray[np.float32]:
     """
     if view.normals_camera is not None:
         return view.normals_camera
-    return surface_from_depth(view, config).normals
+    return surface_from_depth(view, config, sharp=False).normals
 
 
-def surface_from_depth(view: View, config: CloudConfig) -> LocalSurface:
+def surface_from_depth(view: View, config: CloudConfig, *, sharp: bool = True) -> LocalSurface:
     """Smooth a view's depth by local planes that end at creases and depth edges, and measure its noise.
 
     A plane is linear in inverse depth over the image, and the noise of a structured-light sensor nearly even
@@ -40,6 +40,7 @@ def surface_from_depth(view: View, config: CloudConfig) -> LocalSurface:
     Args:
         view: Depth [m] and intrinsics [px]; no pose needed.
         config: Window, working range and depth edges.
+        sharp: Whether creases stay sharp (`local_surface`).
     """
     in_range = (view.depth >= config.min_depth) & (view.depth <= config.max_depth)
     inverse_depth = np.zeros_like(view.depth)
@@ -48,7 +49,7 @@ def surface_from_depth(view: View, config: CloudConfig) -> LocalSurface:
     if in_range.any():
         width = config.normal_size * view.K[0, 0] / float(np.median(view.depth[in_range]))
         radius = min(radius, max(1, round((width - 1.0) / 2.0)))
-    return local_surface(inverse_depth, view.K, radius, config.edge_jump, config.max_slope)
+    return local_surface(inverse_depth, view.K, radius, config.edge_jump, config.max_slope, sharp=sharp)
 
 
 def oriented_points(

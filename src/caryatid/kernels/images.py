@@ -37,7 +37,7 @@ class LocalSurface:
 
 
 def local_surface(
-    inverse_depth: Image, K: Array, radius: int, edge_jump: float, max_slope: float
+    inverse_depth: Image, K: Array, radius: int, edge_jump: float, max_slope: float, *, sharp: bool = True
 ) -> LocalSurface:
     """Fit a plane to the surface around each pixel, up to its creases but not across them.
 
@@ -52,10 +52,13 @@ def local_surface(
         radius: The window is 2·radius + 1 pixels wide [px].
         edge_jump: Readings further than this from the pixel's own lie beyond a depth edge [1/m].
         max_slope: Added to it a pixel of distance, so that steep surfaces hold together [1/m per px].
+        sharp: Whether pixels may take another window's plane; otherwise creases come out rounded.
     """
     image = np.ascontiguousarray(inverse_depth, dtype=np.float32)
     planes = _window_planes(image, radius, np.float32(edge_jump), np.float32(max_slope))
     noise = _noise(planes)
+    if not sharp:
+        return LocalSurface(planes[2], _plane_normals(planes, K), noise)
     limit = np.float32(_limit(noise, radius))
     chosen = _steadiest(image, planes, radius, limit, np.float32(TRUSTED * noise))
     return LocalSurface(chosen[2], _plane_normals(chosen, K), noise)
