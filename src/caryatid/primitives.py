@@ -11,6 +11,7 @@ from caryatid import frames
 from caryatid.config import FitConfig
 from caryatid.frames import Array
 from caryatid.kernels.hypotheses import any_within, count_agreeing
+from caryatid.polish import polish
 from caryatid.ransac import ransac
 from caryatid.refine import distances, refine
 from caryatid.shape_models import BoxModel, CylinderModel, ShapeModel, SphereModel
@@ -66,7 +67,18 @@ def fit(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Gene
     fits = candidates(points, normals, config=config, rng=rng)
     if not fits:
         return FitFailure(_failure_reason(len(points), config))
-    return fits[0]
+    return _polished(fits[0], points, normals, config)
+
+
+def _polished(found: Fit, points: Array, normals: Array, config: FitConfig) -> Fit:
+    keep = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
+    some = points[keep]
+    if len(some) > 5000:
+        some = some[np.linspace(0, len(some) - 1, 5000).astype(np.intp)]
+    origin = some.mean(axis=0)
+    shape = found.shape.moved(frames.rigid(np.eye(3), -origin))
+    shape = polish(shape, np.array(found.seen), np.ascontiguousarray(some - origin), config)
+    return replace(found, shape=shape.moved(frames.rigid(np.eye(3), origin)))
 
 
 def candidates(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Generator) -> list[Fit]:

@@ -1,0 +1,245 @@
+"""How well shapes are fitted to half views: points of one surface seen from one direction.
+
+    python benchmarks/fits.py [--trials 200] [--gate]
+
+A trial draws a shape of table-top size, a direction to look from and points all over what is seen of it within 80°,
+as dense in every part of the image; each gets Gaussian noise in space. Normals are those of planes through each point's
+neighbours, as normals from depth are: noisy, and rounded at edges. What is measured is what such a view can tell:
+
+* An extent of a box counts where a face along it is seen: that face shows its full length. Of a box of which
+  a single face is seen that is two extents of three.
+* Axis and radius of a cylinder always count, of one seen end-on (a disc) too; its height does not where the
+  mantle is not seen.
+* The right shape counts always, a single face or a disc included.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import tyro
+from measures import Measure, gate, write_baseline
+from rich.console import Console
+from rich.table import Table
+from scipy.spatial import cKDTree
+
+from caryatid import frames
+from caryatid.config import FitConfig
+from caryatid.frames import Array
+from caryatid.merging import axes_rotation
+from caryatid.primitives import Fit, fit
+from caryatid.shapes import Box, Cylinder, Sphere
+
+BASELINE = Path(__file__).with_name("fits_baseline.json")
+"""The committed figures."""
+SETTINGS = (("", 0.001, 5000), ("noisy.", 0.003, 800))
+"""Prefix of the measures, σ [m] and points: the targets' setting, and what a sensor gives at 1.5 m."""
+KINDS = ("box", "cylinder", "sphere")
+STEEPEST = np.radians(80.0)
+"""Surfaces seen at a wider angle give no reading."""
+NEIGHBOURS = 20
+"""Points a normal is estimated from."""
+TARGETS = {
+    "box.extent.median": 1.0,
+    "box.extent.95": 3.0,
+    "cylinder.axis.95": 1.0,
+    "cylinder.radius.95": 1.0,
+    "sphere.radius.95": 0.5,
+    "box.right": 0.98,
+    "cylinder.right": 0.98,
+    "sphere.right": 0.98,
+}
+"""What is asked for at σ = 1 mm and 5,000 points."""
+
+
+@dataclass(frozen=True)
+class Args:
+    """Fit shapes to synthetic half views."""
+
+    trials: int = 200
+    """Trials a shape."""
+    jobs: int = 2
+    """Processes."""
+    verbose: bool = False
+    """Print the worst trials."""
+    gate: bool = False
+    """Fail where a figure is worse than the committed baseline."""
+    update: bool = False
+    """Make the figures the committed baseline."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What came of one fit.
+
+    Attributes:
+        kind: Shape that was there.
+        found: Shape that was fitted, `none` where nothing could be.
+        errors: (quantity, error [mm, deg]) of all that the view can tell; none where the shape is wrong.
+        note: The trial, for a person to read.
+    """
+
+    kind: str
+    found: str
+    errors: tuple[tuple[str, float], ...]
+    note: str
+
+
+def random_shape(kind: str, rng: np.random.Generator) -> Box | Cylinder | Sphere:
+    """A shape of table-top size in any pose."""
+    T = frames.rigid(frames.random_rotation(rng), rng.uniform(-0.3, 0.3, 3))
+    if kind == "box":
+        return Box(T, rng.uniform(0.04, 0.25, 3))
+    if kind == "cylinder":
+        return Cylinder(T, float(rng.uniform(0.02, 0.06)), float(rng.uniform(0.05, 0.25)))
+    return Sphere(T, float(rng.uniform(0.02, 0.08)))
+
+
+def half_view(
+    shape: Box | Cylinder | Sphere, count: int, sigma: float, rng: np.random.Generator
+) -> tuple[Array, Array, Array]:
+    """Points (N, 3) [m] and normals (N, 3) of a view along a random direction, and that direction (3,)."""
+    view = frames.random_rotation(rng)[:, 2]
+    dense, outward = dense_surface(shape, 40 * count, rng)
+    cosine = outward @ view
+    weight = np.where(cosine > np.cos(STEEPEST), cosine, 0.0)
+    chosen = rng.choice(len(dense), count, replace=False, p=weight / weight.sum())
+    points = dense[chosen] + sigma * rng.normal(size=(count, 3))
+    _, near = cKDTree(points).query(points, NEIGHBOURS)
+    spread = points[near] - points[near].mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
+    return points, np.where((normals @ view < 0.0)[:, None], -normals, normals), view
+
+
+def dense_surface(
+    shape: Box | Cylinder | Sphere, count: int, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Points (N, 3) [m] drawn evenly over the whole surface, and outward normals (N, 3)."""
+    if isinstance(shape, Sphere):
+        outward = frames.unit(rng.normal(size=(count, 3)))
+        local = shape.radius * outward
+    elif isinstance(shape, Box):
+        e = shape.extents
+        areas = np.repeat([e[1] * e[2], e[0] * e[2], e[0] * e[1]], 2)
+        side = rng.choice(6, count, p=areas / areas.sum())
+        local = rng.uniform(-0.5, 0.5, (count, 3)) * e
+        outward = np.zeros((count, 3))
+        outward[np.arange(count), side // 2] = 2.0 * (side % 2) - 1.0
+        local = np.where(outward != 0.0, outward * e / 2.0, local)
+    else:
+        areas = np.array([2.0 * shape.radius * shape.height, shape.radius**2, shape.radius**2])
+        side = rng.choice(3, count, p=areas / areas.sum())
+        angle = rng.uniform(0.0, 2.0 * np.pi, count)
+        ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+        z = shape.height / 2.0 * np.where(side == 0, rng.uniform(-1.0, 1.0, count), 2.0 * side - 3.0)
+        reach = shape.radius * np.where(side == 0, 1.0, np.sqrt(rng.uniform(size=count)))
+        outward = np.where((side == 0)[:, None], ring, np.array([0.0, 0.0, 1.0]) * np.sign(z)[:, None])
+        local = reach[:, None] * ring + np.array([0.0, 0.0, 1.0]) * z[:, None]
+    return frames.transform(shape.T_world_object, local), frames.rotate(shape.T_world_object, outward)
+
+
+def run_trial(task: tuple[str, int, float, int]) -> Trial:
+    """Draw a shape and a view of it, fit, and compare."""
+    kind, seed, sigma, count = task
+    rng = np.random.default_rng([KINDS.index(kind), seed])
+    shape = random_shape(kind, rng)
+    points, normals, view = half_view(shape, count, sigma, rng)
+    result = fit(points, normals, config=FitConfig(), rng=np.random.default_rng(seed))
+    note = f"{kind} {seed}: {np.round(1e3 * shape.extents, 1)}"
+    if not isinstance(result, Fit):
+        return Trial(kind, "none", (), note)
+    note += f" → {result.shape.kind} {np.round(1e3 * result.shape.extents, 1)}"
+    if result.shape.kind != kind:
+        return Trial(kind, result.shape.kind, (), note)
+    return Trial(kind, kind, tuple(errors_of(result.shape, shape, view)), note)
+
+
+def errors_of(
+    found: Box | Cylinder | Sphere, shape: Box | Cylinder | Sphere, view: Array
+) -> list[tuple[str, float]]:
+    """Signed errors of what a view can tell: lengths [mm], angles [deg]."""
+    turn, angle = axes_rotation(found, shape)
+    longer = 1e3 * (np.abs(turn.T @ found.extents) - shape.extents)
+    if isinstance(shape, Sphere):
+        return [("radius", longer[0] / 2.0)]
+    cosine = np.abs(view @ shape.T_world_object[:3, :3])
+    if isinstance(shape, Cylinder):
+        errors = [("axis", np.degrees(angle)), ("radius", longer[0] / 2.0)]
+        return errors + [("height", longer[2])] * bool(np.hypot(cosine[0], cosine[1]) > np.cos(STEEPEST))
+    facing = cosine > np.cos(STEEPEST)
+    return [("extent", longer[k]) for k in range(3) if np.delete(facing, k).any()]
+
+
+def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
+    """Share of right shapes; median and 95th percentile of each quantity's absolute error, and its mean."""
+    found = []
+    for kind in KINDS:
+        part = [t for t in trials if t.kind == kind]
+        right = float(np.mean([t.found == kind for t in part]))
+        found.append(Measure(f"{prefix}{kind}.right", right, "1", "higher", 0.01))
+        errors: dict[str, list[float]] = {}
+        for name, error in (e for t in part for e in t.errors):
+            errors.setdefault(name, []).append(error)
+        for name, values in errors.items():
+            unit = "deg" if name == "axis" else "mm"
+            for label, figure in (
+                ("median", np.median(np.abs(values))),
+                ("95", np.quantile(np.abs(values), 0.95)),
+                ("bias", abs(np.mean(values)) if name != "axis" else 0.0),
+            ):
+                full = f"{prefix}{kind}.{name}.{label}"
+                found.append(Measure(full, float(figure), unit, "lower", 0.1 + 0.1 * float(figure)))
+    return found
+
+
+def show(found: list[Measure], console: Console) -> None:
+    """Print the figures beside their targets."""
+    table = Table(title="fits of half views")
+    for column in ("measure", "value", "unit", "target"):
+        table.add_column(column)
+    for m in found:
+        target = TARGETS.get(m.name)
+        missed = target is not None and (m.value < target if m.better == "higher" else m.value > target)
+        sign = "≥" if m.better == "higher" else "≤"
+        text = "" if target is None else f"{sign} {target:g}" + (" missed" if missed else "")
+        table.add_row(m.name, f"{m.value:.3f}", m.unit, text)
+    console.print(table)
+
+
+def main() -> int:
+    """Run the measurement."""
+    args = tyro.cli(Args)
+    console = Console(width=120)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    found: list[Measure] = []
+    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
+        for prefix, sigma, count in SETTINGS:
+            tasks = [(kind, seed, sigma, count) for kind in KINDS for seed in range(args.trials)]
+            trials = list(pool.map(run_trial, tasks, chunksize=10))
+            found += measures(prefix, trials)
+            if args.verbose:
+                show_worst(trials, console)
+    show(found, console)
+    if args.update:
+        write_baseline(found, BASELINE)
+    return gate(found, BASELINE, console) if args.gate else 0
+
+
+def show_worst(trials: list[Trial], console: Console) -> None:
+    """Print the trials with a wrong shape, and those furthest off."""
+    for trial in trials:
+        if trial.found != trial.kind:
+            console.print(f"wrong: {trial.note}")
+    worst = sorted(trials, key=lambda t: -max((abs(e) for _, e in t.errors), default=0.0))
+    for trial in worst[:12]:
+        console.print(f"far off: {trial.note} {[(n, round(e, 2)) for n, e in trial.errors]}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
