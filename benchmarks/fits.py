@@ -2,15 +2,18 @@
 
     python benchmarks/fits.py [--trials 200] [--gate]
 
-A trial draws a shape of table-top size, a direction to look from and points all over what is seen of it within 80°,
-as dense in every part of the image; each gets Gaussian noise in space. Normals are those of planes through each point's
-neighbours, as normals from depth are: noisy, and rounded at edges. What is measured is what such a view can tell:
+A trial draws a shape of table-top size, a direction to look from and points all over what is seen of it
+within 80°, as dense in every part of the image; each gets Gaussian noise in space. Normals are those of the
+planes through each point's neighbours, as normals from depth are: noisy, and rounded at edges. What is measured
+is what such a view can tell:
 
 * An extent of a box counts where a face along it is seen: that face shows its full length. Of a box of which
   a single face is seen that is two extents of three.
 * Axis and radius of a cylinder always count, of one seen end-on (a disc) too; its height does not where the
   mantle is not seen.
 * The right shape counts always, a single face or a disc included.
+* `within` is the share of the errors within twice the standard deviation the fit claims for an independent
+  error: 95 % where it is exact.
 """
 
 from __future__ import annotations
@@ -45,6 +48,8 @@ STEEPEST = np.radians(80.0)
 """Surfaces seen at a wider angle give no reading."""
 NEIGHBOURS = 20
 """Points a normal is estimated from."""
+ONE_VIEW = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
+"""Every point here has an error of its own: no registration, no smoothing, no loss of pixels at rims."""
 TARGETS = {
     "box.extent.median": 1.0,
     "box.extent.95": 3.0,
@@ -81,13 +86,14 @@ class Trial:
     Attributes:
         kind: Shape that was there.
         found: Shape that was fitted, `none` where nothing could be.
-        errors: (quantity, error [mm, deg]) of all that the view can tell; none where the shape is wrong.
+        errors: (quantity, error, claimed standard deviation) [mm, deg] of all that the view can tell; none
+            where the shape is wrong.
         note: The trial, for a person to read.
     """
 
     kind: str
     found: str
-    errors: tuple[tuple[str, float], ...]
+    errors: tuple[tuple[str, float, float], ...]
     note: str
 
 
@@ -150,30 +156,33 @@ def run_trial(task: tuple[str, int, float, int]) -> Trial:
     rng = np.random.default_rng([KINDS.index(kind), seed])
     shape = random_shape(kind, rng)
     points, normals, view = half_view(shape, count, sigma, rng)
-    result = fit(points, normals, config=FitConfig(), rng=np.random.default_rng(seed))
+    result = fit(points, normals, config=ONE_VIEW, rng=np.random.default_rng(seed))
     note = f"{kind} {seed}: {np.round(1e3 * shape.extents, 1)}"
     if not isinstance(result, Fit):
         return Trial(kind, "none", (), note)
     note += f" → {result.shape.kind} {np.round(1e3 * result.shape.extents, 1)}"
     if result.shape.kind != kind:
         return Trial(kind, result.shape.kind, (), note)
-    return Trial(kind, kind, tuple(errors_of(result.shape, shape, view)), note)
+    return Trial(kind, kind, tuple(errors_of(result, shape, view)), note)
 
 
-def errors_of(
-    found: Box | Cylinder | Sphere, shape: Box | Cylinder | Sphere, view: Array
-) -> list[tuple[str, float]]:
-    """Signed errors of what a view can tell: lengths [mm], angles [deg]."""
+def errors_of(result: Fit, shape: Box | Cylinder | Sphere, view: Array) -> list[tuple[str, float, float]]:
+    """Signed errors of what a view can tell, and what the fit claims for them: lengths [mm], angles [deg]."""
+    assert result.uncertainty is not None
+    found, claimed = result.shape, result.uncertainty
     turn, angle = axes_rotation(found, shape)
     longer = 1e3 * (np.abs(turn.T @ found.extents) - shape.extents)
+    sigma = 1e3 * np.abs(turn.T @ claimed.sizes)
     if isinstance(shape, Sphere):
-        return [("radius", longer[0] / 2.0)]
+        return [("radius", longer[0] / 2.0, sigma[0] / 2.0)]
     cosine = np.abs(view @ shape.T_world_object[:3, :3])
     if isinstance(shape, Cylinder):
-        errors = [("axis", np.degrees(angle)), ("radius", longer[0] / 2.0)]
-        return errors + [("height", longer[2])] * bool(np.hypot(cosine[0], cosine[1]) > np.cos(STEEPEST))
+        tilt = float(np.degrees(np.hypot(*claimed.rotation[:2])))
+        errors = [("axis", float(np.degrees(angle)), tilt), ("radius", longer[0] / 2.0, sigma[0] / 2.0)]
+        mantle = bool(np.hypot(cosine[0], cosine[1]) > np.cos(STEEPEST))
+        return errors + [("height", longer[2], sigma[2])] * mantle
     facing = cosine > np.cos(STEEPEST)
-    return [("extent", longer[k]) for k in range(3) if np.delete(facing, k).any()]
+    return [("extent", longer[k], sigma[k]) for k in range(3) if np.delete(facing, k).any()]
 
 
 def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
@@ -183,10 +192,10 @@ def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
         part = [t for t in trials if t.kind == kind]
         right = float(np.mean([t.found == kind for t in part]))
         found.append(Measure(f"{prefix}{kind}.right", right, "1", "higher", 0.01))
-        errors: dict[str, list[float]] = {}
-        for name, error in (e for t in part for e in t.errors):
-            errors.setdefault(name, []).append(error)
-        for name, values in errors.items():
+        for name in dict.fromkeys(e[0] for t in part for e in t.errors):
+            values, sigmas = np.array([e[1:] for t in part for e in t.errors if e[0] == name]).T
+            within = float(np.mean(np.abs(values) < 2.0 * sigmas))
+            found.append(Measure(f"{prefix}{kind}.{name}.within", within, "1", "higher", 0.05))
             unit = "deg" if name == "axis" else "mm"
             for label, figure in (
                 ("median", np.median(np.abs(values))),
@@ -236,9 +245,11 @@ def show_worst(trials: list[Trial], console: Console) -> None:
     for trial in trials:
         if trial.found != trial.kind:
             console.print(f"wrong: {trial.note}")
-    worst = sorted(trials, key=lambda t: -max((abs(e) for _, e in t.errors), default=0.0))
+    worst = sorted(trials, key=lambda t: -max((abs(e) for _, e, _ in t.errors), default=0.0))
     for trial in worst[:12]:
-        console.print(f"far off: {trial.note} {[(n, round(e, 2)) for n, e in trial.errors]}")
+        console.print(
+            f"far off: {trial.note} {[(n, round(float(e), 2), round(float(d), 2)) for n, e, d in trial.errors]}"
+        )
 
 
 if __name__ == "__main__":

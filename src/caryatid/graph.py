@@ -10,6 +10,7 @@ import networkx as nx
 from caryatid import frames
 from caryatid.frames import Array
 from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.uncertainty import Uncertainty
 
 Role = Literal["object", "support_surface"]
 Kind = Literal["bottom-up", "lean", "top-down"]
@@ -30,6 +31,7 @@ class SceneObject:
         poor_fit: None of the three shapes explains its points within the configured error.
         seen: Which sides (-x, +x, -y, +y, -z, +z along the object's axes) points bear out.
         why: How the shape came about, for a person to read.
+        uncertainty: How far off the shape may be, where that is known.
     """
 
     id: str
@@ -42,6 +44,7 @@ class SceneObject:
     poor_fit: bool = False
     seen: tuple[bool, bool, bool, bool, bool, bool] = (True,) * 6
     why: str = ""
+    uncertainty: Uncertainty | None = None
 
     @property
     def centre_world(self) -> Array:

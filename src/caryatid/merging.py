@@ -55,6 +55,7 @@ def merge(sightings: Sequence[SceneObject], config: FusionConfig) -> SceneObject
         seen=seen,
         residual=float(np.average([o.residual for o in same], weights=w)),
         poor_fit=best.poor_fit,
+        uncertainty=best.uncertainty,
         why=best.why,
     )
 

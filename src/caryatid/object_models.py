@@ -132,4 +132,10 @@ class ObjectModels:
             self.fits.pop(label, None)
             return
         named = SceneObject(id=object_id(label), label=label, shape=result.shape)
-        self.fits[label] = replace(named, residual=result.residual, poor_fit=result.poor, seen=result.seen)
+        self.fits[label] = replace(
+            named,
+            residual=result.residual,
+            poor_fit=result.poor,
+            seen=result.seen,
+            uncertainty=result.uncertainty,
+        )

@@ -1,8 +1,6 @@
-"""The last word on a fit: every seen side where its points lie, every other where points of its neighbours end."""
+"""The last word on a fit: seen sides where their points lie, all others where the points beside them end."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,24 +9,22 @@ from caryatid import frames
 from caryatid.config import FitConfig
 from caryatid.frames import Array
 from caryatid.kernels.rims import likeliest_end
-from caryatid.refine import distances, refine
+from caryatid.refine import NOISE_FLOOR, distances, refine
 from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.uncertainty import Uncertainty, estimate
 
-OPEN = 5.0
-"""Unseen sides are moved out of the points' way by as many MSAC thresholds."""
-ON_FACE = 3.0
-"""Points within as many standard deviations of a face's plane are the face's."""
+Mask = NDArray[np.bool_]
 
 
 def polish(
-    shape: Box | Cylinder | Sphere, seen: NDArray[np.bool_], points: Array, config: FitConfig
-) -> Box | Cylinder | Sphere:
-    """Refine a fitted shape without the pulls that the search for it needs.
+    shape: Box | Cylinder | Sphere, seen: Mask, points: Array, config: FitConfig
+) -> tuple[Box | Cylinder | Sphere, Uncertainty]:
+    """Refine a fitted shape without the pulls that the search for it needs, and say how sure it is.
 
-    The sides that points bear out (`seen`) are refined by least squares alone, the others out of the way: neither the pull
-    on the extents nor points beyond a rim shift them. Then each unseen side is put where the points on the faces beside
-    it end: at the likeliest end of an even density under the fit's own noise, which neither a trimmed share
-    nor the spread of the noise biases. A side without such points stays.
+    The sides that points bear out (`seen`) are refined by least squares alone, the others out of the way:
+    neither the pull on the extents nor points beyond a rim shift them. Then each unseen side is put where the
+    points on the faces beside it end: at the likeliest end of an even density blurred by the fit's own noise,
+    which neither a trimmed share nor the spread of the noise biases. A side without such points stays.
 
     Args:
         shape: As found by the search, in the points' frame.
@@ -36,83 +32,84 @@ def polish(
         points: (N, 3) [m].
         config: Limits and thresholds.
     """
-    opened = _opened(shape, seen, config)
-    refined = refine(opened, points, steps=config.steps, min_extent=config.min_extent, shrink=0.0)
-    if isinstance(refined, Sphere) or isinstance(shape, Sphere):
-        return refined
-    distance, _ = distances(refined, points)
-    near = np.abs(distance) < config.threshold
-    if not near.any():
-        return shape
-    sigma = max(1.4826 * float(np.median(np.abs(distance[near]))), 1e-4)
-    return _closed(refined, shape, seen, points, sigma, config)
+    opened = refine(
+        _opened(shape, seen, config), points, steps=config.steps, min_extent=config.min_extent, shrink=0.0
+    )
+    absolute = np.abs(distances(opened, points)[0])
+    near = absolute < config.threshold
+    sigma = max(1.4826 * float(np.median(absolute[near])), NOISE_FLOOR) if near.any() else config.threshold
+    hidden = np.full(6, config.max_extent / np.sqrt(12.0))
+    closed = opened
+    if not (isinstance(opened, Sphere) or isinstance(shape, Sphere)):
+        closed, hidden = _closed(opened, shape, seen, points, sigma, config)
+    if closed.extents.max() > config.max_extent or not near.any():
+        closed = shape
+    return closed, estimate(opened, seen, hidden, points, sigma, config)
 
 
-def _opened(
-    shape: Box | Cylinder | Sphere, seen: NDArray[np.bool_], config: FitConfig
-) -> Box | Cylinder | Sphere:
+def _opened(shape: Box | Cylinder | Sphere, seen: Mask, config: FitConfig) -> Box | Cylinder | Sphere:
     """Move the unseen sides out of the way."""
     if isinstance(shape, Sphere):
         return shape
-    by = np.where(seen, 0.0, OPEN * config.threshold)
+    by = np.where(seen, 0.0, config.opening)
     radius = 0.0
     if isinstance(shape, Cylinder):
-        radius = 0.0 if seen[:4].any() else OPEN * config.threshold
+        radius = 0.0 if seen[:4].any() else config.opening
         by[:4] = 0.0
     return _resized(shape, -shape.extents / 2.0 - by[0::2], shape.extents / 2.0 + by[1::2], radius)
 
 
 def _closed(
-    refined: Box | Cylinder,
+    opened: Box | Cylinder,
     shape: Box | Cylinder,
-    seen: NDArray[np.bool_],
+    seen: Mask,
     points: Array,
     sigma: float,
     config: FitConfig,
-) -> Box | Cylinder:
-    """Put the unseen sides of a refined shape where the points end, or back to where they were."""
-    T = refined.T_world_object
-    local = frames.transform(frames.invert(T), points)
-    low, high = -refined.extents / 2.0, refined.extents / 2.0
-    before = frames.transform(frames.invert(T), shape.T_world_object[:3, 3])
-    margin = ON_FACE * sigma
+) -> tuple[Box | Cylinder, Array]:
+    """Put unseen sides where the points end, or back where they were; with their deviation (6,) [m]."""
+    T_object_world = frames.invert(opened.T_world_object)
+    local = frames.transform(T_object_world, points)
+    before = frames.transform(T_object_world, shape.T_world_object[:3, 3])
+    ends = np.stack([-opened.extents, opened.extents], axis=1) / 2.0
+    hidden = np.full(6, config.max_extent / np.sqrt(12.0))
+    margin = config.face_width * sigma
     radius = 0.0
-    if isinstance(refined, Cylinder):
+    if isinstance(opened, Cylinder):
         reach = np.hypot(local[:, 0], local[:, 1])
         if not seen[:4].any():
-            on_end = np.abs(np.abs(local[:, 2]) - high[2]) < margin
-            found = _end(reach[on_end], sigma, config, growing=True)
-            radius = (found if found is not None else shape.extents[0] / 2.0) - refined.radius
-        beside = {2: np.abs(reach - refined.radius) < margin}
+            on_cap = np.abs(np.abs(local[:, 2]) - ends[2, 1]) < margin
+            rim = _end(reach[on_cap], sigma, config, growing=True)
+            radius = (shape.extents[0] / 2.0 if rim is None else rim[0]) - opened.radius
+            hidden[:4] = hidden[:4] if rim is None else rim[1]
+        beside = {2: np.abs(reach - opened.radius) < margin}
     else:
-        gap = np.abs(local) - refined.extents / 2.0
-        beside = {
-            a: np.abs(np.maximum(gap[:, (a + 1) % 3], gap[:, (a + 2) % 3])) < margin for a in range(3)
-        }
-    for axis, on_side in beside.items():
-        for sign, ends in ((-1.0, low), (1.0, high)):
-            if seen[2 * axis + (sign > 0)]:
+        gap = np.abs(local) - opened.extents / 2.0
+        beside = {a: np.abs(np.delete(gap, a, axis=1).max(axis=1)) < margin for a in range(3)}
+    for axis, on_face in beside.items():
+        for side, sign in enumerate((-1.0, 1.0)):
+            if seen[2 * axis + side]:
                 continue
-            found = _end(sign * local[on_side, axis], sigma, config, growing=False)
-            ends[axis] = sign * found if found is not None else before[axis] + sign * shape.extents[axis] / 2
-        if high[axis] - low[axis] < config.min_extent:
-            fixed = seen[2 * axis + 1]
-            low[axis], high[axis] = (
-                (high[axis] - config.min_extent, high[axis])
-                if fixed
-                else (low[axis], low[axis] + config.min_extent)
-            )
-    return _resized(refined, low, high, radius)
+            rim = _end(sign * local[on_face, axis], sigma, config, growing=False)
+            ends[axis, side] = before[axis] + sign * shape.extents[axis] / 2.0
+            if rim is not None:
+                ends[axis, side], hidden[2 * axis + side] = sign * rim[0], rim[1]
+        short = max(config.min_extent - float(ends[axis, 1] - ends[axis, 0]), 0.0)
+        ends[axis] += (-short, 0.0) if seen[2 * axis + 1] else (0.0, short)
+    return _resized(opened, ends[:, 0], ends[:, 1], radius), hidden
 
 
-def _end(coordinates: Array, sigma: float, config: FitConfig, *, growing: bool) -> float | None:
-    """Upper end [m] of the points (N,), or None where there are too few to tell."""
+def _end(coordinates: Array, sigma: float, config: FitConfig, *, growing: bool) -> tuple[float, float] | None:
+    """Upper end [m] of the points (N,) and its standard deviation [m], or None where too few tell."""
     if len(coordinates) < config.min_points:
         return None
     start = float(np.quantile(coordinates, 1.0 - config.trim))
     span = start - (0.0 if growing else float(np.quantile(coordinates, config.trim)))
     window = max(4.0 * sigma, 0.1 * span)
-    return float(likeliest_end(coordinates, start, sigma, window, growing)[0])
+    end, deviation = likeliest_end(
+        np.ascontiguousarray(coordinates), start, sigma, window, growing, config.stray
+    )
+    return float(end), float(np.hypot(deviation * np.sqrt(config.correlated), config.rim))
 
 
 def _resized(shape: Box | Cylinder, low: Array, high: Array, radius: float) -> Box | Cylinder:

@@ -16,6 +16,7 @@ from caryatid.ransac import ransac
 from caryatid.refine import distances, refine
 from caryatid.shape_models import BoxModel, CylinderModel, ShapeModel, SphereModel
 from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.uncertainty import Uncertainty
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
 
@@ -31,6 +32,7 @@ class Fit:
         seen: Which sides (-x, +x, -y, +y, -z, +z of the object) points bear out.
         cost: What model choice compares [m].
         poor: No shape explains the points within the configured residual.
+        uncertainty: How far off it may be; of the fit that was chosen only.
     """
 
     shape: Box | Cylinder | Sphere
@@ -39,6 +41,7 @@ class Fit:
     seen: Seen
     cost: float
     poor: bool
+    uncertainty: Uncertainty | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,7 @@ def fit(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Gene
     """Fit the best of box, cylinder and sphere.
 
     The result does not depend on the frame of the points, only on their order and the generator. Sides
-    without points are drawn in to where the points end.
+    without points lie where the points of the faces beside them end.
 
     Args:
         points: (N, 3) [m], in any frame.
@@ -67,18 +70,28 @@ def fit(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Gene
     fits = candidates(points, normals, config=config, rng=rng)
     if not fits:
         return FitFailure(_failure_reason(len(points), config))
-    return _polished(fits[0], points, normals, config)
+    return _polished(fits[0], points, config)
 
 
-def _polished(found: Fit, points: Array, normals: Array, config: FitConfig) -> Fit:
-    keep = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
-    some = points[keep]
-    if len(some) > 5000:
-        some = some[np.linspace(0, len(some) - 1, 5000).astype(np.intp)]
-    origin = some.mean(axis=0)
-    shape = found.shape.moved(frames.rigid(np.eye(3), -origin))
-    shape = polish(shape, np.array(found.seen), np.ascontiguousarray(some - origin), config)
-    return replace(found, shape=shape.moved(frames.rigid(np.eye(3), origin)))
+def _polished(found: Fit, points: Array, config: FitConfig) -> Fit:
+    """The fit with its shape refined on more points, and how sure it is."""
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) > config.final_points:
+        points = points[np.linspace(0, len(points) - 1, config.final_points).astype(np.intp)]
+    origin = points.mean(axis=0)
+    centred = np.ascontiguousarray(points - origin)
+    away, back = frames.rigid(np.eye(3), -origin), frames.rigid(np.eye(3), origin)
+    shape, uncertainty = polish(found.shape.moved(away), np.array(found.seen), centred, config)
+    absolute = np.abs(distances(shape, centred)[0])
+    residual = float(np.minimum(absolute, config.threshold).mean())
+    return replace(
+        found,
+        shape=shape.moved(back),
+        residual=residual,
+        inliers=float((absolute < config.threshold).mean()),
+        poor=residual > config.max_residual,
+        uncertainty=uncertainty,
+    )
 
 
 def candidates(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Generator) -> list[Fit]:

@@ -46,6 +46,20 @@ class FitConfig:
     """What seen sides without any point near them cost in model choice [m]; a share of them in proportion."""
     bare_spacing: float = 0.008
     """Spacing of the samples that look for points near a side [m]; 2 to 3 pixels at 1.5 m."""
+    final_points: int = 5000
+    """Points the last refinement of the chosen shape looks at [1]; a large object in one view."""
+    opening: float = 0.05
+    """How far unseen sides are moved out of the way for it [m]; beyond all noise."""
+    face_width: float = 3.0
+    """Points within as many standard deviations of a face are the face's [1]; 99.7 % of them."""
+    stray: float = 1e-3
+    """Density of stray points beyond a face's rim, as a share of that on the face [1]."""
+    correlated: float = 4.0
+    """Neighbouring points that share one error [1]: depth is smoothed over 2 × 2 pixels."""
+    registration: float = 0.002
+    """Standard deviation of where views are laid [m], which no number of points averages out."""
+    rim: float = 0.003
+    """The same of where points end beside a depth edge [m]: one pixel at 1.5 m."""
     max_residual: float = 0.008
     """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
 

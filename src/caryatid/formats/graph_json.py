@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from math import inf, isfinite
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -12,6 +13,7 @@ from caryatid.formats.json_files import field, json_text, number, numbers, plain
 from caryatid.frames import Array
 from caryatid.graph import Kind, Role, SceneObject, Stability, Support, SupportGraph
 from caryatid.shapes import Box, Cylinder, Sphere, from_size
+from caryatid.uncertainty import Uncertainty
 from caryatid.views import SUPPORT_LABEL
 
 FORMAT: Final = "caryatid/graph"
@@ -117,7 +119,7 @@ def read_graph(path: Path) -> SupportGraph:
 
 
 def _object_to_json(o: SceneObject) -> dict[str, Any]:
-    return {
+    item = {
         "id": o.id,
         "role": o.role,
         "label": o.label,
@@ -131,6 +133,9 @@ def _object_to_json(o: SceneObject) -> dict[str, Any]:
         "seen": o.seen,
         "why": o.why,
     }
+    if o.uncertainty is not None:
+        item["uncertainty"] = asdict(o.uncertainty)
+    return item
 
 
 def _object_from_json(item: Any, source: str) -> SceneObject:
@@ -155,6 +160,21 @@ def _object_from_json(item: Any, source: str) -> SceneObject:
         poor_fit=field(item, "poor_fit", bool, source, default=False),
         seen=tuple(seen),
         why=field(item, "why", str, source, default=""),
+        uncertainty=_uncertainty_from_json(item, source),
+    )
+
+
+def _uncertainty_from_json(item: Mapping[str, Any], source: str) -> Uncertainty | None:
+    document = field(item, "uncertainty", (dict, type(None)), source, default=None)
+    if document is None:
+        return None
+    source = f"{source}: uncertainty"
+    counts = {"position": 3, "rotation": 3, "sizes": 3, "sides": 6}
+    return Uncertainty(
+        **{
+            name: numbers(field(document, name, list, source), (count,), f"{source}: {name}")
+            for name, count in counts.items()
+        }
     )
 
 

@@ -1,6 +1,6 @@
 """Compiled kernel that finds where points end: the likeliest end of an even density blurred by noise.
 
-`rims.end_reference` is the NumPy reference the tests compare it with.
+The tests hold a NumPy reference.
 """
 
 from __future__ import annotations
@@ -17,13 +17,11 @@ HALVINGS = 14
 """Bisections of the search for the end: to 12 σ / 2¹⁴."""
 ROUNDS = 3
 """How often density and end are found from one another; they change by a hundredth of σ in the last."""
-STRAY = 1e-3
-"""Density beyond the end, as a share of that within: one stray point weighs little against a rim's."""
 
 
 @njit(cache=True, error_model="numpy")
 def likeliest_end(
-    coordinates: NDArray[np.float64], start: float, sigma: float, window: float, growing: bool
+    coordinates: NDArray[np.float64], start: float, sigma: float, window: float, growing: bool, stray: float
 ) -> Array:
     """Upper end [m] of points whose density is even up to it, and its standard deviation [m].
 
@@ -36,6 +34,7 @@ def likeliest_end(
         sigma: Standard deviation of the noise along the coordinate [m].
         window: Length over which the density is measured [m].
         growing: The density grows with the coordinate, as on a disc along its radius.
+        stray: Density beyond the end, as a share of that within: one stray point weighs little against a rim.
 
     Returns:
         The end and its standard deviation (2,).
@@ -60,7 +59,7 @@ def likeliest_end(
                 z = (middle - u) / sigma
                 if -6.0 < z < 4.5:
                     within = 0.5 * math.erfc(-z * 0.7071067811865476)
-                    slope += 0.3989422804014327 * math.exp(-0.5 * z * z) / (within + STRAY)
+                    slope += 0.3989422804014327 * math.exp(-0.5 * z * z) / (within + stray)
             if slope > 0.0:
                 low = middle
             else:

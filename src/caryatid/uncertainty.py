@@ -1,0 +1,78 @@
+"""How far off a fitted shape may be: standard deviations of its pose, its sizes and each of its sides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import FitConfig
+from caryatid.frames import Array
+from caryatid.kernels.fitting import normal_equations
+from caryatid.refine import ROBUST_WIDTH, arrays
+from caryatid.shapes import Box, Cylinder, Sphere
+
+_SIZE_COLUMN = {"box": (6, 7, 8), "cylinder": (6, 6, 8), "sphere": (6, 6, 6)}
+"""Column of the normal equations that holds the half extent along x, y, z."""
+_TURN = 1.0
+"""Standard deviation of a rotation that nothing determines [rad]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Uncertainty:
+    """Standard deviations of a fitted shape, along and about the object's own axes.
+
+    Attributes:
+        position: Of the centre (3,) [m].
+        rotation: (3,) [rad]; large about an axis of symmetry.
+        sizes: Of the full extents (3,) [m] along x, y, z.
+        sides: Of the position of the sides -x, +x, -y, +y, -z, +z (6,) [m] along their normals.
+    """
+
+    position: Array
+    rotation: Array
+    sizes: Array
+    sides: Array
+
+
+def estimate(
+    opened: Box | Cylinder | Sphere,
+    seen: NDArray[np.bool_],
+    unseen: Array,
+    points: Array,
+    sigma: float,
+    config: FitConfig,
+) -> Uncertainty:
+    """Standard deviations from the normal equations of the last fit.
+
+    Args:
+        opened: The refined shape with the unseen sides out of the way.
+        seen: Which sides (6,) points bear out.
+        unseen: Standard deviation (6,) [m] of the sides that no point bears out; passed over for the others.
+        points: (N, 3) [m], same frame.
+        sigma: Robust standard deviation of the points' distances to the shape [m].
+        config: How many points share an error, and the error of registration.
+    """
+    H, _ = normal_equations(*arrays(opened), points, ROBUST_WIDTH * sigma)
+    columns = _SIZE_COLUMN[opened.kind]
+    information = H * len(points) / (config.correlated * sigma**2)
+    prior = np.array([config.max_extent] * 3 + [_TURN] * 3 + [config.max_extent] * 3)
+    covariance = np.linalg.inv(information + np.diag(prior**-2.0))
+    sides = np.empty(6)
+    position, sizes = np.empty(3), np.empty(3)
+    floor = config.registration**2
+    for axis in range(3):
+        centre, half, both = (
+            covariance[axis, axis],
+            covariance[columns[axis], columns[axis]],
+            covariance[axis, columns[axis]],
+        )
+        low, high = centre + half - 2.0 * both, centre + half + 2.0 * both
+        low = low if seen[2 * axis] else unseen[2 * axis] ** 2
+        high = high if seen[2 * axis + 1] else unseen[2 * axis + 1] ** 2
+        sides[2 * axis], sides[2 * axis + 1] = np.sqrt(low + floor), np.sqrt(high + floor)
+        determined = bool(seen[2 * axis] and seen[2 * axis + 1])
+        position[axis] = np.sqrt((centre if determined else (low + high) / 4.0) + floor)
+        sizes[axis] = np.sqrt((4.0 * half if determined else low + high) + floor)
+    return Uncertainty(position, np.sqrt(np.diag(covariance)[3:6]), sizes, sides)
