@@ -4,8 +4,8 @@
 
 A trial draws a shape of table-top size, a direction to look from and points all over what is seen of it
 within 80°, as dense in every part of the image; each gets Gaussian noise in space. Normals are those of the
-planes through each point's neighbours, as normals from depth are: noisy, and rounded at edges. What is measured
-is what such a view can tell:
+planes through each point's neighbours, as normals from depth are: noisy, rounded at edges. Measured is what
+such a view can tell:
 
 * An extent of a box counts where a face along it is seen: that face shows its full length. Of a box of which
   a single face is seen that is two extents of three.
@@ -247,9 +247,8 @@ def show_worst(trials: list[Trial], console: Console) -> None:
             console.print(f"wrong: {trial.note}")
     worst = sorted(trials, key=lambda t: -max((abs(e) for _, e, _ in t.errors), default=0.0))
     for trial in worst[:12]:
-        console.print(
-            f"far off: {trial.note} {[(n, round(float(e), 2), round(float(d), 2)) for n, e, d in trial.errors]}"
-        )
+        figures = ", ".join(f"{name} {error:.2f} (± {sigma:.2f})" for name, error, sigma in trial.errors)
+        console.print(f"far off: {trial.note}: {figures}")
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from caryatid.formats import graph_from_json, graph_text, graph_to_json, read_gr
 from caryatid.formats.json_files import json_text, read_json
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
 from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.uncertainty import Uncertainty
 
 
 def random_graph(seed, count=5):
@@ -48,6 +49,9 @@ def random_graph(seed, count=5):
                 poor_fit=bool(rng.integers(2)),
                 seen=seen,
                 why="σ ≤ 5 mm",
+                uncertainty=Uncertainty(*rng.uniform(size=(3, 3)), rng.uniform(size=6))
+                if rng.integers(2)
+                else None,
             )
         )
     pairs = [(a, b) for a in range(count + 1) for b in range(1, count + 1) if a != b]
@@ -87,6 +91,11 @@ def test_what_is_written_is_read_back(seed):
         assert (a.poor_fit, a.seen, a.why, a.shape.kind) == (b.poor_fit, b.seen, b.why, b.shape.kind)
         assert np.allclose(a.shape.T_world_object, b.shape.T_world_object, atol=1e-9)
         assert np.allclose(a.shape.extents, b.shape.extents, atol=2e-9)
+        assert (a.uncertainty is None) == (b.uncertainty is None)
+        if a.uncertainty is not None:
+            for name in ("position", "rotation", "sizes", "sides"):
+                written, read = getattr(a.uncertainty, name), getattr(b.uncertainty, name)
+                assert np.allclose(written, read, atol=1e-9)
     for a, b in zip(graph.supports, again.supports, strict=True):
         assert (a.pair, a.kind, a.certain, a.occurrences, a.why) == (
             b.pair,
@@ -206,6 +215,9 @@ def change(document, *path_and_value):
         (("objects", 1, "occurrences", -3), "occurrences"),
         (("objects", 1, "seen", [True]), "seen"),
         (("objects", 1, "residual", "small"), "residual"),
+        (("objects", 1, "uncertainty", [0.1]), "uncertainty"),
+        (("objects", 1, "uncertainty", {"position": [0.1, 0.1, 0.1]}), "'rotation' is missing"),
+        (("objects", 1, "uncertainty", {"position": [0.1]}), "3 finite numbers"),
         (("objects", 1, 7), "no JSON object"),
         (("supports", 0, "supporter", "o99"), "o99"),
         (("supports", 0, "supported", "o0"), "o0"),

@@ -59,6 +59,11 @@ def estimate(
     information = H * len(points) / (config.correlated * sigma**2)
     prior = np.array([config.max_extent] * 3 + [_TURN] * 3 + [config.max_extent] * 3)
     covariance = np.linalg.inv(information + np.diag(prior**-2.0))
+    borne_out = np.array(seen)
+    if opened.kind != "box":
+        # What is round is one surface: any part of it tells where all of it is.
+        borne_out[:4] = opened.kind == "sphere" or seen[:4].any()
+        borne_out[4:] |= opened.kind == "sphere"
     sides = np.empty(6)
     position, sizes = np.empty(3), np.empty(3)
     floor = config.registration**2
@@ -69,10 +74,10 @@ def estimate(
             covariance[axis, columns[axis]],
         )
         low, high = centre + half - 2.0 * both, centre + half + 2.0 * both
-        low = low if seen[2 * axis] else unseen[2 * axis] ** 2
-        high = high if seen[2 * axis + 1] else unseen[2 * axis + 1] ** 2
+        low = low if borne_out[2 * axis] else unseen[2 * axis] ** 2
+        high = high if borne_out[2 * axis + 1] else unseen[2 * axis + 1] ** 2
         sides[2 * axis], sides[2 * axis + 1] = np.sqrt(low + floor), np.sqrt(high + floor)
-        determined = bool(seen[2 * axis] and seen[2 * axis + 1])
+        determined = bool(borne_out[2 * axis] and borne_out[2 * axis + 1])
         position[axis] = np.sqrt((centre if determined else (low + high) / 4.0) + floor)
         sizes[axis] = np.sqrt((4.0 * half if determined else low + high) + floor)
     return Uncertainty(position, np.sqrt(np.diag(covariance)[3:6]), sizes, sides)

@@ -35,9 +35,9 @@ class FitConfig:
     size_penalty: float = 0.0125
     """Added to the mean residual [m] per square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
     shrink: float = 2e-5
-    """Pull on every extent [m]: a face that holds a share s of the points is moved in by shrink / (2·s)."""
+    """Pull on every extent in the search [m]: keeps sides that hold no points near; the last fit has none."""
     trim: float = 0.005
-    """Share of the points beyond each end of an extent that count as noise [1]."""
+    """Share of the points beyond each end of an extent that count as noise in the search [1]."""
     side_share: float = 0.02
     """Share of the points that must lie on a side for it to count as seen [1]."""
     normal_weight: float = 0.004
