@@ -32,7 +32,7 @@ def models():
 
 def test_what_was_taken_for_one_is_divided_and_the_view_relabelled(models):
     percept = percept_of((1, 1))
-    models.fit_all(models.add(percept))
+    models.fit_all(models.add(percept, 0))
     assert [o.label for o in models.objects()] == [1]
     changed = models.divide({1})
     assert len(changed) == 2
@@ -46,7 +46,7 @@ def test_what_was_taken_for_one_is_divided_and_the_view_relabelled(models):
 
 
 def test_later_parts_over_both_are_divided_among_the_known(models):
-    models.fit_all(models.add(percept_of((1, 2))))
+    models.fit_all(models.add(percept_of((1, 2)), 0))
     again = models.associate(percept_of((7, 7), seed=1))
     assert set(np.unique(again.labels)) == {1, 2}
     assert (again.labels == percept_of((1, 2), seed=1).labels).mean() > 0.9
@@ -54,9 +54,9 @@ def test_later_parts_over_both_are_divided_among_the_known(models):
 
 def test_two_labels_of_one_object_are_united(models):
     left, right = (-1.2, -0.6, 1.8), (1.2, 0.6, 1.8)
-    models.fit_all(models.add(percept_of((1,), (CRATE,), left)))
-    models.fit_all(models.add(percept_of((1,), (CRATE,), right)))
-    models.fit_all(models.add(percept_of((2,), (CRATE,), left, seed=3)))
+    models.fit_all(models.add(percept_of((1,), (CRATE,), left), 0))
+    models.fit_all(models.add(percept_of((1,), (CRATE,), right), 0))
+    models.fit_all(models.add(percept_of((2,), (CRATE,), left, seed=3), 0))
     given_up = models.unite()
     assert len(given_up) == 1
     assert [o.shape.kind for o in models.objects()] == ["box"]
@@ -64,19 +64,19 @@ def test_two_labels_of_one_object_are_united(models):
 
 
 def test_the_newest_view_alone_is_fitted_on_demand(models):
-    models.fit_all(models.add(percept_of((1, 2))))
-    models.fit_newest(models.add(percept_of((2,), (CAN,))))
+    models.fit_all(models.add(percept_of((1, 2)), 0))
+    models.fit_newest(models.add(percept_of((2,), (CAN,)), 0))
     assert [o.label for o in models.objects()] == [2]
 
 
 def test_an_object_that_could_not_be_divided_is_left_alone_until_it_has_grown(models, monkeypatch):
     tried = []
     monkeypatch.setattr("caryatid.object_models.split", lambda *a, **k: tried.append(len(a[0])))
-    models.fit_all(models.add(percept_of((1,), (CRATE,))))
+    models.fit_all(models.add(percept_of((1,), (CRATE,)), 0))
     assert models.divide({1}) == set()
     assert models.divide({1}) == set()
     assert len(tried) == 1
-    models.fit_all(models.add(percept_of((1,), (CRATE,), (1.2, 0.6, 1.8))))
+    models.fit_all(models.add(percept_of((1,), (CRATE,), (1.2, 0.6, 1.8)), 0))
     models.divide({1})
     assert len(tried) == 2
 

@@ -15,9 +15,9 @@ def cloud(count, label, at=0.0):
 
 def two_views():
     points = ObjectPoints()
-    for at in (0.0, 100.0):
+    for view, at in enumerate((0.0, 100.0)):
         for label, count in ((1, 4), (3, 6), (SUPPORT_LABEL, 5)):
-            points.add(label, cloud(count, label, at))
+            points.add(label, cloud(count, label, at), view)
     return points
 
 

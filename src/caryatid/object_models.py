@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial import cKDTree
 from caryatid import association
 from caryatid.clouds import thin
 from caryatid.config import Config
+from caryatid.frames import Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.object_points import ObjectPoints
 from caryatid.perception import UP, Percept
@@ -51,15 +53,19 @@ class ObjectModels:
         labels[percept.labels == SUPPORT_LABEL] = SUPPORT_LABEL
         return percept.with_labels(labels)
 
-    def add(self, percept: Percept) -> set[int]:
+    def add(self, percept: Percept, view: int) -> set[int]:
         """Add a view's points, thinned, and return the labels of the objects among them."""
         config = self._config
         shown = {int(k) for k in np.unique(percept.labels) if k != 0}
         for label in sorted(shown):
             part = percept.cloud.select(percept.labels == label)
             voxel = config.surface.spacing if label == SUPPORT_LABEL else config.cloud.voxel
-            self.points.add(label, part.select(thin(part.points_world, voxel)))
+            self.points.add(label, part.select(thin(part.points_world, voxel)), view)
         return shown - {SUPPORT_LABEL}
+
+    def move(self, T: Mapping[int, Array]) -> set[int]:
+        """Move the points of some views (view → (4, 4)); returns the labels of the objects that have some."""
+        return self.points.move(T) - {SUPPORT_LABEL}
 
     def fit_newest(self, labels: set[int]) -> None:
         """Fit objects to the newest view's points alone, and forget all other fits (`sg`)."""

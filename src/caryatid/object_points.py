@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,11 @@ class ObjectPoints:
 
     def __init__(self) -> None:
         self.labels_used = 0
-        self._clouds: dict[int, list[Cloud]] = {}
+        self._clouds: dict[int, list[tuple[int, Cloud]]] = {}
 
-    def add(self, label: int, cloud: Cloud) -> None:
+    def add(self, label: int, cloud: Cloud, view: int) -> None:
         """Add a view's points of an object, or of the support surface."""
-        self._clouds.setdefault(label, []).append(cloud)
+        self._clouds.setdefault(label, []).append((view, cloud))
         if label != SUPPORT_LABEL:
             self.labels_used = max(self.labels_used, label)
 
@@ -38,19 +38,29 @@ class ObjectPoints:
 
     def of(self, label: int) -> Cloud:
         """All points of an object."""
-        return joined(self._clouds.get(label, []))
+        return joined(cloud for _, cloud in self._clouds.get(label, []))
 
     def newest(self, label: int) -> Cloud:
         """Points of an object in the newest view that showed it."""
-        return self._clouds[label][-1]
+        return self._clouds[label][-1][1]
 
     def everything(self) -> Cloud:
         """All points of all objects and of the support surface, with labels."""
-        return joined(c for label in sorted(self._clouds) for c in self._clouds[label])
+        return joined(c for label in sorted(self._clouds) for _, c in self._clouds[label])
+
+    def move(self, T: Mapping[int, Array]) -> set[int]:
+        """Move the points of some views, view → (4, 4); returns the labels that have such points."""
+        moved: set[int] = set()
+        for label, clouds in self._clouds.items():
+            if any(view in T for view, _ in clouds):
+                moved.add(label)
+                self._clouds[label] = [(view, c.moved(T[view]) if view in T else c) for view, c in clouds]
+        return moved
 
     def merge(self, old: int, new: int) -> None:
         """Give the points of one object to another."""
-        self._clouds[new] = [*self._clouds[new], *(relabelled(c, new) for c in self._clouds.pop(old))]
+        taken = [(view, relabelled(c, new)) for view, c in self._clouds.pop(old)]
+        self._clouds[new] = [*self._clouds[new], *taken]
 
     def divide(self, label: int, groups: NDArray[np.intp]) -> list[int]:
         """Make several objects of one.
@@ -63,12 +73,12 @@ class ObjectPoints:
             Label of each group; the first keeps the old one.
         """
         clouds = self._clouds.pop(label)
-        ends = np.cumsum([len(c) for c in clouds])
+        ends = np.cumsum([len(c) for _, c in clouds])
         names = [label, *range(self.labels_used + 1, self.labels_used + 1 + int(groups.max()))]
-        for cloud, part in zip(clouds, np.split(groups, ends[:-1]), strict=True):
+        for (view, cloud), part in zip(clouds, np.split(groups, ends[:-1]), strict=True):
             for number, name in enumerate(names):
                 if (part == number).any():
-                    self.add(name, relabelled(cloud.select(part == number), name))
+                    self.add(name, relabelled(cloud.select(part == number), name), view)
         return names
 
 

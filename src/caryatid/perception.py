@@ -55,13 +55,8 @@ class Percept:
 
     def moved(self, T: Array) -> Percept:
         """Return the percept moved by a rigid transform of the world."""
-        cloud = replace(
-            self.cloud,
-            points_world=frames.transform(T, self.cloud.points_world),
-            normals_world=frames.rotate(T, self.cloud.normals_world),
-        )
         view = None if self.view is None else self.view.with_pose(T @ self.view.pose)
-        return replace(self, view=view, cloud=cloud, surface=self.surface.moved(T))
+        return replace(self, view=view, cloud=self.cloud.moved(T), surface=self.surface.moved(T))
 
 
 def perceive(
@@ -125,12 +120,7 @@ def level_cloud(
     given = None if segmentation == "auto" else cloud.labels
     surface = _found(cloud, _loose(cloud, given, config), None, config, rng)
     T = frames.level_world(surface.normal_world, surface.point_world)
-    return replace(
-        cloud,
-        points_world=frames.transform(T, cloud.points_world),
-        normals_world=frames.rotate(T, cloud.normals_world),
-        viewpoint_world=None if cloud.viewpoint_world is None else frames.transform(T, cloud.viewpoint_world),
-    )
+    return cloud.moved(T)
 
 
 def label_image(percept: Percept, source: View | Cloud) -> NDArray[np.int32]:

@@ -9,15 +9,14 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.clouds import thin
 from caryatid.completion import complete
 from caryatid.config import Config, SegmentationMethod
 from caryatid.frames import Array
 from caryatid.fusion import Evidence, absorbed, fuse, fused_graph
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
+from caryatid.joint_registration import ViewRegistration
 from caryatid.object_models import ObjectModels
 from caryatid.perception import UP, Percept, label_image, perceive
-from caryatid.registration import align
 from caryatid.stopwatch import Stopwatch
 from caryatid.support import explain, infer
 from caryatid.surface import SupportSurface, find_support_surface
@@ -62,6 +61,7 @@ class Scene:
         self.views = 0
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
+        self._registration: ViewRegistration | None = None
         self._evidence = Evidence()
         self._shown: Counter[str] = Counter()
         self._contradicted: Counter[str] = Counter()
@@ -98,11 +98,11 @@ class Scene:
         given = source.labels is not None and self.segmentation != "auto"
         percept = perceive(source, self.config, segmentation=self.segmentation, known=self.surface, rng=rng)
         watch.lap("segment")
-        percept = self._registered(percept, given)
+        percept, moved = self._registered(percept, given)
         watch.lap("register")
         if not given and self.config.fusion.method != "sg":
             percept = self._models.associate(percept)
-        shown = self._models.add(percept)
+        shown = self._models.add(percept, self.views) | moved
         self.surface = self._fused_surface(percept)
         surface, voxels = self._bounds(percept)
         watch.lap("map")
@@ -120,16 +120,19 @@ class Scene:
         self.timings = watch.laps
         return self.graph
 
-    def _registered(self, percept: Percept, given: bool) -> Percept:
-        """Lay the view onto the map, which the first view's pose ties to the world."""
-        config = self.config
-        if self.sphere is None or not config.registration.enabled:
-            return percept
-        cloud = percept.cloud.select(percept.labels != 0)
-        cloud = cloud.select(thin(cloud.points_world, config.cloud.voxel * 2.0))
-        if not given:
-            cloud = replace(cloud, labels=None)
-        return percept.moved(align(cloud, self.cloud, self.sphere.centre_world, config.registration).T)
+    def _registered(self, percept: Percept, given: bool) -> tuple[Percept, set[int]]:
+        """Lay the view onto the earlier ones and move those by what it shows of them.
+
+        Returns:
+            The percept, moved, and the labels of the objects some of whose points moved.
+        """
+        if not self.config.registration.enabled:
+            return percept, set()
+        if self._registration is None:
+            self._registration = ViewRegistration(percept.surface.point_world, self.config.registration)
+        moves = self._registration.add(percept.cloud, same_labels=given)
+        moved = self._models.move({v: T for v, T in moves.items() if v < self.views})
+        return percept.moved(moves[self.views]), moved
 
     def _fused_surface(self, percept: Percept) -> SupportSurface:
         """The support surface from the points of all views."""

@@ -138,6 +138,16 @@ class Cloud:
             self.name,
         )
 
+    def moved(self, T: Array) -> Cloud:
+        """Return the cloud moved by a rigid transform (4, 4) of the world."""
+        eye = self.viewpoint_world
+        return replace(
+            self,
+            points_world=frames.transform(T, self.points_world),
+            normals_world=frames.rotate(T, self.normals_world),
+            viewpoint_world=None if eye is None else frames.transform(T, eye),
+        )
+
 
 class Camera(Protocol):
     """What gives a view from a pose: simulation, recording or hardware."""

@@ -68,33 +68,64 @@ class SurfaceConfig:
 
 @dataclass(frozen=True, slots=True)
 class RegistrationConfig:
-    """Refining the reported pose of a view against what is known."""
+    """Refining the reported poses of views against each other."""
 
     enabled: bool = True
     """Refine at all."""
-    iterations: int = 12
-    """Rounds of matching at the most [1]."""
     translation: float = 0.01
-    """Expected error of a reported pose at the table [m]: 5 mm, and 0.3° over the 1.5 m to the camera."""
-    rotation: float = 0.4
-    """Expected error of a reported orientation, per axis [deg]."""
-    noise: float = 0.02
-    """Expected distance of one matched point to its partner's plane [m]; neighbouring points err alike, so it
-    stands for about 40 of them with 3 mm each."""
-    reach: float = 0.03
-    """Partners further away are none [m]; 3σ of the expected error."""
-    min_cosine: float = 0.8
+    """Expected error of a reported position, per axis [m]; the worst that is usual, twice the usual."""
+    rotation: float = 0.5
+    """Expected error of a reported orientation, per axis, about the camera [deg]."""
+    noise: float = 0.001
+    """Expected distance of one patch to its partner's plane beside the spread of their readings [m]."""
+    independent: float = 0.1
+    """Share of the partners that err independently [1]: neighbouring patches err alike."""
+    spacing: float = 0.01
+    """Size of the patches of objects that readings are averaged over [m]; a dozen pixels at 1.5 m."""
+    spacing_far: float = 0.03
+    """Size of the patches of the support surface [m]."""
+    min_readings: int = 4
+    """Patches of fewer readings are left out [1]: rims, and sides seen at a grazing angle."""
+    min_share: float = 0.33
+    """Where few pixels make a patch, this share of what the fullest ones have will do [1]."""
+    min_flatness: float = 0.97
+    """Length of the mean of a patch's normals at least [1]; less is an edge."""
+    plane_rounds: int = 4
+    """Rounds of the robust fit of planes to sides [1]."""
+    flat: float = 0.0015
+    """Distance of a patch from its side's plane at which it counts a quarter in it [m]."""
+    flat_share: float = 0.7
+    """Share of a side's patches that must lie in its plane for the side to be flat [1]."""
+    min_side: float = 0.006
+    """Standard deviation of a flat side's patches along its shorter direction at least [m]; 2 cm wide."""
+    min_patches: int = 6
+    """Sides of fewer patches are left out [1]; blurred edges."""
+    sample: int = 600
+    """Patches of a view that look for partners in another [1]."""
+    reaches: tuple[float, ...] = (0.1, 0.05, 0.025)
+    """Partners further away are none [m], coarse to fine."""
+    rounds: int = 3
+    """Rounds of matching at each reach [1]."""
+    steps: int = 4
+    """Gauss-Newton steps between two rounds of matching at the most [1]."""
+    converged: float = 2e-5
+    """Steps below this end the rounds [m, rad]."""
+    normal_reach: float = 0.05
+    """How far apart [m] directions at right angles count when partners are looked for, by 1/√2."""
+    min_cosine: float = 0.9
     """Cosine of the angle between the normals of partners at least [1]."""
-    outlier: float = 0.01
-    """Distances beyond this lose their weight [m]."""
-    min_points: int = 150
-    """Fewer matched points determine no pose [1]."""
+    outlier: float = 0.3
+    """Share of the reach beyond which distances lose their weight [1]."""
+    min_points: int = 100
+    """Fewer partners determine no pose [1]."""
     exact: float = 0.0003
-    """A view that fits better than this as reported is not moved [m]; exact ones leave 0.1 mm, noisy 2 mm."""
-    max_translation: float = 0.05
-    """A longer move is refused [m]; 5σ."""
-    max_rotation: float = 2.0
-    """A larger turn is refused [deg]; 5σ."""
+    """A view that fits better than this as reported is not moved [m]; exact ones leave 0.1 mm, noisy 1 mm."""
+    settled: float = 0.0003
+    """Views whose points would move less than this stay where they are [m]."""
+    max_translation: float = 0.1
+    """A longer move is refused [m]."""
+    max_rotation: float = 5.0
+    """A larger turn is refused [deg]."""
 
 
 @dataclass(frozen=True, slots=True)
