@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from synthetic import box, sphere, surface_points
 
-from caryatid.association import associate, duplicates
+from caryatid.association import associate
 from caryatid.config import SegmentationConfig
 
 CONFIG = SegmentationConfig()
@@ -96,24 +96,3 @@ def test_a_few_points_beside_its_neighbour_do_not_divide_a_part():
 
 def test_no_parts_no_names():
     assert names_of() == {}
-
-
-def test_an_object_inside_anothers_shape_is_the_same_object():
-    half = KNOWN[3][KNOWN[3][:, 1] > 0.0]
-    shapes = {3: CRATE, 4: box((0.0, 0.03, 0.8), (0.1, 0.06, 0.1)), 7: BALL}
-    assert duplicates(KNOWN | {4: half}, shapes, CONFIG) == {4: 3}
-    # The smaller is given up, whatever the labels.
-    swapped = {3: half, 4: KNOWN[3]}
-    assert duplicates(swapped, {3: shapes[4], 4: CRATE}, CONFIG) == {3: 4}
-
-
-def test_neighbours_that_touch_are_two_objects():
-    beside = box((0.0, 0.11, 0.8), (0.1, 0.1, 0.1))
-    assert duplicates(KNOWN | {4: seen(beside)}, SHAPES | {4: beside}, CONFIG) == {}
-
-
-def test_what_was_given_up_takes_no_points_of_others():
-    middle, small = box((0.0, 0.0, 0.8), (0.09, 0.11, 0.09)), box((0.0, 0.0, 0.8), (0.08, 0.1, 0.08))
-    points = {3: seen(CRATE), 4: seen(middle), 5: seen(small)}
-    given_up = duplicates(points, {3: CRATE, 4: middle, 5: small}, CONFIG)
-    assert given_up == {4: 3, 5: 3}

@@ -12,6 +12,7 @@ from caryatid.simulation import (
     SimulatedScene,
     bounds,
     generate_dense,
+    generate_packed,
     generate_pile,
     ground_truth,
     list_scenes,
@@ -113,7 +114,15 @@ def test_dense_heaps_hold_each_other_up():
     assert len(supports) >= 6
 
 
-@pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4"])
+def test_packed_objects_touch_one_another():
+    shapes = list(true_shapes(generate_packed(6, 3)).values())
+    for shape in shapes:
+        surface = shape.surface(0.003)[0]
+        gaps = [float(other.signed_distance(surface).min()) for other in shapes if other is not shape]
+        assert -0.002 < min(gaps) < 0.004
+
+
+@pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4", "packed-5-1"])
 def test_generated_names_repeat_byte_for_byte(name: str):
     a, b = load_scene(name), load_scene(name)
     assert a.name == name
@@ -140,7 +149,7 @@ def test_the_way_of_the_robot_is_free():
             assert not (low[0] < -1.5 < high[0] and low[1] < 0.0 < high[1])
 
 
-@pytest.mark.parametrize("name", ["pile-0-1", "pile-99-1", "dense-3-1", "dense-26-0"])
+@pytest.mark.parametrize("name", ["pile-0-1", "pile-99-1", "dense-3-1", "dense-26-0", "packed-1-0"])
 def test_sizes_out_of_range_say_the_range(name: str):
     with pytest.raises(InputError, match=r"ask for \d+ to \d+"):
         load_scene(name)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from synthetic import box, cylinder, motion_about_vertical, sphere, surface_points
 
 from caryatid import frames
-from caryatid.config import FitConfig, SplitConfig
-from caryatid.primitives import fit
+from caryatid.config import ExplanationConfig, FitConfig, SplitConfig
+from caryatid.explanation import explain, gather
 from caryatid.splitting import split
+from caryatid.views import Cloud
 
 UP = np.array([0.0, 0.0, 1.0])
+COSTS = ExplanationConfig()
 STACKED = (box((0.0, 0.0, 0.05), (0.16, 0.12, 0.1)), box((0.03, 0.0, 0.15), (0.06, 0.06, 0.1)))
 SIDE_BY_SIDE = (box((0.0, -0.06, 0.05), (0.1, 0.12, 0.1)), box((0.0, 0.04, 0.1), (0.1, 0.08, 0.2)))
 CAN_ON_BOX = (box((0.0, 0.0, 0.04), (0.14, 0.14, 0.08)), cylinder((0.0, 0.0, 0.14), 0.03, 0.12))
@@ -25,18 +28,21 @@ def points_of(shapes, sigma=0.001, seed=0):
     return points, normals, np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
 
 
-def divided(points, normals):
-    residual = fit(points, normals, config=FitConfig(), rng=np.random.default_rng(0)).residual
+def divided(points, normals, noise=0.003):
+    """Group of each point, or None where they are one object."""
+    cloud = Cloud(points, normals)
+    evidence = gather(cloud, noise, None, COSTS)
     rng = np.random.default_rng(0)
-    return split(
-        points,
-        normals,
-        residual,
+    groups = split(
+        evidence,
+        explain(evidence, COSTS, FitConfig(), rng),
         up=UP,
-        config=SplitConfig(min_residual=0.0025),
+        config=SplitConfig(),
+        costs=COSTS,
         fit_config=FitConfig(),
         rng=rng,
     )
+    return None if groups is None else groups[cKDTree(evidence.points).query(points)[1]]
 
 
 def agreement(groups, truth):
@@ -82,6 +88,23 @@ def test_few_points_are_not_divided():
     points, normals, _ = points_of(STACKED)
     few = np.random.default_rng(0).choice(len(points), 2 * SplitConfig().min_points - 1, replace=False)
     assert divided(points[few], normals[few]) is None
+
+
+def test_an_object_that_is_no_primitive_is_not_cut_into_ones():
+    rng = np.random.default_rng(0)
+    azimuth, height = rng.uniform(-np.pi, np.pi, 4000), rng.uniform(0.0, 0.05, 4000)
+    radius = 0.03 + height
+    outward = np.stack([np.cos(azimuth), np.sin(azimuth), -np.ones(4000)], axis=1) / np.sqrt(2.0)
+    bowl = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
+    points = np.concatenate([bowl, bowl - 0.004 * outward]) + rng.normal(0.0, 0.001, (8000, 3))
+    assert divided(points, np.concatenate([outward, -outward])) is None
+
+
+def test_a_view_that_is_off_leaves_a_layer_and_no_second_object():
+    points, normals, _ = points_of([STACKED[0]])
+    top = normals[:, 2] > 0.9
+    layer = points[top] + np.array([0.0, 0.0, 0.007])
+    assert divided(np.concatenate([points, layer]), np.concatenate([normals, normals[top]])) is None
 
 
 def test_the_division_turns_with_the_scene():

@@ -43,7 +43,7 @@ def associate(
         index = np.flatnonzero(labels == part)
         points = points_world[index]
         neighbours = [
-            k for k in trees if _may_touch(points, known_points[k], known_shapes.get(k), config.overlap_reach)
+            k for k in trees if may_touch(points, known_points[k], known_shapes.get(k), config.overlap_reach)
         ]
         gaps = np.array([_gaps(points, trees[k], known_shapes.get(k)) for k in neighbours])
         near = gaps < config.overlap_reach
@@ -58,27 +58,7 @@ def associate(
     return result
 
 
-def duplicates(
-    known_points: Mapping[int, Array], known_shapes: Mapping[int, Shape], config: SegmentationConfig
-) -> dict[int, int]:
-    """Find objects most of whose points lie in another's shape: two labels of one object.
-
-    Returns:
-        Label to give up → label that takes its points.
-    """
-    given_up: dict[int, int] = {}
-    by_size = sorted(known_shapes, key=lambda k: (-known_shapes[k].volume, k))
-    for k, big in enumerate(by_size):
-        for small in by_size[k + 1 :]:
-            if big in given_up or small in given_up:
-                continue
-            inside = known_shapes[big].signed_distance(known_points[small]) < config.overlap_reach / 2.0
-            if inside.mean() >= config.same_share:
-                given_up[small] = big
-    return given_up
-
-
-def _may_touch(points: Array, others: Array, shape: Shape | None, reach: float) -> bool:
+def may_touch(points: Array, others: Array, shape: Shape | None, reach: float) -> bool:
     """Whether the axis-aligned boxes around points (N, 3) and around an object come within reach [m]."""
     low, high = others.min(axis=0), others.max(axis=0)
     if shape is not None:

@@ -12,13 +12,19 @@ from scipy.spatial import cKDTree
 from caryatid import association
 from caryatid.clouds import thin
 from caryatid.config import Config
+from caryatid.explanation import explained_by, gather
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.object_points import ObjectPoints
 from caryatid.perception import UP, Percept
 from caryatid.primitives import FitFailure, fit
 from caryatid.splitting import split
+from caryatid.uniting import united
 from caryatid.views import SUPPORT_LABEL, Cloud
+from caryatid.voxels import VoxelMap
+
+MEAN_TO_DEVIATION = 1.25
+"""Standard deviation of a normal distribution over its mean absolute value."""
 
 
 class ObjectModels:
@@ -39,9 +45,14 @@ class ObjectModels:
         self._config = config
         self._seed = seed
         self._undivided: dict[int, int] = {}
+        self._parts: list[tuple[cKDTree, NDArray[np.int32]]] = []
+        self._apart: dict[tuple[int, int], int] = {}
 
     def associate(self, percept: Percept) -> Percept:
         """Give a view's automatic parts the labels of the objects they belong to, or new ones."""
+        kept = np.flatnonzero((percept.labels != 0) & (percept.labels != SUPPORT_LABEL))
+        kept = kept[thin(percept.cloud.points_world[kept], self._config.explanation.spacing)]
+        self._parts.append((cKDTree(percept.cloud.points_world[kept]), percept.labels[kept]))
         labels = association.associate(
             percept.cloud.points_world,
             np.where(percept.labels == SUPPORT_LABEL, 0, percept.labels),
@@ -79,41 +90,76 @@ class ObjectModels:
             cloud = self.points.of(label)
             self._fit(label, cloud.select(thin(cloud.points_world, self._config.cloud.voxel)))
 
-    def divide(self, labels: set[int]) -> set[int]:
-        """Part objects that no single shape explains and several do; returns the labels that changed."""
+    def divide(self, labels: set[int], voxels: VoxelMap | None = None) -> set[int]:
+        """Part objects that several shapes explain better than one; returns the labels that changed.
+
+        Args:
+            labels: Objects whose points have changed.
+            voxels: Space seen free, which no shape may fill.
+        """
+        config = self._config
         changed: set[int] = set()
+        noise = self._noise()
         for label in sorted(labels & self.fits.keys()):
             cloud = self.points.of(label)
-            if len(cloud) < self._config.split.growth * self._undivided.get(label, 0):
+            if len(cloud) < config.explanation.growth * self._undivided.get(label, 0):
                 continue
+            evidence = gather(cloud, noise, voxels, config.explanation)
             groups = split(
-                cloud.points_world,
-                cloud.normals_world,
-                self.fits[label].residual,
+                evidence,
+                explained_by(self.fits[label].shape, evidence, config.explanation),
+                self._hints(evidence.points),
                 up=UP,
-                config=self._config.split,
-                fit_config=self._config.fit,
+                config=config.split,
+                costs=config.explanation,
+                fit_config=config.fit,
                 rng=np.random.default_rng([self._seed, label]),
             )
             if groups is None:
                 self._undivided[label] = len(cloud)
             else:
-                changed |= set(self.points.divide(label, groups))
+                _, nearest = cKDTree(evidence.points).query(cloud.points_world)
+                changed |= set(self.points.divide(label, groups[nearest]))
         self.fit_all(changed)
         return changed
 
-    def unite(self) -> dict[int, int]:
-        """Merge objects that lie in another's shape; returns label given up → label that takes its points."""
-        given_up = association.duplicates(
-            {k: self.points.of(k).points_world for k in self.points.objects},
-            {k: o.shape for k, o in self.fits.items()},
-            self._config.segmentation,
-        )
-        for old, new in given_up.items():
+    def unite(self, labels: set[int], voxels: VoxelMap | None = None) -> dict[int, int]:
+        """Merge neighbours that one shape explains better than two.
+
+        Args:
+            labels: Objects whose points have changed.
+            voxels: Space seen free, which no shape may fill.
+
+        Returns:
+            Label given up → label that takes its points.
+        """
+        config = self._config
+        noise = self._noise()
+        evidence = {
+            k: gather(self.points.of(k), noise, voxels, config.explanation) for k in sorted(self.fits)
+        }
+        given_up: dict[int, int] = {}
+        alone = {k: explained_by(self.fits[k].shape, e, config.explanation) for k, e in evidence.items()}
+        while True:
+            pair = united(
+                evidence,
+                alone,
+                labels,
+                self._apart,
+                costs=config.explanation,
+                fit_config=config.fit,
+                seed=self._seed,
+            )
+            if pair is None:
+                return given_up
+            new, old = pair
             self.points.merge(old, new)
-            del self.fits[old]
-        self.fit_all(set(given_up.values()))
-        return given_up
+            del self.fits[old], evidence[old], alone[old]
+            given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
+            self.fit_all({new})
+            evidence[new] = gather(self.points.of(new), noise, voxels, config.explanation)
+            alone[new] = explained_by(self.fits[new].shape, evidence[new], config.explanation)
+            labels = labels | {new}
 
     def nearest(self, percept: Percept, labels: set[int]) -> Percept:
         """Give the points of a view that carry one of these labels the label of the nearest point of any."""
@@ -130,6 +176,25 @@ class ObjectModels:
     def objects(self) -> list[SceneObject]:
         """The fitted objects in the order of their labels."""
         return [self.fits[k] for k in sorted(self.fits)]
+
+    def _hints(self, points: Array) -> list[NDArray[np.bool_]]:
+        """Points (N,) that segmentation took for a part of its own in one of the views."""
+        config = self._config
+        hints = []
+        for tree, labels in self._parts:
+            gap, index = tree.query(points, distance_upper_bound=config.split.reach)
+            owner = np.where(np.isfinite(gap), np.append(labels, 0)[index], 0)
+            for part in np.unique(owner[owner > 0]):
+                own = owner == part
+                if config.split.min_points <= own.sum() < 0.9 * (owner > 0).sum():
+                    hints.append(own)
+        return hints
+
+    def _noise(self) -> float:
+        """Standard deviation of points from their surfaces [m]: that of the object in the middle."""
+        residuals = [o.residual for o in self.fits.values()]
+        spread = MEAN_TO_DEVIATION * float(np.median(residuals)) if residuals else 0.0
+        return max(spread, self._config.explanation.least_noise)
 
     def _fit(self, label: int, cloud: Cloud) -> None:
         rng = np.random.default_rng([self._seed, label])

@@ -165,10 +165,10 @@ class Scene:
         self._models.fit_all(shown)
         if given:
             return percept
-        changed = self._models.divide(shown)
+        changed = self._models.divide(shown, self.voxels)
         if changed:
             percept = self._models.nearest(percept, changed)
-        given_up = self._models.unite()
+        given_up = self._models.unite(shown | changed, self.voxels)
         self._evidence = absorbed(
             self._evidence, {object_id(old): object_id(new) for old, new in given_up.items()}
         )

@@ -11,6 +11,7 @@ from caryatid.config.choices import (
 )
 from caryatid.config.modelling import (
     CompletionConfig,
+    ExplanationConfig,
     FitConfig,
     FusionConfig,
     SplitConfig,
@@ -49,6 +50,7 @@ class Config:
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
+    explanation: ExplanationConfig = field(default_factory=ExplanationConfig)
     completion: CompletionConfig = field(default_factory=CompletionConfig)
     support: SupportConfig = field(default_factory=SupportConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
@@ -68,6 +70,7 @@ __all__ = [
     "CompletionConfig",
     "Config",
     "EvaluationConfig",
+    "ExplanationConfig",
     "FitConfig",
     "FusionConfig",
     "FusionMethod",

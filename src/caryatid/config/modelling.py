@@ -68,26 +68,66 @@ class FitConfig:
 class SplitConfig:
     """Parting what automatic segmentation took for one object."""
 
-    min_residual: float = 0.003
-    """Mean distance to the best single shape from which on a cut is tried [m]; noise leaves 2 mm."""
-    gain: float = 0.6
-    """A cut must bring the mean distance below this share of the single shape's [1]."""
-    growth: float = 1.3
-    """An object that was not divided is looked at again when its points have grown by this factor [1]."""
-    cuts: int = 7
-    """Cuts tried along each direction [1]; an eighth of the points apart."""
-    max_points: int = 1000
-    """Points a division looks at [1]; the others go with the nearest of them."""
-    sample: int = 200
-    """Points of a side a cut is first judged by [1]."""
-    hypotheses: int = 25
-    """RANSAC hypotheses a shape when a cut is first judged [1]; the best cut is judged again in full."""
-    steps: int = 8
-    """Least-squares steps when a cut is first judged [1]."""
-    min_points: int = 40
-    """Points a side needs [1]; three times what a shape needs."""
+    cuts: int = 5
+    """Cuts tried along each direction [1]; a sixth of the points apart."""
+    patches: int = 3
+    """Largest patches a single shape does not explain that are tried as objects of their own [1]."""
+    finalists: int = 2
+    """Best starts that are settled with full fits [1]."""
+    rounds: int = 3
+    """Times the points go to the shape that explains them better and the shapes are fitted anew [1]."""
+    min_points: int = 20
+    """Thinned points a side needs [1]; 1.5 times what a shape needs."""
+    crumb: int = 8
+    """Fewer points off the rest of their side go to the other side [1]; 2 cm square of them, thinned."""
     reach: float = 0.02
     """Points further apart are not connected [m]; four times their spacing."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExplanationConfig:
+    """What it costs to explain points by shapes: the least cost decides what is one object and what two."""
+
+    object_cost: float = 40.0
+    """Price of one object more [nats]; nine parameters, each known to a ninetieth of its range."""
+    outlier: float = 4.0
+    """Cost of a point no shape explains [nats]; as likely as one 2.8σ off."""
+    irregular: float = 1.6
+    """Cost of a point on an object that is none of the shapes [nats]."""
+    normal_weight: float = 4.0
+    """Cost of a normal turned by 90° [nats]; blurred over edges, normals are as good as 30°."""
+    reading: float = 0.0002
+    """Surface whose points err alike [m²]; half of the 2 cm square a registration error shows in."""
+    border: float = 2.0
+    """Cost of a point with only the other object around it, on a surface without crease [nats]."""
+    free_cost: float = 0.5
+    """Cost of a voxel inside a shape that was seen free [nats]; four points off at 5 mm spacing."""
+    usual: float = 1.1
+    """Mean cost of the points around a point that is still well explained [nats]; 9 in 10 true shapes."""
+    neighbours: int = 8
+    """Points the mean around a point is taken over [1]; 2 cm square of them."""
+    spacing: float = 0.008
+    """Spacing the points are thinned to [m]; a third of the patch that errs alike."""
+    least_noise: float = 0.002
+    """Least standard deviation of points from their surfaces [m]; what registration leaves."""
+    crease: float = 15.0
+    """Turn between neighbouring normals from which on a crease is concave [deg]; as in segmentation."""
+    reach: float = 0.03
+    """Objects further apart are not taken for one [m]; an occluder's shadow."""
+    sample: int = 150
+    """Points of an object at the most in a fit that only tells what is worth a full one [1]."""
+    hypotheses: int = 10
+    """RANSAC hypotheses a shape in such a fit [1]."""
+    steps: int = 6
+    """Least-squares steps in such a fit [1]."""
+    growth: float = 1.3
+    """What was found to be one object, or two, is looked at again when its points have grown by this [1]."""
+    layer: float = 0.009
+    """Points within this of a surface may be of it [m]; a view that is off by 3σ leaves a layer of them."""
+    layer_share: float = 0.8
+    """Share of an object's points in such a layer, or inside the other, for it to be the other's [1]."""
+    inset: float = 1.2
+    """How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -176,5 +176,3 @@ class SegmentationConfig:
     """A part is divided among the known objects at which at least this share of its points lies [1]."""
     overlap_reach: float = 0.02
     """Distance within which a point lies at an object [m]; 2σ of registration error of both views."""
-    same_share: float = 0.7
-    """Share of an object's points that must lie inside another's shape for the two to be one [1]."""

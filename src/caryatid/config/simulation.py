@@ -110,6 +110,12 @@ class GenerationConfig:
     """Nothing is set down so that it reaches higher over the table top [m]."""
     upset: float = 0.04
     """Setting an object down may shift a pile's others, or a heap's screens, by this much [m]."""
+    packed_stacked: float = 0.3
+    """Share of a packed scene's objects that are set down on another one [1]."""
+    packed_aligned: float = 0.5
+    """Share of a packed scene's objects that are parallel to one another, so that faces touch [1]."""
+    packed_gap: float = 0.0005
+    """Gap between objects of a packed scene before they settle [m]; far below what a camera can see."""
     heap_radius: float = 0.12
     """Radius of the heap of a dense scene of 16 [m]; it grows with the root of the number beyond that."""
     heap_tilted: float = 0.3

@@ -28,19 +28,19 @@ _DENSE_TABLE = (0.7, 1.0)
 _HEAP_OF = 16
 _SCREEN_DENSITY = 1200.0
 _SIDES: tuple[Side, ...] = ("+x", "+y", "-y")
-_DOWN = np.array([[0.0, 0.0, -1.0]])
-_AXES = np.eye(3)
+DOWN = np.array([[0.0, 0.0, -1.0]])
+AXES = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Drop:
+class Drop:
     """A solid where it is let go; `stacked` if it is meant to stay on another one."""
 
     solid: Solid
     stacked: bool = False
 
 
-_Draw = Callable[[np.random.Generator, SimulatedScene | None], _Drop]
+Draw = Callable[[np.random.Generator, SimulatedScene | None], Drop]
 
 
 def generate_pile(
@@ -58,21 +58,21 @@ def generate_pile(
         InputError: The size or the seed is out of range, or an object would not stay where it is put.
     """
     name = f"pile-{size}-{seed}"
-    _check(name, size, seed, PILE_SIZES)
+    check_request(name, size, seed, PILE_SIZES)
     habits = config or GenerationConfig()
 
-    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
-        shape = _upright(rng, habits)
+    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> Drop:
+        shape = upright(rng, habits)
         if scene is None or rng.random() >= habits.stacked:
             half = np.array(TABLE_SIZE) / 2.0 - habits.margin
-            return _Drop(_let_go(shape, rng.uniform(-half, half), scene, habits))
+            return Drop(let_go(shape, rng.uniform(-half, half), scene, habits))
         below = true_shapes(scene)[int(rng.integers(1, len(scene.object_bodies) + 1))]
-        reach = below.support(_AXES)[:2]
+        reach = below.support(AXES)[:2]
         xy = below.T_world_object[:2, 3] + habits.jitter * reach * rng.uniform(-1.0, 1.0, size=2)
-        return _Drop(_let_go(shape, xy, scene, habits), stacked=True)
+        return Drop(let_go(shape, xy, scene, habits), stacked=True)
 
     rng = np.random.default_rng([0, size, seed])
-    return _set_down(name, [], [draw] * size, rng, _Place(TABLE_SIZE, ()), habits, physics)
+    return set_down(name, [], [draw] * size, rng, Place(TABLE_SIZE, ()), habits, physics)
 
 
 def generate_dense(
@@ -90,7 +90,7 @@ def generate_dense(
         InputError: The size or the seed is out of range, or an object would not stay where it is put.
     """
     name = f"dense-{size}-{seed}"
-    _check(name, size, seed, DENSE_SIZES)
+    check_request(name, size, seed, DENSE_SIZES)
     habits = config or GenerationConfig()
     rng = np.random.default_rng([1, size, seed])
     radius = habits.heap_radius * max(1.0, np.sqrt(size / _HEAP_OF))
@@ -98,33 +98,33 @@ def generate_dense(
     count = int(rng.integers(habits.walls[0], habits.walls[1] + 1))
     walls = tuple(_SIDES[i] for i in sorted(rng.choice(len(_SIDES), size=count, replace=False)))
 
-    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
-        shape = _tilted(rng, habits) if rng.random() < habits.heap_tilted else _upright(rng, habits)
-        solid = _let_go(shape, _in_disc(rng, radius), scene, habits)
+    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> Drop:
+        shape = _tilted(rng, habits) if rng.random() < habits.heap_tilted else upright(rng, habits)
+        solid = let_go(shape, _in_disc(rng, radius), scene, habits)
         for _ in range(habits.tries):
             if not _over(solid.shape, [screen.shape for screen in screens]):
                 break
-            solid = _let_go(shape, _in_disc(rng, radius), scene, habits)
-        return _Drop(solid)
+            solid = let_go(shape, _in_disc(rng, radius), scene, habits)
+        return Drop(solid)
 
-    place = _Place(_DENSE_TABLE, walls)
-    return _set_down(name, screens, [draw] * (size - len(screens)), rng, place, habits, physics)
+    place = Place(_DENSE_TABLE, walls)
+    return set_down(name, screens, [draw] * (size - len(screens)), rng, place, habits, physics)
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
+class Place:
     """What stays put: the table's size [m] and where walls stand."""
 
     table: tuple[float, float]
     walls: tuple[Side, ...]
 
 
-def _set_down(
+def set_down(
     name: str,
     solids: list[Solid],
-    draws: Sequence[_Draw],
+    draws: Sequence[Draw],
     rng: np.random.Generator,
-    place: _Place,
+    place: Place,
     habits: GenerationConfig,
     physics: PhysicsConfig | None,
 ) -> SimulatedScene:
@@ -167,7 +167,7 @@ def _set_down(
 def _stands(
     scene: SimulatedScene,
     firm: list[Solid],
-    place: _Place,
+    place: Place,
     habits: GenerationConfig,
     physics: PhysicsConfig,
 ) -> bool:
@@ -200,7 +200,7 @@ def _is_raised(scene: SimulatedScene, habits: GenerationConfig) -> bool:
     return bool(bounds(scene, len(scene.object_bodies))[0][2] > TABLE_HEIGHT + habits.gap)
 
 
-def _let_go(
+def let_go(
     shape: Box | Cylinder | Sphere, xy: Array, scene: SimulatedScene | None, habits: GenerationConfig
 ) -> Solid:
     """Put a shape a little over whatever the boxes around objects say is below it."""
@@ -209,7 +209,7 @@ def _let_go(
     if scene is not None:
         shapes = true_shapes(scene)
         tops += [float(bounds(scene, label)[1][2]) for label in shapes if _over(over, [shapes[label]])]
-    z = max(tops) + float(shape.support(_DOWN)[0]) + habits.gap
+    z = max(tops) + float(shape.support(DOWN)[0]) + habits.gap
     return Solid(over.moved(frames.rigid(np.eye(3), (0.0, 0.0, z))))
 
 
@@ -218,13 +218,13 @@ def _over(shape: Box | Cylinder | Sphere, others: Sequence[Box | Cylinder | Sphe
     return any(
         (
             np.abs(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3])
-            < (shape.support(_AXES) + other.support(_AXES))[:2]
+            < (shape.support(AXES) + other.support(AXES))[:2]
         ).all()
         for other in others
     )
 
 
-def _upright(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
+def upright(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
     """Draw a shape at the origin with one axis vertical: a box on any face, a cylinder on an end or lying."""
     yaw = frames.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
     R = yaw @ _ON_ITS_SIDE if rng.random() < habits.lying else yaw
@@ -266,7 +266,8 @@ def _in_disc(rng: np.random.Generator, radius: float) -> Array:
     return np.array([r * np.cos(azimuth), r * np.sin(azimuth)])
 
 
-def _check(name: str, size: int, seed: int, sizes: tuple[int, int]) -> None:
+def check_request(name: str, size: int, seed: int, sizes: tuple[int, int]) -> None:
+    """Raise InputError where a scene of this size or seed cannot be set up."""
     if not sizes[0] <= size <= sizes[1]:
         raise InputError(name, f"{size} objects cannot be set up", f"ask for {sizes[0]} to {sizes[1]}")
     if seed < 0:

@@ -14,6 +14,7 @@ from caryatid.errors import InputError
 from caryatid.simulation.designed import DESIGNED, designed_scene
 from caryatid.simulation.generate import DENSE_SIZES, PILE_SIZES, generate_dense, generate_pile
 from caryatid.simulation.mjcf import quaternion
+from caryatid.simulation.packed import PACKED_SIZES, generate_packed
 from caryatid.simulation.truth import ground_truth, write_truth
 from caryatid.simulation.world import (
     SimulatedScene,
@@ -29,14 +30,15 @@ SCENE_FILE = "scene.xml"
 TRUTH_FILE = "gt.json"
 """Name of the ground truth beside it."""
 
-_GENERATED = re.compile(r"(pile|dense)-(\d+)-(\d+)")
+_GENERATED = re.compile(r"(pile|dense|packed)-(\d+)-(\d+)")
 
 
 def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None) -> SimulatedScene:
     """Load a scene and let it come to rest.
 
-    Built-in names come before files: a designed scene (`tower`, `bridge`, …), or `pile-SIZE-SEED` and
-    `dense-SIZE-SEED` for a generated one, say `pile-8-3`. A folder of such a name is reached as `./tower`.
+    Built-in names come before files: a designed scene (`tower`, `bridge`, …), or `pile-SIZE-SEED`,
+    `dense-SIZE-SEED` and `packed-SIZE-SEED` for a generated one, say `pile-8-3`. A folder of such a name is
+    reached as `./tower`.
 
     Args:
         source: A built-in name, an MJCF file, or a folder with a `scene.xml`.
@@ -49,7 +51,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
     if text in DESIGNED:
         return designed_scene(text, config)
     if match := _GENERATED.fullmatch(text):
-        generate = {"pile": generate_pile, "dense": generate_dense}[match[1]]
+        generate = {"pile": generate_pile, "dense": generate_dense, "packed": generate_packed}[match[1]]
         return generate(int(match[2]), int(match[3]), physics=config)
     return _load_file(text, config)
 
@@ -60,6 +62,7 @@ def list_scenes() -> list[str]:
         *DESIGNED,
         f"pile-SIZE-SEED (SIZE {PILE_SIZES[0]}…{PILE_SIZES[1]})",
         f"dense-SIZE-SEED (SIZE {DENSE_SIZES[0]}…{DENSE_SIZES[1]})",
+        f"packed-SIZE-SEED (SIZE {PACKED_SIZES[0]}…{PACKED_SIZES[1]})",
     ]
 
 

@@ -1,0 +1,170 @@
+"""What it costs to explain points by shapes: residuals over noise, free space inside, a price an object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from caryatid import frames
+from caryatid.clouds import thin
+from caryatid.config import ExplanationConfig, FitConfig
+from caryatid.frames import Array
+from caryatid.primitives import candidates
+from caryatid.refine import linearise
+from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.views import Cloud
+from caryatid.voxels import FREE, VoxelMap
+
+Solid = Box | Cylinder | Sphere
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Evidence:
+    """Oriented points of the objects to be explained, and what is known of the space around them.
+
+    Attributes:
+        points: (N, 3) [m].
+        normals: Unit normals (N, 3).
+        weights: Independent readings each point stands for (N,) [1].
+        noise: Standard deviation of the points from the surfaces they are on [m].
+        voxels: Space seen free, or None where nothing is known.
+    """
+
+    points: Array
+    normals: Array
+    weights: Array
+    noise: float
+    voxels: VoxelMap | None
+
+    def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> Evidence:
+        """Return the evidence of some of the points."""
+        return replace(self, points=self.points[kept], normals=self.normals[kept], weights=self.weights[kept])
+
+
+def gather(cloud: Cloud, noise: float, voxels: VoxelMap | None, config: ExplanationConfig) -> Evidence:
+    """Thin an object's points to evidence: a place counts once, as all that is seen there errs alike."""
+    kept = thin(cloud.points_world, config.spacing)
+    weights = np.full(len(kept), config.spacing**2 / config.reading)
+    return Evidence(cloud.points_world[kept], cloud.normals_world[kept], weights, noise, voxels)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Explanation:
+    """The best shape for some points.
+
+    Attributes:
+        shape: The shape, or None where none could be fitted, or the points are better left without one.
+        cost: Cost of all the points and of the object itself [nats].
+    """
+
+    shape: Solid | None
+    cost: float
+
+
+def point_costs(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> Array:
+    """Cost (N,) [nats] of each point as one of a shape's surface, before its weight."""
+    distance, J = linearise(shape, evidence.points)
+    outward = -J[:, :3] @ shape.T_world_object[:3, :3].T
+    turned = 1.0 - np.einsum("ij,ij->i", outward, evidence.normals)
+    squared = distance**2 / (2.0 * evidence.noise**2)
+    return np.minimum(squared + config.normal_weight * turned, config.outlier)
+
+
+def free_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> float:
+    """Cost [nats] of the space seen free that a shape fills."""
+    if evidence.voxels is None:
+        return 0.0
+    size = evidence.voxels.config.size
+    half = shape.extents / 2.0 - max(config.inset * size, 3.0 * evidence.noise)
+    if (half <= 0.0).any():
+        return 0.0
+    ticks = [np.arange(-h + size / 2.0, h, size) if h > size / 2.0 else np.zeros(1) for h in half]
+    local = np.stack([g.ravel() for g in np.meshgrid(*ticks, indexing="ij")], axis=-1)
+    if shape.kind != "box":
+        radius = np.hypot(local[:, 0], local[:, 1]) / half[0]
+        if shape.kind == "sphere":
+            radius = np.linalg.norm(local, axis=1) / half[0]
+        local = local[radius <= 1.0]
+    free = evidence.voxels.state_at(frames.transform(shape.T_world_object, local)) == FREE
+    return config.free_cost * float(free.sum())
+
+
+def shape_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> float:
+    """Cost [nats] of points explained by one shape, without the price of an object."""
+    costs = point_costs(shape, evidence, config)
+    return float(costs @ evidence.weights) + free_cost(shape, evidence, config)
+
+
+def explained_by(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> Explanation:
+    """Explain points by a given shape, or as an irregular object where that costs less."""
+    irregular = config.irregular * float(evidence.weights.sum())
+    cost = shape_cost(shape, evidence, config)
+    return Explanation(shape if cost < irregular else None, min(cost, irregular) + config.object_cost)
+
+
+def explain(
+    evidence: Evidence, config: ExplanationConfig, fit_config: FitConfig, rng: np.random.Generator
+) -> Explanation:
+    """Find the shape that explains points at the least cost; an irregular object has a price of its own."""
+    best = Explanation(None, config.irregular * float(evidence.weights.sum()) + config.object_cost)
+    for f in candidates(evidence.points, evidence.normals, config=fit_config, rng=rng):
+        best = min(best, explained_by(f.shape, evidence, config), key=lambda e: e.cost)
+    return best
+
+
+def first_look(fit_config: FitConfig, config: ExplanationConfig) -> FitConfig:
+    """Settings of fits that only tell what is worth a full one."""
+    return replace(
+        fit_config,
+        hypotheses=config.hypotheses,
+        polish=1,
+        steps=config.steps,
+        max_points=config.sample,
+    )
+
+
+def joined(a: Evidence, b: Evidence) -> Evidence:
+    """Put the evidence of two objects together; noise and space are the same for both."""
+    return replace(
+        a,
+        points=np.concatenate([a.points, b.points]),
+        normals=np.concatenate([a.normals, b.normals]),
+        weights=np.concatenate([a.weights, b.weights]),
+    )
+
+
+def around(points: Array, neighbours: int) -> scipy.sparse.csr_array:
+    """Matrix (N, N) that takes the mean over each point's nearest neighbours, itself among them."""
+    count = min(neighbours, len(points))
+    _, index = cKDTree(points).query(points, k=count)
+    index = index.reshape(len(points), count)
+    ends = np.arange(0, index.size + 1, count)
+    return scipy.sparse.csr_array((np.full(index.size, 1.0 / count), index.ravel(), ends))
+
+
+def border_cost(second: NDArray[np.bool_], evidence: Evidence, config: ExplanationConfig) -> float:
+    """Cost [nats] of a border between two objects where the surface goes on without a concave crease.
+
+    Args:
+        second: Which points (N,) belong to the second object.
+        evidence: The points of both.
+        config: Neighbours, and the price.
+    """
+    near = around(evidence.points, config.neighbours).tocoo()
+    across = second[near.row] != second[near.col]
+    row, col = near.row[across], near.col[across]
+    between = evidence.points[col] - evidence.points[row]
+    turn = evidence.normals[col] - evidence.normals[row]
+    bend = np.einsum("ij,ij->i", turn, between) / np.maximum(np.linalg.norm(between, axis=1), 1e-9)
+    flat = bend > -np.sin(np.radians(config.crease))
+    return config.border * float(near.data[across][flat] @ evidence.weights[row][flat])
+
+
+def lies_on(shape: Solid, points: Array, config: ExplanationConfig) -> bool:
+    """Whether most points (N, 3) lie so near a shape's surface [m], or in it, that they may be of it."""
+    near = shape.signed_distance(points) < config.layer
+    return float(near.mean()) >= config.layer_share

@@ -1,0 +1,86 @@
+"""Two labels of one object become one: where a single shape explains both at a lower cost."""
+
+from __future__ import annotations
+
+import numpy as np
+from synthetic import box, cylinder, surface_points
+
+from caryatid.config import ExplanationConfig, FitConfig, VoxelConfig
+from caryatid.explanation import explain, gather
+from caryatid.uniting import united
+from caryatid.views import Cloud
+from caryatid.voxels import VoxelMap
+
+COSTS, FIT = ExplanationConfig(), FitConfig()
+EYE = (-1.2, -0.6, 1.0)
+
+
+def cloud_of(shape, eye=EYE, seed=0):
+    points, normals = surface_points(shape, np.random.default_rng(seed), eye=eye, spacing=0.006, sigma=0.001)
+    return Cloud(points, normals)
+
+
+def pair_of(clouds, changed=None, apart=None, voxels=None):
+    evidence = {k: gather(c, 0.003, voxels, COSTS) for k, c in clouds.items()}
+    alone = {k: explain(e, COSTS, FIT, np.random.default_rng(0)) for k, e in evidence.items()}
+    everything = set(clouds) if changed is None else changed
+    seen = {} if apart is None else apart
+    return united(evidence, alone, everything, seen, costs=COSTS, fit_config=FIT, seed=0)
+
+
+def halves(shape):
+    """A box's points left and right of a gap, as something in front leaves them."""
+    cloud = cloud_of(shape)
+    y = cloud.points_world[:, 1]
+    return cloud.select(y < -0.01), cloud.select(y > 0.01)
+
+
+CRATE = box((0.0, 0.0, 0.05), (0.1, 0.2, 0.1))
+
+
+def test_what_something_in_front_cut_in_two_is_one_object():
+    left, right = halves(CRATE)
+    assert pair_of({1: left, 2: right}) in {(1, 2), (2, 1)}
+
+
+def test_not_where_the_space_between_was_seen_free():
+    left = cloud_of(box((0.0, -0.09, 0.05), (0.1, 0.12, 0.1)))
+    right = cloud_of(box((0.0, 0.09, 0.05), (0.1, 0.12, 0.1)))
+    nothing = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
+    index = np.indices(nothing.hits.shape)
+    between = np.abs(nothing.centres_world(index.reshape(3, -1).T)[:, 1]) < 0.025
+    free = VoxelMap(
+        nothing.origin_world,
+        nothing.hits,
+        between.reshape(nothing.hits.shape).astype(np.uint8),
+        VoxelConfig(),
+    )
+    near = ExplanationConfig(reach=0.1)
+    evidence = {k: gather(c, 0.003, free, near) for k, c in {1: left, 2: right}.items()}
+    alone = {k: explain(e, near, FIT, np.random.default_rng(0)) for k, e in evidence.items()}
+    assert united(evidence, alone, {1, 2}, {}, costs=near, fit_config=FIT, seed=0) is None
+
+
+def test_a_few_points_of_an_object_are_given_to_it_whatever_the_labels():
+    whole, again = cloud_of(CRATE), cloud_of(CRATE, seed=1)
+    few = again.select(again.points_world[:, 1] > 0.05)
+    assert pair_of({1: few, 2: whole}) == (2, 1)
+    assert pair_of({1: whole, 2: few}) == (1, 2)
+
+
+def test_neighbours_that_touch_are_two_objects():
+    can = cloud_of(cylinder((0.0, 0.0, 0.16), 0.03, 0.12))
+    beside = cloud_of(box((0.0, 0.16, 0.03), (0.08, 0.12, 0.06)))
+    assert pair_of({1: cloud_of(CRATE), 2: can, 3: beside}) is None
+
+
+def test_what_did_not_change_is_not_looked_at():
+    left, right = halves(CRATE)
+    assert pair_of({1: left, 2: right}, changed=set()) is None
+
+
+def test_two_are_looked_at_again_when_they_have_grown():
+    left, right = halves(CRATE)
+    apart = {(1, 2): 10 * len(left)}
+    assert pair_of({1: left, 2: right}, apart=apart) is None
+    assert pair_of({1: left, 2: right}, apart={(1, 2): 10}) is not None
