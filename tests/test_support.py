@@ -22,6 +22,7 @@ from caryatid.stability import (
     support_polygon,
 )
 from caryatid.support import explain, infer
+from caryatid.uncertainty import Uncertainty
 
 CONFIG = SupportConfig()
 PAPER = replace(CONFIG, top_down="paper")
@@ -375,3 +376,18 @@ def test_true_shapes_of_the_shared_primitive_scenes_give_their_edges() -> None:
         )
     assert right / (right + wrong) >= 0.97
     assert right / (right + missed) >= 0.97
+
+
+def unsure(side: float) -> Uncertainty:
+    """Of a shape all of whose sides may be this far off [m]."""
+    return Uncertainty(np.full(3, side), np.zeros(3), np.full(3, side), np.full(6, side))
+
+
+@pytest.mark.parametrize(("side", "certain"), [(0.0005, False), (0.004, True)])
+def test_the_contact_margin_follows_the_uncertainty_of_the_fits(side, certain):
+    table = SceneObject("o0", 0, TABLE, "support_surface")
+    lower = SceneObject("o1", 1, block(0.0, 0.0, 0.0, (0.2, 0.2, 0.1)), uncertainty=unsure(side))
+    upper = SceneObject("o2", 2, block(0.0, 0.0, 0.108, (0.1, 0.1, 0.1)), uncertainty=unsure(side))
+    support = infer([table, lower, upper], CONFIG).support("o1", "o2")
+    assert support is not None
+    assert support.certain == certain

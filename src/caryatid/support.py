@@ -35,6 +35,7 @@ class Touch:
         tilt: Angle of the normal to the vertical [deg]; below 90 where `other` is the lower one.
         point_world: Centre (3,) [m] of the contact.
         patch: Contact area projected to the ground [m].
+        margin: Gap up to which the two are taken to touch [m].
     """
 
     other: SceneObject
@@ -43,6 +44,7 @@ class Touch:
     tilt: float
     point_world: Array
     patch: BaseGeometry
+    margin: float
 
     def __str__(self) -> str:
         return f"normal {self.tilt:.0f}° from the vertical, {_gap(self.gap)}"
@@ -130,8 +132,7 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
     if touch.tilt > config.max_tilt:
         steep = f"{touch.tilt:.0f}° from the vertical, bottom-up up to {config.max_tilt:.0f}°"
         return f"{head}they touch side by side (normal {steep}); {verdict}, and it does not lean that way."
-    margin = _mm(config.contact_margin)
-    return f"{head}the contact is doubtful ({touch}, margin {margin}) and not needed; {verdict}."
+    return f"{head}the contact is doubtful ({touch}, margin {_mm(touch.margin)}) and not needed; {verdict}."
 
 
 def _find_touches(objects: Sequence[SceneObject], config: SupportConfig) -> dict[str, list[Touch]]:
@@ -151,7 +152,22 @@ def _touch(other: SceneObject, o: SceneObject, contact: Contact, config: Support
     normal_world = _plane_normal(other, o, contact)
     tilt = float(np.degrees(frames.angle_between(normal_world, (0.0, 0.0, 1.0))))
     patch = contact_patch(o.shape, other.shape, normal_world, contact.points_world, config)
-    return Touch(other, normal_world, contact.distance, tilt, contact.points_world.mean(axis=0), patch)
+    point_world = contact.points_world.mean(axis=0)
+    margin = _margin(other, o, point_world, normal_world, config)
+    return Touch(other, normal_world, contact.distance, tilt, point_world, patch, margin)
+
+
+def _margin(
+    other: SceneObject, o: SceneObject, point_world: Array, normal_world: Array, config: SupportConfig
+) -> float:
+    """Gap [m] up to which two shapes touch: what their fits' uncertainty across the contact explains."""
+    variance = 0.0
+    for each, outward_world in ((other, normal_world), (o, -normal_world)):
+        if each.uncertainty is not None:
+            T_object_world = frames.invert(each.shape.T_world_object)
+            point = frames.transform(T_object_world, point_world)
+            variance += each.uncertainty.along(point, frames.rotate(T_object_world, outward_world)) ** 2
+    return float(np.clip(config.margin_sigma * np.sqrt(variance), config.contact_margin, config.max_margin))
 
 
 def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:
@@ -169,7 +185,7 @@ def _from_below(
 ) -> tuple[list[Support], list[BaseGeometry]]:
     """Bottom-up supports, and the contact areas they carry the object by."""
     below = [t for t in touches if t.tilt <= config.max_tilt]
-    sure = [t for t in below if t.gap <= (config.contact_margin if t.tilt <= config.gentle_tilt else 0.0)]
+    sure = [t for t in below if t.gap <= (t.margin if t.tilt <= config.gentle_tilt else 0.0)]
     supports = [_support(t, o, "bottom-up", True, f"{_below_text(t, o)}.") for t in sure]
     patches = [t.patch for t in sure]
     overhang = find_tipping(o.shape, support_polygon(patches)).overhang
@@ -179,7 +195,7 @@ def _from_below(
         gained = find_tipping(o.shape, support_polygon([*patches, t.patch])).overhang
         if gained < overhang:
             why = f"{_below_text(t, o)}; without it {_overhang_text(o.id, overhang)}."
-            supports.append(_support(t, o, "bottom-up", t.gap <= config.contact_margin, why))
+            supports.append(_support(t, o, "bottom-up", t.gap <= t.margin, why))
             patches.append(t.patch)
             overhang = gained
     return supports, patches
@@ -215,7 +231,7 @@ def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: Sup
     aside = [t for t in touches if config.max_tilt < t.tilt < 180.0 - config.max_tilt]
     against = [t for t in aside if t.normal_world[:2] @ tipping.direction_xy < -push]
     against.sort(key=lambda t: t.gap)
-    touching = [t for t in against if t.gap <= config.contact_margin] or against[:1]
+    touching = [t for t in against if t.gap <= t.margin] or against[:1]
     head = _overhang_text(o.id, tipping.overhang)
     return [_support(t, o, "lean", False, f"{head}; {t.other.id} stands in its way ({t}).") for t in touching]
 

@@ -157,7 +157,11 @@ class SupportConfig:
     """Support relations, section III-A."""
 
     contact_margin: float = 0.005
-    """Gap up to which two shapes are in contact [m]; 1σ of the gap between two fits each 3 mm off."""
+    """Gap up to which two shapes are in contact, however sure both are [m]; method notes section 3."""
+    margin_sigma: float = 2.0
+    """The same in standard deviations of the gap, where that is more [1]; misses one contact in forty."""
+    max_margin: float = 0.01
+    """However unsure they are, shapes further apart are not in contact [m]; method notes section 3."""
     reach: float = 0.012
     """Gap up to which a contact is believed where an object would tip without it [m]; 2.5σ of the same."""
     gentle_tilt: float = 25.0
