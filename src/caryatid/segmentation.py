@@ -11,10 +11,11 @@ from scipy.spatial import cKDTree
 
 from caryatid import frames
 from caryatid.clouds import normals_from_depth
-from caryatid.config import CloudConfig, SegmentationConfig
+from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
 from caryatid.convexity import convex_parts, number_by_appearance
 from caryatid.frames import Array
 from caryatid.kernels.planes import refine_planes
+from caryatid.rejoining import Samples, rejoin
 from caryatid.surface import SupportSurface, find_support_surface
 from caryatid.views import Cloud, View
 
@@ -36,7 +37,12 @@ def on_surface(points_world: Array, surface: SupportSurface, config: Segmentatio
 
 
 def segment(
-    view: View, surface: SupportSurface, config: SegmentationConfig, clouds: CloudConfig | None = None
+    view: View,
+    surface: SupportSurface,
+    config: SegmentationConfig,
+    clouds: CloudConfig | None = None,
+    fit: FitConfig | None = None,
+    rng: np.random.Generator | None = None,
 ) -> Labels:
     """Cut one view into the parts that stand on the support surface.
 
@@ -45,6 +51,8 @@ def segment(
         surface: The support surface.
         config: Sampling, sizes and angles.
         clouds: Working range and normals.
+        fit: Limits of the shapes that parts of one object are rejoined by.
+        rng: Draws the samples of their fits; without it nothing is rejoined.
 
     Returns:
         Label image (H, W): parts 1 … n, 0 = nothing and the surface itself.
@@ -69,7 +77,15 @@ def segment(
     edges, steps = _grid_edges(sampled, points_camera, normals, config)
     coarse = np.zeros(sampled.shape, dtype=np.int32)
     coarse[sampled] = convex_parts(points_camera[sampled], normals[sampled], edges, config, steps)
-    return _fill(_without_slivers(coarse), foreground, view.depth, config)
+    coarse = _without_slivers(coarse)
+    if rng is not None:
+        K = np.diag([1.0 / config.stride, 1.0 / config.stride, 1.0]) @ view.K
+        height = surface.height(frames.transform(T, points_camera))
+        rgb = None if view.rgb is None else view.rgb[grid]
+        samples = Samples(coarse, points_camera, normals, height, view.depth[grid], K, rgb)
+        coarse = rejoin(samples, config, fit or FitConfig(), rng)
+        coarse = number_by_appearance(np.where(coarse > 0, coarse, -1).ravel()).reshape(coarse.shape)
+    return _fill(coarse, foreground, view.depth, config)
 
 
 def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationConfig) -> Labels:
