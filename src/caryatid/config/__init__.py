@@ -18,6 +18,7 @@ from caryatid.config.modelling import (
 )
 from caryatid.config.perception import (
     CloudConfig,
+    MaskConfig,
     RegistrationConfig,
     SegmentationConfig,
     SurfaceConfig,
@@ -72,6 +73,7 @@ __all__ = [
     "FusionConfig",
     "FusionMethod",
     "GenerationConfig",
+    "MaskConfig",
     "NoiseConfig",
     "NoiseModel",
     "PhysicsConfig",

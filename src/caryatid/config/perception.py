@@ -180,3 +180,17 @@ class SegmentationConfig:
     """Distance within which a point lies at an object [m]; 2σ of registration error of both views."""
     same_share: float = 0.7
     """Share of an object's points that must lie inside another's shape for the two to be one [1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class MaskConfig:
+    """Masks of a learned segmenter."""
+
+    min_pixels: int = 200
+    """Masks with fewer pixels, before or after smaller ones are laid over them, are left out [px]."""
+    max_share: float = 0.4
+    """A mask of more than this share of the image is the table or what is behind it [1]."""
+    min_score: float = 0.0
+    """Masks with a lower score are left out [the segmenter's unit]."""
+    same: float = 0.8
+    """Two masks with a larger intersection over union are one object seen twice [1]."""
