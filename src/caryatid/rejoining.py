@@ -12,6 +12,7 @@ from caryatid.config import FitConfig, SegmentationConfig
 from caryatid.convexity import concave_share, hollowness
 from caryatid.frames import Array
 from caryatid.kernels.gaps import hidden_gaps
+from caryatid.plain_colours import two_colours
 from caryatid.primitives import Fit, candidates
 from caryatid.refine import linearise
 from caryatid.shapes import Box, Cylinder, Sphere
@@ -80,7 +81,9 @@ def rejoin(
                 continue
             refused.add((small, large))
             mine, theirs = labels == small, labels == large
-            if not _convex(samples, mine, theirs, config) or _two_colours(samples, mine, theirs, config):
+            if not _convex(samples, mine, theirs, config) or (
+                samples.rgb is not None and two_colours(samples.rgb[mine], samples.rgb[theirs], config)
+            ):
                 continue
             alone = fitted(small), fitted(large)
             joint = _fit(samples, mine | theirs, quick, rng)
@@ -167,25 +170,6 @@ def _thinned(samples: Samples, mask: NDArray[np.bool_]) -> tuple[Array, Array]:
     chosen = np.flatnonzero(mask)
     chosen = chosen[:: max(1, len(chosen) // 60)]
     return samples.points_camera.reshape(-1, 3)[chosen], samples.normals_camera.reshape(-1, 3)[chosen]
-
-
-def _two_colours(
-    samples: Samples, first: NDArray[np.bool_], second: NDArray[np.bool_], config: SegmentationConfig
-) -> bool:
-    """Whether each part is of one plain colour, and the two colours differ; prints and shades say nothing."""
-    if samples.rgb is None:
-        return False
-    (mean, spread), (other_mean, other_spread) = (_colour(samples.rgb[m]) for m in (first, second))
-    plain = max(spread, other_spread) < config.plain_colour
-    return plain and float(np.linalg.norm(mean - other_mean)) > 4.0 * config.plain_colour
-
-
-def _colour(rgb: NDArray[np.uint8]) -> tuple[Array, float]:
-    """Mean share of red, green and blue (3,), which shading leaves, and the usual distance from it."""
-    colours = rgb.astype(np.float64) + 1.0
-    shares = colours / colours.sum(axis=-1, keepdims=True)
-    mean = shares.mean(axis=0)
-    return mean, float(np.sqrt(np.mean(np.sum((shares - mean) ** 2, axis=-1))))
 
 
 def _explains(

@@ -15,6 +15,7 @@ from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
 from caryatid.convexity import convex_parts, number_by_appearance
 from caryatid.frames import Array
 from caryatid.kernels.planes import refine_planes
+from caryatid.plain_colours import cut_by_colour
 from caryatid.rejoining import Samples, rejoin
 from caryatid.surface import SupportSurface, find_support_surface
 from caryatid.views import Cloud, View
@@ -78,6 +79,8 @@ def segment(
     coarse = np.zeros(sampled.shape, dtype=np.int32)
     coarse[sampled] = convex_parts(points_camera[sampled], normals[sampled], edges, config, steps)
     coarse = _without_slivers(coarse)
+    if view.rgb is not None:
+        coarse = cut_by_colour(coarse, view.rgb[grid], config)
     if rng is not None:
         K = np.diag([1.0 / config.stride, 1.0 / config.stride, 1.0]) @ view.K
         height = surface.height(frames.transform(T, points_camera))

@@ -166,6 +166,12 @@ class SegmentationConfig:
     """Share of a part's samples that its own shape explains and the joint one need not [1]."""
     plain_colour: float = 0.02
     """Usual distance of the shares of red, green and blue from their mean below which a part is plain [1]."""
+    other_colour: float = 0.08
+    """Distance between the mean shares from which two plain colours differ [1]; four times their spread."""
+    plain_share: float = 0.9
+    """Share of a part its plain pieces make up where it is cut between them [1]; above 1 nothing is."""
+    border_bend: float = 0.25
+    """Width of a border between two colours over its length that is straight [1]; round bodies bend it."""
     rejoin_empty: float = 0.1
     """Share of a joint shape's visible faces that may lie where the camera saw through [1]; edges fray."""
     clearance: float = 0.008
