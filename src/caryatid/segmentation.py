@@ -24,6 +24,11 @@ __all__ = ["SupportSurface", "find_support_surface", "on_surface", "segment", "s
 
 Labels = NDArray[np.int32]
 
+Crop = tuple[slice, slice]
+
+MARGIN = 16
+"""Pixels beyond the foreground that windows and gaps may look at [px]."""
+
 NORMAL_RADIUS = (2, 6)
 """Least and greatest radius of the window for normals [px]: fewer leave the noise, more cost time."""
 
@@ -64,9 +69,40 @@ def segment(
     foreground = np.zeros(view.depth.shape, dtype=bool)
     foreground[in_range] = on_surface(frames.transform(T, view.points_camera[in_range]), surface, config)
 
-    if not foreground.any():
-        return np.zeros(view.depth.shape, dtype=np.int32)
+    labels = np.zeros(view.depth.shape, dtype=np.int32)
+    if foreground.any():
+        crop = _around(foreground, config.stride)
+        labels[crop] = _parts(_cropped(view, crop), foreground[crop], surface, config, clouds, fit, rng)
+    return labels
 
+
+def _around(mask: NDArray[np.bool_], stride: int) -> Crop:
+    """Rows and columns of a mask with a margin, starting on the sampling grid."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    top, left = (max(0, int(i[0]) - MARGIN) // stride * stride for i in (rows, columns))
+    return slice(top, int(rows[-1]) + MARGIN + 1), slice(left, int(columns[-1]) + MARGIN + 1)
+
+
+def _cropped(view: View, crop: Crop) -> View:
+    """Cut a window out of a view."""
+    K = view.K.copy()
+    K[0, 2] -= crop[1].start
+    K[1, 2] -= crop[0].start
+    rgb = None if view.rgb is None else view.rgb[crop]
+    normals = None if view.normals_camera is None else view.normals_camera[crop]
+    return replace(view, depth=view.depth[crop], K=K, rgb=rgb, labels=None, normals_camera=normals)
+
+
+def _parts(
+    view: View,
+    foreground: NDArray[np.bool_],
+    surface: SupportSurface,
+    config: SegmentationConfig,
+    clouds: CloudConfig,
+    fit: FitConfig | None,
+    rng: np.random.Generator | None,
+) -> Labels:
+    """Cut the foreground (H, W) of a view; arguments as of `segment`."""
     width = config.normal_size * view.K[0, 0] / float(np.median(view.depth[foreground]))
     window = 2 * int(np.clip(np.floor(width / 2.0), *NORMAL_RADIUS)) + 1
     normals_image = normals_from_depth(view, replace(clouds, normal_window=window))
@@ -83,6 +119,7 @@ def segment(
         coarse = cut_by_colour(coarse, view.rgb[grid], config)
     if rng is not None:
         K = np.diag([1.0 / config.stride, 1.0 / config.stride, 1.0]) @ view.K
+        T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
         height = surface.height(frames.transform(T, points_camera))
         rgb = None if view.rgb is None else view.rgb[grid]
         samples = Samples(coarse, points_camera, normals, height, view.depth[grid], K, rgb)
