@@ -153,7 +153,7 @@ def measure(task: tuple[str, Args]) -> list[Row]:
         if percept.view is None or view.labels is None:
             raise CaryatidError(f"{view.name}: has no masks to compare with")
         started = time.perf_counter()
-        labels = segment(percept.view, percept.surface, config.segmentation, config.cloud)
+        labels = segment(percept.view, percept.surface, config.segmentation, config.cloud, config.fit, rng)
         seconds = time.perf_counter() - started
         name = Path(source).name
         rows.append(Row(name, number, *compare(labels[view.valid], view.labels[view.valid]), seconds))

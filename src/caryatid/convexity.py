@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,9 @@ from caryatid.frames import Array
 from caryatid.kernels.images import nearest_seeds
 
 Index = NDArray[np.intp]
+
+SAMPLED = 60
+"""Surfels of a cluster at the most that are compared with another's [1]; bounds time."""
 
 EDGES_ACROSS = 3.0
 """Sample edges that cross a border for each sample along it, on a grid with diagonals."""
@@ -68,7 +72,11 @@ def convex_parts(
     pairs, lengths = surfel_borders(surfels, edges)
     attraction = border_attraction(surfels, pairs, config)
     repelled = _with_steps(surfels, pairs, attraction, lengths, steps)
-    cluster = cluster_by_mean(len(surfels.sizes), *repelled)
+
+    def convex(first: list[int], second: list[int]) -> bool:
+        return convex_together(surfels, first, second, config)
+
+    cluster = cluster_by_mean(len(surfels.sizes), *repelled, allowed=convex)
     min_width = config.min_width / _spacing(points, edges)
     cluster = _absorb_slivers(cluster, surfels.sizes, pairs, lengths, config.min_size, min_width)
     part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
@@ -126,7 +134,59 @@ def _with_steps(
     return np.stack(np.divmod(keys, len(surfels.sizes)), axis=-1), total / length, length
 
 
-def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array) -> Index:
+def convex_together(
+    surfels: Surfels, first: list[int], second: list[int], config: SegmentationConfig
+) -> bool:
+    """Whether two clusters of surfels may be one body where their border attracts: few rise over the other's.
+
+    Too few surfels tell nothing, and two patches of the inside of a bowl rise over each other.
+    """
+    if min(len(first), len(second)) < config.least_surfels:
+        return True
+    i, j = (np.array(m[:: max(1, len(m) // SAMPLED)]) for m in (first, second))
+    if all(hollowness(surfels.centres[k], surfels.normals[k]) > config.hollow for k in (i, j)):
+        return True
+    share = concave_share(
+        (surfels.centres[i], surfels.normals[i]), (surfels.centres[j], surfels.normals[j]), config
+    )
+    return share <= config.concave_share
+
+
+def hollowness(points: Array, normals: Array) -> float:
+    """How much a patch looks inwards: mean cosine between normals (N, 3) and the way to its middle (N, 3).
+
+    0 on a plane, positive on the inside of a bowl, negative on the outside.
+    """
+    inwards = points.mean(axis=0) - points
+    length = np.maximum(np.linalg.norm(inwards, axis=-1), 1e-9)
+    return float(np.mean(np.einsum("ij,ij->i", normals, inwards) / length))
+
+
+def concave_share(
+    first: tuple[Array, Array], second: tuple[Array, Array], config: SegmentationConfig
+) -> float:
+    """Share of the pairs of points of two patches of which one rises above the other's tangent plane.
+
+    Args:
+        first: Points (N, 3) [m] and unit normals (N, 3).
+        second: Points (M, 3) [m] and unit normals (M, 3).
+        config: How far counts: a height, and an angle as normals err.
+    """
+    (p, n), (q, m) = first, second
+    between = q[None] - p[:, None]
+    slack = config.rise + np.linalg.norm(between, axis=-1) * np.sin(np.radians(config.concavity))
+    over_first = np.einsum("abi,ai->ab", between, n) > slack
+    over_second = -np.einsum("abi,bi->ab", between, m) > slack
+    return float((over_first | over_second).mean())
+
+
+def cluster_by_mean(
+    count: int,
+    pairs: Index,
+    attraction: Array,
+    lengths: Array,
+    allowed: Callable[[list[int], list[int]], bool] | None = None,
+) -> Index:
     """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
 
     Args:
@@ -134,6 +194,8 @@ def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array)
         pairs: Borders (B, 2) between nodes.
         attraction: Signed attraction of each border (B,).
         lengths: Weight of each border in the mean (B,).
+        allowed: Says of the nodes of two clusters whether they may be merged; a border across which they may
+            not repels from then on.
 
     Returns:
         Cluster of each node (count,): the number of one of its nodes.
@@ -146,13 +208,18 @@ def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array)
             heap.append((-weight, i, j, length))
     heapq.heapify(heap)
     parent = list(range(count))
+    members = [[k] for k in range(count)]
     while heap:
         _, i, j, length = heapq.heappop(heap)
         if parent[i] != i or parent[j] != j or borders[i][j][1] != length:
             continue
+        if allowed is not None and not allowed(members[i], members[j]):
+            borders[i][j] = borders[j][i] = (-length, length)
+            continue
         if len(borders[i]) < len(borders[j]):
             i, j = j, i
         parent[j] = i
+        members[i] += members[j]
         del borders[i][j]
         for k, (total, size) in borders[j].items():
             if k == i:

@@ -93,7 +93,7 @@ def perceive(
     if given is not None:
         labels = given
     elif isinstance(source, View):
-        labels = segment(source, surface, config.segmentation, config.cloud).ravel()[pixels]
+        labels = segment(source, surface, config.segmentation, config.cloud, config.fit, rng).ravel()[pixels]
     else:
         labels = segment_cloud(cloud, surface, config.segmentation)
     labels = labels.astype(np.int32)

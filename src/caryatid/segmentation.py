@@ -11,16 +11,23 @@ from scipy.spatial import cKDTree
 
 from caryatid import frames
 from caryatid.clouds import normals_from_depth
-from caryatid.config import CloudConfig, SegmentationConfig
+from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
 from caryatid.convexity import convex_parts, number_by_appearance
 from caryatid.frames import Array
 from caryatid.kernels.planes import refine_planes
+from caryatid.plain_colours import cut_by_colour
+from caryatid.rejoining import Samples, rejoin
 from caryatid.surface import SupportSurface, find_support_surface
 from caryatid.views import Cloud, View
 
 __all__ = ["SupportSurface", "find_support_surface", "on_surface", "segment", "segment_cloud"]
 
 Labels = NDArray[np.int32]
+
+Crop = tuple[slice, slice]
+
+MARGIN = 16
+"""Pixels beyond the foreground that windows and gaps may look at [px]."""
 
 NORMAL_RADIUS = (2, 6)
 """Least and greatest radius of the window for normals [px]: fewer leave the noise, more cost time."""
@@ -36,7 +43,12 @@ def on_surface(points_world: Array, surface: SupportSurface, config: Segmentatio
 
 
 def segment(
-    view: View, surface: SupportSurface, config: SegmentationConfig, clouds: CloudConfig | None = None
+    view: View,
+    surface: SupportSurface,
+    config: SegmentationConfig,
+    clouds: CloudConfig | None = None,
+    fit: FitConfig | None = None,
+    rng: np.random.Generator | None = None,
 ) -> Labels:
     """Cut one view into the parts that stand on the support surface.
 
@@ -45,6 +57,8 @@ def segment(
         surface: The support surface.
         config: Sampling, sizes and angles.
         clouds: Working range and normals.
+        fit: Limits of the shapes that parts of one object are rejoined by.
+        rng: Draws the samples of their fits; without it nothing is rejoined.
 
     Returns:
         Label image (H, W): parts 1 … n, 0 = nothing and the surface itself.
@@ -55,9 +69,40 @@ def segment(
     foreground = np.zeros(view.depth.shape, dtype=bool)
     foreground[in_range] = on_surface(frames.transform(T, view.points_camera[in_range]), surface, config)
 
-    if not foreground.any():
-        return np.zeros(view.depth.shape, dtype=np.int32)
+    labels = np.zeros(view.depth.shape, dtype=np.int32)
+    if foreground.any():
+        crop = _around(foreground, config.stride)
+        labels[crop] = _parts(_cropped(view, crop), foreground[crop], surface, config, clouds, fit, rng)
+    return labels
 
+
+def _around(mask: NDArray[np.bool_], stride: int) -> Crop:
+    """Rows and columns of a mask with a margin, starting on the sampling grid."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    top, left = (max(0, int(i[0]) - MARGIN) // stride * stride for i in (rows, columns))
+    return slice(top, int(rows[-1]) + MARGIN + 1), slice(left, int(columns[-1]) + MARGIN + 1)
+
+
+def _cropped(view: View, crop: Crop) -> View:
+    """Cut a window out of a view."""
+    K = view.K.copy()
+    K[0, 2] -= crop[1].start
+    K[1, 2] -= crop[0].start
+    rgb = None if view.rgb is None else view.rgb[crop]
+    normals = None if view.normals_camera is None else view.normals_camera[crop]
+    return replace(view, depth=view.depth[crop], K=K, rgb=rgb, labels=None, normals_camera=normals)
+
+
+def _parts(
+    view: View,
+    foreground: NDArray[np.bool_],
+    surface: SupportSurface,
+    config: SegmentationConfig,
+    clouds: CloudConfig,
+    fit: FitConfig | None,
+    rng: np.random.Generator | None,
+) -> Labels:
+    """Cut the foreground (H, W) of a view; arguments as of `segment`."""
     width = config.normal_size * view.K[0, 0] / float(np.median(view.depth[foreground]))
     window = 2 * int(np.clip(np.floor(width / 2.0), *NORMAL_RADIUS)) + 1
     normals_image = normals_from_depth(view, replace(clouds, normal_window=window))
@@ -69,7 +114,18 @@ def segment(
     edges, steps = _grid_edges(sampled, points_camera, normals, config)
     coarse = np.zeros(sampled.shape, dtype=np.int32)
     coarse[sampled] = convex_parts(points_camera[sampled], normals[sampled], edges, config, steps)
-    return _fill(_without_slivers(coarse), foreground, view.depth, config)
+    coarse = _without_slivers(coarse)
+    if view.rgb is not None:
+        coarse = cut_by_colour(coarse, view.rgb[grid], config)
+    if rng is not None:
+        K = np.diag([1.0 / config.stride, 1.0 / config.stride, 1.0]) @ view.K
+        T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
+        height = surface.height(frames.transform(T, points_camera))
+        rgb = None if view.rgb is None else view.rgb[grid]
+        samples = Samples(coarse, points_camera, normals, height, view.depth[grid], K, rgb)
+        coarse = rejoin(samples, config, fit or FitConfig(), rng)
+        coarse = number_by_appearance(np.where(coarse > 0, coarse, -1).ravel()).reshape(coarse.shape)
+    return _fill(coarse, foreground, view.depth, config)
 
 
 def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationConfig) -> Labels:

@@ -19,6 +19,7 @@ from caryatid.config.modelling import (
 )
 from caryatid.config.perception import (
     CloudConfig,
+    MaskConfig,
     RegistrationConfig,
     SegmentationConfig,
     SurfaceConfig,
@@ -75,6 +76,7 @@ __all__ = [
     "FusionConfig",
     "FusionMethod",
     "GenerationConfig",
+    "MaskConfig",
     "NoiseConfig",
     "NoiseModel",
     "PhysicsConfig",

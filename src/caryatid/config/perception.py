@@ -156,16 +156,55 @@ class SegmentationConfig:
     """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
     concavity: float = 15.0
     """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's 10 and noise."""
+    rise: float = 0.01
+    """Height over the tangent plane of another place of a part from which the pair is concave [m]."""
+    concave_share: float = 0.2
+    """Share of concave pairs between two clusters from which they are two bodies [1]."""
+    least_surfels: int = 10
+    """Surfels a cluster needs for that to be asked [1]; fewer are bumps and flaws."""
+    hollow: float = 0.2
+    """Mean cosine between normals and the way inwards that makes a patch the inside of something [1]; a
+    bowl's has 0.6, flat faces and their noise 0.05."""
+    rim: float = 0.025
+    """Difference in height of the tops of an inside and of what it hangs in [m]; a rim's width and noise."""
     min_size: int = 40
     """Samples a part needs to be an object [points]."""
-    min_width: float = 0.015
-    """A part narrower than this beside a larger one belongs to it [m]; normals are blurred so far."""
+    min_width: float = 0.02
+    """A part narrower than this beside a larger one belongs to it [m]; creases are rounded so far."""
     normal_size: float = 0.013
     """Side of the window normals are estimated over, at the objects' median distance [m]."""
     plane_radius: int = 5
     """Radius of the wider window the samples' tangent planes are evened out over [px]."""
     plane_tolerance: float = 0.004
     """Readings further from a tangent plane are another surface's [1/m]; 3σ of the sensor at 2 m."""
+    rejoin_gap: float = 0.25
+    """Parts are rejoined across what hides this much between them at the most [m]; table-top sizes."""
+    rejoin_votes: int = 5
+    """Rows and columns of samples on which they must meet [1]; 3 cm at 1.5 m."""
+    rejoin_share: float = 0.25
+    """A part smaller than this share of two that touch may be a splinter of the other [1]."""
+    rejoin_concave: float = 0.1
+    """Share of pairs of samples that may be concave where two parts are one [1]; creases are rounded."""
+    rejoin_hypotheses: int = 40
+    """RANSAC hypotheses a shape when a joint is judged [1]; samples are evened out and hold few outliers."""
+    rejoin_points: int = 300
+    """Points a joint is judged by [1]."""
+    rejoin_distance: float = 0.006
+    """Distance within which a sample lies at a shape [m]; 3σ of the evened out samples."""
+    rejoin_cosine: float = 0.7
+    """Cosine of the angle between the normals of a sample and of the shape it lies at, at least [1]; 45°."""
+    rejoin_loss: float = 0.1
+    """Share of a part's samples that its own shape explains and the joint one need not [1]."""
+    plain_colour: float = 0.02
+    """Usual distance of the shares of red, green and blue from their mean below which a part is plain [1]."""
+    other_colour: float = 0.08
+    """Distance between the mean shares from which two plain colours differ [1]; four times their spread."""
+    plain_share: float = 0.9
+    """Share of a part its plain pieces make up where it is cut between them [1]; above 1 nothing is."""
+    border_bend: float = 0.25
+    """Width of a border between two colours over its length that is straight [1]; round bodies bend it."""
+    rejoin_empty: float = 0.1
+    """Share of a joint shape's visible faces that may lie where the camera saw through [1]; edges fray."""
     clearance: float = 0.008
     """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
     max_height: float = 0.6
@@ -176,3 +215,17 @@ class SegmentationConfig:
     """A part is divided among the known objects at which at least this share of its points lies [1]."""
     overlap_reach: float = 0.02
     """Distance within which a point lies at an object [m]; 2σ of registration error of both views."""
+
+
+@dataclass(frozen=True, slots=True)
+class MaskConfig:
+    """Masks of a learned segmenter."""
+
+    min_pixels: int = 200
+    """Masks with fewer pixels, before or after smaller ones are laid over them, are left out [px]."""
+    max_share: float = 0.4
+    """A mask of more than this share of the image is the table or what is behind it [1]."""
+    min_score: float = 0.0
+    """Masks with a lower score are left out [the segmenter's unit]."""
+    same: float = 0.8
+    """Two masks with a larger intersection over union are one object seen twice [1]."""

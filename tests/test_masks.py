@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from caryatid.config import MaskConfig
+from caryatid.errors import InputError
+from caryatid.masks import labels_from_masks
+
+
+def square(first, last, size=60):
+    mask = np.zeros((size, size), dtype=bool)
+    mask[first:last, first:last] = True
+    return mask
+
+
+def test_the_smallest_mask_is_on_top_in_whatever_order():
+    large, small = square(5, 40), square(10, 30)
+    for masks, on_top, below in (([large, small], 2, 1), ([small, large], 1, 2)):
+        labels = labels_from_masks(masks)
+        assert labels.dtype == np.int32
+        assert labels[20, 20] == on_top
+        assert labels[6, 6] == below
+        assert labels[50, 50] == 0
+
+
+def test_background_crumbs_and_doubtful_masks_are_left_out():
+    masks = [square(0, 60), square(0, 5), square(5, 30), square(32, 55)]
+    labels = labels_from_masks(masks, [0.9, 0.9, 0.9, 0.3], MaskConfig(min_score=0.5))
+    assert np.unique(labels).tolist() == [0, 3]
+
+
+def test_of_two_equal_masks_the_better_stays():
+    masks = [square(5, 30), square(5, 31)]
+    assert np.unique(labels_from_masks(masks, [0.7, 0.9])).tolist() == [0, 2]
+    assert np.unique(labels_from_masks(masks)).tolist() == [0, 1]
+
+
+def test_a_mask_nearly_covered_by_smaller_ones_leaves_no_crumbs():
+    cover = square(5, 30)
+    low, high = cover.copy(), cover.copy()
+    low[:18], high[17:] = False, False
+    labels = labels_from_masks([cover, low, high])
+    assert np.unique(labels).tolist() == [0, 2, 3]
+
+
+def test_bytes_are_masks_too_and_nothing_is_changed():
+    masks = np.stack([square(5, 30), square(31, 50)])
+    given = masks.astype(np.uint8) * 255
+    before = given.copy()
+    np.testing.assert_array_equal(labels_from_masks(given), labels_from_masks(masks))
+    np.testing.assert_array_equal(given, before)
+
+
+@pytest.mark.parametrize(
+    ("masks", "scores", "what"),
+    [
+        ([], None, "shape"),
+        (square(5, 30), None, "shape"),
+        ([square(5, 30), square(5, 30, size=50)], None, "size"),
+        ([square(5, 30) * 0.7], None, "threshold"),
+        ([square(5, 30)], [0.5, 0.6], "scores"),
+        ([square(5, 30)], [np.nan], "scores"),
+    ],
+)
+def test_bad_masks_are_errors_that_say_so(masks, scores, what):
+    with pytest.raises(InputError, match=what):
+        labels_from_masks(masks, scores)
