@@ -19,6 +19,7 @@ from caryatid.explanation import (
     joined,
     lies_on,
     point_costs,
+    price,
 )
 
 Pair = tuple[int, int]
@@ -85,7 +86,7 @@ def _gain(
     found = [explained_by(shape, both, costs) for shape in shapes]
     for config in (first_look(fit_config, costs), replace(fit_config, polish=1)):
         one = min([*found, explain(both, costs, config, rng)], key=lambda e: e.cost)
-        if one.cost > two + costs.object_cost:
+        if one.cost > two + price(None, costs):
             return 0.0
         found.append(one)
     if one.shape is not None:

@@ -88,8 +88,8 @@ class SplitConfig:
 class ExplanationConfig:
     """What it costs to explain points by shapes: the least cost decides what is one object and what two."""
 
-    object_cost: float = 40.0
-    """Price of one object more [nats]; nine parameters, each known to a ninetieth of its range."""
+    parameter_cost: float = 4.5
+    """Price of each number that an object's shape has [nats]; each is known to a ninetieth of its range."""
     outlier: float = 4.0
     """Cost of a point no shape explains [nats]; as likely as one 2.8σ off."""
     irregular: float = 1.6
