@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from synthetic import box, cylinder, surface_points
 
@@ -84,3 +86,12 @@ def test_two_are_looked_at_again_when_they_have_grown():
     apart = {(1, 2): 10 * len(left)}
     assert pair_of({1: left, 2: right}, apart=apart) is None
     assert pair_of({1: left, 2: right}, apart={(1, 2): 10}) is not None
+
+
+def test_two_that_have_shapes_do_not_become_one_without():
+    can = cloud_of(cylinder((0.0, 0.0, 0.16), 0.03, 0.12))
+    dear = replace(COSTS, parameter_cost=20.0)
+    evidence = {1: gather(cloud_of(CRATE), 0.003, None, dear), 2: gather(can, 0.003, None, dear)}
+    alone = {k: explain(e, dear, FIT, np.random.default_rng(0)) for k, e in evidence.items()}
+    assert all(e.shape is not None for e in alone.values())
+    assert united(evidence, alone, {1, 2}, {}, costs=dear, fit_config=FIT, seed=0) is None

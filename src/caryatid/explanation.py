@@ -21,6 +21,9 @@ from caryatid.voxels import FREE, VoxelMap
 
 Solid = Box | Cylinder | Sphere
 
+PARAMETERS = {"box": 9, "cylinder": 7, "sphere": 4}
+"""Numbers that determine a shape."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evidence:
@@ -65,6 +68,11 @@ class Explanation:
     cost: float
 
 
+def price(shape: Solid | None, config: ExplanationConfig) -> float:
+    """Price [nats] of an object: of the parameters of its shape; an irregular one has as many as a box."""
+    return config.parameter_cost * (9 if shape is None else PARAMETERS[shape.kind])
+
+
 def point_costs(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> Array:
     """Cost (N,) [nats] of each point as one of a shape's surface, before its weight."""
     distance, J = linearise(shape, evidence.points)
@@ -103,14 +111,16 @@ def explained_by(shape: Solid, evidence: Evidence, config: ExplanationConfig) ->
     """Explain points by a given shape, or as an irregular object where that costs less."""
     irregular = config.irregular * float(evidence.weights.sum())
     cost = shape_cost(shape, evidence, config)
-    return Explanation(shape if cost < irregular else None, min(cost, irregular) + config.object_cost)
+    regular = Explanation(shape, cost + price(shape, config))
+    left = Explanation(None, irregular + price(None, config))
+    return min(regular, left, key=lambda e: e.cost)
 
 
 def explain(
     evidence: Evidence, config: ExplanationConfig, fit_config: FitConfig, rng: np.random.Generator
 ) -> Explanation:
     """Find the shape that explains points at the least cost; an irregular object has a price of its own."""
-    best = Explanation(None, config.irregular * float(evidence.weights.sum()) + config.object_cost)
+    best = Explanation(None, config.irregular * float(evidence.weights.sum()) + price(None, config))
     for f in candidates(evidence.points, evidence.normals, config=fit_config, rng=rng):
         best = min(best, explained_by(f.shape, evidence, config), key=lambda e: e.cost)
     return best

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from caryatid import frames
 from caryatid.config import ExplanationConfig, FitConfig, SplitConfig
 from caryatid.explanation import (
+    PARAMETERS,
     Evidence,
     Explanation,
     around,
@@ -22,6 +23,7 @@ from caryatid.explanation import (
     first_look,
     lies_on,
     point_costs,
+    price,
 )
 from caryatid.frames import Array
 
@@ -103,8 +105,8 @@ def _best_pair(
     near = around(evidence.points, costs.neighbours)
     bad = unexplained(evidence, whole, costs)
     excess = float(np.maximum(bad - costs.usual, 0.0) @ evidence.weights)
-    free = whole.cost - costs.object_cost - float(_costs(whole, evidence, costs) @ evidence.weights)
-    if excess + free < costs.object_cost:
+    free = whole.cost - price(whole.shape, costs) - float(_costs(whole, evidence, costs) @ evidence.weights)
+    if excess + free < costs.parameter_cost * min(PARAMETERS.values()):
         return None
     quick = first_look(fit_config, costs)
     tried: list[tuple[float, int, NDArray[np.bool_]]] = []

@@ -19,6 +19,7 @@ from caryatid.explanation import (
     joined,
     lies_on,
     point_costs,
+    price,
 )
 
 Pair = tuple[int, int]
@@ -74,7 +75,10 @@ def _gain(
     fit_config: FitConfig,
     rng: np.random.Generator,
 ) -> float:
-    """How much less [nats] one object costs than two; nothing where it leaves one of them unexplained."""
+    """How much less [nats] one object costs than two; nothing where it leaves one of them unexplained.
+
+    Two that have shapes of their own do not become one without a shape.
+    """
     both = joined(*evidence)
     second = np.arange(len(both.points)) >= len(evidence[0].points)
     two = alone[0].cost + alone[1].cost + border_cost(second, both, costs)
@@ -85,13 +89,14 @@ def _gain(
     found = [explained_by(shape, both, costs) for shape in shapes]
     for config in (first_look(fit_config, costs), replace(fit_config, polish=1)):
         one = min([*found, explain(both, costs, config, rng)], key=lambda e: e.cost)
-        if one.cost > two + costs.object_cost:
+        if one.cost > two + price(None, costs):
             return 0.0
         found.append(one)
-    if one.shape is not None:
-        cost = point_costs(one.shape, both, costs)
-        if max(cost[second].mean(), cost[~second].mean()) > costs.irregular:
-            return 0.0
+    if one.shape is None:
+        return 0.0 if len(shapes) == len(alone) else two - one.cost
+    cost = point_costs(one.shape, both, costs)
+    if max(cost[second].mean(), cost[~second].mean()) > costs.irregular:
+        return 0.0
     return two - one.cost
 
 

@@ -88,21 +88,21 @@ class SplitConfig:
 class ExplanationConfig:
     """What it costs to explain points by shapes: the least cost decides what is one object and what two."""
 
-    object_cost: float = 40.0
-    """Price of one object more [nats]; nine parameters, each known to a ninetieth of its range."""
+    parameter_cost: float = 4.5
+    """Price of each number that an object's shape has [nats]; each is known to a ninetieth of its range."""
     outlier: float = 4.0
     """Cost of a point no shape explains [nats]; as likely as one 2.8σ off."""
-    irregular: float = 1.6
+    irregular: float = 1.4
     """Cost of a point on an object that is none of the shapes [nats]."""
     normal_weight: float = 4.0
     """Cost of a normal turned by 90° [nats]; blurred over edges, normals are as good as 30°."""
     reading: float = 0.0002
     """Surface whose points err alike [m²]; half of the 2 cm square a registration error shows in."""
-    border: float = 2.0
+    border: float = 4.0
     """Cost of a point with only the other object around it, on a surface without crease [nats]."""
     free_cost: float = 0.5
     """Cost of a voxel inside a shape that was seen free [nats]; four points off at 5 mm spacing."""
-    usual: float = 1.1
+    usual: float = 0.9
     """Mean cost of the points around a point that is still well explained [nats]; 9 in 10 true shapes."""
     neighbours: int = 8
     """Points the mean around a point is taken over [1]; 2 cm square of them."""
