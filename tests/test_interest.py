@@ -12,6 +12,7 @@ from caryatid.interest import (
     inhibition_of_return,
     largest_arc,
     painted,
+    points_of_doubt,
     points_of_interest,
     relation_saliency,
     surface_point,
@@ -112,6 +113,16 @@ def test_an_unsupported_object_is_looked_at_from_the_middle_of_the_largest_arc()
     assert floating.saliency == 1.0
     assert floating.position_world[0] == pytest.approx(-0.2 + 0.04), "the face towards +x"
     assert "o3" in floating.why
+
+
+def test_an_implausible_object_is_worth_a_look_from_the_largest_arc():
+    doubtful = replace(box(1, (0.0, 0.0, 0.8), (0.1, 0.1, 0.1)), doubt="overlaps o2 by 30 mm")
+    graph = SupportGraph((box(0, (0.0, 0.0, 0.7), (1.0, 1.0, 0.04)), doubtful))
+    (point,) = points_of_doubt(graph, SPHERE, np.array([at(0.0)]))
+    assert point.subject == ("o1",)
+    assert "overlaps o2 by 30 mm" in point.why
+    np.testing.assert_allclose(point.direction, (-1.0, 0.0, 0.0), atol=1e-9)
+    assert point.position_world[0] == pytest.approx(-0.05, abs=1e-3)
 
 
 def test_a_relations_point_is_the_midpoint_or_the_contact():

@@ -32,6 +32,7 @@ class SceneObject:
         seen: Which sides (-x, +x, -y, +y, -z, +z along the object's axes) points bear out.
         why: How the shape came about, for a person to read.
         uncertainty: How far off the shape may be, where that is known.
+        doubt: What is physically implausible about it, for a person to read; empty where nothing is.
     """
 
     id: str
@@ -45,6 +46,7 @@ class SceneObject:
     seen: tuple[bool, bool, bool, bool, bool, bool] = (True,) * 6
     why: str = ""
     uncertainty: Uncertainty | None = None
+    doubt: str = ""
 
     @property
     def centre_world(self) -> Array:

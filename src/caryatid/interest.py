@@ -66,6 +66,18 @@ def points_of_interest(
     return points
 
 
+def points_of_doubt(graph: SupportGraph, sphere: ViewSphere, visited: Array) -> list[PointOfInterest]:
+    """Where shapes are physically implausible: one point an object, to be looked at from the largest arc.
+
+    Args:
+        graph: What is known.
+        sphere: The view sphere.
+        visited: Unit directions (V, 3) of the earlier views.
+    """
+    middle = largest_arc(visited)
+    return [_looked_at(o, sphere, middle, f"{o.id} {o.doubt}") for o in graph.objects if o.doubt]
+
+
 def largest_arc(visited: Array) -> float:
     """Azimuth [rad] of the middle of the largest arc between views on the horizontal circle.
 
@@ -126,11 +138,14 @@ def inhibition_of_return(visited: Array, directions: Array, config: ActiveVision
 
 
 def _unsupported(subject: SceneObject, sphere: ViewSphere, azimuth: float) -> PointOfInterest:
+    return _looked_at(subject, sphere, azimuth, f"nothing is known to support {subject.id}")
+
+
+def _looked_at(subject: SceneObject, sphere: ViewSphere, azimuth: float, reason: str) -> PointOfInterest:
     middle = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     position = surface_point(subject.shape, sphere.centre_world + sphere.radius * middle)
     gap = f"the largest gap between views is at {np.rad2deg(azimuth):.0f}°"
-    why = f"nothing is known to support {subject.id}; {gap}"
-    return PointOfInterest(position, middle, MAX_SALIENCY, (subject.id,), why)
+    return PointOfInterest(position, middle, MAX_SALIENCY, (subject.id,), f"{reason}; {gap}")
 
 
 def _relation(

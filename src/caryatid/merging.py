@@ -57,6 +57,7 @@ def merge(sightings: Sequence[SceneObject], config: FusionConfig) -> SceneObject
         poor_fit=best.poor_fit,
         uncertainty=best.uncertainty,
         why=best.why,
+        doubt=sightings[-1].doubt,
     )
 
 

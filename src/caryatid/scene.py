@@ -17,6 +17,7 @@ from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object
 from caryatid.joint_registration import ViewRegistration
 from caryatid.object_models import ObjectModels
 from caryatid.perception import UP, Percept, label_image, perceive
+from caryatid.plausibility import reconcile
 from caryatid.stopwatch import Stopwatch
 from caryatid.support import explain, infer
 from caryatid.surface import SupportSurface, find_support_surface
@@ -110,7 +111,8 @@ class Scene:
         watch.lap("fit")
         completed = complete(self._models.objects(), surface, voxels, self.config.completion)
         table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
-        newest = infer([table, *completed], self.config.support)
+        plausible = reconcile([table, *completed], self.config.plausibility)
+        newest = infer(plausible, self.config.support)
         watch.lap("infer")
         percept = self._fused(percept, newest, given)
         self.labels = label_image(percept, source)

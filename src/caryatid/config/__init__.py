@@ -14,6 +14,7 @@ from caryatid.config.modelling import (
     ExplanationConfig,
     FitConfig,
     FusionConfig,
+    PlausibilityConfig,
     SplitConfig,
     SupportConfig,
 )
@@ -53,6 +54,7 @@ class Config:
     split: SplitConfig = field(default_factory=SplitConfig)
     explanation: ExplanationConfig = field(default_factory=ExplanationConfig)
     completion: CompletionConfig = field(default_factory=CompletionConfig)
+    plausibility: PlausibilityConfig = field(default_factory=PlausibilityConfig)
     support: SupportConfig = field(default_factory=SupportConfig)
     fusion: FusionConfig = field(default_factory=FusionConfig)
     voxels: VoxelConfig = field(default_factory=VoxelConfig)
@@ -80,6 +82,7 @@ __all__ = [
     "NoiseConfig",
     "NoiseModel",
     "PhysicsConfig",
+    "PlausibilityConfig",
     "RegistrationConfig",
     "ReportConfig",
     "RobotConfig",

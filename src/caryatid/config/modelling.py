@@ -153,6 +153,24 @@ class CompletionConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class PlausibilityConfig:
+    """Shapes that neither overlap nor float."""
+
+    rounds: int = 3
+    """Corrections at the most [1]; 0 leaves shapes as they were fitted."""
+    touch: float = 0.001
+    """How far from zero the gap of two shapes in contact may be [m]; roundness of edges, softness."""
+    reach: float = 0.01
+    """Gap below an object that touches nothing below it that is closed [m]; as of contacts."""
+    max_tilt: float = 25.0
+    """Separating planes steeper than this carry nothing for sure [deg]; as for supports."""
+    sigmas: float = 3.0
+    """Standard deviations of a gap beyond which the fits' uncertainty does not explain it [1]."""
+    min_extent: float = 0.008
+    """Shortest extent [m]; as of the fits."""
+
+
+@dataclass(frozen=True, slots=True)
 class SupportConfig:
     """Support relations, section III-A."""
 

@@ -132,6 +132,7 @@ def _object_to_json(o: SceneObject) -> dict[str, Any]:
         "poor_fit": o.poor_fit,
         "seen": o.seen,
         "why": o.why,
+        "doubt": o.doubt,
     }
     if o.uncertainty is not None:
         item["uncertainty"] = asdict(o.uncertainty)
@@ -160,6 +161,7 @@ def _object_from_json(item: Any, source: str) -> SceneObject:
         poor_fit=field(item, "poor_fit", bool, source, default=False),
         seen=tuple(seen),
         why=field(item, "why", str, source, default=""),
+        doubt=field(item, "doubt", str, source, default=""),
         uncertainty=_uncertainty_from_json(item, source),
     )
 

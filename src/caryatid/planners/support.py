@@ -14,7 +14,13 @@ from scipy.spatial import KDTree
 
 from caryatid import frames
 from caryatid.frames import Array
-from caryatid.interest import PointOfInterest, inhibition_of_return, painted, points_of_interest
+from caryatid.interest import (
+    PointOfInterest,
+    inhibition_of_return,
+    painted,
+    points_of_doubt,
+    points_of_interest,
+)
 from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
 from caryatid.planners.hidden import (
     SPACE,
@@ -44,6 +50,7 @@ class SupportPlanner:
         check_candidates(state)
         config, sphere, candidates = state.config, state.sphere, state.candidates
         relations = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
+        relations += points_of_doubt(state.graph, sphere, state.visited)
         samples, gain, chosen = _expected_gain(state, relations)
 
         total = gain.sum(axis=0)

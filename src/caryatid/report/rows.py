@@ -137,7 +137,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> ObjectRow:
         overhang,
         "–" if surface else ", ".join(supporters) or "nothing known",
         surface,
-        item.why,
+        f"{item.why}; doubtful: {item.doubt}" if item.doubt else item.why,
     )
 
 
