@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test check format clean
+.PHONY: install demo test check accuracy-gate format clean
 
 install: $(VENV)/.installed
 
@@ -22,6 +22,9 @@ check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+accuracy-gate: install
+	$(BIN)/python benchmarks/accuracy.py suite --gate
 
 format: install
 	$(BIN)/ruff check --fix-only .

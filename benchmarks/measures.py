@@ -40,6 +40,11 @@ def write_baseline(measures: Iterable[Measure], path: Path) -> None:
     path.write_text(json.dumps(document, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
 
+def read_baseline(path: Path) -> list[Measure]:
+    """Read the measures of a baseline."""
+    return [Measure(**known) for known in json.loads(path.read_text(encoding="utf-8")).values()]
+
+
 def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
     """Compare with a baseline; returns the exit status, 1 where a measure is worse than it may be."""
     baseline = json.loads(path.read_text(encoding="utf-8"))

@@ -24,11 +24,12 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from accuracy import SUITE, THREADS, family
+from episodes import THREADS, family
 from measures import Measure, gate, write_baseline
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
+from suites import BUILT_IN
 
 from caryatid.config import Config, NoiseModel
 from caryatid.errors import CaryatidError
@@ -49,7 +50,7 @@ SHARE = 0.2
 class Args:
     """Segment views and compare with true masks."""
 
-    sources: Annotated[tuple[str, ...], tyro.conf.Positional] = SUITE
+    sources: Annotated[tuple[str, ...], tyro.conf.Positional] = BUILT_IN
     """Scene folders, names of built-in scenes, or BOP folders."""
     views: int = 4
     """Views of each scene; a recording has its own."""
