@@ -95,3 +95,29 @@ def test_two_that_have_shapes_do_not_become_one_without():
     alone = {k: explain(e, dear, FIT, np.random.default_rng(0)) for k, e in evidence.items()}
     assert all(e.shape is not None for e in alone.values())
     assert united(evidence, alone, {1, 2}, {}, costs=dear, fit_config=FIT, seed=0) is None
+
+
+def bowl(azimuths, seed=0):
+    """Outside of a bowl that widens upwards, of the directions [rad] given: none of the shapes."""
+    rng = np.random.default_rng(seed)
+    azimuth, height = rng.uniform(*azimuths, 2500), rng.uniform(0.0, 0.06, 2500)
+    radius = 0.03 + height * (1.0 + 0.5 * np.sin(4.0 * azimuth))
+    across = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    normals = np.concatenate([across, np.full((2500, 1), -1.0)], axis=1) / np.sqrt(2.0)
+    return Cloud(np.column_stack([radius[:, None] * across, height]), normals)
+
+
+def test_an_irregular_object_in_two_parts_is_one_where_its_surface_goes_on():
+    assert pair_of({1: bowl((-np.pi, 0.3)), 2: bowl((0.3, np.pi))}) is not None
+
+
+def test_irregular_neighbours_stay_two_where_a_crease_parts_them():
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(-0.15, 0.15, (6000, 2))
+    xy = xy[np.hypot(*xy.T) > 0.035]
+    crumpled = np.column_stack([xy, 0.02 * np.sin(70.0 * xy[:, 0]) * np.sin(50.0 * xy[:, 1]) - 0.02])
+    paper = Cloud(crumpled, np.tile((0.0, 0.0, 1.0), (len(xy), 1)))
+    standing = bowl((-np.pi, np.pi))
+    for cloud in (paper, standing):
+        assert explain(gather(cloud, 0.003, None, COSTS), COSTS, FIT, rng).shape is None
+    assert pair_of({1: standing, 2: paper}) is None

@@ -156,13 +156,18 @@ def around(points: Array, neighbours: int) -> scipy.sparse.csr_array:
     return scipy.sparse.csr_array((np.full(index.size, 1.0 / count), index.ravel(), ends))
 
 
-def border_cost(second: NDArray[np.bool_], evidence: Evidence, config: ExplanationConfig) -> float:
+def border_cost(
+    second: NDArray[np.bool_], evidence: Evidence, config: ExplanationConfig
+) -> tuple[float, float]:
     """Cost [nats] of a border between two objects where the surface goes on without a concave crease.
 
     Args:
         second: Which points (N,) belong to the second object.
         evidence: The points of both.
         config: Neighbours, and the price.
+
+    Returns:
+        The cost, and the share of the border without a crease; nothing where they have no border.
     """
     near = around(evidence.points, config.neighbours).tocoo()
     across = second[near.row] != second[near.col]
@@ -171,7 +176,9 @@ def border_cost(second: NDArray[np.bool_], evidence: Evidence, config: Explanati
     turn = evidence.normals[col] - evidence.normals[row]
     bend = np.einsum("ij,ij->i", turn, between) / np.maximum(np.linalg.norm(between, axis=1), 1e-9)
     flat = bend > -np.sin(np.radians(config.crease))
-    return config.border * float(near.data[across][flat] @ evidence.weights[row][flat])
+    length = near.data[across] * evidence.weights[row]
+    smooth = float(length[flat].sum())
+    return config.border * smooth, smooth / max(float(length.sum()), 1e-12)
 
 
 def lies_on(shape: Solid, points: Array, config: ExplanationConfig) -> bool:

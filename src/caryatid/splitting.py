@@ -113,7 +113,7 @@ def _best_pair(
     for start in _starts(evidence, bad, hints, up, config, costs):
         pair = _settled(evidence, start, near, 0, config, costs, quick, rng)
         if pair is not None:
-            cost = pair[1][0].cost + pair[1][1].cost + border_cost(pair[0], evidence, costs)
+            cost = pair[1][0].cost + pair[1][1].cost + border_cost(pair[0], evidence, costs)[0]
             tried.append((cost, len(tried), pair[0]))
     best, least_cost = None, whole.cost
     for _, _, start in sorted(tried, key=lambda t: t[:2])[: config.finalists]:
@@ -122,7 +122,7 @@ def _best_pair(
         )
         if pair is None:
             continue
-        cost = pair[1][0].cost + pair[1][1].cost + border_cost(pair[0], evidence, costs)
+        cost = pair[1][0].cost + pair[1][1].cost + border_cost(pair[0], evidence, costs)[0]
         if cost < least_cost and not _is_layer(evidence, pair[0], pair[1], costs):
             best, least_cost = pair, cost
     return best

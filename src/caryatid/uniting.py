@@ -77,11 +77,13 @@ def _gain(
 ) -> float:
     """How much less [nats] one object costs than two; nothing where it leaves one of them unexplained.
 
-    Two that have shapes of their own do not become one without a shape.
+    Two that have shapes of their own do not become one without a shape; others only where most of the border
+    between them has no concave crease, so that one surface goes on.
     """
     both = joined(*evidence)
     second = np.arange(len(both.points)) >= len(evidence[0].points)
-    two = alone[0].cost + alone[1].cost + border_cost(second, both, costs)
+    border, smooth = border_cost(second, both, costs)
+    two = alone[0].cost + alone[1].cost + border
     shapes = [e.shape for e in alone if e.shape is not None]
     for points, other in ((evidence[1].points, alone[0].shape), (evidence[0].points, alone[1].shape)):
         if other is not None and lies_on(other, points, costs):
@@ -93,7 +95,7 @@ def _gain(
             return 0.0
         found.append(one)
     if one.shape is None:
-        return 0.0 if len(shapes) == len(alone) else two - one.cost
+        return two - one.cost if smooth > 0.5 and len(shapes) < len(alone) else 0.0
     cost = point_costs(one.shape, both, costs)
     if max(cost[second].mean(), cost[~second].mean()) > costs.irregular:
         return 0.0
