@@ -9,6 +9,7 @@ from synthetic import box, cylinder, edges, hausdorff, sphere, table_object, thi
 from caryatid.config import FusionConfig
 from caryatid.fusion import Evidence, absorbed, fuse, fused_graph, match
 from caryatid.graph import Support, SupportGraph
+from caryatid.uncertainty import Uncertainty
 
 SG, PC, BOTH = (FusionConfig(method=m) for m in ("sg", "pc", "pc+sg"))
 CRATE = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1))
@@ -55,6 +56,14 @@ def test_one_of_another_size_is_another():
     assert matched(CRATE, box((0.0, 0.0, 0.8), (0.1, 0.12, 0.15)))
     assert not matched(CRATE, box((0.0, 0.0, 0.8), (0.1, 0.12, 0.25)))
     assert not matched(BALL, sphere((0.2, 0.2, 0.79), 0.07))
+
+
+def test_a_sighting_that_is_unsure_of_a_hidden_side_may_differ_by_it():
+    deep, cut = box((0.055, 0.0, 0.8), (0.24, 0.12, 0.1)), box((0.0, 0.0, 0.8), (0.13, 0.12, 0.1))
+    unsure = Uncertainty(np.array([0.04, 0.0, 0.0]), np.zeros(3), np.array([0.08, 0.0, 0.0]), np.zeros(6))
+    shallow = replace(thing(9, cut), uncertainty=unsure)
+    assert not matched(deep, cut)
+    assert match([thing(1, deep)], [shallow], SG, same_labels=False) == {"o9": "o1"}
 
 
 def test_one_that_lies_otherwise_is_another():

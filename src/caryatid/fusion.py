@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from caryatid.config import FusionConfig
+from caryatid.frames import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
 from caryatid.merging import axes_rotation, merge
 from caryatid.shapes import Cylinder, Shape, Sphere
@@ -167,8 +168,9 @@ def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> 
         return 0.0
     a, b = known.shape, seen.shape
     reach = max(config.max_distance, float(min(a.extents.min(), b.extents.min())) / 2.0)
-    distance = float(np.linalg.norm(known.centre_world - seen.centre_world)) / reach
-    ratio = _extent_ratio(a, b)
+    unsure = config.sigmas * np.hypot(np.linalg.norm(_position(known)), np.linalg.norm(_position(seen)))
+    distance = float(np.linalg.norm(known.centre_world - seen.centre_world)) / (reach + unsure)
+    ratio = _extent_ratio(known, seen, config)
     kind_differs = a.kind != b.kind
     angle = 0.0 if kind_differs or _is_round(a) else np.degrees(axes_rotation(b, a)[1]) / config.max_angle
     size = np.log(ratio) / np.log(config.max_ratio)
@@ -176,9 +178,23 @@ def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> 
     return total if max(distance, size, angle) <= 1.0 else np.inf
 
 
-def _extent_ratio(a: Shape, b: Shape) -> float:
-    x, y = np.sort(a.extents), np.sort(b.extents)
-    return float(np.max(np.maximum(x / y, y / x)))
+def _extent_ratio(known: SceneObject, seen: SceneObject, config: FusionConfig) -> float:
+    """Largest ratio of the sorted extents, once what both fits' uncertainty explains is taken off."""
+    a, b = known.shape.extents, seen.shape.extents
+    first, second = np.argsort(a, kind="stable"), np.argsort(b, kind="stable")
+    unsure = config.sigmas * np.hypot(_sizes(known)[first], _sizes(seen)[second])
+    excess = np.maximum(np.abs(a[first] - b[second]) - unsure, 0.0)
+    return float(np.max(1.0 + excess / np.minimum(a[first], b[second])))
+
+
+def _position(o: SceneObject) -> Array:
+    """Standard deviations (3,) [m] of the centre; zero where they are not known."""
+    return np.zeros(3) if o.uncertainty is None else o.uncertainty.position
+
+
+def _sizes(o: SceneObject) -> Array:
+    """Standard deviations (3,) [m] of the extents; zero where they are not known."""
+    return np.zeros(3) if o.uncertainty is None else o.uncertainty.sizes
 
 
 def _is_round(shape: Shape) -> bool:

@@ -214,6 +214,8 @@ class FusionConfig:
     """Axes further apart are two orientations [deg], up to the shape's symmetry."""
     max_ratio: float = 1.6
     """Sorted extents that differ by more than this factor are two objects."""
+    sigmas: float = 2.0
+    """Standard deviations of centres and extents by which two sightings may differ beyond that [1]."""
     settled: float = 0.005
     """A shape that moves, grows or turns by less than this has not changed [m]; σ of registration error."""
     surface_spacing: float = 0.01
