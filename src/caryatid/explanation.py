@@ -9,10 +9,10 @@ import scipy.sparse
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from caryatid import frames
 from caryatid.clouds import thin
 from caryatid.config import ExplanationConfig, FitConfig
 from caryatid.frames import Array
+from caryatid.interior import interior_states
 from caryatid.primitives import candidates
 from caryatid.refine import linearise
 from caryatid.shapes import Box, Cylinder, Sphere
@@ -86,19 +86,8 @@ def free_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> fl
     """Cost [nats] of the space seen free that a shape fills."""
     if evidence.voxels is None:
         return 0.0
-    size = evidence.voxels.config.size
-    half = shape.extents / 2.0 - max(config.inset * size, 3.0 * evidence.noise)
-    if (half <= 0.0).any():
-        return 0.0
-    ticks = [np.arange(-h + size / 2.0, h, size) if h > size / 2.0 else np.zeros(1) for h in half]
-    local = np.stack([g.ravel() for g in np.meshgrid(*ticks, indexing="ij")], axis=-1)
-    if shape.kind != "box":
-        radius = np.hypot(local[:, 0], local[:, 1]) / half[0]
-        if shape.kind == "sphere":
-            radius = np.linalg.norm(local, axis=1) / half[0]
-        local = local[radius <= 1.0]
-    free = evidence.voxels.state_at(frames.transform(shape.T_world_object, local)) == FREE
-    return config.free_cost * float(free.sum())
+    inset = max(config.inset * evidence.voxels.config.size, 3.0 * evidence.noise)
+    return config.free_cost * float((interior_states(shape, evidence.voxels, inset) == FREE).sum())
 
 
 def shape_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> float:

@@ -84,11 +84,12 @@ class ObjectModels:
         for label in sorted(labels):
             self._fit(label, self.points.newest(label))
 
-    def fit_all(self, labels: set[int]) -> None:
-        """Fit objects to all their points so far (`pc`, `pc+sg`)."""
+    def fit_all(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
+        """Fit objects to all their points so far (`pc`, `pc+sg`), where shapes fill no space seen free."""
         for label in sorted(labels):
             cloud = self.points.of(label)
-            self._fit(label, cloud.select(thin(cloud.points_world, self._config.cloud.voxel)))
+            thinned = cloud.select(thin(cloud.points_world, self._config.cloud.voxel))
+            self._fit(label, thinned, voxels)
 
     def divide(self, labels: set[int], voxels: VoxelMap | None = None) -> set[int]:
         """Part objects that several shapes explain better than one; returns the labels that changed.
@@ -120,7 +121,7 @@ class ObjectModels:
             else:
                 _, nearest = cKDTree(evidence.points).query(cloud.points_world)
                 changed |= set(self.points.divide(label, groups[nearest]))
-        self.fit_all(changed)
+        self.fit_all(changed, voxels)
         return changed
 
     def unite(self, labels: set[int], voxels: VoxelMap | None = None) -> dict[int, int]:
@@ -156,7 +157,7 @@ class ObjectModels:
             self.points.merge(old, new)
             del self.fits[old], evidence[old], alone[old]
             given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
-            self.fit_all({new})
+            self.fit_all({new}, voxels)
             evidence[new] = gather(self.points.of(new), noise, voxels, config.explanation)
             alone[new] = explained_by(self.fits[new].shape, evidence[new], config.explanation)
             labels = labels | {new}
@@ -196,9 +197,9 @@ class ObjectModels:
         spread = MEAN_TO_DEVIATION * float(np.median(residuals)) if residuals else 0.0
         return max(spread, self._config.explanation.least_noise)
 
-    def _fit(self, label: int, cloud: Cloud) -> None:
+    def _fit(self, label: int, cloud: Cloud, voxels: VoxelMap | None = None) -> None:
         rng = np.random.default_rng([self._seed, label])
-        result = fit(cloud.points_world, cloud.normals_world, config=self._config.fit, rng=rng)
+        result = fit(cloud.points_world, cloud.normals_world, config=self._config.fit, rng=rng, space=voxels)
         if isinstance(result, FitFailure):
             self.fits.pop(label, None)
             return

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from caryatid import frames
 from caryatid.config import FitConfig
 from caryatid.frames import Array
+from caryatid.interior import free_share
 from caryatid.kernels.hypotheses import any_within, count_agreeing
 from caryatid.polish import polish
 from caryatid.ransac import ransac
@@ -17,6 +18,7 @@ from caryatid.refine import distances, refine
 from caryatid.shape_models import BoxModel, CylinderModel, ShapeModel, SphereModel
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.uncertainty import Uncertainty
+from caryatid.voxels import VoxelMap
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
 
@@ -55,7 +57,14 @@ class FitFailure:
     reason: str
 
 
-def fit(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Generator) -> Fit | FitFailure:
+def fit(
+    points: Array,
+    normals: Array,
+    *,
+    config: FitConfig,
+    rng: np.random.Generator,
+    space: VoxelMap | None = None,
+) -> Fit | FitFailure:
     """Fit the best of box, cylinder and sphere.
 
     The result does not depend on the frame of the points, only on their order and the generator. Sides
@@ -66,10 +75,14 @@ def fit(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Gene
         normals: Unit normals (N, 3) towards the sensor.
         config: Limits and thresholds.
         rng: Source of the samples.
+        space: What has been seen free, where points are in the world frame: shapes do not fill it.
     """
     fits = candidates(points, normals, config=config, rng=rng)
     if not fits:
         return FitFailure(_failure_reason(len(points), config))
+    if space is not None:
+        inset = config.free_inset * space.config.size
+        fits.sort(key=lambda f: f.cost + config.free_weight * free_share(f.shape, space, inset))
     return _polished(fits[0], points, config)
 
 

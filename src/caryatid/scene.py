@@ -164,7 +164,7 @@ class Scene:
         if self.config.fusion.method == "sg":
             self._models.fit_newest(shown)
             return percept
-        self._models.fit_all(shown)
+        self._models.fit_all(shown, self.voxels)
         if given:
             return percept
         changed = self._models.divide(shown, self.voxels)

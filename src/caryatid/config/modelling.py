@@ -60,6 +60,10 @@ class FitConfig:
     """Standard deviation of where views are laid [m], which no number of points averages out."""
     rim: float = 0.003
     """The same of where points end beside a depth edge [m]: one pixel at 1.5 m."""
+    free_weight: float = 0.01
+    """What an inside seen free costs in model choice [m]; a share of it in proportion."""
+    free_inset: float = 1.2
+    """How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
     max_residual: float = 0.008
     """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
 
