@@ -104,6 +104,7 @@ PICTURES: Mapping[str, Picture] = {
 }
 
 
+NAMELESS = "? is no true object"
 HULL = "hull"
 """The picture that needs no scene."""
 
@@ -164,6 +165,9 @@ def draw(picture: Picture, outcome: Outcome) -> Any:
     figure.subplots_adjust(0.004, 0.075, 0.996, 0.85, wspace=0.015)
     figure.suptitle(picture.title, fontsize=15, fontweight="bold", y=0.985)
     lines = [Line2D([], [], color=colour, linewidth=3.0, label=text) for text, colour in LEGEND]
+    lines.append(
+        Line2D([], [], color=INVENTED_COLOUR, marker="s", markersize=11, linestyle="", label=NAMELESS)
+    )
     figure.legend(handles=lines, loc="lower center", ncols=len(lines), frameon=False, fontsize=11)
     show_view(panels[0], outcome.steps, {labels[name]: tag for name, tag in tags.items()})
     solids = {name: (shape, *tags[name]) for name, shape in true.items()}

@@ -30,7 +30,6 @@ LEGEND = (
     ("right support", RIGHT),
     ("missed", MISSED),
     ("found, but not there", EXTRA),
-    ("?  is no true object", INVENTED_COLOUR),
 )
 ASIDE = 8.0
 """How far an arrow is beside the line between two centres: there may be one each way [px]."""
