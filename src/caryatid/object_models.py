@@ -155,6 +155,7 @@ class ObjectModels:
                 return given_up
             new, old = pair
             self.points.merge(old, new)
+            self._forget(set(pair))
             del self.fits[old], evidence[old], alone[old]
             given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
             self.fit_all({new}, voxels)
@@ -190,6 +191,11 @@ class ObjectModels:
                 if config.split.min_points <= own.sum() < 0.9 * (owner > 0).sum():
                     hints.append(own)
         return hints
+
+    def _forget(self, labels: set[int]) -> None:
+        """Drop what was found of objects that were others then: which are one, and which pairs are two."""
+        self._undivided = {k: n for k, n in self._undivided.items() if k not in labels}
+        self._apart = {pair: n for pair, n in self._apart.items() if not labels & set(pair)}
 
     def _noise(self) -> float:
         """Standard deviation of points from their surfaces [m]: that of the object in the middle."""
