@@ -77,8 +77,8 @@ def _gain(
 ) -> float:
     """How much less [nats] one object costs than two; nothing where it leaves one of them unexplained.
 
-    Two that have shapes of their own do not become one without a shape; others only where most of the border
-    between them has no concave crease, so that one surface goes on.
+    Two become one without a shape only where most of the border between them has no concave crease, so that
+    one surface goes on.
     """
     both = joined(*evidence)
     second = np.arange(len(both.points)) >= len(evidence[0].points)
@@ -95,7 +95,7 @@ def _gain(
             return 0.0
         found.append(one)
     if one.shape is None:
-        return two - one.cost if smooth > 0.5 and len(shapes) < len(alone) else 0.0
+        return two - one.cost if smooth > 0.5 else 0.0
     cost = point_costs(one.shape, both, costs)
     if max(cost[second].mean(), cost[~second].mean()) > costs.irregular:
         return 0.0
