@@ -78,7 +78,7 @@ def _gain(
     """How much less [nats] one object costs than two; nothing where it leaves one of them unexplained.
 
     Two become one without a shape only where most of the border between them has no concave crease, so that
-    one surface goes on.
+    one surface goes on: nearly all of it where both have shapes of their own.
     """
     both = joined(*evidence)
     second = np.arange(len(both.points)) >= len(evidence[0].points)
@@ -95,7 +95,8 @@ def _gain(
             return 0.0
         found.append(one)
     if one.shape is None:
-        return two - one.cost if smooth > 0.5 else 0.0
+        least = costs.smooth_border if len(shapes) == len(alone) else 0.5
+        return two - one.cost if smooth > least else 0.0
     cost = point_costs(one.shape, both, costs)
     if max(cost[second].mean(), cost[~second].mean()) > costs.irregular:
         return 0.0
