@@ -121,6 +121,7 @@ class ObjectModels:
             else:
                 _, nearest = cKDTree(evidence.points).query(cloud.points_world)
                 changed |= set(self.points.divide(label, groups[nearest]))
+        self._forget(changed)
         self.fit_all(changed, voxels)
         return changed
 
