@@ -84,10 +84,12 @@ def test_an_object_that_could_not_be_divided_is_left_alone_until_it_has_grown(mo
 def test_a_pair_is_looked_at_again_when_one_of_them_has_been_divided(models, monkeypatch):
     models.fit_all(models.add(percept_of((1, 1)), 0))
     models.fit_all(models.add(percept_of((2,), (CRATE,), seed=3), 0))
+
+    def all_are_two(evidence, alone, changed, apart, **settings):
+        apart[1, 2] = 10**6
+
     with monkeypatch.context() as patched:
-        patched.setattr(
-            "caryatid.object_models.united", lambda e, alone, changed, apart, **k: apart.update({(1, 2): 10**6})
-        )
+        patched.setattr("caryatid.object_models.united", all_are_two)
         assert models.unite({1, 2}) == {}
     assert models.unite({1, 2}) == {}
     models.unite(models.divide({1}))
