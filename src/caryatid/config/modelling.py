@@ -105,7 +105,7 @@ class ExplanationConfig:
     border: float = 4.0
     """Cost of a point with only the other object around it, on a surface without crease [nats]."""
     smooth_border: float = 0.8
-    """Share of a border without crease for two with shapes to be one irregular object [1]; the rest is noise."""
+    """Share of a border without crease for two with shapes to be one irregular object [1]."""
     free_cost: float = 0.5
     """Cost of a voxel inside a shape that was seen free [nats]; four points off at 5 mm spacing."""
     usual: float = 0.9
