@@ -94,7 +94,7 @@ PICTURES: Mapping[str, Picture] = {
     "lean": Picture(
         "dense-14-116", ("object10", "object11", "object9"), "A hangs between B and C: all contacts are steep"
     ),
-    "merged": Picture("packed-20-1", ("object2", "object0"), "A and a piece of B become one box", "auto"),
+    "merged": Picture("packed-20-1", ("object2", "object0"), "A and B become one box", "auto"),
     "split": Picture(
         "dense-15-124", ("object4", "object8"), "A is found in two pieces, B not at all", "auto"
     ),
