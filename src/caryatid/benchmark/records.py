@@ -1,0 +1,134 @@
+"""What a benchmark is made of: episodes, what was measured view by view, and where each belongs."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+
+from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One run of the loop: with a fingerprint of the code, everything that determines its figures.
+
+    Attributes:
+        scene: Name of a built-in scene, or a scene folder.
+        content: Digest of a scene folder's files; empty for a built-in scene, which its name determines.
+        fusion: What is fused.
+        planner: Who chooses the views.
+        segmentation: Where parts come from.
+        noise: Noise of the camera.
+        settings: Changes of the default settings, `stage.name=value`.
+        views: Views it has, the first one too.
+        seed: Seed of the noise and of every choice.
+    """
+
+    scene: str
+    content: str = ""
+    fusion: FusionMethod = "pc+sg"
+    planner: str = "support"
+    segmentation: SegmentationMethod = "labels"
+    noise: NoiseModel = "carmine"
+    settings: tuple[str, ...] = ()
+    views: int = 5
+    seed: int = 0
+
+    def key(self, fingerprint: str) -> str:
+        """Digest of the episode and of the code that runs it.
+
+        Args:
+            fingerprint: Of the code, see `caryatid.benchmark.fingerprint`.
+        """
+        text = json.dumps([fingerprint, asdict(self)], sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class ViewRow:
+    """What was measured after one view.
+
+    Attributes:
+        view: How many views there have been, 1 after the first.
+        precision: Eq. 4, vertices and edges together [1].
+        recall: Eq. 5, vertices and edges together [1].
+        f1: Their harmonic mean [1].
+        vertex_precision: Vertices alone, the table included [1].
+        vertex_recall: Vertices alone [1].
+        vertex_f1: Vertices alone [1].
+        edge_precision: Edges alone [1].
+        edge_recall: Edges alone [1].
+        edge_f1: Edges alone [1].
+        mean_iou: Of the matched objects [1].
+        angle: Travelled so far on the view sphere [rad].
+        path: Travelled so far over the floor [m].
+        planning_seconds: Time the choice of this view took [s]; 0 for the first.
+        perception_seconds: Time from this view to the fused graph [s].
+    """
+
+    view: int
+    precision: float
+    recall: float
+    f1: float
+    vertex_precision: float
+    vertex_recall: float
+    vertex_f1: float
+    edge_precision: float
+    edge_recall: float
+    edge_f1: float
+    mean_iou: float
+    angle: float
+    path: float
+    planning_seconds: float
+    perception_seconds: float
+
+
+MEASURES = tuple(name for name in ViewRow.__slots__ if name != "view")
+"""Names of what is measured after each view."""
+
+TIMES = ("planning_seconds", "perception_seconds")
+"""Measures that differ from run to run and from machine to machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What an episode gave.
+
+    Attributes:
+        rows: One row a view; none where it failed.
+        error: Why it failed, in one line, or None.
+    """
+
+    rows: tuple[ViewRow, ...]
+    error: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """An episode of a suite, and what it is compared as.
+
+    Attributes:
+        episode: What is run.
+        method: Label of the method: one line of a figure.
+        condition: Label of noise and segmentation: one figure of a suite.
+        family: Kind of the scene: `designed`, `pile`, `dense`, …
+    """
+
+    episode: Episode
+    method: str
+    condition: str
+    family: str
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """A member of a suite that was run.
+
+    Attributes:
+        member: What was run.
+        outcome: What it gave.
+    """
+
+    member: Member
+    outcome: Outcome
