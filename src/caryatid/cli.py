@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from caryatid.errors import CaryatidError
+from caryatid.errors import in_one_line
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -31,6 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(arguments: Sequence[str]) -> int:
     import tyro
 
+    from caryatid.commands.benchmark import Benchmark
     from caryatid.commands.demo import Demo
     from caryatid.commands.evaluate import Evaluate
     from caryatid.commands.explore import Explore
@@ -43,6 +44,7 @@ def _run(arguments: Sequence[str]) -> int:
             "explore": Explore,
             "extract": Extract,
             "evaluate": Evaluate,
+            "benchmark": Benchmark,
             "config": ShowConfig,
         },
         prog="caryatid",
@@ -61,25 +63,9 @@ def _run(arguments: Sequence[str]) -> int:
     except Exception as error:
         if command.general.debug:
             raise
-        sys.stderr.write(f"error: {_in_one_line(error)}\n")
+        sys.stderr.write(f"error: {in_one_line(error)}\n")
         return 1
     return status
-
-
-def _in_one_line(error: Exception) -> str:
-    """Say what failed, and where, in one line."""
-    match error:
-        case CaryatidError():
-            text = str(error)
-        case OSError(filename=str() as name, strerror=str() as reason):
-            text = f"{name}: {reason.lower()}"
-        case OSError():
-            text = str(error)
-        case MemoryError():
-            text = f"out of memory: {error}"
-        case _:
-            text = f"a fault in caryatid, {type(error).__name__}: {error}; --debug shows where"
-    return " ".join(text.splitlines())
 
 
 if __name__ == "__main__":

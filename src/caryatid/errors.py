@@ -31,3 +31,19 @@ class PerceptionError(CaryatidError):
 
 class PlanningError(CaryatidError):
     """No next view exists: none is reachable, or all have been visited."""
+
+
+def in_one_line(error: Exception) -> str:
+    """Say what failed, and where, in one line."""
+    match error:
+        case CaryatidError():
+            text = str(error)
+        case OSError(filename=str() as name, strerror=str() as reason):
+            text = f"{name}: {reason.lower()}"
+        case OSError():
+            text = str(error)
+        case MemoryError():
+            text = f"out of memory: {error}"
+        case _:
+            text = f"a fault in caryatid, {type(error).__name__}: {error}; --debug shows where"
+    return " ".join(text.splitlines())

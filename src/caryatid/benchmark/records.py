@@ -36,12 +36,13 @@ class Episode:
     seed: int = 0
 
     def key(self, fingerprint: str) -> str:
-        """Digest of the episode and of the code that runs it.
+        """Digest of the episode and of the code that runs it; where a scene's folder lies does not matter.
 
         Args:
             fingerprint: Of the code, see `caryatid.benchmark.fingerprint`.
         """
-        text = json.dumps([fingerprint, asdict(self)], sort_keys=True)
+        told = asdict(self) | ({"scene": ""} if self.content else {})
+        text = json.dumps([fingerprint, told], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 

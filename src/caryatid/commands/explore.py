@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from caryatid.commands.names import PlannerName
 from caryatid.commands.options import SAID, ModellingCommand, OutPath, Views, defaults_to, with_views
-from caryatid.commands.planner_names import PlannerName
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record, step_record, view_record
 from caryatid.commands.sources import Source, open_source

@@ -1,0 +1,240 @@
+"""Named suites: which methods meet which scenes, under which conditions, how often."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+
+from caryatid.benchmark.records import Episode, Member
+from caryatid.benchmark.scenes import content_of, family
+from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.errors import InputError
+
+DESIGNED = ("tower", "bridge", "counterweight", "leaning_plank", "hidden_stack", "shelf", "clutter")
+"""Scenes with one difficulty each."""
+PILES = tuple(
+    f"pile-{size}-{seed}" for seed, size in enumerate((4, 5, 6, 8, 10, 12, 14, 16, 18, 20), start=1)
+)
+"""Primitives set down one by one, 4 to 20."""
+DENSE = tuple(f"dense-{10 + i % 16}-{301 + i}" for i in range(32))
+"""Heaps of 10 to 25 between screens and walls; nothing is tuned on these seeds."""
+VOLUMETRIC = (
+    "occlusion-aware",
+    "unobserved-voxel",
+    "rear-side-voxel",
+    "rear-side-entropy",
+    "proximity-count",
+)
+"""Planners that look at space alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One line of a figure.
+
+    Attributes:
+        label: Its name there.
+        planner: Who chooses the views.
+        fusion: What is fused.
+        settings: Changes of the default settings.
+    """
+
+    label: str
+    planner: str = "support"
+    fusion: FusionMethod = "pc+sg"
+    settings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What the camera gives.
+
+    Attributes:
+        label: Its name; figures are drawn for each.
+        noise: Noise model of the camera.
+        segmentation: Where parts come from.
+        settings: Changes of the default settings.
+    """
+
+    label: str
+    noise: NoiseModel = "carmine"
+    segmentation: SegmentationMethod = "labels"
+    settings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Suite:
+    """Methods × conditions × scenes × seeds.
+
+    Attributes:
+        name: Its name on the command line.
+        what: What it shows, in one sentence.
+        methods: The first one is what the others are compared with.
+        scenes: Names of built-in scenes, or scene folders.
+        conditions: What the camera gives.
+        seeds: Seeds 0…n−1.
+        views: Views an episode, the first one too.
+    """
+
+    name: str
+    what: str
+    methods: tuple[Method, ...]
+    scenes: tuple[str, ...]
+    conditions: tuple[Condition, ...] = (Condition("labels, Carmine noise"),)
+    seeds: int = 3
+    views: int = 5
+
+    def members(self) -> list[Member]:
+        """All episodes, those of a scene one after the other."""
+        content = {scene: content_of(scene) for scene in self.scenes}
+        cross = product(self.scenes, range(self.seeds), self.conditions, self.methods)
+        return [
+            Member(
+                Episode(
+                    scene=scene,
+                    content=content[scene],
+                    fusion=method.fusion,
+                    planner=method.planner,
+                    segmentation=condition.segmentation,
+                    noise=condition.noise,
+                    settings=condition.settings + method.settings,
+                    views=self.views,
+                    seed=seed,
+                ),
+                method.label,
+                condition.label,
+                family(scene),
+            )
+            for scene, seed, condition, method in cross
+        ]
+
+
+def find_suite(name: str) -> Suite:
+    """Return the suite of this name.
+
+    Raises:
+        InputError: There is none; the message lists those there are.
+    """
+    if name in SUITES:
+        return SUITES[name]
+    raise InputError("--suite", f"there is no suite '{name}'", f"choose one of {', '.join(SUITES)}")
+
+
+def with_planners(suite: Suite, planners: Sequence[str]) -> Suite:
+    """Return the suite with these planners in place of its methods, each with the default fusion."""
+    return replace(suite, methods=tuple(Method(name, name) for name in planners))
+
+
+def _depth_noise(factor: float) -> tuple[str, ...]:
+    """Settings for axial noise so many times the sensor's."""
+    constant, slope, start = Config().noise.axial
+    return (f"noise.axial=[{factor * constant:.6g}, {factor * slope:.6g}, {start:g}]",)
+
+
+def _registration(centimetres: float, degrees: float) -> tuple[str, ...]:
+    """Settings for poses of views that are off by so much (σ)."""
+    return (f"noise.translation={centimetres / 100.0:g}", f"noise.rotation={degrees:g}")
+
+
+_FIG5 = (
+    Method("PC+SG"),
+    Method("PC", fusion="pc"),
+    Method("SG", fusion="sg"),
+    Method("random PC", "random", "pc"),
+    Method("random SG", "random", "sg"),
+)
+_PLANNERS = ("support", "attention", "paper", "random", "ring", "farthest", *VOLUMETRIC, "oracle")
+_FUSIONS: tuple[FusionMethod, ...] = ("pc+sg", "pc", "sg")
+_ATTENTION = {
+    "eq. 2 with 2π": "active.saliency=paper",
+    "point at midpoint": "active.edge_point=midpoint",
+    "λ_s 0.5": "active.saliency_weight=0.5",
+    "λ_s 0.9": "active.saliency_weight=0.9",
+    "λ_s 1": "active.saliency_weight=1.0",
+    "no inhibition": "active.inhibition=0.0",
+    "cost: path": "active.path_cost=path",
+    "cost: none": "active.path_cost=none",
+    "r_s,min 0.05": "support.min_area_ratio=0.05",
+    "r_s,min 0.2": "support.min_area_ratio=0.2",
+}
+_SUPPORT = {
+    "eq. 2 with 2π": "active.saliency=paper",
+    "point at midpoint": "active.edge_point=midpoint",
+    "no inhibition": "active.inhibition=0.0",
+    "cost: path": "active.path_cost=path",
+    "cost: none": "active.path_cost=none",
+    "no relations": "active.relation_weight=0.0",
+    "no unseen space": "active.space_weight=0.0",
+    "r_s,min 0.05": "support.min_area_ratio=0.05",
+    "r_s,min 0.2": "support.min_area_ratio=0.2",
+}
+_REGISTRATION = {
+    f"registration {cm:g} cm, {deg:g}°": _registration(cm, deg)
+    for cm, deg in ((0.0, 0.0), (0.5, 0.3), (1.0, 1.0), (2.0, 2.0))
+}
+_NOISE = tuple(
+    Condition(f"depth noise ×{factor:g}", settings=_depth_noise(factor)) for factor in (0.0, 1.0, 2.0, 4.0)
+) + tuple(Condition(label, settings=settings) for label, settings in _REGISTRATION.items())
+_AUTO = Condition("automatic parts, Carmine noise", segmentation="auto")
+
+SUITES: Mapping[str, Suite] = {
+    suite.name: suite
+    for suite in (
+        Suite(
+            "smoke",
+            "Whether everything runs: few scenes, few views.",
+            (*_FIG5, Method("attention", "attention"), Method("rear-side-voxel", "rear-side-voxel")),
+            ("tower", "pile-6-3", "dense-10-1"),
+            seeds=1,
+            views=3,
+        ),
+        Suite(
+            "fig5",
+            "The paper's Fig. 5: fusing points, graphs or both, against random views.",
+            _FIG5,
+            (*DESIGNED, *PILES, *DENSE[:16]),
+            views=10,
+        ),
+        Suite(
+            "planners",
+            "Who finds the support graph with the fewest views, where views differ: in dense heaps.",
+            tuple(Method(name, name) for name in _PLANNERS),
+            DENSE,
+        ),
+        Suite(
+            "ablation",
+            "What the paper leaves open, one setting at a time, for its planner and for ours.",
+            (
+                Method("support"),
+                *(Method(f"support, {label}", settings=(s,)) for label, s in _SUPPORT.items()),
+                Method("attention", "attention"),
+                *(
+                    Method(f"attention, {label}", "attention", settings=(s,))
+                    for label, s in _ATTENTION.items()
+                ),
+            ),
+            DENSE[:16],
+        ),
+        Suite(
+            "noise",
+            "What depth noise, wrong poses and automatic parts cost.",
+            (Method("support"), Method("random", "random")),
+            (*DESIGNED, *PILES[2::2], *DENSE[:8]),
+            (*_NOISE, _AUTO),
+            seeds=1,
+        ),
+        Suite(
+            "full",
+            "Everything against everything: for a cluster.",
+            tuple(
+                Method(f"{planner} {fusion.upper()}", planner, fusion)
+                for planner, fusion in product(_PLANNERS, _FUSIONS)
+            ),
+            (*DESIGNED, *PILES, *DENSE),
+            (Condition("labels, no noise", "none"), Condition("labels, Carmine noise"), *_NOISE, _AUTO),
+            views=10,
+        ),
+    )
+}
+"""All suites by name."""

@@ -1,0 +1,130 @@
+"""`caryatid benchmark`: ways to look at clutter compared over scenes, sensors and seeds."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from caryatid.benchmark.fingerprint import fingerprint
+from caryatid.benchmark.records import Episode, Outcome
+from caryatid.benchmark.running import Executor, LocalExecutor, run_all
+from caryatid.benchmark.scenes import find_scenes, short_name
+from caryatid.benchmark.store import ResultStore
+from caryatid.benchmark.suites import Suite, find_suite, with_planners
+from caryatid.commands.names import PlannerName, SuiteName
+from caryatid.commands.options import SAID, General, defaults_to, whole_number
+from caryatid.formats.json_files import json_text
+
+RESULTS = "results.sqlite"
+"""Name of the result store in the folder."""
+
+Count = Annotated[int | None, whole_number(1)]
+CORES = os.cpu_count() or 1
+GENERAL = General()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """Compare ways to look at clutter: methods × scenes × seeds, with figures.
+
+    What is done is kept after every episode: stop it at any time and start it again. Without --suite the
+    figures of what a folder holds are made again, and nothing is run.
+
+    To try:
+      caryatid benchmark --suite smoke --out bench
+      caryatid benchmark --suite planners --planner support --planner random --out bench
+      caryatid benchmark --suite fig5 --scenes my-scenes/ --seeds 1 --out bench
+    """
+
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
+    """Folder of the results; those already there count."""
+    suite: Annotated[SuiteName, SAID] = None
+    """What to compare."""
+    scenes: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")
+    ] = ()
+    """Scenes in place of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
+    planner: Annotated[tyro.conf.UseAppendAction[tuple[PlannerName, ...]], SAID] = ()
+    """Planner in place of the suite's methods; may be repeated. The others are compared with the first."""
+    seeds: Annotated[Count, defaults_to("the suite's")] = None
+    """Seeds 0…N−1 of every episode."""
+    views: Annotated[Count, defaults_to("the suite's")] = None
+    """Views of every episode, the first one too."""
+    jobs: Annotated[Count, defaults_to(f"the cores of this machine, {CORES}")] = None
+    """Processes."""
+    retry: Annotated[bool, SAID] = False
+    """Run episodes again that failed."""
+    general: tyro.conf.OmitArgPrefixes[General] = GENERAL
+
+    def __call__(self) -> int:
+        """Run the command."""
+        console = Console(
+            stderr=True, quiet=self.general.quiet or self.general.json, highlight=False, soft_wrap=True
+        )
+        suite = None if self.suite is None else self._suite(self.suite)
+        with ResultStore(self.out / RESULTS, None if suite is None else fingerprint()) as store:
+            if suite is not None:
+                try:
+                    self._run(suite, store, console)
+                except KeyboardInterrupt:
+                    console.print("interrupted: what is done is kept, start again to go on")
+                    return 130
+            return self._tell(store, console)
+
+    def _suite(self, name: str) -> Suite:
+        """The suite with what the options change."""
+        suite = find_suite(name)
+        if self.planner:
+            suite = with_planners(suite, self.planner)
+        if self.scenes:
+            suite = replace(suite, scenes=tuple(find_scenes(self.scenes)))
+        return replace(suite, seeds=self.seeds or suite.seeds, views=self.views or suite.views)
+
+    def _run(self, suite: Suite, store: ResultStore, console: Console) -> None:
+        """Run what is not done, with a bar."""
+        if self.retry:
+            store.forget_failures()
+        members = suite.members()
+        missing = store.plan(suite.name, members)
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeRemainingColumn(elapsed_when_finished=True),
+        )
+        with Progress(*columns, console=console, disable=console.quiet) as bar:
+            total = store.planned(suite.name)
+            task = bar.add_task(suite.name, total=total, completed=total - len(missing), rate="")
+
+            def done(episode: Episode, outcome: Outcome) -> None:
+                speed = bar.tasks[task].speed
+                bar.update(task, advance=1, rate="" if speed is None else f"{60.0 * speed:.0f} a minute")
+                if outcome.error is not None:
+                    name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
+                    bar.console.print(f"failed: {name}: {outcome.error}", markup=False)
+
+            run_all(store, missing, self._executor(), done)
+
+    def _executor(self) -> Executor:
+        return LocalExecutor(self.jobs or CORES)
+
+    def _tell(self, store: ResultStore, console: Console) -> int:
+        """Say what there is."""
+        told = {}
+        for name in store.suites():
+            records = store.records(name)
+            failed = sum(r.outcome.error is not None for r in records)
+            told[name] = {"episodes": store.planned(name), "done": len(records), "failed": failed}
+            failures = f", {failed} failed" if failed else ""
+            console.print(f"{name}: {len(records)} of {store.planned(name)} episodes{failures}")
+        if self.general.json:
+            sys.stdout.write(json_text({"results": str(self.out), "suites": told}))
+        return 0

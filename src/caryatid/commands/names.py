@@ -1,0 +1,43 @@
+"""Options that are names of something: what is not known is a usage error that lists what is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Annotated
+
+from tyro.constructors import PrimitiveConstructorSpec
+
+from caryatid.benchmark.suites import SUITES, find_suite
+from caryatid.errors import InputError
+from caryatid.planners import BUILT_IN, make_planner
+
+
+def name_of(find: Callable[[str], object], metavar: Iterable[str]) -> PrimitiveConstructorSpec[str]:
+    """A name that `find` accepts.
+
+    Args:
+        find: Raises InputError where it does not know a name.
+        metavar: Names the help shows.
+    """
+
+    def parse(words: list[str]) -> str:
+        try:
+            find(words[0])
+        except InputError as error:
+            raise ValueError(f"{error.reason}; {error.remedy}") from None
+        return words[0]
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(metavar) + "}",
+        instance_from_str=parse,
+        is_instance=lambda value: value is None or isinstance(value, str),
+        str_from_instance=lambda value: [value],
+    )
+
+
+PlannerName = Annotated[str, name_of(make_planner, [*BUILT_IN, "…"])]
+"""A name `make_planner` knows, of another package's planner too."""
+
+SuiteName = Annotated[str | None, name_of(find_suite, SUITES)]
+"""A name `find_suite` knows."""

@@ -1,0 +1,132 @@
+"""Suites, their scenes, and running them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import SMALL
+
+from caryatid.benchmark.episodes import run_episode, settings_of
+from caryatid.benchmark.records import TIMES, Episode, Outcome
+from caryatid.benchmark.running import LocalExecutor, run_all
+from caryatid.benchmark.scenes import content_of, family, find_scenes
+from caryatid.benchmark.store import ResultStore
+from caryatid.benchmark.suites import SUITES, find_suite, with_planners
+from caryatid.errors import InputError
+from caryatid.simulation.scenes import is_builtin, load_scene, write_scene
+
+QUICK = tuple(flag.removeprefix("--set=") for flag in SMALL)
+
+
+def without_times(outcome: Outcome) -> Outcome:
+    return replace(outcome, rows=tuple(replace(r, **dict.fromkeys(TIMES, 0.0)) for r in outcome.rows))
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_every_suite_is_made_of_valid_episodes(name):
+    suite = find_suite(name)
+    members = suite.members()
+    assert len(members) == len(suite.scenes) * suite.seeds * len(suite.conditions) * len(suite.methods)
+    for m in {replace(m.episode, scene="", seed=0): m for m in members}.values():
+        settings_of(m.episode)
+    assert all(is_builtin(scene) for scene in suite.scenes)
+    for condition in suite.conditions:
+        labels = [m.method for m in members if m.condition == condition.label]
+        assert len(set(labels)) == len(suite.methods)
+        episodes = {m.episode for m in members if m.condition == condition.label}
+        assert len(episodes) == len(labels)
+
+
+def test_the_figure_of_the_paper_has_thirty_scenes_of_each_kind():
+    suite = find_suite("fig5")
+    assert len(suite.scenes) >= 30
+    assert {family(s) for s in suite.scenes} == {"designed", "pile", "dense"}
+    assert {m.label for m in suite.methods} == {"PC", "SG", "PC+SG", "random SG", "random PC"}
+    assert (suite.seeds, suite.views) == (3, 10)
+
+
+def test_planners_can_take_the_place_of_the_methods():
+    suite = with_planners(find_suite("smoke"), ["random", "paper"])
+    assert [(m.label, m.planner, m.fusion) for m in suite.methods] == [
+        ("random", "random", "pc+sg"),
+        ("paper", "paper", "pc+sg"),
+    ]
+
+
+def test_an_unknown_suite_lists_those_there_are():
+    with pytest.raises(InputError, match="no suite 'fig6'; choose one of smoke, fig5, planners"):
+        find_suite("fig6")
+
+
+@pytest.mark.parametrize(
+    ("scene", "kind"),
+    [("tower", "designed"), ("pile-4-1", "pile"), ("dense-10-1", "dense"), ("a/ycb4_8", "ycb"), ("arch", "designed")],
+)  # fmt: skip
+def test_family_is_the_kind_of_scene(scene, kind):
+    assert family(scene) == kind
+
+
+def test_folders_of_scenes_are_found(tmp_path):
+    for name in ("tower", "bridge"):
+        write_scene(load_scene(name), tmp_path / name)
+    folders = [str(tmp_path / "bridge"), str(tmp_path / "tower")]
+    assert find_scenes([str(tmp_path), str(tmp_path / "tower"), "shelf"]) == [*folders, "shelf"]
+    assert len({content_of(folder) for folder in folders}) == 2
+    before = content_of(folders[0])
+    (tmp_path / "bridge" / "gt.json").unlink()
+    assert content_of(folders[0]) != before
+    with pytest.raises(InputError, match=r"bridge: has no gt\.json"):
+        find_scenes([str(tmp_path)])
+
+
+def test_no_scene_says_what_there_is(tmp_path):
+    with pytest.raises(InputError, match=r"holds no scene: no scene\.xml"):
+        find_scenes([str(tmp_path)])
+    with pytest.raises(InputError, match=r"neither a built-in scene nor a folder; give .* tower"):
+        find_scenes(["castle"])
+
+
+def test_an_episode_is_scored_view_by_view():
+    outcome = run_episode(Episode("tower", settings=QUICK, views=2))
+    assert outcome.error is None
+    first, second = outcome.rows
+    assert (first.view, second.view) == (1, 2)
+    assert first.angle == first.path == first.planning_seconds == 0.0
+    assert second.angle > 0.0
+    assert second.path > 0.0
+    assert second.planning_seconds > 0.0
+    assert 0.5 < second.f1 <= 1.0
+    expected = 2.0 * second.edge_precision * second.edge_recall / (second.edge_precision + second.edge_recall)
+    assert np.isclose(second.edge_f1, expected)
+
+
+def test_what_fails_is_an_outcome_that_says_why():
+    outcome = run_episode(Episode("dense-99-1", settings=QUICK, views=2))
+    assert outcome.rows == ()
+    assert outcome.error is not None
+    assert "dense-99-1: 99 objects cannot be set up" in outcome.error
+    assert "\n" not in outcome.error
+
+
+def test_rows_are_the_same_on_any_number_of_processes(tmp_path):
+    suite = replace(find_suite("smoke"), scenes=("tower", "dense-99-1"), seeds=1, views=2)
+    suite = with_planners(suite, ["support", "random"])
+    members = [
+        replace(m, episode=replace(m.episode, settings=QUICK + m.episode.settings)) for m in suite.members()
+    ]
+    found = []
+    for jobs in (1, 2):
+        with ResultStore(tmp_path / f"{jobs}.sqlite", "code") as store:
+            told: list[Episode] = []
+            run_all(
+                store,
+                store.plan("smoke", members),
+                LocalExecutor(jobs),
+                lambda episode, _, to=told: to.append(episode),
+            )
+            assert {e.key("") for e in told} == {m.episode.key("") for m in members}
+            found.append([without_times(r.outcome) for r in store.records("smoke")])
+    assert found[0] == found[1]
+    assert [outcome.error is None for outcome in found[0]] == [True, True, False, False]
