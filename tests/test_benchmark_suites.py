@@ -62,7 +62,7 @@ def test_an_unknown_suite_lists_those_there_are():
 
 @pytest.mark.parametrize(
     ("scene", "kind"),
-    [("tower", "designed"), ("pile-4-1", "pile"), ("dense-10-1", "dense"), ("a/ycb4_8", "ycb"), ("arch", "designed")],
+    [("tower", "designed"), ("pile-4-1", "pile"), ("dense-10-1", "dense"), ("a/ycb4_8", "ycb")],
 )  # fmt: skip
 def test_family_is_the_kind_of_scene(scene, kind):
     assert family(scene) == kind
