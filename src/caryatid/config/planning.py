@@ -50,6 +50,8 @@ class ActiveVisionConfig:
     """Views at the most, the first one too; the paper's."""
     clearance: float = 0.05
     """Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
+    ring_views: int = 5
+    """Stops of the planner `ring` in a round [1]; two rounds are the ten views of the paper, 36° apart."""
     look_directions: int = 1200
     """Directions on the whole sphere the planner `support` looks in [1]; about 6° apart."""
     surface_samples: int = 400

@@ -7,14 +7,18 @@ from importlib.metadata import entry_points
 
 from caryatid.errors import InputError
 from caryatid.planners.decision import Decision, Planner, PlanningState
+from caryatid.planners.farthest import FarthestPlanner
 from caryatid.planners.paper import PaperPlanner
 from caryatid.planners.random import RandomPlanner
+from caryatid.planners.ring import RingPlanner
 from caryatid.planners.support import SupportPlanner
 
 BUILT_IN: dict[str, Callable[[], Planner]] = {
     "support": SupportPlanner,
     "paper": PaperPlanner,
     "random": RandomPlanner,
+    "ring": RingPlanner,
+    "farthest": FarthestPlanner,
 }
 """The planners that come with caryatid, the default first."""
 
@@ -41,10 +45,12 @@ def make_planner(name: str) -> Planner:
 __all__ = [
     "BUILT_IN",
     "Decision",
+    "FarthestPlanner",
     "PaperPlanner",
     "Planner",
     "PlanningState",
     "RandomPlanner",
+    "RingPlanner",
     "SupportPlanner",
     "make_planner",
 ]
