@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import entry_points
 
 from caryatid.errors import InputError
@@ -12,6 +13,7 @@ from caryatid.planners.paper import PaperPlanner
 from caryatid.planners.random import RandomPlanner
 from caryatid.planners.ring import RingPlanner
 from caryatid.planners.support import SupportPlanner
+from caryatid.planners.volumetric import FORMULATIONS, VolumetricPlanner
 
 BUILT_IN: dict[str, Callable[[], Planner]] = {
     "support": SupportPlanner,
@@ -19,6 +21,7 @@ BUILT_IN: dict[str, Callable[[], Planner]] = {
     "random": RandomPlanner,
     "ring": RingPlanner,
     "farthest": FarthestPlanner,
+    **{name: partial(VolumetricPlanner, name) for name in FORMULATIONS},
 }
 """The planners that come with caryatid, the default first."""
 
@@ -52,5 +55,6 @@ __all__ = [
     "RandomPlanner",
     "RingPlanner",
     "SupportPlanner",
+    "VolumetricPlanner",
     "make_planner",
 ]
