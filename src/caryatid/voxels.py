@@ -26,6 +26,7 @@ from caryatid.shapes import Shape
 from caryatid.views import View
 
 Number = TypeVar("Number", np.int8, np.float32)
+"""What a lookup table holds."""
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from caryatid.frames import Array
 from caryatid.kernels.rays import Triple, advance, enter, traversed_reference, within
+from caryatid.voxels import OCCUPIED, UNKNOWN
 
 FORMULATIONS = (
     "occlusion-aware",
@@ -21,9 +22,6 @@ FORMULATIONS = (
     "proximity-count",
 )
 """Columns of what `gather` returns."""
-
-UNKNOWN, OCCUPIED = 0, 2
-"""States of a voxel, as in `caryatid.voxels`, that the formulations tell apart."""
 
 
 @njit(cache=True)
