@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,9 @@ from caryatid.frames import Array
 from caryatid.kernels import rays
 from caryatid.shapes import Shape
 from caryatid.views import View
+
+Number = TypeVar("Number", np.int8, np.float32)
+"""What a lookup table holds."""
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
@@ -56,12 +60,19 @@ class VoxelMap:
     @cached_property
     def states(self) -> NDArray[np.int8]:
         """State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied."""
-        hit = np.log(self.config.hit / (1.0 - self.config.hit))
-        miss = np.log(self.config.miss / (1.0 - self.config.miss))
-        outweighed = np.arange(256) * hit + np.arange(256)[:, None] * miss <= 0.0
-        table = np.where(outweighed, FREE, OCCUPIED).astype(np.int8)
+        table = np.where(self._log_odds() <= 0.0, FREE, OCCUPIED).astype(np.int8)
         table[0, 0] = UNKNOWN
-        return np.take(table.ravel(), self.passes.astype(np.uint16) * np.uint16(256) + self.hits)
+        return self._looked_up(table)
+
+    @property
+    def occupancy(self) -> NDArray[np.float32]:
+        """Probability (X, Y, Z) that a voxel is occupied: 0.5 where nothing is known, else within the clamp.
+
+        A view weighs as much as `config.readings` readings.
+        """
+        low, high = (np.log(p / (1.0 - p)) for p in self.config.clamp)
+        log_odds = np.clip(self.config.readings * self._log_odds(), low, high)
+        return self._looked_up((1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32))
 
     @property
     def end_world(self) -> Array:
@@ -115,6 +126,15 @@ class VoxelMap:
             passes[window][inside] = 0
         return VoxelMap(self.origin_world, hits, passes, self.config)
 
+    def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
+        """Return the part of the map whose voxels lie, all or in part, between two corners (3,) [m]."""
+        ends = (low_world - self.origin_world, high_world - self.origin_world)
+        low = np.clip(np.floor(ends[0] / self.config.size + 1e-9).astype(int), 0, self.hits.shape)
+        high = np.clip(np.ceil(ends[1] / self.config.size - 1e-9).astype(int), low, self.hits.shape)
+        window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+        origin_world = self.origin_world + self.config.size * low
+        return VoxelMap(origin_world, self.hits[window], self.passes[window], self.config)
+
     def centres_world(self, index: NDArray[np.integer]) -> Array:
         """Centres (N, 3) [m] of the voxels with these indices (N, 3)."""
         return self.origin_world + (index + 0.5) * self.config.size
@@ -160,6 +180,16 @@ class VoxelMap:
             window.append(slice(filled[0], filled[-1] + 1) if len(filled) else slice(0, 1))
         corner = self.origin_world + self.config.size * np.array([w.start for w in window])
         return np.ascontiguousarray(occupied[tuple(window)], dtype=np.uint8), corner
+
+    def _log_odds(self) -> Array:
+        """Log-odds of being occupied (256, 256) by how many views looked through and how many hit."""
+        hit = np.log(self.config.hit / (1.0 - self.config.hit))
+        miss = np.log(self.config.miss / (1.0 - self.config.miss))
+        return np.arange(256) * hit + np.arange(256)[:, None] * miss
+
+    def _looked_up(self, table: NDArray[Number]) -> NDArray[Number]:
+        """Value of each voxel (X, Y, Z) in a table (256, 256) as `_log_odds`."""
+        return np.take(table.ravel(), self.passes.astype(np.uint16) * np.uint16(256) + self.hits)
 
     def _index(self, points_world: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         index = np.floor((points_world - self.origin_world) / self.config.size).astype(np.intp)

@@ -24,6 +24,10 @@ class VoxelConfig:
     """Occupancy one view with a reading in a voxel speaks for [1]; the usual sensor model."""
     miss: float = 0.4
     """Occupancy one view that looks through a voxel speaks for [1]; the usual sensor model."""
+    clamp: tuple[float, float] = (0.12, 0.97)
+    """Lowest and highest occupancy of a voxel the volumetric planners reckon with [1]; the usual ones."""
+    readings: int = 5
+    """Images one view stands for in that occupancy [1]; as many misses reach the clamp."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +54,10 @@ class ActiveVisionConfig:
     """Views at the most, the first one too; the paper's."""
     clearance: float = 0.05
     """Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
+    ring_views: int = 5
+    """Stops of the planner `ring` in a round [1]; two rounds are the ten views of the paper, 36° apart."""
     look_directions: int = 1200
-    """Directions on the whole sphere the planner `support` looks in [1]; about 6° apart."""
+    """Directions on the whole sphere that planners look in at the most [1]; about 6° apart."""
     surface_samples: int = 400
     """Points on the fitted shapes the planner `support` tests for being seen [1]."""
     sample_clearance: float = 0.025
@@ -64,6 +70,12 @@ class ActiveVisionConfig:
     """Worth of all the space on the table against all the objects' surfaces [1]."""
     relation_weight: float = 0.1
     """Worth of all relations' points of interest against all the objects' surfaces [1]."""
+    ray_spacing: float = 0.02
+    """Spacing of the volumetric planners' rays at the sphere's centre [m]; 2 voxels, no object is missed."""
+    proximity: float = 0.1
+    """d_max of the planner `proximity-count` [m]; a common object reaches that far behind its seen side."""
+    cost_weight: float = 1.0
+    """Weight w of the cost in the volumetric planners' utility [1]; the usual one."""
     view_cone: float = 30.0
     """Angle from the optical axis within which a point is in the image [deg]; 57° × 43° sensor."""
 

@@ -16,53 +16,96 @@ Grid = NDArray[np.uint8]
 """One byte a voxel, indexed [x, y, z]."""
 
 
+Triple = tuple[float, float, float]
+"""One number an axis."""
+Voxel = tuple[int, int, int]
+"""Index of a voxel."""
+
+
 @njit(cache=True)
-def _walk(
-    grid: Grid,
-    start: tuple[float, float, float],
-    ray: tuple[float, float, float],
-    t_from: float,
-    t_to: float,
-    mark: bool,
-) -> bool:
-    """Follow one ray, start and direction in voxel units: mark its voxels, or stop at one that is not 0."""
-    nx, ny, nz = grid.shape
-    x, y, z = start
-    dx, dy, dz = ray
-    for position, direction, count in ((x, dx, nx), (y, dy, ny), (z, dz, nz)):
+def enter(
+    shape: Voxel, start: Triple, ray: Triple, t_from: float, t_to: float
+) -> tuple[float, float, Voxel, Triple, Triple]:
+    """Cut a ray to a grid and find where it enters.
+
+    Args:
+        shape: Voxels of the grid along each axis.
+        start: Start of the ray in voxels from the grid's corner.
+        ray: Its direction, length 1 in t, in voxels.
+        t_from: Where it begins.
+        t_to: Where it ends.
+
+    Returns:
+        Begin and end within the grid (nothing is left where the end is not beyond the begin), the first
+        voxel, how much t there is between planes of each axis, and t at the next plane of each axis.
+    """
+    for axis in range(3):
+        position, direction, count = start[axis], ray[axis], shape[axis]
         if direction == 0.0:
             if position < 0.0 or position >= count:
-                return False
+                t_to = t_from
             continue
         near, far = -position / direction, (count - position) / direction
         t_from, t_to = max(t_from, min(near, far)), min(t_to, max(near, far))
+    x, y, z = start
+    dx, dy, dz = ray
     if t_from >= t_to:
-        return False
-    i = min(max(int(np.floor(x + t_from * dx)), 0), nx - 1)
-    j = min(max(int(np.floor(y + t_from * dy)), 0), ny - 1)
-    k = min(max(int(np.floor(z + t_from * dz)), 0), nz - 1)
-    step_x = abs(1.0 / dx) if dx != 0.0 else np.inf
-    step_y = abs(1.0 / dy) if dy != 0.0 else np.inf
-    step_z = abs(1.0 / dz) if dz != 0.0 else np.inf
-    next_x = (i + (1 if dx > 0.0 else 0) - x) / dx if dx != 0.0 else np.inf
-    next_y = (j + (1 if dy > 0.0 else 0) - y) / dy if dy != 0.0 else np.inf
-    next_z = (k + (1 if dz > 0.0 else 0) - z) / dz if dz != 0.0 else np.inf
-    while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
+        return t_from, t_from, (-1, -1, -1), (np.inf, np.inf, np.inf), (np.inf, np.inf, np.inf)
+    i = min(max(int(np.floor(x + t_from * dx)), 0), shape[0] - 1)
+    j = min(max(int(np.floor(y + t_from * dy)), 0), shape[1] - 1)
+    k = min(max(int(np.floor(z + t_from * dz)), 0), shape[2] - 1)
+    step = (
+        abs(1.0 / dx) if dx != 0.0 else np.inf,
+        abs(1.0 / dy) if dy != 0.0 else np.inf,
+        abs(1.0 / dz) if dz != 0.0 else np.inf,
+    )
+    ahead = (
+        (i + (1 if dx > 0.0 else 0) - x) / dx if dx != 0.0 else np.inf,
+        (j + (1 if dy > 0.0 else 0) - y) / dy if dy != 0.0 else np.inf,
+        (k + (1 if dz > 0.0 else 0) - z) / dz if dz != 0.0 else np.inf,
+    )
+    return t_from, t_to, (i, j, k), step, ahead
+
+
+@njit(cache=True)
+def advance(voxel: Voxel, ray: Triple, step: Triple, ahead: Triple) -> tuple[Voxel, Triple]:
+    """Go on to the next voxel of a ray: the one beyond the nearest plane.
+
+    Args:
+        voxel: Where the ray is.
+        ray: Its direction.
+        step: How much t there is between planes of each axis.
+        ahead: t at the next plane of each axis.
+
+    Returns:
+        The next voxel, and t at the next planes from there.
+    """
+    i, j, k = voxel
+    x, y, z = ahead
+    if x <= y and x <= z:
+        return (i + (1 if ray[0] > 0.0 else -1), j, k), (x + step[0], y, z)
+    if y <= z:
+        return (i, j + (1 if ray[1] > 0.0 else -1), k), (x, y + step[1], z)
+    return (i, j, k + (1 if ray[2] > 0.0 else -1)), (x, y, z + step[2])
+
+
+@njit(cache=True)
+def within(voxel: Voxel, shape: Voxel) -> bool:
+    """Whether a voxel belongs to a grid."""
+    return 0 <= voxel[0] < shape[0] and 0 <= voxel[1] < shape[1] and 0 <= voxel[2] < shape[2]
+
+
+@njit(cache=True)
+def _walk(grid: Grid, start: Triple, ray: Triple, t_from: float, t_to: float, mark: bool) -> bool:
+    """Follow one ray, start and direction in voxel units: mark its voxels, or stop at one that is not 0."""
+    t, end, voxel, step, ahead = enter(grid.shape, start, ray, t_from, t_to)
+    while t < end and within(voxel, grid.shape):
         if mark:
-            grid[i, j, k] = 1
-        elif grid[i, j, k] != 0:
+            grid[voxel] = 1
+        elif grid[voxel] != 0:
             return True
-        if min(next_x, next_y, next_z) >= t_to:
-            return False
-        if next_x <= next_y and next_x <= next_z:
-            i += 1 if dx > 0.0 else -1
-            next_x += step_x
-        elif next_y <= next_z:
-            j += 1 if dy > 0.0 else -1
-            next_y += step_y
-        else:
-            k += 1 if dz > 0.0 else -1
-            next_z += step_z
+        t = min(ahead[0], ahead[1], ahead[2])
+        voxel, ahead = advance(voxel, ray, step, ahead)
     return False
 
 
@@ -89,7 +132,7 @@ def carve(passed: Grid, start: Array, ends: Array, t_to: Array, origin: Array, s
 def carve_reference(passed: Grid, start: Array, ends: Array, t_to: Array, origin: Array, size: float) -> None:
     """Do the same as `carve`, ray by ray from all crossings with the grid's planes."""
     for end, limit in zip(ends, t_to, strict=True):
-        voxels = _traversed_reference(passed.shape, start, end, 0.0, float(limit), origin, size)
+        voxels = traversed_reference(passed.shape, start, end, 0.0, float(limit), origin, size)
         passed[tuple(voxels.T)] = 1
 
 
@@ -149,14 +192,14 @@ def blocked_reference(
         for q, target in enumerate(targets):
             length = float(np.linalg.norm(target - point))
             if asked[p, q] and length > clearance:
-                voxels = _traversed_reference(
+                voxels = traversed_reference(
                     occupied.shape, point, target, clearance / length, 1.0, origin, size
                 )
                 result[p, q] = bool(occupied[tuple(voxels.T)].any())
     return result
 
 
-def _traversed_reference(
+def traversed_reference(
     shape: tuple[int, ...], start: Array, end: Array, t_from: float, t_to: float, origin: Array, size: float
 ) -> NDArray[np.intp]:
     """Voxels (K, 3) a ray traverses: between two neighbouring plane crossings it is inside one voxel."""

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import entry_points
 
 from caryatid.errors import InputError
 from caryatid.planners.decision import Decision, Planner, PlanningState
+from caryatid.planners.farthest import FarthestPlanner
 from caryatid.planners.paper import PaperPlanner
 from caryatid.planners.random import RandomPlanner
+from caryatid.planners.ring import RingPlanner
 from caryatid.planners.support import SupportPlanner
+from caryatid.planners.volumetric import FORMULATIONS, VolumetricPlanner
 
 BUILT_IN: dict[str, Callable[[], Planner]] = {
     "support": SupportPlanner,
     "paper": PaperPlanner,
     "random": RandomPlanner,
+    "ring": RingPlanner,
+    "farthest": FarthestPlanner,
+    **{name: partial(VolumetricPlanner, name) for name in FORMULATIONS},
 }
 """The planners that come with caryatid, the default first."""
 
@@ -41,10 +48,13 @@ def make_planner(name: str) -> Planner:
 __all__ = [
     "BUILT_IN",
     "Decision",
+    "FarthestPlanner",
     "PaperPlanner",
     "Planner",
     "PlanningState",
     "RandomPlanner",
+    "RingPlanner",
     "SupportPlanner",
+    "VolumetricPlanner",
     "make_planner",
 ]

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from caryatid import frames
 from caryatid.config import ActiveVisionConfig
@@ -14,6 +16,7 @@ from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.interest import PointOfInterest
 from caryatid.robot import Candidates
+from caryatid.shapes import fibonacci_sphere
 from caryatid.view_sphere import ViewSphere
 from caryatid.voxels import VoxelMap
 
@@ -103,3 +106,12 @@ def path_cost(state: PlanningState) -> Array:
             return state.candidates.path_length / (2.0 * state.sphere.radius)
         case "none":
             return np.zeros(len(state.candidates))
+
+
+def thin(directions: Array, count: int) -> NDArray[np.intp]:
+    """Pick the candidates nearest to those of `count` directions all over the sphere that have one near."""
+    if len(directions) <= count // 8:
+        return np.arange(len(directions))
+    distance, nearest = KDTree(directions).query(fibonacci_sphere(count))
+    near = distance < np.sqrt(4.0 * np.pi / count)
+    return np.unique(nearest[near]) if near.any() else np.unique(nearest)

@@ -73,6 +73,29 @@ def surface_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionCo
     return join(parts) if parts else _nothing()
 
 
+def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
+    """Find the box over the table in which something may stand, up to the height of the highest object.
+
+    Args:
+        graph: The objects and the table.
+        voxels: Bounds the box; it begins two voxels over the table, clear of readings of its top.
+
+    Returns:
+        Its corners (3,) and (3,) [m], or None without a table, objects, or space between them.
+    """
+    table = graph.support_surface
+    objects = [o for o in graph.objects if o.role == "object"]
+    if table is None or not objects:
+        return None
+    axes = np.eye(3)
+    reach = table.shape.support(axes)
+    low, high = table.centre_world - reach, table.centre_world + reach
+    low[2] = high[2] + 2.0 * voxels.config.size
+    high[2] = max(float(o.centre_world[2] + o.shape.support(axes[2:])[0]) for o in objects)
+    low, high = np.maximum(low, voxels.origin_world), np.minimum(high, voxels.end_world)
+    return None if (high <= low).any() else (low, high)
+
+
 def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConfig) -> Samples:
     """Spread points over the unseen space on the table, where something may stand; they weigh at most 1.
 
@@ -85,17 +108,10 @@ def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConf
         config: Spacing of the points.
     """
     table = graph.support_surface
-    objects = [o for o in graph.objects if o.role == "object"]
-    if table is None or not objects:
+    corners = space_above(graph, solid)
+    if table is None or corners is None:
         return _nothing()
-    axes = np.eye(3)
-    reach = table.shape.support(axes)
-    low, high = table.centre_world - reach, table.centre_world + reach
-    low[2] = high[2] + 2.0 * solid.config.size
-    high[2] = max(float(o.centre_world[2] + o.shape.support(axes[2:])[0]) for o in objects)
-    low, high = np.maximum(low, solid.origin_world), np.minimum(high, solid.end_world)
-    if (high <= low).any():
-        return _nothing()
+    low, high = corners
     grid = np.meshgrid(*(np.arange(a, b, config.space_spacing) for a, b in zip(low, high, strict=True)))
     points = np.stack([g.ravel() for g in grid], axis=-1)
     local = (points - table.centre_world) @ table.shape.T_world_object[:3, :3]
@@ -167,6 +183,7 @@ __all__ = [
     "Samples",
     "join",
     "relation_samples",
+    "space_above",
     "space_samples",
     "surface_samples",
     "visibility",

@@ -21,7 +21,7 @@ from caryatid.interest import (
     points_of_doubt,
     points_of_interest,
 )
-from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost, thin
 from caryatid.planners.hidden import (
     SPACE,
     Samples,
@@ -32,7 +32,6 @@ from caryatid.planners.hidden import (
     visibility,
     weighted,
 )
-from caryatid.shapes import fibonacci_sphere
 
 WORTH_SAYING = 0.05
 """Shares of the whole below this are not mentioned."""
@@ -95,7 +94,7 @@ def _expected_gain(
             weighted(relation_samples(relations), config.relation_weight),
         ]
     )
-    chosen = _thin(candidates.directions, config.look_directions)
+    chosen = thin(candidates.directions, config.look_directions)
     now = visibility(samples, candidates.T_world_camera[chosen], solid, config)
     before = visibility(samples, sphere.poses(state.visited), solid, config).max(axis=1, initial=0.0)
     unseen_space = np.array([name == SPACE for name in samples.names])
@@ -103,15 +102,6 @@ def _expected_gain(
         before[unseen_space[samples.subjects]] = 0.0
     gain = samples.weights[:, None] * np.maximum(now - before[:, None], 0.0)
     return samples, gain, chosen
-
-
-def _thin(directions: Array, count: int) -> NDArray[np.intp]:
-    """Pick the candidates nearest to those of `count` directions all over the sphere that have one near."""
-    if len(directions) <= count // 8:
-        return np.arange(len(directions))
-    distance, nearest = KDTree(directions).query(fibonacci_sphere(count))
-    near = distance < np.sqrt(4.0 * np.pi / count)
-    return np.unique(nearest[near]) if near.any() else np.unique(nearest)
 
 
 def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[PointOfInterest]:

@@ -1,0 +1,23 @@
+"""The candidate farthest from all earlier views: coverage of the view sphere without a look at the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caryatid import frames
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+
+
+class FarthestPlanner:
+    """Goes where the smallest angle to any earlier view is largest."""
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the farthest candidate; of equal ones the first."""
+        check_candidates(state)
+        directions = state.candidates.directions
+        nearest = (directions @ state.visited.T).max(axis=1)
+        index = int(np.argmin(nearest))
+        angle = np.rad2deg(frames.angle_between(state.visited, directions[index]).min())
+        cost = float(path_cost(state)[index])
+        why = f"{angle:.0f}° from the nearest earlier view, farther than any other"
+        return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
