@@ -18,6 +18,9 @@ BUILT_IN: dict[str, Callable[[], Planner]] = {
 }
 """The planners that come with caryatid, the default first."""
 
+ORACLE = "oracle"
+"""Name of the planner that knows the truth; `caryatid.evaluation.oracle` makes it, not `make_planner`."""
+
 ENTRY_POINTS = "caryatid.planners"
 """Group under which other packages offer planners: callables without arguments that return a `Planner`."""
 
@@ -26,7 +29,7 @@ def make_planner(name: str) -> Planner:
     """Return the planner of this name.
 
     Raises:
-        InputError: There is none; the message lists those there are.
+        InputError: There is none, then the message lists those there are; or it is `oracle`.
     """
     if name in BUILT_IN:
         return BUILT_IN[name]()
@@ -34,12 +37,19 @@ def make_planner(name: str) -> Planner:
     if name in offered:
         planner: Planner = offered[name].load()()
         return planner
-    names = ", ".join([*BUILT_IN, *sorted(set(offered) - set(BUILT_IN))])
+    if name == ORACLE:
+        raise InputError(
+            "planner",
+            f"'{ORACLE}' needs a simulated scene, whose truth is known",
+            "give a scene, or make it with caryatid.evaluation.oracle.OraclePlanner",
+        )
+    names = ", ".join([*BUILT_IN, *sorted(set(offered) - {*BUILT_IN, ORACLE}), ORACLE])
     raise InputError("planner", f"there is no planner '{name}'", f"choose one of {names}")
 
 
 __all__ = [
     "BUILT_IN",
+    "ORACLE",
     "Decision",
     "PaperPlanner",
     "Planner",
