@@ -118,7 +118,7 @@ class TestEveryPlanner:
 
 
 def test_an_unknown_planner_lists_those_there_are():
-    with pytest.raises(InputError, match=r"no planner 'best'.*support, paper, random"):
+    with pytest.raises(InputError, match=r"no planner 'best'.*support, attention, paper, random"):
         make_planner("best")
 
 
@@ -126,7 +126,7 @@ def test_other_packages_offer_planners_by_entry_point(monkeypatch: pytest.Monkey
     offer = EntryPoint("ring", "caryatid.planners.random:RandomPlanner", planners.ENTRY_POINTS)
     monkeypatch.setattr(planners, "entry_points", lambda group: [offer] if group == offer.group else [])
     assert isinstance(make_planner("ring"), planners.RandomPlanner)
-    with pytest.raises(InputError, match="support, paper, random, ring"):
+    with pytest.raises(InputError, match="support, attention, paper, random, ring"):
         make_planner("best")
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 
 from caryatid.errors import InputError
+from caryatid.planners.attention import AttentionPlanner
 from caryatid.planners.decision import Decision, Planner, PlanningState
 from caryatid.planners.paper import PaperPlanner
 from caryatid.planners.random import RandomPlanner
@@ -13,6 +14,7 @@ from caryatid.planners.support import SupportPlanner
 
 BUILT_IN: dict[str, Callable[[], Planner]] = {
     "support": SupportPlanner,
+    "attention": AttentionPlanner,
     "paper": PaperPlanner,
     "random": RandomPlanner,
 }
@@ -50,6 +52,7 @@ def make_planner(name: str) -> Planner:
 __all__ = [
     "BUILT_IN",
     "ORACLE",
+    "AttentionPlanner",
     "Decision",
     "PaperPlanner",
     "Planner",
