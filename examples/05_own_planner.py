@@ -4,6 +4,8 @@ To use it on the command line as `--planner opposite`, a package offers it as an
 
     [project.entry-points."caryatid.planners"]
     opposite = "my_package:OppositePlanner"
+
+`planner_package/` beside this file is such a package.
 """
 
 import numpy as np

@@ -95,7 +95,7 @@ def test_the_reason_of_a_choice_is_told(steps):
         np.testing.assert_array_equal(poses[step.decision.index], step.decision.T_world_camera)
 
 
-@pytest.mark.parametrize("planner", ["support", "paper", "random"])
+@pytest.mark.parametrize("planner", ["support", "attention", "paper", "random"])
 def test_every_planner_goes_by_its_name(planner):
     steps = exploration(planner=planner, early_stop=False)
     assert len(steps) == 3
@@ -105,7 +105,7 @@ def test_every_planner_goes_by_its_name(planner):
 def test_a_planner_that_does_not_exist_is_refused_with_those_that_do():
     with pytest.raises(InputError, match="no planner 'clever'") as caught:
         exploration(planner="clever")
-    assert "support, paper, random" in caught.value.remedy
+    assert "support, attention, paper, random" in caught.value.remedy
 
 
 def test_anyone_can_bring_a_planner():

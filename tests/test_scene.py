@@ -24,6 +24,7 @@ from caryatid.config import Config, RegistrationConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.formats.graph_json import graph_text
 from caryatid.scene import Scene
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.truth import ground_truth
@@ -238,3 +239,27 @@ def test_the_sensor_of_these_tests_is_the_carmine_made_smaller():
     assert SENSOR.focal == pytest.approx(525.0 * ratio, rel=0.01)
     view = SimulatedCamera(simulated_scene("tower"), sensor=SENSOR).capture(look_from(0.0))
     assert view.depth.shape == (180, 240)
+
+
+@pytest.mark.parametrize(("method", "segmentation"), [("pc+sg", "labels"), ("sg", "labels"), ("pc", "auto")])
+def test_what_a_copy_learns_the_original_does_not(method, segmentation):
+    azimuths = (180.0, 60.0, 300.0, 0.0) if segmentation == "labels" else (180.0, 300.0, 0.0)
+    *known, last, other = simulated_views("tower", azimuths=azimuths, noise="carmine")
+    alone, copied = (model_of(known, config_for(method), segmentation=segmentation) for _ in range(2))
+    graph, labels, points = graph_text(copied.graph), copied.labels, copied.cloud.points_world
+    copy = copied.copy()
+    copy.update(other)
+    assert (copy.views, copied.views) == (len(known) + 1, len(known))
+    assert graph_text(copied.graph) == graph
+    np.testing.assert_array_equal(copied.labels, labels)
+    np.testing.assert_array_equal(copied.cloud.points_world, points)
+    assert graph_text(copied.update(last)) == graph_text(alone.update(last))
+    np.testing.assert_array_equal(copied.labels, alone.labels)
+    np.testing.assert_array_equal(copied.cloud.points_world, alone.cloud.points_world)
+
+
+def test_a_copy_goes_on_as_the_original_would():
+    first, *rest = simulated_views("tower", noise="carmine")
+    scene = model_of([first])
+    copy = scene.copy()
+    assert [graph_text(copy.update(v)) for v in rest] == [graph_text(scene.update(v)) for v in rest]

@@ -195,3 +195,14 @@ def test_bad_arguments(clutter: SimulatedScene):
         SimulatedCamera(clutter, K=np.diag([0.0, 500.0, 1.0]))
     with pytest.raises(InputError, match="rotation"):
         SimulatedCamera(clutter, sensor=SMALL).capture(np.diag([1.0, 2.0, 1.0, 1.0]))
+
+
+def test_a_fork_sees_with_the_noise_that_is_next_and_leaves_the_camera_alone(clutter: SimulatedScene):
+    cameras = [SimulatedCamera(clutter, "carmine", sensor=SMALL) for _ in range(2)]
+    for camera in cameras:
+        camera.capture(FROM_THE_ROBOT)
+    forked = [cameras[0].fork().capture(FROM_THE_ROBOT) for _ in range(2)]
+    after, untouched = (camera.capture(FROM_THE_ROBOT) for camera in cameras)
+    for view in (*forked, after):
+        np.testing.assert_array_equal(view.depth, untouched.depth)
+        np.testing.assert_array_equal(view.pose, untouched.pose)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
@@ -61,6 +62,14 @@ class ViewRegistration:
         self._views: list[RegisteredView] = []
         self._twists = np.zeros((0, 6))
         self._pairs: dict[tuple[int, int], tuple[Array, Matches]] = {}
+
+    def copy(self) -> ViewRegistration:
+        """Return a registration that knows the same and goes on by itself; the views so far are shared."""
+        other = copy.copy(self)
+        other.placements = self.placements.copy()
+        other._views = self._views.copy()
+        other._pairs = self._pairs.copy()
+        return other
 
     def add(self, cloud: Cloud, *, same_labels: bool) -> dict[int, Array]:
         """Take in a view.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -47,6 +48,16 @@ class ObjectModels:
         self._undivided: dict[int, int] = {}
         self._parts: list[tuple[cKDTree, NDArray[np.int32]]] = []
         self._apart: dict[tuple[int, int], int] = {}
+
+    def copy(self) -> ObjectModels:
+        """Return models that know the same and go on by themselves; clouds, trees and shapes are shared."""
+        other = copy.copy(self)
+        other.points = self.points.copy()
+        other.fits = self.fits.copy()
+        other._undivided = self._undivided.copy()
+        other._parts = self._parts.copy()
+        other._apart = self._apart.copy()
+        return other
 
     def associate(self, percept: Percept) -> Percept:
         """Give a view's automatic parts the labels of the objects they belong to, or new ones."""

@@ -22,6 +22,13 @@ class ObjectPoints:
         self.labels_used = 0
         self._clouds: dict[int, list[tuple[int, Cloud]]] = {}
 
+    def copy(self) -> ObjectPoints:
+        """Return points that go on growing by themselves; the clouds so far are shared."""
+        other = ObjectPoints()
+        other.labels_used = self.labels_used
+        other._clouds = {label: list(clouds) for label, clouds in self._clouds.items()}
+        return other
+
     def add(self, label: int, cloud: Cloud, view: int) -> None:
         """Add a view's points of an object, or of the support surface."""
         self._clouds.setdefault(label, []).append((view, cloud))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections import Counter
 from dataclasses import replace
 
@@ -85,6 +86,19 @@ class Scene:
             supported: Id of an object.
         """
         return explain(self.graph, supporter, supported, self.config.support)
+
+    def copy(self) -> Scene:
+        """Return a scene that knows the same; what one of the two learns, the other does not.
+
+        Both go on alike: the same views give the same graphs. What no update changes in place is shared, so
+        a copy costs next to nothing.
+        """
+        other = copy.copy(self)
+        other._models = self._models.copy()
+        other._registration = None if self._registration is None else self._registration.copy()
+        other._shown = self._shown.copy()
+        other._contradicted = self._contradicted.copy()
+        return other
 
     @one_blas_thread
     def update(self, source: View | Cloud) -> SupportGraph:

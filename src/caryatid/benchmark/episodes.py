@@ -10,10 +10,10 @@ from caryatid.benchmark.records import Episode, Outcome, ViewRow
 from caryatid.benchmark.scenes import opened
 from caryatid.config import Config
 from caryatid.errors import in_one_line
+from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, score
 from caryatid.evaluation.truths import SEED
 from caryatid.exploration import Step, explore
-from caryatid.planners import make_planner
 from caryatid.settings import read_settings
 from caryatid.simulation.stage import set_stage
 
@@ -49,10 +49,13 @@ def _rows(episode: Episode) -> tuple[ViewRow, ...]:
     stage = set_stage(scene, config, noise=episode.noise, seed=episode.seed)
     rows: list[ViewRow] = []
     planning = 0.0
+    planner, camera = planner_for(
+        episode.planner, stage.camera, truth, config, segmentation=episode.segmentation, seed=episode.seed
+    )
     for step in explore(
-        stage.camera,
+        camera,
         stage.robot,
-        planner=make_planner(episode.planner),
+        planner=planner,
         config=config,
         segmentation=episode.segmentation,
         seed=episode.seed,

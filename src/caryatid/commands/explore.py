@@ -15,6 +15,7 @@ from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record, step_record, view_record
 from caryatid.commands.sources import Source, open_source
 from caryatid.config import Config, NoiseModel, SegmentationMethod
+from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, score
 from caryatid.exploration import Step, explore
 from caryatid.formats.graph_json import graph_to_json
@@ -45,7 +46,7 @@ class Explore(ModellingCommand):
     views: Annotated[Views, defaults_to(10)] = None
     """Views at the most, the first one too."""
     planner: PlannerName = "support"
-    """Who chooses the next view."""
+    """Who chooses the next view; oracle, which knows the truth, in simulation only."""
     segmentation: Annotated[
         SegmentationMethod | None, tyro.conf.DisallowNone, defaults_to("labels where the source has them")
     ] = None
@@ -71,15 +72,18 @@ def run_exploration(options: Explore, config: Config) -> int:
             source = open_source(
                 options.source, config, noise=options.noise, segmentation=options.segmentation, seed=seed
             )
+        planner, camera = planner_for(
+            options.planner, source.camera, source.truth, config, segmentation=options.segmentation, seed=seed
+        )
         pages: list[ViewPage] = []
         steps: list[dict[str, Any]] = []
         scores: list[Score] = []
         last: Step | None = None
         try:
             for step in explore(
-                source.camera,
+                camera,
                 source.robot,
-                planner=options.planner,
+                planner=planner,
                 config=config,
                 segmentation=options.segmentation,
                 seed=seed,

@@ -9,7 +9,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from caryatid.benchmark.suites import SUITES, find_suite
 from caryatid.errors import InputError
-from caryatid.planners import BUILT_IN, make_planner
+from caryatid.planners import BUILT_IN, ORACLE, make_planner
 
 
 def name_of(find: Callable[[str], object], metavar: Iterable[str]) -> PrimitiveConstructorSpec[str]:
@@ -36,8 +36,13 @@ def name_of(find: Callable[[str], object], metavar: Iterable[str]) -> PrimitiveC
     )
 
 
-PlannerName = Annotated[str, name_of(make_planner, [*BUILT_IN, "…"])]
-"""A name `make_planner` knows, of another package's planner too."""
+def _known_planner(name: str) -> None:
+    if name != ORACLE:
+        make_planner(name)
+
+
+PlannerName = Annotated[str, name_of(_known_planner, [*BUILT_IN, ORACLE, "…"])]
+"""`oracle`, or a name `make_planner` knows, of another package's planner too."""
 
 SuiteName = Annotated[str | None, name_of(find_suite, SUITES)]
 """A name `find_suite` knows."""

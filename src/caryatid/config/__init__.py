@@ -32,6 +32,7 @@ from caryatid.config.planning import (
 )
 from caryatid.config.reporting import (
     EvaluationConfig,
+    OracleConfig,
     ReportConfig,
 )
 from caryatid.config.simulation import (
@@ -65,6 +66,7 @@ class Config:
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    oracle: OracleConfig = field(default_factory=OracleConfig)
 
 
 __all__ = [
@@ -81,6 +83,7 @@ __all__ = [
     "MaskConfig",
     "NoiseConfig",
     "NoiseModel",
+    "OracleConfig",
     "PhysicsConfig",
     "PlausibilityConfig",
     "RegistrationConfig",

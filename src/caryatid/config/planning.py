@@ -44,10 +44,14 @@ class ActiveVisionConfig:
     """Eq. 2 with 2π as printed, or with π so that relations seen often matter less."""
     edge_point: Literal["midpoint", "contact"] = "contact"
     """Where a relation's point of interest lies: the middle of the centres, or the contact patch."""
+    occlusion: Literal["invert", "ignore"] = "invert"
+    """Saliency of a point is negated where it is hidden, as in the paper; or hidden points count as seen."""
+    propagation: bool = True
+    """Saliency spreads to neighbouring views, as in the paper; or a point's nearest view alone gets it."""
     spread: float = 20.0
     """Angle on the sphere at which saliency has fallen to exp(−½) [deg]."""
     inhibition: float = 1.0
-    """Depth of the negative bump at every visited view [1]."""
+    """Depth of the negative bump at every visited view [1]; 0 is no inhibition of return."""
     path_cost: Literal["angle", "path", "none"] = "angle"
     """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing."""
     max_views: int = 10

@@ -1,4 +1,4 @@
-"""Settings of scores and reports."""
+"""Settings of scores, of the planner that knows the truth, and of reports."""
 
 from __future__ import annotations
 
@@ -15,6 +15,18 @@ class EvaluationConfig:
     """The table is found when its top is within this of the true height [m]."""
     samples: int = 10_000
     """Points the overlap of two volumes is measured with [1]; σ is at most 0.01, 0.005 for most pairs."""
+
+
+@dataclass(frozen=True, slots=True)
+class OracleConfig:
+    """The planner that knows the truth, method notes section 6."""
+
+    candidates: int = 32
+    """Views tried at the most [1]; about 20° apart where the robot can look from, 20 s a decision."""
+    surface_cell: float = 0.01
+    """Edge of the cells true surface is counted in [m]; that of a voxel of the map."""
+    stride: int = 2
+    """Pixels between the rays that look for true surface [1]; 6 mm at 1.5 m, below the cell's size."""
 
 
 @dataclass(frozen=True, slots=True)

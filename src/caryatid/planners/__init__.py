@@ -7,6 +7,7 @@ from functools import partial
 from importlib.metadata import entry_points
 
 from caryatid.errors import InputError
+from caryatid.planners.attention import AttentionPlanner
 from caryatid.planners.decision import Decision, Planner, PlanningState
 from caryatid.planners.farthest import FarthestPlanner
 from caryatid.planners.paper import PaperPlanner
@@ -17,6 +18,7 @@ from caryatid.planners.volumetric import FORMULATIONS, VolumetricPlanner
 
 BUILT_IN: dict[str, Callable[[], Planner]] = {
     "support": SupportPlanner,
+    "attention": AttentionPlanner,
     "paper": PaperPlanner,
     "random": RandomPlanner,
     "ring": RingPlanner,
@@ -24,6 +26,9 @@ BUILT_IN: dict[str, Callable[[], Planner]] = {
     **{name: partial(VolumetricPlanner, name) for name in FORMULATIONS},
 }
 """The planners that come with caryatid, the default first."""
+
+ORACLE = "oracle"
+"""Name of the planner that knows the truth; `caryatid.evaluation.oracle` makes it, not `make_planner`."""
 
 ENTRY_POINTS = "caryatid.planners"
 """Group under which other packages offer planners: callables without arguments that return a `Planner`."""
@@ -33,7 +38,7 @@ def make_planner(name: str) -> Planner:
     """Return the planner of this name.
 
     Raises:
-        InputError: There is none; the message lists those there are.
+        InputError: There is none, then the message lists those there are; or it is `oracle`.
     """
     if name in BUILT_IN:
         return BUILT_IN[name]()
@@ -41,12 +46,20 @@ def make_planner(name: str) -> Planner:
     if name in offered:
         planner: Planner = offered[name].load()()
         return planner
-    names = ", ".join([*BUILT_IN, *sorted(set(offered) - set(BUILT_IN))])
+    if name == ORACLE:
+        raise InputError(
+            "planner",
+            f"'{ORACLE}' needs a simulated scene, whose truth is known",
+            "give a scene, or make it with caryatid.evaluation.oracle.OraclePlanner",
+        )
+    names = ", ".join([*BUILT_IN, *sorted(set(offered) - {*BUILT_IN, ORACLE}), ORACLE])
     raise InputError("planner", f"there is no planner '{name}'", f"choose one of {names}")
 
 
 __all__ = [
     "BUILT_IN",
+    "ORACLE",
+    "AttentionPlanner",
     "Decision",
     "FarthestPlanner",
     "PaperPlanner",

@@ -150,7 +150,8 @@ def visibility(samples: Samples, T_world_camera: Array, solid: VoxelMap, config:
     """How well each camera (T, 4, 4) sees each sample: (K, T) from 0 hidden to 1.
 
     A sample is seen when its line of sight is free and within the image; surface turned away by more than
-    `config.good_incidence` is seen less well, as the cosine.
+    `config.good_incidence` is seen less well, as the cosine. Lines of sight are all free where
+    `config.occlusion` is `ignore`.
     """
     origin = samples.points_world.mean(axis=0) if len(samples.points_world) else np.zeros(3)
     points, eyes = samples.points_world - origin, T_world_camera[:, :3, 3] - origin
@@ -162,6 +163,8 @@ def visibility(samples: Samples, T_world_camera: Array, solid: VoxelMap, config:
     facing[~normals.any(axis=1)] = 1.0
     along = (points @ axes.T - (eyes * axes).sum(axis=1)) / distance
     facing[along < np.cos(np.deg2rad(config.view_cone))] = 0.0
+    if config.occlusion == "ignore":
+        return facing
     eyes_world = T_world_camera[:, :3, 3]
     hidden = solid.blocked(samples.points_world, eyes_world, config.sample_clearance, facing > 0.0)
     facing[hidden] = 0.0

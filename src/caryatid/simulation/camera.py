@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import mujoco
@@ -82,6 +83,10 @@ class SimulatedCamera:
         self.K = check_intrinsics(intrinsics(self.sensor) if K is None else K, "simulated camera")
         self._seed = int((rng or np.random.default_rng(0)).integers(2**63))
         self._captures = 0
+
+    def fork(self) -> SimulatedCamera:
+        """Return a camera whose next captures have the noise this one's would have; this one stays put."""
+        return copy.copy(self)
 
     def capture(self, T_world_camera: Array) -> View:
         """Take one view from a pose.

@@ -1,0 +1,221 @@
+"""The planner that knows the truth: what any planner that thinks one view ahead could reach at best.
+
+It tries candidates in simulation, each on a copy of what is known, and takes the one after which the score is
+in fact highest. Nobody else may see what it sees: it is not among `caryatid.planners.BUILT_IN`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import Config, SegmentationMethod
+from caryatid.errors import CaryatidError, InputError
+from caryatid.evaluation.scores import TrueScene, score
+from caryatid.evaluation.truths import SEED
+from caryatid.formats.graph_json import graph_text
+from caryatid.frames import Array
+from caryatid.graph import SupportGraph
+from caryatid.planners import ORACLE, Decision, Planner, PlanningState, make_planner
+from caryatid.planners.decision import check_candidates, path_cost
+from caryatid.scene import Scene
+from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
+from caryatid.views import Camera, View
+
+EQUAL = 1e-9
+"""Scores nearer than this are the same [1]; they are ratios of small whole numbers."""
+
+CELLS = 4096
+"""Cells of true surface along each axis around the world's origin [1]; 41 m of 1 cm."""
+
+
+class WatchedCamera:
+    """A camera that passes views through and remembers them.
+
+    Args:
+        camera: Takes the views.
+
+    Attributes:
+        taken: True pose (4, 4) and view of each capture that nobody has asked about yet.
+    """
+
+    def __init__(self, camera: SimulatedCamera) -> None:
+        self.taken: list[tuple[Array, View]] = []
+        self._camera = camera
+
+    def capture(self, T_world_camera: Array) -> View:
+        """Take a view from a pose (4, 4)."""
+        view = self._camera.capture(T_world_camera)
+        self.taken.append((T_world_camera, view))
+        return view
+
+
+class OraclePlanner:
+    """Takes the candidate that raises F1, vertices and edges together, most.
+
+    Of equal ones it takes that which shows most true surface no earlier view has shown, then the shorter way,
+    then the first. True surface is counted in cells of `config.oracle.surface_cell`, object by object: those
+    in which a ray of a camera without noise meets the object. The views tried are spread evenly over the
+    candidates, away from the views so far.
+
+    It is good for one exploration. Its predictions are exact: it knows the noise the next view will have, and
+    explores with the same configuration, segmentation and seed.
+
+    Args:
+        camera: Looks at the scene. `camera` below is to be explored with in its place.
+        truth: What is really there.
+        config: All settings of the exploration.
+        segmentation: That of the exploration.
+        seed: That of the exploration.
+
+    Attributes:
+        camera: The camera to hand to `explore`.
+    """
+
+    def __init__(
+        self,
+        camera: SimulatedCamera,
+        truth: TrueScene,
+        config: Config | None = None,
+        *,
+        segmentation: SegmentationMethod | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.camera = WatchedCamera(camera)
+        self._simulated = camera
+        self._truth = truth
+        self._config = config or Config()
+        self._scene = Scene(self._config, segmentation=segmentation, seed=seed)
+        self._shown = np.zeros(0, dtype=np.int64)
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the candidate after which F1 is highest.
+
+        The decision's saliency is the F1 that will be reached.
+
+        Raises:
+            PlanningError: There is no candidate.
+            InputError: The exploration is not the one this planner was made for.
+        """
+        check_candidates(state)
+        self._catch_up(state)
+        candidates = state.candidates
+        tried = spread_out(candidates.directions, state.visited, self._config.oracle.candidates)
+        unseen = np.array([self._unseen_surface(candidates.T_world_camera[i]) for i in tried])
+        # Best tie first: then the first of the highest F1 is the one to take, and nothing beats F1 = 1.
+        order = np.lexsort((tried, candidates.path_length[tried], -unseen))
+        best, reached = int(order[0]), -1.0
+        for k in order:
+            f1 = self._f1_after(candidates.T_world_camera[tried[k]])
+            if f1 > reached + EQUAL:
+                best, reached = int(k), f1
+            if reached > 1.0 - EQUAL:
+                break
+        index = int(tried[best])
+        cost = float(path_cost(state)[index])
+        area = float(unseen[best]) * self._config.oracle.surface_cell**2
+        now = self._f1(self._scene.graph)
+        why = (
+            f"F1 goes from {now:.2f} to {reached:.2f}, the best of {len(tried)} views; "
+            f"{1e4 * area:.0f} cm² of surface come into sight"
+        )
+        T_world_camera = candidates.T_world_camera[index]
+        return Decision(T_world_camera, index, reached, cost, reached - cost, why)
+
+    def _catch_up(self, state: PlanningState) -> None:
+        """Learn what the exploration has seen since the last decision."""
+        for T_world_camera, view in self.camera.taken:
+            self._scene.update(view)
+            self._shown = np.union1d(self._shown, self._surface(T_world_camera))
+        self.camera.taken.clear()
+        same_views = self._scene.views == len(state.visited)
+        if not same_views or graph_text(self._scene.graph) != graph_text(state.graph):
+            raise InputError(
+                f"planner {ORACLE}",
+                "its views and settings are not those of this exploration",
+                "hand its camera to explore(), with the same configuration, segmentation and seed",
+            )
+
+    def _f1_after(self, T_world_camera: Array) -> float:
+        """F1 of the fused graph after a view from there, or -1 where that view cannot be used."""
+        scene = self._scene.copy()
+        try:
+            graph = scene.update(self._simulated.fork().capture(T_world_camera))
+        except CaryatidError:
+            return -1.0
+        return self._f1(graph)
+
+    def _f1(self, graph: SupportGraph) -> float:
+        return score(graph, self._truth, np.random.default_rng(SEED), self._config.evaluation).f1
+
+    def _unseen_surface(self, T_world_camera: Array) -> int:
+        """Cells of true surface that come into sight from there."""
+        cells = self._surface(T_world_camera)
+        return len(cells) - int(np.isin(cells, self._shown, assume_unique=True).sum())
+
+    def _surface(self, T_world_camera: Array) -> NDArray[np.int64]:
+        """Cells (N,) of the objects' true surface seen from there, each a number of object and place."""
+        config, camera = self._config.oracle, self._simulated
+        K = np.diag([1.0 / config.stride, 1.0 / config.stride, 1.0]) @ camera.K
+        width, height = camera.sensor.width // config.stride, camera.sensor.height // config.stride
+        image = render(camera.scene, T_world_camera, K, replace(camera.sensor, width=width, height=height))
+        rays_world, _ = pixel_rays(K, T_world_camera[:3, :3], width, height)
+        labels = image.labels.ravel()
+        on_object = labels > 0
+        reach = image.depth.ravel()[on_object, None]
+        points_world = T_world_camera[:3, 3] + reach * rays_world[on_object]
+        place = np.floor(points_world / config.surface_cell).astype(np.int64) + CELLS // 2
+        place = np.clip(place, 0, CELLS - 1)
+        numbers = np.concatenate([labels[on_object, None].astype(np.int64), place], axis=1)
+        return np.unique(numbers @ np.array([CELLS**3, CELLS**2, CELLS, 1], dtype=np.int64))
+
+
+def planner_for(
+    name: str,
+    camera: Camera,
+    truth: TrueScene | None,
+    config: Config,
+    *,
+    segmentation: SegmentationMethod | None,
+    seed: int,
+) -> tuple[Planner, Camera]:
+    """Make a planner by its name, `oracle` too, and the camera to explore with.
+
+    Args:
+        name: Of the planner.
+        camera: Gives the views.
+        truth: What is really there, where known.
+        config: All settings of the exploration.
+        segmentation: That of the exploration.
+        seed: That of the exploration.
+
+    Raises:
+        InputError: There is no such planner, or it is the oracle and nothing is simulated.
+    """
+    if name != ORACLE or truth is None or not isinstance(camera, SimulatedCamera):
+        return make_planner(name), camera
+    oracle = OraclePlanner(camera, truth, config, segmentation=segmentation, seed=seed)
+    return oracle, oracle.camera
+
+
+def spread_out(directions: Array, visited: Array, count: int) -> NDArray[np.intp]:
+    """Pick directions one by one, each as far from the visited and the picked ones as can be.
+
+    Args:
+        directions: Unit vectors (N, 3) to pick from.
+        visited: Unit vectors (V, 3), V ≥ 1.
+        count: How many to pick; fewer where there are not so many.
+
+    Returns:
+        Indices (min(count, N),), each once; of equally far ones the first.
+    """
+    nearness = (directions @ visited.T).max(axis=1)
+    picked = []
+    for _ in range(min(count, len(directions))):
+        farthest = int(np.argmin(nearness))
+        picked.append(farthest)
+        nearness = np.maximum(nearness, directions @ directions[farthest])
+        nearness[farthest] = np.inf
+    return np.array(picked, dtype=np.intp)

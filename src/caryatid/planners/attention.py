@@ -1,0 +1,92 @@
+"""Algorithm 2 as the settings read it: what the paper leaves open is theirs to decide."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.frames import Array
+from caryatid.interest import PointOfInterest, inhibition_of_return, painted, points_of_interest
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+
+
+class AttentionPlanner:
+    """Saliency painted on the view sphere around projected points of interest.
+
+    Eq. 2 (`saliency`, `saliency_weight`), where a relation's point lies (`edge_point`), how far its saliency
+    spreads (`propagation`, `spread`), what a hidden point is worth (`occlusion`), how much earlier views
+    repel (`inhibition`) and what going there costs (`path_cost`) are as `PlanningState.config` says.
+    """
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
+
+        Of several points of interest that reach a candidate the one with the largest saliency there counts,
+        after that of the hidden ones is negated; a candidate that none reaches has none.
+        """
+        check_candidates(state)
+        config, candidates, sphere = state.config, state.candidates, state.sphere
+        points = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
+
+        saliency = np.zeros(len(candidates))
+        sphere_saliency = np.zeros(len(sphere.directions))
+        why = "no point of interest is left; the nearest new view"
+        strongest = np.full(len(candidates), -1)
+        if points:
+            given, reached = _given(points, candidates.directions, config)
+            signed = np.where(_hidden(points, state), -1.0, 1.0) * given
+            saliency, strongest = _largest(signed, reached)
+            sphere_saliency, _ = _largest(*_given(points, sphere.directions, config))
+        saliency = saliency + inhibition_of_return(state.visited, candidates.directions, config)
+        sphere_saliency = sphere_saliency + inhibition_of_return(state.visited, sphere.directions, config)
+        if candidates.indices is not None:
+            sphere_saliency[candidates.indices] = saliency
+
+        cost = path_cost(state)
+        score = saliency - cost
+        best = int(np.argmax(score))
+        if strongest[best] >= 0:
+            why = points[strongest[best]].why
+        return Decision(
+            candidates.T_world_camera[best],
+            best,
+            float(saliency[best]),
+            float(cost[best]),
+            float(score[best]),
+            why,
+            tuple(points),
+            saliency,
+            sphere_saliency,
+        )
+
+
+def _given(
+    points: Sequence[PointOfInterest], directions: Array, config: ActiveVisionConfig
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Saliency each point gives each view (M, K), and where it reaches: all, or the nearest alone."""
+    if config.propagation:
+        given = painted(points, directions, float(np.deg2rad(config.spread)))
+        return given, np.ones(given.shape, dtype=np.bool_)
+    tops = np.stack([p.direction for p in points])
+    reached = np.zeros((len(directions), len(points)), dtype=np.bool_)
+    reached[np.argmax(directions @ tops.T, axis=0), np.arange(len(points))] = True
+    return np.where(reached, [p.saliency for p in points], 0.0), reached
+
+
+def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[np.bool_]:
+    """Which points are hidden from which candidates (N, K); none where `config.occlusion` ignores it."""
+    if state.config.occlusion == "ignore":
+        return np.zeros((len(state.candidates), len(points)), dtype=np.bool_)
+    positions = np.stack([p.position_world for p in points])
+    eyes_world = state.candidates.T_world_camera[:, :3, 3]
+    return state.voxels.blocked(positions, eyes_world, state.config.clearance).T
+
+
+def _largest(given: Array, reached: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:
+    """Largest saliency (M,) that reaches each view, 0 where none does, and whose it is (M,), −1 for none."""
+    counted = np.where(reached, given, -np.inf)
+    strongest = np.where(reached.any(axis=1), counted.argmax(axis=1), -1)
+    return np.where(strongest < 0, 0.0, counted.max(axis=1)), strongest

@@ -1,0 +1,157 @@
+"""A planner sees what a robot would know: what it is given does not lead to the truth, and it needs none."""
+
+from __future__ import annotations
+
+import gc
+import json
+import pickle
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+from synthetic import SENSOR, simulated_scene
+
+from caryatid.config import ActiveVisionConfig, Config
+from caryatid.evaluation.oracle import OraclePlanner
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.exploration import explore
+from caryatid.planners import BUILT_IN, make_planner
+from caryatid.simulation.stage import set_stage
+from caryatid.simulation.truth import ground_truth
+
+FORBIDDEN = ("mujoco", "caryatid.simulation", "caryatid.evaluation")
+"""Packages whose objects know the truth."""
+
+CONFIG = Config(
+    sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
+)
+
+ELSEWHERE = """
+import json, pickle, sys, types
+
+# The contacts of fitted shapes are computed by MuJoCo; importing them takes the names of its shapes only.
+shapes = types.SimpleNamespace(mjGEOM_BOX=0, mjGEOM_CYLINDER=1, mjGEOM_SPHERE=2)
+sys.modules["mujoco"] = types.SimpleNamespace(mjtGeom=shapes)
+FORBIDDEN = sys.argv[2:]
+
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if any(name == f or name.startswith(f + ".") for f in FORBIDDEN):
+            raise ImportError(f"{name} is not to be had")
+
+sys.meta_path.insert(0, Refuse())
+import numpy as np
+from caryatid.planners import BUILT_IN, make_planner
+del sys.modules["mujoco"]
+
+said = {}
+for forbidden in FORBIDDEN:
+    try:
+        __import__(forbidden)
+        said[forbidden] = "imported"
+    except ImportError as error:
+        said[forbidden] = str(error)
+with open(sys.argv[1], "rb") as file:
+    states = pickle.load(file)
+for name in BUILT_IN:
+    try:
+        planner = make_planner(name)
+        said[name] = [planner.plan(s, np.random.default_rng([0, k])).index for k, s in enumerate(states)]
+    except Exception as error:
+        said[name] = repr(error)
+print(json.dumps(said))
+"""
+
+
+def reachable(*roots: object) -> list[object]:
+    """Every object that can be got at from some; not the code they are made of: modules, types, globals."""
+    found: dict[int, object] = {}
+    waiting = list(roots)
+    while waiting:
+        item = waiting.pop()
+        if id(item) in found or isinstance(item, types.ModuleType | type):
+            continue
+        found[id(item)] = item
+        if isinstance(item, types.FunctionType):
+            waiting += [item.__closure__, item.__defaults__, item.__kwdefaults__]
+        elif isinstance(item, np.ndarray):
+            waiting.append(item.base)
+            waiting += item.ravel().tolist() if item.dtype == object else []
+        else:
+            waiting += gc.get_referents(item)
+    return list(found.values())
+
+
+def forbidden(*roots: object) -> set[str]:
+    """Kinds of objects within reach that know the truth."""
+    kinds = {type(item) for item in reachable(*roots)}
+    names = {f"{kind.__module__}.{kind.__qualname__}" for kind in kinds}
+    return {n for n in names if any(n.startswith(f + ".") for f in FORBIDDEN)}
+
+
+class Witness:
+    """Keeps what a planner is given."""
+
+    def __init__(self, planner):
+        self.planner, self.states, self.decisions = planner, [], []
+
+    def plan(self, state, rng):
+        self.states.append(state)
+        self.decisions.append(self.planner.plan(state, rng))
+        return self.decisions[-1]
+
+
+def witnessed(planner):
+    stage = set_stage(simulated_scene("hidden_stack"), CONFIG, noise="carmine", seed=0)
+    witness = Witness(planner)
+    steps = explore(stage.camera, stage.robot, planner=witness, config=CONFIG, early_stop=False)
+    assert len(list(steps)) == 3
+    return witness
+
+
+@pytest.fixture(scope="module")
+def states():
+    return witnessed(make_planner("support")).states
+
+
+@pytest.fixture(scope="module")
+def decided_elsewhere(states, tmp_path_factory):
+    """What each planner decides in a process that has the states and no truth."""
+    file = tmp_path_factory.mktemp("states") / "states.pickle"
+    file.write_bytes(pickle.dumps(states))
+    command = [sys.executable, "-c", ELSEWHERE, str(file), *FORBIDDEN]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_no_planner_can_reach_the_truth(name):
+    witness = witnessed(make_planner(name))
+    assert len(witness.states) == 2
+    assert not forbidden(witness.states, witness.planner, witness.decisions)
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_a_planner_decides_the_same_where_there_is_no_truth(name, states, decided_elsewhere):
+    here = [make_planner(name).plan(s, np.random.default_rng([0, k])).index for k, s in enumerate(states)]
+    assert decided_elsewhere[name] == here
+
+
+def test_there_the_truth_cannot_be_imported(decided_elsewhere):
+    assert {f: decided_elsewhere[f] for f in FORBIDDEN} == {f: f"{f} is not to be had" for f in FORBIDDEN}
+
+
+def test_the_truth_would_be_found():
+    """The oracle has it; so would have whoever is handed the camera, or a function that knows it."""
+    scene = simulated_scene("hidden_stack")
+    camera = set_stage(scene, CONFIG, noise="carmine", seed=0).camera
+    truth = true_scene_from_simulation(scene, ground_truth(scene))
+    oracle = OraclePlanner(camera, truth, CONFIG)
+    assert {"caryatid.simulation.world.SimulatedScene", "mujoco._structs.MjData"} <= forbidden(oracle)
+    assert "caryatid.evaluation.scores.TrueScene" in forbidden({"hint": [lambda: truth]})
+    assert "mujoco._structs.MjData" in forbidden(types.SimpleNamespace(look=camera.capture))
+    view_of_truth = np.array([truth, None], dtype=object)[:1]
+    assert "caryatid.evaluation.scores.TrueScene" in forbidden((view_of_truth,))

@@ -1,0 +1,143 @@
+"""The planner that knows the truth: what it predicts comes true, and nothing else comes of its trying."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import run_command
+from synthetic import SENSOR, simulated_scene
+
+from caryatid import frames
+from caryatid.config import ActiveVisionConfig, Config, OracleConfig
+from caryatid.errors import InputError
+from caryatid.evaluation.oracle import OraclePlanner, planner_for, spread_out
+from caryatid.evaluation.scores import score
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.exploration import explore
+from caryatid.formats.graph_json import graph_text
+from caryatid.planners import make_planner
+from caryatid.shapes import fibonacci_sphere
+from caryatid.simulation.stage import set_stage
+from caryatid.simulation.truth import ground_truth
+
+CONFIG = Config(
+    sensor=SENSOR,
+    active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3),
+    oracle=OracleConfig(candidates=8, stride=1),
+)
+
+
+class Chosen:
+    """Goes to the same candidates again."""
+
+    def __init__(self, indices):
+        self.indices = list(indices)
+
+    def plan(self, state, rng):
+        decision = make_planner("random").plan(state, rng)
+        index = self.indices.pop(0)
+        return replace(decision, index=index, T_world_camera=state.candidates.T_world_camera[index])
+
+
+def truth_of(name):
+    return true_scene_from_simulation(simulated_scene(name), ground_truth(simulated_scene(name)))
+
+
+def exploration(planner, name="hidden_stack", config=CONFIG, seed=3):
+    """Steps and their F1."""
+    stage = set_stage(simulated_scene(name), config, noise="carmine", seed=seed)
+    truth = truth_of(name)
+    options = {"segmentation": "labels", "seed": seed}
+    chooser, camera = (planner, stage.camera)
+    if planner == "oracle":
+        chooser, camera = planner_for(planner, stage.camera, truth, config, **options)
+    steps = list(explore(camera, stage.robot, planner=chooser, config=config, early_stop=False, **options))
+    return steps, [score(s.graph, truth, np.random.default_rng(0)).f1 for s in steps]
+
+
+@pytest.fixture(scope="module")
+def explored():
+    return exploration("oracle")
+
+
+def test_what_it_predicts_is_what_comes(explored):
+    steps, f1 = explored
+    assert len(steps) == 3
+    assert [s.decision.saliency for s in steps[:-1]] == f1[1:]
+    assert f1[1] > f1[0]
+
+
+def test_trying_views_changes_nothing_of_the_exploration(explored):
+    steps, _ = explored
+    again, _ = exploration(Chosen(s.decision.index for s in steps[:-1]))
+    assert [graph_text(s.graph) for s in again] == [graph_text(s.graph) for s in steps]
+    for one, other in zip(steps, again, strict=True):
+        np.testing.assert_array_equal(one.view.depth, other.view.depth)
+
+
+def test_none_of_the_views_it_tries_would_have_been_better(explored):
+    steps, f1 = explored
+    tried = spread_out(steps[0].candidates.directions, steps[0].visited, 8)
+    assert steps[0].decision.index in tried
+    config = replace(CONFIG, active=replace(CONFIG.active, max_views=2))
+    others = [exploration(Chosen([index]), config=config)[1][1] for index in tried]
+    assert f1[1] == max(others)
+    assert min(others) < max(others)
+
+
+def test_the_reason_says_from_where_to_where_f1_goes(explored):
+    steps, f1 = explored
+    assert f"F1 goes from {f1[0]:.2f} to {f1[1]:.2f}, the best of 8 views" in steps[0].decision.why
+
+
+def test_of_equal_views_it_takes_the_one_that_shows_most_unseen_surface():
+    """Where any overlap makes an object a true one, F1 is 1 from everywhere."""
+    config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, min_iou=0.0))
+    stage = set_stage(simulated_scene("tower"), config, noise="none", seed=0)
+    oracle = OraclePlanner(stage.camera, truth_of("tower"), config, segmentation="labels")
+    steps = list(explore(oracle.camera, stage.robot, planner=oracle, config=config, segmentation="labels"))
+    first = steps[0]
+    assert first.decision.saliency == 1.0
+    assert frames.angle_between(first.visited[0], steps[1].visited[1]) > np.pi / 3.0
+
+
+def test_views_to_try_are_spread_over_all_there_are():
+    directions = fibonacci_sphere(2000)
+    visited = directions[:1]
+    picked = spread_out(directions, visited, 32)
+    assert len(set(picked)) == 32
+    apart = frames.angle_between(directions[picked][:, None], directions[picked][None])
+    assert apart[~np.eye(32, dtype=bool)].min() > np.deg2rad(25.0)
+    assert frames.angle_between(directions[picked], visited).min() > np.deg2rad(25.0)
+    covered = frames.angle_between(directions[:, None], directions[picked][None]).min(axis=1)
+    assert covered.max() < np.deg2rad(35.0)
+    assert sorted(spread_out(directions[:5], visited, 32)) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("wrong", ["camera", "seed"])
+def test_another_exploration_than_its_own_is_refused(wrong):
+    stage = set_stage(simulated_scene("tower"), CONFIG, noise="carmine", seed=0)
+    oracle = OraclePlanner(stage.camera, truth_of("tower"), CONFIG, segmentation="labels")
+    camera, seed = (stage.camera, 0) if wrong == "camera" else (oracle.camera, 1)
+    steps = explore(camera, stage.robot, planner=oracle, config=CONFIG, segmentation="labels", seed=seed)
+    with pytest.raises(InputError, match="not those of this exploration; hand its camera"):
+        list(steps)
+
+
+def test_by_its_name_alone_it_is_not_to_be_had():
+    with pytest.raises(InputError, match=r"'oracle' needs a simulated scene.*OraclePlanner"):
+        make_planner("oracle")
+
+
+def test_the_command_line_has_it_for_scenes_and_not_for_recordings(tmp_path, scene_file, recording, capsys):
+    options = ["--planner", "oracle", "--views", 2, "--no-report", "--quiet", "--no-early-stop"]
+    small = ["--set=sensor.width=160", "--set=sensor.height=120", "--set=sensor.focal=131.25"]
+    few = ["--set=oracle.candidates=2"]
+    assert run_command("explore", scene_file, "--out", tmp_path / "a", *options, *small, *few) == 0
+    assert "F1 goes from" in (tmp_path / "a/views/00/view.json").read_text()
+    capsys.readouterr()
+    assert run_command("explore", recording, "--out", tmp_path / "b", *options) == 1
+    assert "'oracle' needs a simulated scene" in capsys.readouterr().err
+    assert not (tmp_path / "b").exists()
