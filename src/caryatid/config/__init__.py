@@ -34,6 +34,7 @@ from caryatid.config.reporting import (
     EvaluationConfig,
     OracleConfig,
     ReportConfig,
+    StatisticsConfig,
 )
 from caryatid.config.simulation import (
     GenerationConfig,
@@ -93,6 +94,7 @@ __all__ = [
     "SegmentationMethod",
     "SensorConfig",
     "SplitConfig",
+    "StatisticsConfig",
     "SupportConfig",
     "SurfaceConfig",
     "VoxelConfig",
