@@ -24,8 +24,8 @@ class Difference:
         scenes: Scenes both have.
         episodes: Scenes × seeds both have.
         measures: For each measure its mean difference after each view.
-        path_ratios: For each threshold, the method's path to it by the reference's, both as `Reach.mean_path`;
-            None where one of them does not reach it, or the reference need not move.
+        path_ratios: For each threshold, the method's path to it by the reference's, both as
+            `Reach.mean_path`; None where one of them does not reach it, or the reference need not move.
     """
 
     method: str

@@ -20,8 +20,9 @@ class Sample:
 
     Attributes:
         keys: Scene and seed of each of the E episodes that did not fail, sorted.
-        values: What was measured (E, V, M), M as in `MEASURES`. An episode that ended before its last view keeps
-            what it had: its model stays what it is, and the robot where it is. NaN beyond the views it was to have.
+        values: What was measured (E, V, M), M as in `MEASURES`. An episode that ended before its last view
+            keeps what it had: its model stays what it is, and the robot where it is. NaN beyond the views it
+            was to have.
         failed: Episodes that failed and are in none of the arrays.
         planning: Time of every choice of a view (D,) [s]; the first view of an episode is not chosen.
         perception: Time of every view's perception (P,) [s].

@@ -1,7 +1,7 @@
 """What a suite's records say: means over scenes with intervals, thresholds, paired differences, failures.
 
-Scenes are what is sampled: the seeds of a scene are averaged first, and the bootstrap draws scenes. An episode
-that failed is counted and listed, and is in no mean.
+Scenes are what is sampled: the seeds of a scene are averaged first, and the bootstrap draws scenes. An
+episode that failed is counted and listed, and is in no mean.
 """
 
 from __future__ import annotations
@@ -113,8 +113,8 @@ class Summary:
     """What the records of a suite say.
 
     Attributes:
-        groups: One for each condition over all its scenes, followed, where they are of more than one family, by
-            one for each family.
+        groups: One for each condition over all its scenes, followed, where they are of more than one family,
+            by one for each family.
         methods: Names of the methods, in the order of the records; a method has one colour in all figures.
         reference: The method others are compared with.
         scenes: How many scenes there are.
@@ -152,8 +152,8 @@ def summarise(
         config: Resamples, confidence, thresholds.
 
     Raises:
-        ValueError: There is no record, or none of the reference, or two are of one method, condition, scene and
-            seed.
+        ValueError: There is no record, or none of the reference, or two are of one method, condition, scene
+            and seed.
     """
     config = config or StatisticsConfig()
     methods = tuple(group(records))

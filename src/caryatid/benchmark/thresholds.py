@@ -31,7 +31,8 @@ class Reach:
         median_views: Median over episodes of the first view that reaches it [1].
         median_path: Median over episodes of the path travelled up to that view [m].
         mean_views: First view after which the mean F1 reaches it [1].
-        mean_path: Path at which the curve of mean F1 over mean path first reaches it, straight between views [m].
+        mean_path: Path at which the curve of mean F1 over mean path first reaches it, straight between
+            views [m].
     """
 
     threshold: float

@@ -54,7 +54,7 @@ class StatisticsConfig:
     """What is made of a benchmark's episodes; nothing here changes one."""
 
     resamples: int = 2000
-    """Bootstrap resamples of the scenes [1]; the ends of a 95 % interval then move by a tenth of its half width."""
+    """Bootstrap resamples of the scenes [1]; the ends of an interval then move by 3 % of its half width."""
     confidence: float = 0.95
     """Probability with which an interval covers the true mean [1]."""
     thresholds: tuple[float, ...] = (0.94, 0.90)
