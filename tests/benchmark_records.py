@@ -42,7 +42,7 @@ def make_record(
 def make_suite(
     methods: Sequence[str] = METHODS, *, scenes=12, seeds=2, views=5, condition="carmine, labels", rng=None
 ):
-    """Methods over dense and piled scenes: the later its place, the slower a method and the further it goes."""
+    """Dense and piled scenes: the later a method, the slower it rises and the further it goes."""
     rng = rng or np.random.default_rng(0)
     records = []
     hardness = rng.normal(0.0, 0.06, scenes)

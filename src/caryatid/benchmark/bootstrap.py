@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -57,13 +58,11 @@ class Bootstrap:
         shape = (1 + self.resamples, *values.shape[1:])
         if count == 0:
             return np.full(shape, np.nan)
-        rng = np.random.default_rng((self.seed, count))
-        drawn = rng.multinomial(count, np.full(count, 1.0 / count), size=self.resamples)
-        weights = np.concatenate([np.ones((1, count)), drawn])
+        weights = _weights(self.seed, count, self.resamples)
         flat = values.reshape(count, -1)
         known = np.isfinite(flat)
         total = weights @ np.where(known, flat, 0.0)
-        number = weights @ known
+        number = weights @ known.astype(np.float64)
         means = np.divide(total, number, out=np.full_like(total, np.nan), where=number > 0.0)
         return means.reshape(shape)
 
@@ -81,3 +80,14 @@ class Bootstrap:
         tail = (1.0 - self.confidence) / 2.0 * (len(drawn) - 1)
         low, high = drawn[math.floor(tail)], drawn[len(drawn) - 1 - math.floor(tail)]
         return Estimate(float(figures[0]), float(low), float(high))
+
+
+@lru_cache(maxsize=16)
+def _weights(seed: int, count: int, resamples: int) -> Array:
+    """How often each scene is in each resample (1 + resamples, count); in the first row once each."""
+    drawn = np.random.default_rng((seed, count)).multinomial(
+        count, np.full(count, 1.0 / count), size=resamples
+    )
+    weights = np.concatenate([np.ones((1, count)), drawn])
+    weights.flags.writeable = False
+    return weights
