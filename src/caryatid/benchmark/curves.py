@@ -118,7 +118,10 @@ def _scale(
     high = max(float(np.nanmax(high)) for _, high in ends)
     bottom = max(0.0, math.floor(10.0 * low - 0.2) / 10.0)
     top = min(1.0, max(math.ceil(10.0 * high + 0.2) / 10.0, bottom + 0.2))
+    step = 0.1 if top - bottom > 0.25 else 0.05
     axes.set_ylim(bottom, top + 1e-6)
+    axes.set_yticks(np.arange(round(bottom / step), round(top / step) + 1) * step)
+    axes.yaxis.set_major_formatter("{x:.1f}" if step == 0.1 else "{x:.2f}")
     axes.set_ylabel(name)
     for threshold in thresholds:
         if bottom < threshold < top:

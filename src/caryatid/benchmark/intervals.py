@@ -111,7 +111,7 @@ def _panels(
     from matplotlib.ticker import MaxNLocator
 
     width, height = figure.get_size_inches()
-    left, bottom, top, gap = 0.15 + name_width(names), 0.5, 0.3, 0.2
+    left, bottom, top, gap = 0.15 + name_width(names), 0.5, 0.3, 0.32
     each = (width - left - right - gap * (len(views) - 1)) / len(views)
     panels: list[Any] = []
     for k, view in enumerate(views):

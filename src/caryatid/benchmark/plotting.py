@@ -173,7 +173,8 @@ def label_lines(axes: Any, lines: Sequence[tuple[Mark, float]], *, lead: bool) -
     width, height = figure.get_size_inches()
     transform = axes.transData + figure.transFigure.inverted()
     ordered = sorted(
-        ((float(transform.transform((0.0, y))[1]), mark) for mark, y in lines), key=lambda line: line[0]
+        ((float(transform.transform((0.0, y))[1]), mark) for mark, y in reversed(lines)),
+        key=lambda line: line[0],
     )
     heights = spread(np.array([end for end, _ in ordered]), ROW / height, box.y0, box.y1)
     start = box.x1 + 0.22 / width

@@ -28,12 +28,12 @@ def say_difference(value: float | None, digits: int = 3) -> str:
 
 
 def say_estimate(estimate: Estimate | None, digits: int = 3, *, signed: bool = False) -> str:
-    """Write a figure and its interval."""
+    """Write a figure and its interval; of a threshold out of reach of the whole interval just that."""
     if estimate is None:
         return NONE
     say = say_difference if signed else say_number
     text = say(estimate.value, digits)
-    if estimate.low is None or estimate.high is None or text == NONE:
+    if estimate.low is None or estimate.high is None or text == NONE or math.isinf(estimate.low):
         return text
     return f"{text} [{say(estimate.low, digits)}, {say(estimate.high, digits)}]"
 
