@@ -25,9 +25,9 @@ NASTY = "<script>alert(1)</script> | *x*"
 VOID = {"meta", "br", "link", "img", "hr", "input"}
 
 
-def report(name, records):
-    summary = summarise(records, np.random.default_rng(0), config=StatisticsConfig(resamples=50))
-    return report_suite(name, f"What {name} compares.", summary)
+def report(name, records, planned=None, **options):
+    summary = summarise(records, np.random.default_rng(0), config=StatisticsConfig(resamples=50), **options)
+    return report_suite(name, f"What {name} compares.", summary, planned)
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def suites():
     )
     good = make_suite(["support", "random", NASTY], scenes=3, seeds=1, views=3)
     noise = [r for c in ("none", "carmine") for r in make_suite(["support"], scenes=2, seeds=1, condition=c)]
-    return (report("planners", [*good, failed]), report("noise", noise))
+    return (report("planners", [*good, failed], gap=("random", NASTY)), report("noise", noise, planned=11))
 
 
 @pytest.fixture(scope="module")
@@ -99,6 +99,7 @@ def test_page_says_all_there_is_to_say(structure, suites):
         "What planners compares.", "1 failed", f"no view: {NASTY}", "heap7", "0123456789ab", "A <fast> one",
         "caryatid benchmark --x", "F1 of edges", "Until F1 reaches a threshold", "F1 along the path",
         "F1 compared with support", "dense scenes only", "none failed", "F1 by condition",
+        "Share of the gap from random to", "Not finished: 7 episodes of 11 to be run.",
     ):  # fmt: skip
         assert said in text, said
     mean = suites[0].summary.groups[0].methods[0].curves["f1"][1]

@@ -209,6 +209,19 @@ def test_closed_gap_by_hand():
     assert (shares[1].value, shares[1].low, shares[1].high) == pytest.approx((0.5, 0.5, 0.5))
 
 
+def test_gaps_are_told_where_they_are_asked_for():
+    records = [
+        make_record([f1], scene=s, method=m)
+        for s in "ab"
+        for m, f1 in (("ours", 0.8), ("random", 0.7), ("oracle", 0.9))
+    ]
+    gaps = summary_of(records, gap=("random", "oracle")).groups[0].gaps
+    assert list(gaps) == ["ours"]
+    assert gaps["ours"][0].value == pytest.approx(0.5)
+    assert summary_of(records, gap=("random", "nobody")).groups[0].gaps == {}
+    assert summary_of(records).groups[0].gaps == {}
+
+
 def test_families_are_told_apart_where_there_are_several():
     summary = summary_of(make_suite(scenes=6))
     assert [(g.family, g.scenes) for g in summary.groups] == [("", 6), ("pile", 2), ("dense", 4)]

@@ -58,7 +58,7 @@ def render_document(
         f"```\n{command}\n```",
     ]
     for suite in suites:
-        parts += [f"## {suite.name}", f"{_plain(suite.what)} {describe(suite.summary)}"]
+        parts += [f"## {suite.name}", f"{_plain(suite.what)} {describe(suite)}"]
         parts += [_draw(figure, suite, folder) for figure in _shown(suite) if not figure.condition]
         for group in suite.summary.groups:
             of = f", {group.family} scenes only" if group.family else ""
@@ -88,7 +88,7 @@ def _draw(figure: Figure, suite: SuiteReport, folder: str) -> str:
 
 def _show(table: Table) -> str:
     lines = [
-        f"**{_plain(table.title)}.** {table.note}".rstrip(),
+        f"**{_plain(table.title)}.** {_plain(table.note)}".rstrip(),
         "",
         "| " + " | ".join(_plain(name) for name in table.head) + " |",
         "|" + " --- |" * len(table.head),

@@ -42,12 +42,14 @@ class SuiteReport:
         what: What it compares, in one sentence.
         summary: What its records say.
         figures: Its figures.
+        planned: Episodes it is to have; more than the summary has where it is not finished.
     """
 
     name: str
     what: str
     summary: Summary
     figures: tuple[Figure, ...]
+    planned: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,7 @@ class Table:
         head: Headings of the columns; the first is of the row's name.
         rows: Cells.
         strong: Row and column of the cells whose interval excludes 0.
+        aside: Whether it is told beside the main ones.
     """
 
     title: str
@@ -67,25 +70,35 @@ class Table:
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     strong: frozenset[tuple[int, int]] = frozenset()
+    aside: bool = False
 
 
-def report_suite(name: str, what: str, summary: Summary) -> SuiteReport:
+def report_suite(name: str, what: str, summary: Summary, planned: int | None = None) -> SuiteReport:
     """Draw the figures of a suite, for page and document.
 
     Args:
         name: Its name on the command line.
         what: What it compares, in one sentence.
         summary: What its records say.
+        planned: Episodes it is to have; None for as many as there are.
     """
-    return SuiteReport(name, what, summary, draw_figures(summary))
+    number = summary.episodes if planned is None else planned
+    return SuiteReport(name, what, summary, draw_figures(summary), number)
 
 
-def describe(summary: Summary) -> str:
+def describe(suite: SuiteReport) -> str:
     """Say how much was run, and how much of it failed."""
+    summary = suite.summary
     failed = len(summary.failures)
     said = f"{say_count(summary.episodes, 'episode')} of {say_count(len(summary.methods), 'method')} in "
     said += f"{say_count(summary.scenes, 'scene')} with {say_count(summary.seeds, 'seed')}"
-    return f"{said}; {'none failed' if failed == 0 else f'{failed} failed'}."
+    said += f"; {'none failed' if failed == 0 else f'{failed} failed'}."
+    missing = suite.planned - summary.episodes
+    return (
+        f"{said} Not finished: {say_count(missing, 'episode')} of {suite.planned:,} to be run."
+        if missing
+        else said
+    )
 
 
 def explain(config: StatisticsConfig) -> tuple[str, ...]:
@@ -100,8 +113,8 @@ def explain(config: StatisticsConfig) -> tuple[str, ...]:
         "Until F1 reaches a threshold: the share of the episodes that ever reach it; the median over all "
         "episodes of the first view that does, and of the path up to there. An episode that never does "
         "counts as longer than any other, so the median is “not reached” where half of them do not. “Mean "
-        "curve” is where the curve of mean F1 over mean path first reaches it, straight between views; an end of its "
-        "interval is “not reached” where that many resamples do not reach it.",
+        "curve” is where the curve of mean F1 over mean path first reaches it, straight between views; an "
+        "end of its interval is “not reached” where that many resamples do not reach it.",
         "F1 along the path: the area under F1 over the path travelled, divided by its length. F1 holds until "
         "the next view. The length is the mean path of the method that travels least; where an episode ends "
         "before, its last F1 holds.",
@@ -126,6 +139,8 @@ def tables(group: Group, summary: Summary, *, brief: bool = False) -> tuple[Tabl
         made.append(_differences(rows, group, summary, "f1", "F1", 3))
         if not brief:
             made.append(_differences(rows, group, summary, "path", "Path", 2))
+    if group.gaps:
+        made.append(_gaps(group, summary))
     made.append(_thresholds(known, rows, summary))
     if not brief:
         made.append(_at_the_end(known))
@@ -150,7 +165,8 @@ def _by_view(
         for m, count in zip(methods, counts, strict=True)
     )
     head = ("method", *(f"view {v}" for v in views), "scenes / episodes / failed")
-    return Table(name, "Mean and interval after so many views.", head, rows)
+    note = "Mean and interval after so many views."
+    return Table(name, note, head, rows, aside=measure != "f1")
 
 
 def _differences(
@@ -178,7 +194,21 @@ def _differences(
         ("method", *(f"view {v}" for v in views), "scenes / episodes"),
         cells,
         frozenset(strong),
+        aside=measure != "f1",
     )
+
+
+def _gaps(group: Group, summary: Summary) -> Table:
+    assert summary.gap is not None
+    low, high = summary.gap
+    views = [v for v in table_views(summary.config.views, group.views) if v > 1] or [1]
+    rows = tuple(
+        (method, *(_at(shares, v, lambda e: say_estimate(e, 2)) for v in views))
+        for method, shares in group.gaps.items()
+    )
+    note = f"(F1 − that of {low}) / (F1 of {high} − that of {low}), over the scenes and seeds all three have."
+    head = ("method", *(f"view {v}" for v in views))
+    return Table(f"Share of the gap from {low} to {high} that is closed", note, head, rows)
 
 
 def _thresholds(methods: Sequence[MethodSummary], rows: Sequence[Difference], summary: Summary) -> Table:
@@ -212,7 +242,8 @@ def _at_the_end(methods: Sequence[MethodSummary]) -> Table:
         (m.method, *(say_estimate(m.curves[measure][-1], digits) for measure, _, digits in AT_THE_END))
         for m in methods
     )
-    return Table("After the last view", "", ("method", *(name for _, name, _ in AT_THE_END)), rows)
+    head = ("method", *(name for _, name, _ in AT_THE_END))
+    return Table("After the last view", "", head, rows, aside=True)
 
 
 def _times(methods: Sequence[MethodSummary]) -> Table:

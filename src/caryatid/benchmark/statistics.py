@@ -13,7 +13,7 @@ from pathlib import PurePath
 import numpy as np
 
 from caryatid.benchmark.bootstrap import Bootstrap, Estimate
-from caryatid.benchmark.comparison import Difference, compare
+from caryatid.benchmark.comparison import Difference, closed_gap, compare
 from caryatid.benchmark.records import MEASURES, Record
 from caryatid.benchmark.samples import Sample, group, sample, scene_means
 from caryatid.benchmark.thresholds import Reach, area_over_path, path_budget, reach
@@ -81,6 +81,8 @@ class Group:
         budget: Path over which F1 is averaged: the smallest of the methods' mean final paths [m].
         methods: The methods, in the order of the records.
         differences: Each method but the reference minus the reference.
+        gaps: Share of the gap between two methods that each other method closes after each view, where it was
+            asked for and both are there.
     """
 
     condition: str
@@ -90,6 +92,7 @@ class Group:
     budget: float
     methods: tuple[MethodSummary, ...]
     differences: tuple[Difference, ...]
+    gaps: dict[str, tuple[Estimate, ...]]
 
     @property
     def views(self) -> int:
@@ -117,6 +120,7 @@ class Summary:
             by one for each family.
         methods: Names of the methods, in the order of the records; a method has one colour in all figures.
         reference: The method others are compared with.
+        gap: The two methods of which the others close the gap, or None.
         scenes: How many scenes there are.
         episodes: How many episodes there are, the failed ones too.
         seeds: How many seeds there are.
@@ -127,6 +131,7 @@ class Summary:
     groups: tuple[Group, ...]
     methods: tuple[str, ...]
     reference: str
+    gap: tuple[str, str] | None
     scenes: int
     episodes: int
     seeds: int
@@ -139,6 +144,7 @@ def summarise(
     rng: np.random.Generator,
     *,
     reference: str | None = None,
+    gap: tuple[str, str] | None = None,
     config: StatisticsConfig | None = None,
 ) -> Summary:
     """Say what the records of a suite mean.
@@ -149,6 +155,8 @@ def summarise(
         records: Of one suite.
         rng: Draws the bootstrap's seed.
         reference: The method others are compared with; None for the first.
+        gap: Two methods, such as random choice and the oracle, of whose gap in F1 is told how much each other
+            method closes.
         config: Resamples, confidence, thresholds.
 
     Raises:
@@ -169,11 +177,12 @@ def summarise(
         families = tuple(dict.fromkeys(record.member.family for record in part))
         for family in ("", *(families if len(families) > 1 else ())):
             chosen = [record for record in part if family in ("", record.member.family)]
-            groups.append(_group(chosen, condition, family, reference, config, bootstrap))
+            groups.append(_group(chosen, condition, family, reference, gap, config, bootstrap))
     return Summary(
         groups=tuple(groups),
         methods=methods,
         reference=reference,
+        gap=gap,
         scenes=len({record.member.episode.scene for record in records}),
         episodes=len(records),
         seeds=len({record.member.episode.seed for record in records}),
@@ -187,6 +196,7 @@ def _group(
     condition: str,
     family: str,
     reference: str,
+    gap: tuple[str, str] | None,
     config: StatisticsConfig,
     bootstrap: Bootstrap,
 ) -> Group:
@@ -204,6 +214,11 @@ def _group(
             for name, s in samples.items()
             if name != reference and reference in samples
         ),
+        gaps={
+            name: closed_gap(s, samples[gap[0]], samples[gap[1]], bootstrap)
+            for name, s in samples.items()
+            if gap is not None and name not in gap and set(gap) <= set(samples)
+        },
     )
 
 
