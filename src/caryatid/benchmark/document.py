@@ -103,4 +103,4 @@ def _show(table: Table) -> str:
 
 def _plain(text: str) -> str:
     """Text that means nothing but itself in Markdown."""
-    return re.sub(r"([\\`*_<>|~]|\[|\])", r"\\\1", " ".join(text.split()))
+    return re.sub(r"([\\`*_<>|~]|\](?=[(\[]))", r"\\\1", " ".join(text.split()))

@@ -13,7 +13,7 @@ from caryatid.benchmark.plotting import Mark, marks, render
 from caryatid.benchmark.statistics import Group, Summary
 from caryatid.benchmark.words import say_count
 
-MOST_PANELS = 3
+MOST_PANELS = 4
 """Views side by side in one figure; the later ones."""
 OVER_VIEWS = (
     ("f1", "F1", "vertices and edges together"),

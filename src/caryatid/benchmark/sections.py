@@ -144,8 +144,7 @@ def tables(group: Group, summary: Summary, *, brief: bool = False) -> tuple[Tabl
     made.append(_thresholds(known, rows, summary))
     if not brief:
         made.append(_at_the_end(known))
-    if not group.family:
-        made.append(_times(known))
+    made.append(_times(known))
     return tuple(made)
 
 
