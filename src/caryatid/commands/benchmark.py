@@ -10,16 +10,18 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from caryatid.benchmark.cluster import ClusterExecutor
 from caryatid.benchmark.fingerprint import fingerprint
 from caryatid.benchmark.records import Episode, Outcome
 from caryatid.benchmark.running import Executor, LocalExecutor, run_all
 from caryatid.benchmark.scenes import find_scenes, short_name
 from caryatid.benchmark.store import ResultStore
 from caryatid.benchmark.suites import Suite, find_suite, with_planners
+from caryatid.commands.episode_bar import EpisodeBar
 from caryatid.commands.names import PlannerName, SuiteName
 from caryatid.commands.options import SAID, General, defaults_to, whole_number
+from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
 
 RESULTS = "results.sqlite"
@@ -58,7 +60,9 @@ class Benchmark:
     views: Annotated[Count, defaults_to("the suite's")] = None
     """Views of every episode, the first one too."""
     jobs: Annotated[Count, defaults_to(f"the cores of this machine, {CORES}")] = None
-    """Processes."""
+    """Processes of this machine."""
+    scheduler: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="ADDRESS"), SAID] = None
+    """Run on the workers of this dask.distributed scheduler instead, say tcp://10.0.0.5:8786."""
     retry: Annotated[bool, SAID] = False
     """Run episodes again that failed."""
     general: tyro.conf.OmitArgPrefixes[General] = GENERAL
@@ -72,7 +76,8 @@ class Benchmark:
         with ResultStore(self.out / RESULTS, None if suite is None else fingerprint()) as store:
             if suite is not None:
                 try:
-                    self._run(suite, store, console)
+                    with store.alone():
+                        self._run(suite, store, console)
                 except KeyboardInterrupt:
                     console.print("interrupted: what is done is kept, start again to go on")
                     return 130
@@ -91,30 +96,24 @@ class Benchmark:
         """Run what is not done, with a bar."""
         if self.retry:
             store.forget_failures()
-        members = suite.members()
-        missing = store.plan(suite.name, members)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(elapsed_when_finished=True),
-        )
-        with Progress(*columns, console=console, disable=console.quiet) as bar:
-            total = store.planned(suite.name)
-            task = bar.add_task(suite.name, total=total, completed=total - len(missing), rate="")
+        missing = store.plan(suite.name, suite.members())
+        total = store.planned(suite.name)
+        with EpisodeBar(console, suite.name, total, total - len(missing)) as bar:
 
             def done(episode: Episode, outcome: Outcome) -> None:
-                speed = bar.tasks[task].speed
-                bar.update(task, advance=1, rate="" if speed is None else f"{60.0 * speed:.0f} a minute")
+                bar.advance()
                 if outcome.error is not None:
                     name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
-                    bar.console.print(f"failed: {name}: {outcome.error}", markup=False)
+                    bar.say(f"failed: {name}: {outcome.error}")
 
-            run_all(store, missing, self._executor(), done)
+            run_all(store, missing, self._executor(bar), done)
 
-    def _executor(self) -> Executor:
-        return LocalExecutor(self.jobs or CORES)
+    def _executor(self, bar: EpisodeBar) -> Executor:
+        if self.scheduler is None:
+            return LocalExecutor(self.jobs or CORES)
+        if self.jobs is not None:
+            raise InputError("--jobs", "a cluster has the workers it has", "leave --jobs or --scheduler out")
+        return ClusterExecutor(self.scheduler, bar.say)
 
     def _tell(self, store: ResultStore, console: Console) -> int:
         """Say what there is."""
