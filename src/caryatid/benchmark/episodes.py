@@ -45,7 +45,7 @@ def settings_of(episode: Episode) -> Config:
 
 def _rows(episode: Episode) -> tuple[ViewRow, ...]:
     config = settings_of(episode)
-    scene, truth = opened(episode.scene)
+    scene, truth = opened(episode.scene, episode.content)
     stage = set_stage(scene, config, noise=episode.noise, seed=episode.seed)
     rows: list[ViewRow] = []
     planning = 0.0

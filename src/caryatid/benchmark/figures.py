@@ -47,19 +47,17 @@ class Figure:
     png: bytes
 
 
-def draw(summary: Summary, folder: Path) -> tuple[Figure, ...]:
-    """Draw all figures of a suite and write each as SVG and PNG.
+def write_figures(figures: Sequence[Figure], folder: Path) -> None:
+    """Write each figure as SVG and PNG.
 
     Args:
-        summary: What the suite's records say.
+        figures: What to write.
         folder: Where to; made where it is missing.
     """
-    figures = draw_figures(summary)
     folder.mkdir(parents=True, exist_ok=True)
     for figure in figures:
         (folder / f"{figure.name}.svg").write_text(figure.svg, encoding="utf-8")
         (folder / f"{figure.name}.png").write_bytes(figure.png)
-    return figures
 
 
 def draw_figures(summary: Summary) -> tuple[Figure, ...]:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+import signal
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from contextlib import closing, contextmanager
+from multiprocessing import active_children, get_context, parent_process
+from threading import Thread
 from typing import Protocol
 
 from caryatid.benchmark.episodes import run_episode
@@ -20,8 +23,8 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 class Executor(Protocol):
     """Runs episodes somewhere."""
 
-    def run(self, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, Outcome]]:
-        """Yield each episode with its outcome as soon as it is done, in any order."""
+    def run(self, episodes: Sequence[Episode]) -> Generator[tuple[Episode, Outcome]]:
+        """Yield each episode with its outcome as soon as it is done, in any order; stop when closed."""
         ...
 
 
@@ -35,7 +38,7 @@ class LocalExecutor:
     def __init__(self, jobs: int) -> None:
         self._jobs = jobs
 
-    def run(self, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, Outcome]]:
+    def run(self, episodes: Sequence[Episode]) -> Generator[tuple[Episode, Outcome]]:
         """Yield each episode with its outcome as soon as it is done.
 
         Raises:
@@ -43,18 +46,30 @@ class LocalExecutor:
         """
         for name in THREADS:
             os.environ.setdefault(name, "1")
-        pool = ProcessPoolExecutor(min(self._jobs, len(episodes)), get_context("spawn"))
+        others = set(active_children())
+        pool = ProcessPoolExecutor(
+            min(self._jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent
+        )
+        killed = False
         try:
-            futures: dict[Future[Outcome], Episode] = {pool.submit(run_episode, e): e for e in episodes}
+            with _interrupts_held():
+                futures: dict[Future[Outcome], Episode] = {pool.submit(run_episode, e): e for e in episodes}
             for future in as_completed(futures):
-                yield futures.pop(future), future.result()
-        except BrokenExecutor:
+                if isinstance(future.exception(), BrokenExecutor):
+                    killed = True
+                else:
+                    yield futures.pop(future), future.result()
+        except BaseException:
+            for process in set(active_children()) - others:
+                process.terminate()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)
+        if killed:
             raise CaryatidError(
                 "a process was killed, perhaps for want of memory; what is done is kept: "
                 "start again, with fewer --jobs"
-            ) from None
-        finally:
-            pool.shutdown(cancel_futures=True)
+            )
 
 
 def run_all(
@@ -73,6 +88,29 @@ def run_all(
     """
     if not episodes:
         return
-    for episode, outcome in executor.run(episodes):
-        store.add(episode, outcome)
-        done(episode, outcome)
+    with closing(executor.run(episodes)) as outcomes:
+        for episode, outcome in outcomes:
+            store.add(episode, outcome)
+            done(episode, outcome)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back; processes started meanwhile never get it, so that they leave quietly."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    """End this process as soon as the one that started it is gone, however that ended."""
+    parent = parent_process()
+
+    def follow() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    Thread(target=follow, daemon=True).start()

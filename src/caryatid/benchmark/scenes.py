@@ -64,12 +64,18 @@ def family(scene: str) -> str:
 
 
 @lru_cache(maxsize=8)
-def opened(scene: str) -> tuple[SimulatedScene, TrueScene]:
+def opened(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene]:
     """Load a scene and its truth; kept, as the episodes of a scene are run one after the other.
 
+    Args:
+        scene: Name or folder.
+        content: Digest its files must have; empty where it does not matter.
+
     Raises:
-        InputError: It cannot be loaded.
+        InputError: It cannot be loaded, or its files are not those the run was planned with.
     """
+    if content and Path(scene).is_dir() and content_of(scene) != content:
+        raise InputError(scene, "its files are not those this run was planned with", "start again")
     simulated = load_scene(scene)
     file = Path(scene) / TRUTH_FILE
     truth = ground_truth(simulated) if is_builtin(scene) else read_truth(file)

@@ -80,6 +80,29 @@ class ResultStore:
         """Close the file."""
         self._database.close()
 
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Be the only run on this file, till the end or till death; others may read it meanwhile.
+
+        Raises:
+            InputError: Another run is on it.
+        """
+        path = self.path.with_name(f"{self.path.name}-run")
+        lock = sqlite3.connect(path, isolation_level=None, timeout=0.0)
+        try:
+            try:
+                lock.execute("BEGIN EXCLUSIVE")
+            except sqlite3.OperationalError as error:
+                busy = error.sqlite_errorcode == sqlite3.SQLITE_BUSY
+                reason = "another run is under way" if busy else f"cannot be locked ({error})"
+                raise InputError(self.path, reason, "wait for its end, or choose another --out") from None
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+        finally:
+            lock.close()
+
     def about(self) -> dict[str, str]:
         """Fingerprint, format and what else was told of code and machine."""
         return dict(self._database.execute("SELECT name, value FROM about ORDER BY name"))

@@ -10,6 +10,7 @@ from caryatid.benchmark.records import Episode, Member
 from caryatid.benchmark.scenes import content_of, family
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
+from caryatid.planners.volumetric import FORMULATIONS as VOLUMETRIC
 
 DESIGNED = ("tower", "bridge", "counterweight", "leaning_plank", "hidden_stack", "shelf", "clutter")
 """Scenes with one difficulty each."""
@@ -19,14 +20,6 @@ PILES = tuple(
 """Primitives set down one by one, 4 to 20."""
 DENSE = tuple(f"dense-{10 + i % 16}-{301 + i}" for i in range(32))
 """Heaps of 10 to 25 between screens and walls; nothing is tuned on these seeds."""
-VOLUMETRIC = (
-    "occlusion-aware",
-    "unobserved-voxel",
-    "rear-side-voxel",
-    "rear-side-entropy",
-    "proximity-count",
-)
-"""Planners that look at space alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,11 +63,13 @@ class Suite:
     Attributes:
         name: Its name on the command line.
         what: What it shows, in one sentence.
-        methods: The first one is what the others are compared with.
+        methods: What is compared.
         scenes: Names of built-in scenes, or scene folders.
         conditions: What the camera gives.
         seeds: Seeds 0…n−1.
         views: Views an episode, the first one too.
+        reference: Method the others are compared with; None for the first.
+        gap: Two methods of which is told how much of the way between them each other one goes.
     """
 
     name: str
@@ -84,6 +79,8 @@ class Suite:
     conditions: tuple[Condition, ...] = (Condition("labels, Carmine noise"),)
     seeds: int = 3
     views: int = 5
+    reference: str | None = None
+    gap: tuple[str, str] | None = None
 
     def members(self) -> list[Member]:
         """All episodes, those of a scene one after the other."""
@@ -202,8 +199,16 @@ SUITES: Mapping[str, Suite] = {
         Suite(
             "planners",
             "Who finds the support graph with the fewest views, where views differ: in dense heaps.",
-            tuple(Method(name, name) for name in _PLANNERS),
+            (
+                *(Method(name, name) for name in _PLANNERS),
+                *(
+                    Method(f"{name}, w = 0", name, settings=("active.cost_weight=0.0",))
+                    for name in VOLUMETRIC
+                ),
+            ),
             DENSE,
+            reference="random",
+            gap=("random", "oracle"),
         ),
         Suite(
             "ablation",

@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from caryatid.benchmark.cluster import ClusterExecutor
 from caryatid.benchmark.fingerprint import fingerprint
+from caryatid.benchmark.provenance import collect_provenance
 from caryatid.benchmark.records import Episode, Outcome
 from caryatid.benchmark.running import Executor, LocalExecutor, run_all
 from caryatid.benchmark.scenes import find_scenes, short_name
+from caryatid.benchmark.sections import SuiteReport
 from caryatid.benchmark.store import ResultStore
 from caryatid.benchmark.suites import Suite, find_suite, with_planners
+from caryatid.benchmark.telling import report_all, write_docs, write_page, write_tables
+from caryatid.commands.episode_bar import EpisodeBar
 from caryatid.commands.names import PlannerName, SuiteName
 from caryatid.commands.options import SAID, General, defaults_to, whole_number
+from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
 
 RESULTS = "results.sqlite"
@@ -58,9 +64,13 @@ class Benchmark:
     views: Annotated[Count, defaults_to("the suite's")] = None
     """Views of every episode, the first one too."""
     jobs: Annotated[Count, defaults_to(f"the cores of this machine, {CORES}")] = None
-    """Processes."""
+    """Processes of this machine."""
+    scheduler: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="ADDRESS"), SAID] = None
+    """Run on the workers of this dask.distributed scheduler instead, say tcp://10.0.0.5:8786."""
     retry: Annotated[bool, SAID] = False
     """Run episodes again that failed."""
+    docs: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.md"), SAID] = None
+    """Write the figures as a Markdown document too."""
     general: tyro.conf.OmitArgPrefixes[General] = GENERAL
 
     def __call__(self) -> int:
@@ -69,10 +79,12 @@ class Benchmark:
             stderr=True, quiet=self.general.quiet or self.general.json, highlight=False, soft_wrap=True
         )
         suite = None if self.suite is None else self._suite(self.suite)
-        with ResultStore(self.out / RESULTS, None if suite is None else fingerprint()) as store:
+        code = None if suite is None else fingerprint()
+        with ResultStore(self.out / RESULTS, code, collect_provenance().as_strings()) as store:
             if suite is not None:
                 try:
-                    self._run(suite, store, console)
+                    with store.alone():
+                        self._run(suite, store, console)
                 except KeyboardInterrupt:
                     console.print("interrupted: what is done is kept, start again to go on")
                     return 130
@@ -91,40 +103,62 @@ class Benchmark:
         """Run what is not done, with a bar."""
         if self.retry:
             store.forget_failures()
-        members = suite.members()
-        missing = store.plan(suite.name, members)
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeRemainingColumn(elapsed_when_finished=True),
-        )
-        with Progress(*columns, console=console, disable=console.quiet) as bar:
-            total = store.planned(suite.name)
-            task = bar.add_task(suite.name, total=total, completed=total - len(missing), rate="")
+        missing = store.plan(suite.name, suite.members())
+        total = store.planned(suite.name)
+        with EpisodeBar(console, suite.name, total, total - len(missing)) as bar:
 
             def done(episode: Episode, outcome: Outcome) -> None:
-                speed = bar.tasks[task].speed
-                bar.update(task, advance=1, rate="" if speed is None else f"{60.0 * speed:.0f} a minute")
+                bar.advance()
                 if outcome.error is not None:
                     name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
-                    bar.console.print(f"failed: {name}: {outcome.error}", markup=False)
+                    bar.say(f"failed: {name}: {outcome.error}")
 
-            run_all(store, missing, self._executor(), done)
+            run_all(store, missing, self._executor(bar), done)
 
-    def _executor(self) -> Executor:
-        return LocalExecutor(self.jobs or CORES)
+    def _executor(self, bar: EpisodeBar) -> Executor:
+        if self.scheduler is None:
+            return LocalExecutor(self.jobs or CORES)
+        if self.jobs is not None:
+            raise InputError("--jobs", "a cluster has the workers it has", "leave --jobs or --scheduler out")
+        return ClusterExecutor(self.scheduler, bar.say)
 
     def _tell(self, store: ResultStore, console: Console) -> int:
-        """Say what there is."""
-        told = {}
+        """Write tables, figures and pages; say what there is."""
+        reports = report_all(store)
         for name in store.suites():
-            records = store.records(name)
-            failed = sum(r.outcome.error is not None for r in records)
-            told[name] = {"episodes": store.planned(name), "done": len(records), "failed": failed}
-            failures = f", {failed} failed" if failed else ""
-            console.print(f"{name}: {len(records)} of {store.planned(name)} episodes{failures}")
+            console.print(f"{name}: {said(store, name)}", markup=False)
+        for line in write_tables(store, self.out):
+            console.print(line, markup=False)
+        if reports:
+            page = write_page(reports, store, self.out, f"caryatid benchmark --out {self.out.name}")
+            console.print(f"figures: {page}", markup=False)
+            if self.docs is not None:
+                command = f"caryatid benchmark --out {self.out.name} --docs {self.docs.name}"
+                write_docs(reports, store, self.docs, command)
         if self.general.json:
-            sys.stdout.write(json_text({"results": str(self.out), "suites": told}))
+            sys.stdout.write(json_text({"results": str(self.out), "suites": figures(reports)}))
         return 0
+
+
+def said(store: ResultStore, suite: str) -> str:
+    """How much of a suite is done."""
+    records = store.records(suite)
+    failed = sum(record.outcome.error is not None for record in records)
+    return f"{len(records)} of {store.planned(suite)} episodes" + (f", {failed} failed" if failed else "")
+
+
+def figures(reports: Sequence[SuiteReport]) -> dict[str, Any]:
+    """Mean F1 by view of each suite, condition and method, for other programs."""
+    return {
+        report.name: {
+            "planned": report.planned,
+            "done": report.summary.episodes,
+            "failed": len(report.summary.failures),
+            "f1": {
+                group.condition: {m.method: [e.value for e in m.curves["f1"]] for m in group.methods}
+                for group in report.summary.groups
+                if not group.family
+            },
+        }
+        for report in reports
+    }
