@@ -22,7 +22,7 @@ class OracleConfig:
     """The planner that knows the truth, method notes section 6."""
 
     candidates: int = 32
-    """Views tried at the most [1]; about 20° apart where the robot can look from, 20 s a decision."""
+    """Views tried beside the default planner's, at the most [1]; about 20° apart, 0.7 s each."""
     surface_cell: float = 0.01
     """Edge of the cells true surface is counted in [m]; that of a voxel of the map."""
     stride: int = 2

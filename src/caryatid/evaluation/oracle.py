@@ -18,7 +18,7 @@ from caryatid.evaluation.truths import SEED
 from caryatid.formats.graph_json import graph_text
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
-from caryatid.planners import ORACLE, Decision, Planner, PlanningState, make_planner
+from caryatid.planners import ORACLE, Decision, Planner, PlanningState, SupportPlanner, make_planner
 from caryatid.planners.decision import check_candidates, path_cost
 from caryatid.scene import Scene
 from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
@@ -58,7 +58,8 @@ class OraclePlanner:
     Of equal ones it takes that which shows most true surface no earlier view has shown, then the shorter way,
     then the first. True surface is counted in cells of `config.oracle.surface_cell`, object by object: those
     in which a ray of a camera without noise meets the object. The views tried are spread evenly over the
-    candidates, away from the views so far.
+    candidates, away from the views so far; the one the default planner would choose is tried too, so that no
+    step of that planner can be better.
 
     It is good for one exploration. Its predictions are exact: it knows the noise the next view will have, and
     explores with the same configuration, segmentation and seed.
@@ -103,6 +104,7 @@ class OraclePlanner:
         self._catch_up(state)
         candidates = state.candidates
         tried = spread_out(candidates.directions, state.visited, self._config.oracle.candidates)
+        tried = np.union1d(tried, SupportPlanner().plan(state, rng).index)
         unseen = np.array([self._unseen_surface(candidates.T_world_camera[i]) for i in tried])
         # Best tie first: then the first of the highest F1 is the one to take, and nothing beats F1 = 1.
         order = np.lexsort((tried, candidates.path_length[tried], -unseen))
