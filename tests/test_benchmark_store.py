@@ -88,7 +88,7 @@ def test_failures_are_forgotten_only_when_asked_to(tmp_path):
 @pytest.mark.parametrize(
     "other",
     [{"scene": "bridge"}, {"seed": 1}, {"views": 6}, {"planner": "random"}, {"fusion": "pc"},
-     {"segmentation": "auto"}, {"noise": "none"}, {"settings": ()}, {"content": "abc"}],
+     {"segmentation": "auto"}, {"noise": "none"}, {"settings": ()}, {"content": "abc"}, {"plugin": "abc"}],
 )  # fmt: skip
 def test_everything_that_decides_an_episode_is_in_its_key(other):
     episode = member().episode

@@ -18,6 +18,7 @@ class Episode:
         content: Digest of a scene folder's files; empty for a built-in scene, which its name determines.
         fusion: What is fused.
         planner: Who chooses the views.
+        plugin: Digest of the package that offers the planner; empty for those that come with caryatid.
         segmentation: Where parts come from.
         noise: Noise of the camera.
         settings: Changes of the default settings, `stage.name=value`.
@@ -29,6 +30,7 @@ class Episode:
     content: str = ""
     fusion: FusionMethod = "pc+sg"
     planner: str = "support"
+    plugin: str = ""
     segmentation: SegmentationMethod = "labels"
     noise: NoiseModel = "carmine"
     settings: tuple[str, ...] = ()

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
+from caryatid.benchmark.fingerprint import plugin_of
 from caryatid.benchmark.records import Episode, Member
 from caryatid.benchmark.scenes import content_of, family
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
@@ -85,6 +86,7 @@ class Suite:
     def members(self) -> list[Member]:
         """All episodes, those of a scene one after the other."""
         content = {scene: content_of(scene) for scene in self.scenes}
+        plugins = {method.planner: plugin_of(method.planner) for method in self.methods}
         cross = product(self.scenes, range(self.seeds), self.conditions, self.methods)
         return [
             Member(
@@ -93,6 +95,7 @@ class Suite:
                     content=content[scene],
                     fusion=method.fusion,
                     planner=method.planner,
+                    plugin=plugins[method.planner],
                     segmentation=condition.segmentation,
                     noise=condition.noise,
                     settings=condition.settings + method.settings,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 
 from caryatid.errors import InputError
 from caryatid.planners.attention import AttentionPlanner
@@ -34,6 +34,11 @@ ENTRY_POINTS = "caryatid.planners"
 """Group under which other packages offer planners: callables without arguments that return a `Planner`."""
 
 
+def offered() -> dict[str, EntryPoint]:
+    """Planners of other packages by name; a name of ours stays ours."""
+    return {p.name: p for p in entry_points(group=ENTRY_POINTS) if p.name not in {*BUILT_IN, ORACLE}}
+
+
 def make_planner(name: str) -> Planner:
     """Return the planner of this name.
 
@@ -42,9 +47,9 @@ def make_planner(name: str) -> Planner:
     """
     if name in BUILT_IN:
         return BUILT_IN[name]()
-    offered = {point.name: point for point in entry_points(group=ENTRY_POINTS)}
-    if name in offered:
-        planner: Planner = offered[name].load()()
+    others = offered()
+    if name in others:
+        planner: Planner = others[name].load()()
         return planner
     if name == ORACLE:
         raise InputError(
@@ -52,7 +57,7 @@ def make_planner(name: str) -> Planner:
             f"'{ORACLE}' needs a simulated scene, whose truth is known",
             "give a scene, or make it with caryatid.evaluation.oracle.OraclePlanner",
         )
-    names = ", ".join([*BUILT_IN, *sorted(set(offered) - {*BUILT_IN, ORACLE}), ORACLE])
+    names = ", ".join([*BUILT_IN, *sorted(others), ORACLE])
     raise InputError("planner", f"there is no planner '{name}'", f"choose one of {names}")
 
 
@@ -70,4 +75,5 @@ __all__ = [
     "SupportPlanner",
     "VolumetricPlanner",
     "make_planner",
+    "offered",
 ]
