@@ -13,11 +13,14 @@ from caryatid.config import VoxelConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.graph import Support, SupportGraph
 from caryatid.planners import BUILT_IN, make_planner
-from caryatid.planners.hidden import SPACE, space_samples, surface_samples, visibility
+from caryatid.planners.hidden import SPACE, space_samples, surface_samples, unseen_shares, visibility
 from caryatid.recording_robot import RecordingRobot
 from caryatid.robot import Candidates
 from caryatid.view_sphere import direction
 from caryatid.voxels import VoxelMap
+
+CORNERS = ((0.12, 0.12), (0.12, -0.12), (-0.12, 0.12), (-0.12, -0.12))
+"""Where four objects stand around the middle of the table [m]."""
 
 
 @pytest.mark.parametrize("name", BUILT_IN)
@@ -183,8 +186,35 @@ class TestSupport:
         nothing_known = VoxelMap.around(SPHERE.centre_world, VoxelConfig()).with_shapes([CUBE.shape])
         unseen = space_samples(graph, nothing_known, CONFIG)
         assert len(seen.points_world) == 0
-        assert 0.5 < unseen.weights.sum() <= 1.0
+        assert 0.9 * CONFIG.space_weight < unseen.weights.sum() <= CONFIG.space_weight + CONFIG.heap_weight
         assert (CUBE.shape.signed_distance(unseen.points_world) >= -0.01).all()
+
+    def test_space_among_the_objects_weighs_most(self):
+        corners = [box(i, (x, y, 0.8), (0.06, 0.06, 0.1)) for i, (x, y) in enumerate(CORNERS, start=1)]
+        nothing_known = VoxelMap.around(SPHERE.centre_world, VoxelConfig()).with_shapes(
+            [o.shape for o in corners]
+        )
+        samples = space_samples(SupportGraph((TABLE, *corners)), nothing_known, CONFIG)
+        among = np.abs(samples.points_world[:, :2]).max(axis=1) < 0.1
+        beyond = np.abs(samples.points_world[:, :2]).max(axis=1) > 0.15
+        assert samples.weights[among].mean() > 10.0 * samples.weights[beyond].mean() > 0.0
+        assert samples.weights.sum() <= CONFIG.space_weight + CONFIG.heap_weight
+
+    def test_objects_of_which_little_was_seen_are_worth_more(self):
+        graph = SupportGraph((TABLE, CUBE, box(2, (0.0, 0.3, 0.8), (0.1, 0.1, 0.1))))
+        samples = surface_samples(graph, known(list(graph.objects)), CONFIG)
+        seen = np.where(samples.subjects == 0, 1.0, 0.25)
+        np.testing.assert_allclose(unseen_shares(samples, seen), np.where(samples.subjects == 0, 0.0, 0.75))
+
+    def test_the_more_a_way_costs_the_shorter_it_is(self):
+        ways = []
+        for effort in (0.0, 0.05, 0.5, 100.0):
+            situation = state([CUBE], (ON_TABLE,), effort=effort, inhibition=0.0)
+            decision = make_planner("support").plan(situation, np.random.default_rng(0))
+            ways.append(float(OPEN.path_length[decision.index]))
+        assert ways == sorted(ways, reverse=True)
+        assert ways[0] > 2.0 * ways[2] > 0.0
+        assert ways[3] < 0.1
 
     def test_surfaces_in_contact_are_not_asked_for(self):
         graph = SupportGraph((TABLE, CUBE))

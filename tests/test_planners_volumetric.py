@@ -194,11 +194,13 @@ def test_it_goes_to_the_side_that_shows_unknown_space(name: str, side: float):
 @pytest.mark.parametrize("name", FORMULATIONS)
 class TestPlanner:
     def test_its_score_is_the_utility(self, name: str):
-        situation = beside_screen(1.0, cost_weight=0.7)
+        situation = beside_screen(1.0, cost_weight=0.7, path_cost="angle")
         decision = make_planner(name).plan(situation, np.random.default_rng(0))
         alpha = frames.angle_between(HOME, OPEN.directions[decision.index])
         assert decision.score == pytest.approx(decision.saliency - decision.cost)
-        double = make_planner(name).plan(beside_screen(1.0, cost_weight=1.4), np.random.default_rng(0))
+        double = make_planner(name).plan(
+            beside_screen(1.0, cost_weight=1.4, path_cost="angle"), np.random.default_rng(0)
+        )
         other = frames.angle_between(HOME, OPEN.directions[double.index])
         ratio = np.sin(other / 2.0) / np.sin(alpha / 2.0)
         assert double.cost == pytest.approx(2.0 * ratio * decision.cost)

@@ -52,8 +52,8 @@ class ActiveVisionConfig:
     """Angle on the sphere at which saliency has fallen to exp(−½) [deg]."""
     inhibition: float = 1.0
     """Depth of the negative bump at every visited view [1]; 0 is no inhibition of return."""
-    path_cost: Literal["angle", "path", "none"] = "angle"
-    """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing."""
+    path_cost: Literal["angle", "path", "none"] = "path"
+    """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path halves it."""
     max_views: int = 10
     """Views at the most, the first one too; the paper's."""
     clearance: float = 0.05
@@ -70,8 +70,12 @@ class ActiveVisionConfig:
     """A surface met at less than this from its normal is seen as well as can be [deg]."""
     space_spacing: float = 0.04
     """Spacing of the points in unseen space the planner `support` tests for being seen [m]."""
-    space_weight: float = 1.0
-    """Worth of all the space on the table against all the objects' surfaces [1]."""
+    space_weight: float = 0.5
+    """Worth of all the space on the table against all surfaces of objects [1]; little of it holds any."""
+    heap_weight: float = 1.0
+    """Worth of the space among the objects against all their surfaces [1]; objects hide in it."""
+    effort: float = 0.05
+    """Share of all there is to see for which the planner `support` goes one sphere diameter [1]."""
     relation_weight: float = 0.1
     """Worth of all relations' points of interest against all the objects' surfaces [1]."""
     ray_spacing: float = 0.02

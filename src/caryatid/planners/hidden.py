@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.interest import PointOfInterest
+from caryatid.stability import ground_outline
 from caryatid.voxels import OCCUPIED, UNKNOWN, VoxelMap
 
 SPACE = "unseen space"
@@ -97,15 +99,17 @@ def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | 
 
 
 def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConfig) -> Samples:
-    """Spread points over the unseen space on the table, where something may stand; they weigh at most 1.
+    """Spread points over the unseen space on the table, where something may stand.
 
     Space counts up to the height of the highest object, fully at the table and less the higher it is: what
-    stands there has to be carried. All of the table unseen up to there weighs 1.
+    stands there has to be carried. All of the table unseen up to there weighs `config.space_weight`; the
+    space among the objects, over the convex hull of their outlines, weighs `config.heap_weight` beside: what
+    holds up a heap, or leans on it, is in there.
 
     Args:
         graph: The objects and the table.
         solid: The voxel map with the shapes filled in.
-        config: Spacing of the points.
+        config: Spacing of the points, and their worth.
     """
     table = graph.support_surface
     corners = space_above(graph, solid)
@@ -116,8 +120,11 @@ def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConf
     points = np.stack([g.ravel() for g in grid], axis=-1)
     local = (points - table.centre_world) @ table.shape.T_world_object[:3, :3]
     on_table = (np.abs(local[:, :2]) <= table.shape.extents[:2] / 2.0).all(axis=1)
-    weights = np.where(on_table, 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2]), 0.0)
-    weights /= max(float(weights.sum()), 1e-9)
+    lowness = np.where(on_table, 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2]), 0.0)
+    outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
+    heap = shapely.GeometryCollection(outlines).convex_hull
+    among = np.where(shapely.contains_xy(heap, points[:, 0], points[:, 1]), lowness, 0.0)
+    weights = config.space_weight * _shares(lowness) + config.heap_weight * _shares(among)
     unseen = on_table & (solid.state_at(points) == UNKNOWN)
     points = points[unseen]
     zeros = np.zeros(len(points), dtype=np.intp)
@@ -135,8 +142,8 @@ def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
     return Samples(positions, np.zeros_like(positions), saliency / total, np.arange(len(points)), names)
 
 
-def weighted(samples: Samples, weight: float) -> Samples:
-    """Scale all weights."""
+def weighted(samples: Samples, weight: float | Array) -> Samples:
+    """Scale all weights, by one number or each by its own (K,)."""
     return Samples(
         samples.points_world,
         samples.normals_world,
@@ -171,6 +178,22 @@ def visibility(samples: Samples, T_world_camera: Array, solid: VoxelMap, config:
     return facing
 
 
+def unseen_shares(samples: Samples, seen: Array) -> Array:
+    """How much of what each sample is about has not been seen (K,): 1 nothing, 0 all of it.
+
+    Args:
+        samples: Points.
+        seen: How well each has been seen (K,), from 0 to 1.
+    """
+    count = np.bincount(samples.subjects, minlength=len(samples.names))
+    left = np.bincount(samples.subjects, weights=1.0 - seen, minlength=len(samples.names))
+    return (left / np.maximum(count, 1))[samples.subjects]
+
+
+def _shares(weights: Array) -> Array:
+    return weights / max(float(weights.sum()), 1e-9)
+
+
 def _area(subject: SceneObject) -> float:
     """Surface of the box around a shape [m²]."""
     x, y, z = subject.shape.extents
@@ -189,6 +212,7 @@ __all__ = [
     "space_above",
     "space_samples",
     "surface_samples",
+    "unseen_shares",
     "visibility",
     "weighted",
 ]

@@ -2,8 +2,9 @@
 
 It keeps the frame of Algorithm 2, c = s − h with inhibition of return over the reachable part of the view
 sphere, and asks of each candidate what it would show that no earlier view has: the surface of the fitted
-objects, the unseen space on the table in which a supporter may stand, and the points of Algorithm 1. A
-point counts when its line of sight is free of what was seen occupied and of the fitted shapes.
+objects, most of those of which least has been seen; the unseen space on the table in which a supporter may
+stand, most of it among the objects; and the points of Algorithm 1. A point counts when its line of sight is
+free of what was seen occupied and of the fitted shapes.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from caryatid.planners.hidden import (
     relation_samples,
     space_samples,
     surface_samples,
+    unseen_shares,
     visibility,
     weighted,
 )
@@ -43,8 +45,8 @@ class SupportPlanner:
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
 
-        s is the worth of what a candidate shows anew, in shares of the best candidate's, with the
-        inhibition of return.
+        s is the worth of what a candidate shows anew, h the cost of going there, `config.effort` times that
+        of eq. 3, and so is the inhibition of return: both only decide where views show about as much.
         """
         check_candidates(state)
         config, sphere, candidates = state.config, state.sphere, state.candidates
@@ -52,10 +54,9 @@ class SupportPlanner:
         relations += points_of_doubt(state.graph, sphere, state.visited)
         samples, gain, chosen = _expected_gain(state, relations)
 
-        total = gain.sum(axis=0)
-        saliency = total / max(float(total.max(initial=0.0)), 1e-9)
-        saliency = saliency + inhibition_of_return(state.visited, candidates.directions[chosen], config)
-        cost = path_cost(state)
+        inhibition = inhibition_of_return(state.visited, candidates.directions[chosen], config)
+        saliency = gain.sum(axis=0) + config.effort * inhibition
+        cost = config.effort * path_cost(state)
         score = saliency - cost[chosen]
         best = int(np.argmax(score))
         index = int(chosen[best])
@@ -87,21 +88,17 @@ def _expected_gain(
     """Samples, what some candidates show of them anew (K, C), and which candidates those are (C,)."""
     config, sphere, candidates = state.config, state.sphere, state.candidates
     solid = state.voxels.with_shapes([o.shape for o in state.graph.objects])
-    samples = join(
-        [
-            surface_samples(state.graph, solid, config),
-            weighted(space_samples(state.graph, solid, config), config.space_weight),
-            weighted(relation_samples(relations), config.relation_weight),
-        ]
-    )
+    T_world_visited = sphere.poses(state.visited)
+    surfaces = surface_samples(state.graph, solid, config)
+    points = relation_samples(relations)
+    seen = visibility(join([surfaces, points]), T_world_visited, solid, config).max(axis=1, initial=0.0)
+    surfaces = weighted(surfaces, unseen_shares(surfaces, seen[: len(surfaces.weights)]))
+    space = space_samples(state.graph, solid, config)
+    samples = join([surfaces, weighted(points, config.relation_weight), space])
+    before = np.concatenate([seen, np.zeros(len(space.weights))])
     chosen = thin(candidates.directions, config.look_directions)
     now = visibility(samples, candidates.T_world_camera[chosen], solid, config)
-    before = visibility(samples, sphere.poses(state.visited), solid, config).max(axis=1, initial=0.0)
-    unseen_space = np.array([name == SPACE for name in samples.names])
-    if len(samples.names):
-        before[unseen_space[samples.subjects]] = 0.0
-    gain = samples.weights[:, None] * np.maximum(now - before[:, None], 0.0)
-    return samples, gain, chosen
+    return samples, samples.weights[:, None] * np.maximum(now - before[:, None], 0.0), chosen
 
 
 def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[PointOfInterest]:
