@@ -91,7 +91,7 @@ def test_with_the_literal_settings_it_is_the_papers():
         {"spread": 10.0},
         {"inhibition": 0.0},
         {"path_cost": "none"},
-        {"path_cost": "path"},
+        {"path_cost": "angle"},
     ],
     ids=lambda s: "-".join(f"{k}={v}" for k, v in s.items()),
 )
@@ -136,7 +136,7 @@ def test_without_propagation_a_hidden_point_still_repels():
 
 def test_a_view_no_point_reaches_is_not_said_to_be_about_one():
     """A relation found in all views is worth nothing with λ_s = ½: the robot stays where it is."""
-    settings = {"saliency_weight": 0.5, "inhibition": 0.0}
+    settings = {"saliency_weight": 0.5, "inhibition": 0.0, "path_cost": "angle"}
     alone = decision("attention", [CUBE], (Support("o0", "o1"),), propagation=False, **settings)
     assert frames.angle_between(HOME, OPEN.directions[alone.index]) < 0.02
     assert "no point of interest" in alone.why

@@ -139,6 +139,12 @@ def test_workers_with_other_code_are_refused(cluster, tmp_path):
     assert told[0] == f"no workers; waiting for some: dask worker {cluster.address} --nthreads 1 --nworkers N"
 
 
+def test_a_worker_without_the_planner_is_refused():
+    episode = Episode("tower", planner="above-first", plugin="abc", settings=QUICK, views=1)
+    with pytest.raises(CaryatidError, match="not the same package that offers the planner above-first; inst"):
+        run_on_worker(episode, fingerprint())
+
+
 def test_a_scheduler_that_goes_ends_the_run(cluster):
     executor = ClusterExecutor(cluster.address, lambda text: cluster.scheduler.kill(), patience=1.0)
     with pytest.raises(CaryatidError, match=r"the scheduler at tcp://\S+ is gone; what is done is kept"):

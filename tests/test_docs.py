@@ -40,10 +40,11 @@ def test_python_blocks_run(page, workplace, capsys):
         exec(compile(block, str(page), "exec"), {"__name__": "__main__"})
 
 
-def test_commands_run(workplace, capsys):
+def test_commands_run(workplace, capsys, monkeypatch):
+    monkeypatch.setattr("caryatid.commands.benchmark.run_all", lambda *arguments: None)
     lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("caryatid ")]
-    assert {command[0] for command in commands} == {"explore", "extract", "evaluate", "config"}
+    assert {command[0] for command in commands} == {"explore", "extract", "evaluate", "benchmark", "config"}
     for command in commands:
         redirected = command[command.index(">") + 1] if ">" in command else None
         arguments = command[: command.index(">")] if redirected else command

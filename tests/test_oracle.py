@@ -97,11 +97,11 @@ def test_the_reason_says_from_where_to_where_f1_goes(explored):
 
 def test_the_default_planner_is_never_a_step_ahead():
     config = replace(CONFIG, active=replace(CONFIG.active, max_views=2), oracle=OracleConfig(candidates=1))
-    (first, _), (_, f1) = exploration("oracle", "clutter", config)
-    (default, _), (_, f1_default) = exploration(make_planner("support"), "clutter", config)
+    (first, _), (_, f1) = exploration("oracle", "shelf", config)
+    (default, _), (_, f1_default) = exploration(make_planner("support"), "shelf", config)
     (lone,) = spread_out(first.candidates.directions, first.visited, 1)
     assert lone != default.decision.index
-    _, (_, f1_lone) = exploration(Chosen([lone]), "clutter", config)
+    _, (_, f1_lone) = exploration(Chosen([lone]), "shelf", config)
     assert f1 == max(f1_default, f1_lone)
     assert f1_default != f1_lone
 

@@ -13,7 +13,7 @@ from threading import Lock
 from typing import TYPE_CHECKING
 
 from caryatid.benchmark.episodes import run_episode
-from caryatid.benchmark.fingerprint import fingerprint
+from caryatid.benchmark.fingerprint import fingerprint, plugin_of
 from caryatid.benchmark.records import Episode, Outcome
 from caryatid.errors import CaryatidError, InputError
 from caryatid.threads import one_blas_thread
@@ -138,12 +138,17 @@ def run_on_worker(episode: Episode, code: str) -> Outcome:
         code: Fingerprint the worker's code must have.
 
     Raises:
-        CaryatidError: It has another.
+        CaryatidError: It has another, or another package that offers the planner.
     """
     from numba import set_num_threads
 
     if fingerprint() != code:
         raise _other_code("a worker", fingerprint())
+    if plugin_of(episode.planner) != episode.plugin:
+        raise CaryatidError(
+            f"a worker has not the same package that offers the planner {episode.planner}; "
+            "install it there and start the worker again"
+        )
     with _ONE_AT_A_TIME:
         set_num_threads(1)
         return one_blas_thread(run_episode)(episode)

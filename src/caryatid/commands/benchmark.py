@@ -81,14 +81,14 @@ class Benchmark:
         suite = None if self.suite is None else self._suite(self.suite)
         code = None if suite is None else fingerprint()
         with ResultStore(self.out / RESULTS, code, collect_provenance().as_strings()) as store:
-            if suite is not None:
-                try:
+            try:
+                if suite is not None:
                     with store.alone():
                         self._run(suite, store, console)
-                except KeyboardInterrupt:
-                    console.print("interrupted: what is done is kept, start again to go on")
-                    return 130
-            return self._tell(store, console)
+                return self._tell(store, console)
+            except KeyboardInterrupt:
+                console.print("interrupted: what is done is kept, start again to go on")
+                return 130
 
     def _suite(self, name: str) -> Suite:
         """The suite with what the options change."""

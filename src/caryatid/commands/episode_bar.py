@@ -33,7 +33,7 @@ class EpisodeBar:
         self._name, self._total, self._before, self._done = name, total, before, before
         self._start = self._told = time.monotonic()
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Pace(before))
-        shown = console.is_terminal and not console.quiet
+        shown = console.is_interactive and not console.quiet
         self._bar = Progress(*columns, console=console, disable=not shown)
         self._task = self._bar.add_task(name, total=total, completed=before)
 
@@ -73,7 +73,8 @@ def pace(done: int, missing: int, seconds: float) -> str:
         return ""
     a_minute = 60.0 * done / seconds
     rate = f"{a_minute:.0f} a minute" if a_minute >= 10.0 else f"{60.0 * a_minute:.0f} an hour"
-    return f"{rate}, {timedelta(seconds=round(missing * seconds / done))} left"
+    left = timedelta(seconds=round(missing * seconds / done))
+    return f"{rate}, {left} left" if missing else rate
 
 
 class _Pace(ProgressColumn):
