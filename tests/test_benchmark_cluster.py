@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,16 +39,21 @@ class Cluster:
         self._folder = folder
         folder.mkdir()
         self._processes: list[subprocess.Popen[bytes]] = []
-        file = folder / "address"
-        self.scheduler = self._start("scheduler", *LOCAL, "--port=0", f"--scheduler-file={file}")
-        while not file.is_file():
-            assert self.scheduler.poll() is None, (folder / "0.log").read_text()
+        self.scheduler = self._start(
+            "scheduler", *LOCAL, "--port=0", f"--scheduler-file={folder / 'address'}"
+        )
+        self.address = ""
+
+    def wait_for_scheduler(self) -> None:
+        file = self._folder / "address"
+        while not self.address:
+            assert self.scheduler.poll() is None, (self._folder / "0.log").read_text()
             time.sleep(0.05)
-        self.address = json.loads(file.read_text())["address"]
+            with suppress(FileNotFoundError, json.JSONDecodeError):
+                self.address = json.loads(file.read_text())["address"]
 
     def add_worker(self, threads: int = 1, code: Path | None = None) -> subprocess.Popen[bytes]:
-        scratch = f"--local-directory={self._folder / f'scratch{len(self._processes)}'}"
-        options = [*LOCAL, "--no-nanny", f"--nthreads={threads}", scratch]
+        options = [*LOCAL, "--no-nanny", f"--nthreads={threads}"]
         return self._start("worker", self.address, *options, code=code)
 
     def end(self) -> None:
@@ -58,10 +64,11 @@ class Cluster:
 
     def _start(self, what: str, *options: str, code: Path | None = None) -> subprocess.Popen[bytes]:
         source = code or Path(caryatid.__file__).parents[1]
+        environment = {"PYTHONPATH": str(source), "DASK_TEMPORARY_DIRECTORY": str(self._folder)}
         with (self._folder / f"{len(self._processes)}.log").open("wb") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", f"distributed.cli.dask_{what}", *options],
-                stdout=log, stderr=log, cwd=self._folder, env={**os.environ, "PYTHONPATH": str(source)},
+                stdout=log, stderr=log, cwd=self._folder, env={**os.environ, **environment},
             )  # fmt: skip
         self._processes.append(process)
         return process
@@ -70,8 +77,11 @@ class Cluster:
 @pytest.fixture
 def cluster(tmp_path):
     started = Cluster(tmp_path / "cluster")
-    yield started
-    started.end()
+    try:
+        started.wait_for_scheduler()
+        yield started
+    finally:
+        started.end()
 
 
 def test_a_run_that_loses_a_worker_is_complete_and_the_same(cluster, tmp_path, scene_file, monkeypatch):
