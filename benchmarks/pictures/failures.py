@@ -78,11 +78,7 @@ class Picture:
 
 
 PICTURES: Mapping[str, Picture] = {
-    "hidden": Picture(
-        "dense-15-103",
-        ("object8", "object14", "object7"),
-        "The ball A lies under B: a sliver of it is seen",
-    ),
+    "hidden": Picture("dense-15-124", ("object8", "object4"), "A strip of the can A is seen behind B"),
     "friction": Picture(
         "dense-12-107",
         ("object11", "object5", "object6", "object7"),
@@ -96,10 +92,13 @@ PICTURES: Mapping[str, Picture] = {
     ),
     "merged": Picture("packed-20-1", ("object2", "object0"), "A and B become one box", "auto"),
     "split": Picture(
-        "dense-15-124", ("object4", "object8"), "A is found in two pieces, B not at all", "auto"
+        "dense-15-124", ("object4", "object8"), "An end of A is all that is found, B not at all", "auto"
     ),
     "slivers": Picture(
-        "dense-15-103", ("object5", "object8", "object4"), "Too few pixels of A and B to be parts", "auto"
+        "dense-15-103",
+        ("object5", "object8", "object4"),
+        "A strip of C becomes a box, A is too small to be a part",
+        "auto",
     ),
 }
 

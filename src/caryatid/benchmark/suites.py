@@ -231,6 +231,18 @@ SUITES: Mapping[str, Suite] = {
             DENSE[:16],
         ),
         Suite(
+            "poses",
+            "What fusing points, graphs or both makes of views whose poses are taken as they come.",
+            tuple(
+                Method(fused.label + how, fusion=fused.fusion, settings=settings)
+                for how, settings in (("", ()), (", poses as they come", ("registration.enabled=false",)))
+                for fused in _FIG5[:3]
+            ),
+            (*DESIGNED, *PILES[2::2], *DENSE[:8]),
+            seeds=1,
+            views=10,
+        ),
+        Suite(
             "noise",
             "What depth noise, wrong poses and automatic parts cost.",
             (Method("support"), Method("random", "random")),
