@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -130,3 +132,26 @@ def test_rows_are_the_same_on_any_number_of_processes(tmp_path):
             found.append([without_times(r.outcome) for r in store.records("smoke")])
     assert found[0] == found[1]
     assert [outcome.error is None for outcome in found[0]] == [True, True, False, False]
+
+
+def test_running_leaves_the_environment_as_it_was():
+    before = dict(os.environ)
+    for _, outcome in LocalExecutor(1).run([Episode("dense-99-1", settings=QUICK, views=2)]):
+        assert outcome.error is not None
+        assert dict(os.environ) == before
+
+
+def test_an_interrupt_waits_until_all_processes_are_started():
+    class Interrupting(list):
+        left = 0
+
+        def __iter__(self):
+            os.kill(os.getpid(), signal.SIGINT)
+            for episode in super().__iter__():
+                yield episode
+                self.left += 1
+
+    episodes = Interrupting(Episode("tower", settings=QUICK, views=2, seed=seed) for seed in range(3))
+    with pytest.raises(KeyboardInterrupt):
+        next(LocalExecutor(2).run(episodes))
+    assert episodes.left == len(episodes)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from multiprocessing import active_children, get_context, parent_process
-from threading import Thread
+from threading import Thread, current_thread, main_thread
 from typing import Protocol
 
 from caryatid.benchmark.episodes import run_episode
@@ -17,7 +17,7 @@ from caryatid.benchmark.store import ResultStore
 from caryatid.errors import CaryatidError
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Set to 1 for the processes, unless set already: they share the cores."""
+"""Set to 1 in the environment of the processes, unless set already: they share the cores."""
 
 
 class Executor(Protocol):
@@ -44,15 +44,13 @@ class LocalExecutor:
         Raises:
             CaryatidError: A process was killed.
         """
-        for name in THREADS:
-            os.environ.setdefault(name, "1")
         others = set(active_children())
         pool = ProcessPoolExecutor(
             min(self._jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent
         )
         killed = False
         try:
-            with _interrupts_held():
+            with _one_thread_each(), _interrupts_held():
                 futures: dict[Future[Outcome], Episode] = {pool.submit(run_episode, e): e for e in episodes}
             for future in as_completed(futures):
                 if isinstance(future.exception(), BrokenExecutor):
@@ -95,13 +93,37 @@ def run_all(
 
 
 @contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back; processes started meanwhile never get it, so that they leave quietly."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+def _one_thread_each() -> Iterator[None]:
+    """Have processes started meanwhile compute on one thread; this one, whose threads may run, goes on."""
+    added = [name for name in THREADS if name not in os.environ]
+    os.environ.update(dict.fromkeys(added, "1"))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for name in added:
+            del os.environ[name]
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back until the end; processes started meanwhile never get it, so that they leave quietly.
+
+    The mask is what the processes inherit. It does not hold Ctrl-C back here, where another thread may take
+    it and half-started processes would be left behind: the handler does.
+    """
+    if current_thread() is not main_thread():
+        yield
+        return
+    held: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, frame: held.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if held:
+        raise KeyboardInterrupt
 
 
 def _end_with_parent() -> None:
