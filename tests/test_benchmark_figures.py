@@ -98,8 +98,8 @@ def test_what_cannot_be_drawn_is_left_out():
 
 
 def test_no_two_methods_look_alike():
-    looks = [(m.colour, str(m.dash), m.marker) for m in marks([f"m{k}" for k in range(21)]).values()]
-    assert len(set(looks)) == 21
+    looks = [(m.colour, str(m.dash), m.marker) for m in marks([f"m{k}" for k in range(147)]).values()]
+    assert len(set(looks)) == 147
 
 
 def test_labels_keep_apart_and_inside():

@@ -94,12 +94,13 @@ class Mark:
 
 
 def marks(methods: Sequence[str]) -> dict[str, Mark]:
-    """Give each method a mark; up to 21 differ."""
+    """Give each method a mark; up to 147 differ."""
     found = {}
     for k, name in enumerate(methods):
         turn, place = divmod(k, len(COLOURS))
-        dash = DASHES[turn % len(DASHES)]
-        found[name] = Mark(name, COLOURS[place], dash, *MARKERS[place], hollow=turn > 0)
+        shift, dash = divmod(turn, len(DASHES))
+        marker = MARKERS[(place + shift) % len(MARKERS)]
+        found[name] = Mark(name, COLOURS[place], DASHES[dash], *marker, hollow=dash > 0)
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from caryatid.benchmark.export import write_csv, write_parquet
 from caryatid.benchmark.figures import write_figures
 from caryatid.benchmark.page import render_page
 from caryatid.benchmark.provenance import Provenance
+from caryatid.benchmark.records import Record
 from caryatid.benchmark.sections import SuiteReport, report_suite
 from caryatid.benchmark.statistics import summarise
 from caryatid.benchmark.store import ResultStore
@@ -21,41 +24,67 @@ SEED = 0
 """Seed of the resamples, so that a result always gives the same figures."""
 
 
-def report_all(store: ResultStore) -> list[SuiteReport]:
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a store holds of one suite.
+
+    Attributes:
+        name: Of the suite.
+        records: What is done of it.
+        planned: How many episodes it has.
+    """
+
+    name: str
+    records: Sequence[Record]
+    planned: int
+
+    def said(self) -> str:
+        """How much of it is done, in a line."""
+        failed = sum(record.outcome.error is not None for record in self.records)
+        done = f"{len(self.records)} of {self.planned} episodes"
+        return f"{self.name}: {done}, {failed} failed" if failed else f"{self.name}: {done}"
+
+
+def read_results(store: ResultStore) -> list[Result]:
+    """Read every suite that was asked for."""
+    return [Result(name, store.records(name), store.planned(name)) for name in store.suites()]
+
+
+def report_all(results: Sequence[Result]) -> list[SuiteReport]:
     """What there is to tell of every suite of which something is done.
 
     Args:
-        store: A result.
+        results: Of a store.
     """
     reports = []
-    for name in store.suites():
-        records = store.records(name)
-        if not records:
+    for result in results:
+        if not result.records:
             continue
-        known = SUITES.get(name)
-        methods = {record.member.method for record in records}
+        known = SUITES.get(result.name)
+        methods = {record.member.method for record in result.records}
         gap = known.gap if known is not None and methods.issuperset(known.gap or ()) else None
         reference = known.reference if known is not None and known.reference in methods else None
-        summary = summarise(records, np.random.default_rng(SEED), reference=reference, gap=gap)
-        reports.append(report_suite(name, "" if known is None else known.what, summary, store.planned(name)))
+        summary = summarise(result.records, np.random.default_rng(SEED), reference=reference, gap=gap)
+        what = "" if known is None else known.what
+        reports.append(report_suite(result.name, what, summary, result.planned))
     return reports
 
 
-def write_tables(store: ResultStore, folder: Path) -> list[str]:
+def write_tables(results: Sequence[Result], folder: Path) -> list[str]:
     """Write all rows of each suite as `SUITE.csv` and, where pyarrow is installed, `SUITE.parquet`.
 
     Args:
-        store: A result.
+        results: Of a store.
         folder: Where to.
 
     Returns:
         What is to be said: how to get what was left out.
     """
-    for name in store.suites():
-        write_csv(store.records(name), folder / f"{name}.csv")
+    for result in results:
+        write_csv(result.records, folder / f"{result.name}.csv")
     try:
-        for name in store.suites():
-            write_parquet(store.records(name), folder / f"{name}.parquet")
+        for result in results:
+            write_parquet(result.records, folder / f"{result.name}.parquet")
     except InputError as error:
         return [str(error)]
     return []

@@ -21,7 +21,7 @@ from caryatid.benchmark.scenes import find_scenes, short_name
 from caryatid.benchmark.sections import SuiteReport
 from caryatid.benchmark.store import ResultStore
 from caryatid.benchmark.suites import Suite, find_suite, with_planners
-from caryatid.benchmark.telling import report_all, write_docs, write_page, write_tables
+from caryatid.benchmark.telling import read_results, report_all, write_docs, write_page, write_tables
 from caryatid.commands.episode_bar import EpisodeBar
 from caryatid.commands.names import PlannerName, SuiteName
 from caryatid.commands.options import SAID, General, defaults_to, whole_number
@@ -124,10 +124,9 @@ class Benchmark:
 
     def _tell(self, store: ResultStore, console: Console) -> int:
         """Write tables, figures and pages; say what there is."""
-        reports = report_all(store)
-        for name in store.suites():
-            console.print(f"{name}: {said(store, name)}", markup=False)
-        for line in write_tables(store, self.out):
+        results = read_results(store)
+        reports = report_all(results)
+        for line in [result.said() for result in results] + write_tables(results, self.out):
             console.print(line, markup=False)
         if reports:
             page = write_page(reports, store, self.out, f"caryatid benchmark --out {self.out.name}")
@@ -138,13 +137,6 @@ class Benchmark:
         if self.general.json:
             sys.stdout.write(json_text({"results": str(self.out), "suites": figures(reports)}))
         return 0
-
-
-def said(store: ResultStore, suite: str) -> str:
-    """How much of a suite is done."""
-    records = store.records(suite)
-    failed = sum(record.outcome.error is not None for record in records)
-    return f"{len(records)} of {store.planned(suite)} episodes" + (f", {failed} failed" if failed else "")
 
 
 def figures(reports: Sequence[SuiteReport]) -> dict[str, Any]:
