@@ -26,7 +26,8 @@ from caryatid.benchmark.records import Episode, Outcome
 from caryatid.benchmark.running import run_all
 from caryatid.benchmark.scenes import content_of
 from caryatid.benchmark.store import ResultStore
-from caryatid.benchmark.suites import find_suite, with_planners
+from caryatid.benchmark.suites import find_suite
+from caryatid.benchmark.variants import with_planners
 from caryatid.errors import CaryatidError, InputError
 
 LOCAL = ["--host", "127.0.0.1", "--no-dashboard"]

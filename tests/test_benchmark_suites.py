@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from caryatid.benchmark.records import TIMES, Episode, Outcome
 from caryatid.benchmark.running import LocalExecutor, run_all
 from caryatid.benchmark.scenes import content_of, family, find_scenes
 from caryatid.benchmark.store import ResultStore
-from caryatid.benchmark.suites import SUITES, find_suite, with_planners
+from caryatid.benchmark.suites import SUITES, find_suite
+from caryatid.benchmark.variants import with_conditions, with_fusions, with_planners, with_settings
 from caryatid.errors import InputError
 from caryatid.simulation.scenes import is_builtin, load_scene, write_scene
 
@@ -55,6 +57,52 @@ def test_planners_can_take_the_place_of_the_methods():
         ("random", "random", "pc+sg"),
         ("paper", "paper", "pc+sg"),
     ]
+
+
+def test_fusions_take_the_place_of_those_of_the_suite():
+    both = with_fusions(find_suite("smoke"), ["pc", "sg"])
+    assert [(m.label, m.planner, m.fusion) for m in both.methods] == [
+        ("support PC", "support", "pc"),
+        ("support SG", "support", "sg"),
+        ("random PC", "random", "pc"),
+        ("random SG", "random", "sg"),
+        ("attention PC", "attention", "pc"),
+        ("attention SG", "attention", "sg"),
+        ("rear-side-voxel PC", "rear-side-voxel", "pc"),
+        ("rear-side-voxel SG", "rear-side-voxel", "sg"),
+    ]
+    ablation = find_suite("ablation")
+    one = with_fusions(ablation, ["sg", "sg"])
+    assert [(m.label, m.settings) for m in one.methods] == [(m.label, m.settings) for m in ablation.methods]
+    assert {m.fusion for m in one.methods} == {"sg"}
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_every_suite_can_be_changed(name):
+    suite = with_fusions(find_suite(name), ["pc", "sg", "pc+sg"])
+    suite = with_conditions(suite, ["auto", "labels"], ["none", "carmine"])
+    suite = with_settings(suite, ["noise.translation=0.02"])
+    assert [c.label for c in suite.conditions] == [
+        "automatic parts, no noise, noise.translation=0.02",
+        "automatic parts, Carmine noise, noise.translation=0.02",
+        "labels, no noise, noise.translation=0.02",
+        "labels, Carmine noise, noise.translation=0.02",
+    ]
+    labels = [method.label for method in suite.methods]
+    assert len(set(labels)) == len(labels)
+    few = replace(suite, scenes=suite.scenes[:1], seeds=1).members()
+    assert {(m.episode.segmentation, m.episode.noise, m.episode.fusion) for m in few} == set(
+        product(("labels", "auto"), ("none", "carmine"), ("pc", "sg", "pc+sg"))
+    )
+    assert all(settings_of(m.episode).noise.translation == 0.02 for m in few)
+
+
+def test_settings_that_cannot_be_changed_are_refused():
+    suite = find_suite("smoke")
+    with pytest.raises(InputError, match=r"fusion\.method=pc: every episode has its own; use --fusion"):
+        with_settings(suite, ["fusion.method=pc"])
+    with pytest.raises(InputError, match="there is no setting"):
+        with_settings(suite, ["fit.hypothesis=3"])
 
 
 def test_an_unknown_suite_lists_those_there_are():

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import product
 
 from caryatid.benchmark.fingerprint import plugin_of
@@ -119,11 +119,6 @@ def find_suite(name: str) -> Suite:
     if name in SUITES:
         return SUITES[name]
     raise InputError("--suite", f"there is no suite '{name}'", f"choose one of {', '.join(SUITES)}")
-
-
-def with_planners(suite: Suite, planners: Sequence[str]) -> Suite:
-    """Return the suite with these planners in place of its methods, each with the default fusion."""
-    return replace(suite, methods=tuple(Method(name, name) for name in planners))
 
 
 def _depth_noise(factor: float) -> tuple[str, ...]:

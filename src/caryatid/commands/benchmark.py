@@ -20,11 +20,13 @@ from caryatid.benchmark.running import Executor, LocalExecutor, run_all
 from caryatid.benchmark.scenes import find_scenes, short_name
 from caryatid.benchmark.sections import SuiteReport
 from caryatid.benchmark.store import ResultStore
-from caryatid.benchmark.suites import Suite, find_suite, with_planners
+from caryatid.benchmark.suites import Suite, find_suite
 from caryatid.benchmark.telling import read_results, report_all, write_docs, write_page, write_tables
+from caryatid.benchmark.variants import with_conditions, with_fusions, with_planners, with_settings
 from caryatid.commands.episode_bar import EpisodeBar
 from caryatid.commands.names import PlannerName, SuiteName
 from caryatid.commands.options import SAID, General, defaults_to, whole_number
+from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
 
@@ -47,6 +49,7 @@ class Benchmark:
       caryatid benchmark --suite smoke --out bench
       caryatid benchmark --suite planners --planner support --planner random --out bench
       caryatid benchmark --suite fig5 --scenes my-scenes/ --seeds 1 --out bench
+      caryatid benchmark --suite planners --segmentation auto --noise none --out bench
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
@@ -59,6 +62,17 @@ class Benchmark:
     """Scenes in place of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
     planner: Annotated[tyro.conf.UseAppendAction[tuple[PlannerName, ...]], SAID] = ()
     """Planner in place of the suite's methods; may be repeated. The others are compared with the first."""
+    fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], SAID] = ()
+    """Fusion in place of the suite's; may be repeated."""
+    segmentation: Annotated[tyro.conf.UseAppendAction[tuple[SegmentationMethod, ...]], SAID] = ()
+    """Where parts come from, in place of the suite's conditions; may be repeated. Without: labels."""
+    noise: Annotated[tyro.conf.UseAppendAction[tuple[NoiseModel, ...]], SAID] = ()
+    """Noise of the camera, in place of the suite's conditions; may be repeated. Without: carmine."""
+    set: Annotated[
+        tyro.conf.UseAppendAction[tuple[str, ...]],
+        tyro.conf.arg(metavar="STAGE.NAME=VALUE", help_behavior_hint=""),
+    ] = ()
+    """One setting of all episodes, say `--set noise.translation=0.02`; may be repeated."""
     seeds: Annotated[Count, defaults_to("the suite's")] = None
     """Seeds 0…N−1 of every episode."""
     views: Annotated[Count, defaults_to("the suite's")] = None
@@ -95,6 +109,12 @@ class Benchmark:
         suite = find_suite(name)
         if self.planner:
             suite = with_planners(suite, self.planner)
+        if self.fusion:
+            suite = with_fusions(suite, self.fusion)
+        if self.segmentation or self.noise:
+            suite = with_conditions(suite, self.segmentation or ("labels",), self.noise or ("carmine",))
+        if self.set:
+            suite = with_settings(suite, self.set)
         if self.scenes:
             suite = replace(suite, scenes=tuple(find_scenes(self.scenes)))
         return replace(suite, seeds=self.seeds or suite.seeds, views=self.views or suite.views)
