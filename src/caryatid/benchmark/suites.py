@@ -152,8 +152,6 @@ _ATTENTION = {
     "no inhibition": "active.inhibition=0.0",
     "cost: angle": "active.path_cost=angle",
     "cost: none": "active.path_cost=none",
-    "r_s,min 0.05": "support.min_area_ratio=0.05",
-    "r_s,min 0.2": "support.min_area_ratio=0.2",
 }
 _SUPPORT = {
     "eq. 2 with 2π": "active.saliency=paper",
@@ -167,9 +165,12 @@ _SUPPORT = {
     "space: heap alone": "active.space_weight=0.0",
     "effort 0": "active.effort=0.0",
     "effort 0.15": "active.effort=0.15",
-    "r_s,min 0.05": "support.min_area_ratio=0.05",
-    "r_s,min 0.2": "support.min_area_ratio=0.2",
 }
+_TOP_DOWN = {
+    f"top-down by r_s,min {ratio:g}": ("support.top_down=paper", f"support.min_area_ratio={ratio:g}")
+    for ratio in (0.05, 0.1, 0.2)
+}
+"""Only the paper's rule asks for the ratio."""
 _REGISTRATION = {
     f"registration {cm:g} cm, {deg:g}°": _registration(cm, deg)
     for cm, deg in ((0.0, 0.0), (0.5, 0.3), (1.0, 1.0), (2.0, 2.0))
@@ -214,7 +215,11 @@ SUITES: Mapping[str, Suite] = {
         Suite(
             "ablation",
             "What the paper leaves open, one setting at a time, for the default planner.",
-            (Method("support"), *(Method(label, settings=(s,)) for label, s in _SUPPORT.items())),
+            (
+                Method("support"),
+                *(Method(label, settings=(s,)) for label, s in _SUPPORT.items()),
+                *(Method(label, settings=s) for label, s in _TOP_DOWN.items()),
+            ),
             DENSE[:16],
         ),
         Suite(
