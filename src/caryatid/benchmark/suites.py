@@ -140,6 +140,8 @@ _FIG5 = (
     Method("random SG", "random", "sg"),
 )
 _PLANNERS = ("support", "attention", "paper", "random", "ring", "farthest", *VOLUMETRIC, "oracle")
+_FREE = "active.cost_weight=0.0"
+"""Volumetric planners that do not mind the way."""
 _FUSIONS: tuple[FusionMethod, ...] = ("pc+sg", "pc", "sg")
 _ATTENTION = {
     "eq. 2 with 2π": "active.saliency=paper",
@@ -203,14 +205,22 @@ SUITES: Mapping[str, Suite] = {
             "Who finds the support graph with the fewest views, where views differ: in dense heaps.",
             (
                 *(Method(name, name) for name in _PLANNERS),
-                *(
-                    Method(f"{name}, w = 0", name, settings=("active.cost_weight=0.0",))
-                    for name in VOLUMETRIC
-                ),
+                *(Method(f"{name}, w = 0", name, settings=(_FREE,)) for name in VOLUMETRIC),
             ),
             DENSE,
             reference="random",
             gap=("random", "oracle"),
+        ),
+        Suite(
+            "path",
+            "How far one has to go in dense heaps until the support graph is good.",
+            (
+                *(Method(name, name) for name in ("support", "random", "ring")),
+                Method("proximity-count, w = 0", "proximity-count", settings=(_FREE,)),
+            ),
+            DENSE,
+            views=10,
+            reference="random",
         ),
         Suite(
             "ablation",
