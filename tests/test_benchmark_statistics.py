@@ -183,8 +183,10 @@ def test_area_by_hand():
         make_record([0.6, 0.7, 0.7], [0.0, 2.0, 2.0], scene="a", method="b"),
     ]
     group = summary_of(records).groups[0]
-    assert group.budget == 2.0
-    assert [m.area.value for m in group.methods] == pytest.approx([0.5 * 0.4 + 0.5 * 0.8, 0.6])
+    assert group.budget == 2.5
+    assert [m.area.value for m in group.methods] == pytest.approx(
+        [(0.4 + 1.5 * 0.8) / 2.5, (1.2 + 0.35) / 2.5]
+    )
 
 
 def test_nobody_moves_no_area():

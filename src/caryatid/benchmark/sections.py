@@ -116,8 +116,8 @@ def explain(config: StatisticsConfig) -> tuple[str, ...]:
         "curve” is where the curve of mean F1 over mean path first reaches it, straight between views; an "
         "end of its interval is “not reached” where that many resamples do not reach it.",
         "F1 along the path: the area under F1 over the path travelled, divided by its length. F1 holds until "
-        "the next view. The length is the mean path of the method that travels least; where an episode ends "
-        "before, its last F1 holds.",
+        "the next view. The length is the median of the methods' mean paths; where an episode ends before, "
+        "its last F1 holds.",
     )
 
 

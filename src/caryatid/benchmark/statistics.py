@@ -78,7 +78,7 @@ class Group:
         family: Kind of the scenes; empty for all of them.
         families: The kinds of scenes in it.
         scenes: How many scenes there are.
-        budget: Path over which F1 is averaged: the smallest of the methods' mean final paths [m].
+        budget: Path over which F1 is averaged: the median of the methods' mean final paths [m].
         methods: The methods, in the order of the records.
         differences: Each method but the reference minus the reference.
         gaps: Share of the gap between two methods that each other method closes after each view, where it was
