@@ -86,6 +86,7 @@ def test_several_conditions_have_figures_each_and_one_of_all():
     records = [r for c in ("none", "carmine × 2") for r in make_suite(scenes=3, seeds=1, condition=c)]
     names = [figure.name for figure in draw_figures(summary_of(records))]
     assert {"f1-over-views-none", "f1-over-views-carmine-2", "f1-by-condition"} < set(names)
+    assert not any("dense" in name for name in names)
     assert len(set(names)) == len(names)
 
 

@@ -143,6 +143,16 @@ def test_tables_of_the_document_are_whole(suites):
     assert "<script>" not in text.replace("\\<script\\>", "")
 
 
+def test_document_compares_conditions_in_one_table(suites):
+    text = render_document(suites[1:], MACHINE, title="Benchmark", command="c", folder="benchmark")
+    assert re.findall(r"!\[(.*?)\]", text) == ["F1 by condition"]
+    rows = re.findall(r"^\| (.*?) \| (.*?) \|", text, re.M)
+    assert rows == [("condition", "method"), ("---", "---"), ("none", "support"), ("carmine", "support")]
+    everything = [group for group in suites[1].summary.groups if not group.family]
+    mean = everything[-1].methods[0].curves["f1"][1]
+    assert f"{mean.value:.3f} [" in text
+
+
 def test_nothing_to_tell_of_is_refused():
     with pytest.raises(ValueError, match="one suite"):
         render_page([], MACHINE)

@@ -1,4 +1,7 @@
-"""What the page says as Markdown, for a documentation: the figures beside it, fewer tables."""
+"""What the page says as Markdown, for a documentation: the figures beside it, fewer tables.
+
+Of a suite with several conditions it says how they compare, not what the methods do under each.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from pathlib import Path
 
 from caryatid.benchmark.figures import Figure
 from caryatid.benchmark.provenance import Provenance
-from caryatid.benchmark.sections import SuiteReport, Table, describe, explain, failures, tables
+from caryatid.benchmark.sections import SuiteReport, Table, by_condition, describe, explain, failures, tables
 
 LEFT_OUT = ("vertex-f1-over-views", "mean-iou-over-views")
 """Figures the document does not show: what their names begin with."""
@@ -60,7 +63,10 @@ def render_document(
     for suite in suites:
         parts += [f"## {suite.name}", f"{_plain(suite.what)} {describe(suite)}"]
         parts += [_draw(figure, suite, folder) for figure in _shown(suite) if not figure.condition]
-        for group in suite.summary.groups:
+        combined = by_condition(suite.summary)
+        if combined is not None:
+            parts.append(_show(combined))
+        for group in suite.summary.groups if combined is None else ():
             of = f", {group.family} scenes only" if group.family else ""
             parts.append(f"### {suite.name}: {_plain(group.condition)}{of}")
             here = [f for f in _shown(suite) if (f.condition, f.family) == (group.condition, group.family)]
@@ -75,7 +81,12 @@ def render_document(
 
 
 def _shown(suite: SuiteReport) -> list[Figure]:
-    return [figure for figure in suite.figures if not figure.name.startswith(LEFT_OUT)]
+    several = by_condition(suite.summary) is not None
+    return [
+        figure
+        for figure in suite.figures
+        if not figure.name.startswith(LEFT_OUT) and not (several and figure.condition)
+    ]
 
 
 def _file(suite: SuiteReport, figure: Figure) -> str:

@@ -64,12 +64,13 @@ def draw_figures(summary: Summary) -> tuple[Figure, ...]:
     """Draw all figures of a suite.
 
     For each condition: F1, edge F1, vertex F1 and mean IoU over views, F1 over path, differences from the
-    reference and planning time; for each family F1 over views and over path, and the differences; and F1 by
-    condition where there are several. A figure with nothing to show is left out.
+    reference and planning time. Where there is but one, F1 over views and over path and the differences for
+    each family too; where there are several, F1 by condition. A figure with nothing to show is left out.
     """
     looks = marks(summary.methods)
-    figures = [figure for group in summary.groups for figure in _draw_group(group, looks, summary)]
     groups = [group for group in summary.groups if not group.family and group.views]
+    drawn = summary.groups if len(groups) < 2 else groups
+    figures = [figure for group in drawn for figure in _draw_group(group, looks, summary)]
     if len(groups) > 1:
         views = later_views(summary, groups)
         plot, height = plot_conditions(groups, views, summary.methods, looks)

@@ -8,7 +8,7 @@ from importlib import resources
 
 from caryatid.benchmark.figures import Figure
 from caryatid.benchmark.provenance import Provenance
-from caryatid.benchmark.sections import SuiteReport, describe, explain, failures, tables
+from caryatid.benchmark.sections import SuiteReport, by_condition, describe, explain, failures, tables
 
 
 def render_page(
@@ -39,6 +39,7 @@ def render_page(
         provenance=provenance,
         suites=suites,
         inline=inline,
+        by_condition=by_condition,
         describe=describe,
         failures=failures,
         tables=tables,

@@ -148,6 +148,26 @@ def tables(group: Group, summary: Summary, *, brief: bool = False) -> tuple[Tabl
     return tuple(made)
 
 
+def by_condition(summary: Summary) -> Table | None:
+    """F1 of all scenes under each condition, or None where there is but one."""
+    groups = [group for group in summary.groups if not group.family and group.views]
+    if len(groups) < 2:
+        return None
+    views = table_views(summary.config.views, max(group.views for group in groups))
+    rows = tuple(
+        (
+            group.condition,
+            method.method,
+            *(_at(method.curves["f1"], view, say_estimate) for view in views),
+            f"{method.scenes} / {method.episodes} / {method.failed}",
+        )
+        for group in groups
+        for method in group.methods
+    )
+    head = ("condition", "method", *(f"view {view}" for view in views), "scenes / episodes / failed")
+    return Table("F1 by condition", "Mean and interval after so many views.", head, rows)
+
+
 def failures(summary: Summary) -> Table:
     """The episodes that failed, and why."""
     rows = tuple((f.method, f.condition, f.scene, str(f.seed), f.error) for f in summary.failures)
