@@ -46,8 +46,10 @@ class Result:
 
 
 def read_results(store: ResultStore) -> list[Result]:
-    """Read every suite that was asked for."""
-    return [Result(name, store.records(name), store.planned(name)) for name in store.suites()]
+    """Read every suite that was asked for, in the order in which suites are listed."""
+    place = {name: k for k, name in enumerate(SUITES)}
+    names = sorted(store.suites(), key=lambda name: place.get(name, len(place)))
+    return [Result(name, store.records(name), store.planned(name)) for name in names]
 
 
 def report_all(results: Sequence[Result]) -> list[SuiteReport]:
