@@ -27,7 +27,10 @@ COMMAND += ["--jobs", "2"]
 
 @pytest.fixture
 def started(tmp_path):
-    """Start the command on a folder, as a terminal would: all its processes get what is typed."""
+    """Start the command on a folder, as a terminal would: all its processes get what is typed.
+
+    Ctrl-C is not ignored there, even where it is here, in the background of a shell.
+    """
     runs: list[subprocess.Popen[str]] = []
 
     def start(seeds: int = SEEDS) -> subprocess.Popen[str]:
@@ -39,7 +42,9 @@ def started(tmp_path):
         runs.append(run)
         return run
 
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield start
+    signal.signal(signal.SIGINT, before)
     for run in runs:
         with suppress(ProcessLookupError):
             os.killpg(run.pid, signal.SIGKILL)

@@ -189,17 +189,33 @@ def test_running_leaves_the_environment_as_it_was():
         assert dict(os.environ) == before
 
 
-def test_an_interrupt_waits_until_all_processes_are_started():
-    class Interrupting(list):
-        left = 0
+class Interrupting(list):
+    """Episodes at whose beginning Ctrl-C is pressed; they count how many were taken."""
 
-        def __iter__(self):
-            os.kill(os.getpid(), signal.SIGINT)
-            for episode in super().__iter__():
-                yield episode
-                self.left += 1
+    taken = 0
 
-    episodes = Interrupting(Episode("tower", settings=QUICK, views=2, seed=seed) for seed in range(3))
+    def __iter__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for episode in super().__iter__():
+            yield episode
+            self.taken += 1
+
+
+@pytest.fixture
+def interrupting():
+    before = signal.getsignal(signal.SIGINT)
+    yield Interrupting(Episode("tower", settings=QUICK, views=1, seed=seed) for seed in range(3))
+    signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_waits_until_all_processes_are_started(interrupting):
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     with pytest.raises(KeyboardInterrupt):
-        next(LocalExecutor(2).run(episodes))
-    assert episodes.left == len(episodes)
+        next(LocalExecutor(2).run(interrupting))
+    assert interrupting.taken == len(interrupting)
+
+
+def test_an_interrupt_that_is_ignored_stays_ignored(interrupting):
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    assert len(list(LocalExecutor(2).run(interrupting))) == len(interrupting)
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN

@@ -109,9 +109,10 @@ def _interrupts_held() -> Iterator[None]:
     """Hold Ctrl-C back until the end; processes started meanwhile never get it, so that they leave quietly.
 
     The mask is what the processes inherit. It does not hold Ctrl-C back here, where another thread may take
-    it and half-started processes would be left behind: the handler does.
+    it and half-started processes would be left behind: the handler does. Where Ctrl-C is ignored, as in the
+    background of a shell, it stays so.
     """
-    if current_thread() is not main_thread():
+    if current_thread() is not main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         yield
         return
     held: list[int] = []
