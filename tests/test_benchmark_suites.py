@@ -182,7 +182,8 @@ def test_rows_are_the_same_on_any_number_of_processes(tmp_path):
     assert [outcome.error is None for outcome in found[0]] == [True, True, False, False]
 
 
-def test_running_leaves_the_environment_as_it_was():
+def test_running_leaves_the_environment_as_it_was(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     before = dict(os.environ)
     for _, outcome in LocalExecutor(1).run([Episode("dense-99-1", settings=QUICK, views=2)]):
         assert outcome.error is not None

@@ -81,7 +81,7 @@ def render_document(
 
 
 def _shown(suite: SuiteReport) -> list[Figure]:
-    several = by_condition(suite.summary) is not None
+    several = len(suite.summary.conditions) > 1
     return [
         figure
         for figure in suite.figures

@@ -68,7 +68,7 @@ def draw_figures(summary: Summary) -> tuple[Figure, ...]:
     each family too; where there are several, F1 by condition. A figure with nothing to show is left out.
     """
     looks = marks(summary.methods)
-    groups = [group for group in summary.groups if not group.family and group.views]
+    groups = summary.conditions
     drawn = summary.groups if len(groups) < 2 else groups
     figures = [figure for group in drawn for figure in _draw_group(group, looks, summary)]
     if len(groups) > 1:

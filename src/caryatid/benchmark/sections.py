@@ -150,7 +150,7 @@ def tables(group: Group, summary: Summary, *, brief: bool = False) -> tuple[Tabl
 
 def by_condition(summary: Summary) -> Table | None:
     """F1 of all scenes under each condition, or None where there is but one."""
-    groups = [group for group in summary.groups if not group.family and group.views]
+    groups = summary.conditions
     if len(groups) < 2:
         return None
     views = table_views(summary.config.views, max(group.views for group in groups))

@@ -138,6 +138,11 @@ class Summary:
     failures: tuple[Failure, ...]
     config: StatisticsConfig
 
+    @property
+    def conditions(self) -> tuple[Group, ...]:
+        """The groups over all scenes of a condition, of those in which something was measured."""
+        return tuple(group for group in self.groups if not group.family and group.views)
+
 
 def summarise(
     records: Sequence[Record],

@@ -52,12 +52,20 @@ def read_results(store: ResultStore) -> list[Result]:
     return [Result(name, store.records(name), store.planned(name)) for name in names]
 
 
-def report_all(results: Sequence[Result]) -> list[SuiteReport]:
+def report_all(results: Sequence[Result], reference: str | None = None) -> list[SuiteReport]:
     """What there is to tell of every suite of which something is done.
 
     Args:
         results: Of a store.
+        reference: Method the others are compared with, in the suites that have it, in place of the suite's.
+
+    Raises:
+        InputError: No suite has such a method.
     """
+    there = {record.member.method: None for result in results for record in result.records}
+    if reference is not None and reference not in there:
+        names = ", ".join(there) or "none yet"
+        raise InputError(f"--reference {reference}", "there is no such method", f"choose one of {names}")
     reports = []
     for result in results:
         if not result.records:
@@ -65,8 +73,9 @@ def report_all(results: Sequence[Result]) -> list[SuiteReport]:
         known = SUITES.get(result.name)
         methods = {record.member.method for record in result.records}
         gap = known.gap if known is not None and methods.issuperset(known.gap or ()) else None
-        reference = known.reference if known is not None and known.reference in methods else None
-        summary = summarise(result.records, np.random.default_rng(SEED), reference=reference, gap=gap)
+        wanted = (reference, None if known is None else known.reference)
+        chosen = next((name for name in wanted if name in methods), None)
+        summary = summarise(result.records, np.random.default_rng(SEED), reference=chosen, gap=gap)
         what = "" if known is None else known.what
         reports.append(report_suite(result.name, what, summary, result.planned))
     return reports

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -83,6 +84,8 @@ class Benchmark:
     """Run on the workers of this dask.distributed scheduler instead, say tcp://10.0.0.5:8786."""
     retry: Annotated[bool, SAID] = False
     """Run episodes again that failed."""
+    reference: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="METHOD"), SAID] = None
+    """Method the others are compared with in the figures, in place of the suite's."""
     docs: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.md"), SAID] = None
     """Write the figures as a Markdown document too."""
     general: tyro.conf.OmitArgPrefixes[General] = GENERAL
@@ -145,15 +148,17 @@ class Benchmark:
     def _tell(self, store: ResultStore, console: Console) -> int:
         """Write tables, figures and pages; say what there is."""
         results = read_results(store)
-        reports = report_all(results)
+        reports = report_all(results, self.reference)
         for line in [result.said() for result in results] + write_tables(results, self.out):
             console.print(line, markup=False)
         if reports:
-            page = write_page(reports, store, self.out, f"caryatid benchmark --out {self.out.name}")
+            command = f"caryatid benchmark --out {self.out.name}"
+            if self.reference is not None:
+                command += f" --reference {shlex.quote(self.reference)}"
+            page = write_page(reports, store, self.out, command)
             console.print(f"figures: {page}", markup=False)
             if self.docs is not None:
-                command = f"caryatid benchmark --out {self.out.name} --docs {self.docs.name}"
-                write_docs(reports, store, self.docs, command)
+                write_docs(reports, store, self.docs, f"{command} --docs {self.docs.name}")
         if self.general.json:
             sys.stdout.write(json_text({"results": str(self.out), "suites": figures(reports)}))
         return 0
