@@ -41,7 +41,7 @@ def test_python_blocks_run(page, workplace, capsys):
 
 
 def test_commands_run(workplace, capsys, monkeypatch):
-    monkeypatch.setattr("caryatid.commands.benchmark.run_all", lambda *arguments: None)
+    monkeypatch.setattr("caryatid.commands.benchmarking.run_all", lambda *arguments: None)
     lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("caryatid ")]
     assert {command[0] for command in commands} == {"explore", "extract", "evaluate", "benchmark", "config"}

@@ -44,6 +44,7 @@ class Refuse:
 sys.meta_path.insert(0, Refuse())
 import numpy as np
 from caryatid.planners import BUILT_IN, make_planner
+planners = {name: make_planner(name) for name in BUILT_IN}
 del sys.modules["mujoco"]
 
 said = {}
@@ -55,9 +56,8 @@ for forbidden in FORBIDDEN:
         said[forbidden] = str(error)
 with open(sys.argv[1], "rb") as file:
     states = pickle.load(file)
-for name in BUILT_IN:
+for name, planner in planners.items():
     try:
-        planner = make_planner(name)
         said[name] = [planner.plan(s, np.random.default_rng([0, k])).index for k, s in enumerate(states)]
     except Exception as error:
         said[name] = repr(error)

@@ -1,4 +1,8 @@
-"""The command line: `caryatid COMMAND …`; errors end here, in one line."""
+"""The command line: `caryatid COMMAND …`; errors end here, in one line.
+
+The modules of the commands say what options there are. What does the work, and takes its time to import, they
+import when they are called.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     try:
         return _run(sys.argv[1:] if arguments is None else arguments)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted: nothing was written\n")
+        return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
@@ -57,9 +64,6 @@ def _run(arguments: Sequence[str]) -> int:
         sys.stdout.flush()
     except BrokenPipeError:
         raise
-    except KeyboardInterrupt:
-        sys.stderr.write("interrupted: nothing was written\n")
-        return 130
     except Exception as error:
         if command.general.debug:
             raise

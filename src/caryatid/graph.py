@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Literal
-
-import networkx as nx
+from typing import TYPE_CHECKING, Literal
 
 from caryatid import frames
 from caryatid.frames import Array
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.uncertainty import Uncertainty
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 Role = Literal["object", "support_surface"]
 Kind = Literal["bottom-up", "lean", "top-down"]
@@ -134,6 +135,8 @@ class SupportGraph:
 
     def to_networkx(self) -> nx.DiGraph:
         """Return a DiGraph, supporter → supported; nodes and edges carry `data`, the frozen objects here."""
+        import networkx as nx
+
         graph = nx.DiGraph()
         for o in self.objects:
             graph.add_node(o.id, data=o, role=o.role, shape=o.shape.kind)

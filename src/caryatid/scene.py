@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +27,9 @@ from caryatid.view_sphere import ViewSphere
 from caryatid.views import SUPPORT_LABEL, Cloud, View
 from caryatid.visibility import seen_through
 from caryatid.voxels import VoxelMap
+
+if TYPE_CHECKING:
+    import networkx as nx
 
 
 class Scene:

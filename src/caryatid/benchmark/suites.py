@@ -8,10 +8,9 @@ from itertools import product
 
 from caryatid.benchmark.fingerprint import plugin_of
 from caryatid.benchmark.records import Episode, Member
-from caryatid.benchmark.scenes import content_of, family
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
-from caryatid.planners.volumetric import FORMULATIONS as VOLUMETRIC
+from caryatid.planners import VOLUMETRIC
 
 DESIGNED = ("tower", "bridge", "counterweight", "leaning_plank", "hidden_stack", "shelf", "clutter")
 """Scenes with one difficulty each."""
@@ -85,6 +84,8 @@ class Suite:
 
     def members(self) -> list[Member]:
         """All episodes, those of a scene one after the other."""
+        from caryatid.benchmark.scenes import content_of, family
+
         content = {scene: content_of(scene) for scene in self.scenes}
         plugins = {method.planner: plugin_of(method.planner) for method in self.methods}
         cross = product(self.scenes, range(self.seeds), self.conditions, self.methods)

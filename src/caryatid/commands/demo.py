@@ -8,8 +8,15 @@ from typing import Annotated
 
 import tyro
 
-from caryatid.commands.explore import Explore, run_exploration
-from caryatid.commands.options import DEFAULTS, ModellingCommand, OutPath, Views, defaults_to, with_views
+from caryatid.commands.explore import Explore
+from caryatid.commands.options import (
+    DEFAULTS,
+    ModellingCommand,
+    OutPath,
+    Views,
+    defaults_to,
+    with_views,
+)
 
 SCENE = "clutter"
 VIEWS = 5
@@ -34,6 +41,12 @@ class Demo(ModellingCommand):
         """Run the command."""
         config = with_views(self.modelling.settings(with_views(DEFAULTS, VIEWS)), self.views)
         options = Explore(
-            source=self.scene, out=self.out, noise="carmine", modelling=self.modelling, general=self.general
+            source=self.scene,
+            out=self.out,
+            noise="carmine",
+            modelling=self.modelling,
+            general=self.general,
         )
+        from caryatid.commands.exploring import run_exploration
+
         return run_exploration(options, config)

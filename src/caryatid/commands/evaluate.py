@@ -8,13 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from caryatid.commands.options import General
-from caryatid.evaluation.truths import evaluate_run
-from caryatid.formats.json_files import json_text
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,6 +28,13 @@ class Evaluate:
 
     def __call__(self) -> int:
         """Run the command."""
+        from rich.console import Console
+        from rich.table import Table
+        from rich.text import Text
+
+        from caryatid.evaluation.truths import evaluate_run
+        from caryatid.formats.json_files import json_text
+
         scores = evaluate_run(self.run, self.truth)
         if self.general.json:
             sys.stdout.write(json_text({"views": [s.to_json() for s in scores]}))

@@ -37,7 +37,7 @@ def name_of(find: Callable[[str], object], metavar: Iterable[str]) -> PrimitiveC
 
 
 def _known_planner(name: str) -> None:
-    if name != ORACLE:
+    if name not in {*BUILT_IN, ORACLE}:
         make_planner(name)
 
 

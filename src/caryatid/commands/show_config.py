@@ -6,7 +6,6 @@ import sys
 from dataclasses import asdict, dataclass
 
 from caryatid.commands.options import ModellingCommand
-from caryatid.formats.json_files import json_text
 from caryatid.settings import write_settings
 
 
@@ -21,5 +20,10 @@ class ShowConfig(ModellingCommand):
     def __call__(self) -> int:
         """Run the command."""
         config = self.modelling.settings()
-        sys.stdout.write(json_text(asdict(config)) if self.general.json else write_settings(config))
+        if self.general.json:
+            from caryatid.formats.json_files import json_text
+
+            sys.stdout.write(json_text(asdict(config)))
+        else:
+            sys.stdout.write(write_settings(config))
         return 0

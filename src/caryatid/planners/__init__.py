@@ -5,25 +5,60 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING
 
 from caryatid.errors import InputError
-from caryatid.planners.attention import AttentionPlanner
-from caryatid.planners.decision import Decision, Planner, PlanningState
-from caryatid.planners.farthest import FarthestPlanner
-from caryatid.planners.paper import PaperPlanner
-from caryatid.planners.random import RandomPlanner
-from caryatid.planners.ring import RingPlanner
-from caryatid.planners.support import SupportPlanner
-from caryatid.planners.volumetric import FORMULATIONS, VolumetricPlanner
+from caryatid.late import imported_late
+
+if TYPE_CHECKING:
+    from caryatid.planners.attention import AttentionPlanner
+    from caryatid.planners.decision import Decision, Planner, PlanningState
+    from caryatid.planners.farthest import FarthestPlanner
+    from caryatid.planners.paper import PaperPlanner
+    from caryatid.planners.random import RandomPlanner
+    from caryatid.planners.ring import RingPlanner
+    from caryatid.planners.support import SupportPlanner
+    from caryatid.planners.volumetric import VolumetricPlanner
+
+VOLUMETRIC = (
+    "occlusion-aware",
+    "unobserved-voxel",
+    "rear-side-voxel",
+    "rear-side-entropy",
+    "proximity-count",
+)
+"""The planners that are a `VolumetricPlanner` of the formulation of that name."""
+
+
+_imported = imported_late(
+    __name__,
+    {
+        "attention": ["AttentionPlanner"],
+        "decision": ["Decision", "Planner", "PlanningState"],
+        "farthest": ["FarthestPlanner"],
+        "paper": ["PaperPlanner"],
+        "random": ["RandomPlanner"],
+        "ring": ["RingPlanner"],
+        "support": ["SupportPlanner"],
+        "volumetric": ["VolumetricPlanner"],
+    },
+)
+
+
+def _make(name: str, *arguments: str) -> Planner:
+    """Import a planner of ours and make it."""
+    planner: Planner = _imported(name)(*arguments)
+    return planner
+
 
 BUILT_IN: dict[str, Callable[[], Planner]] = {
-    "support": SupportPlanner,
-    "attention": AttentionPlanner,
-    "paper": PaperPlanner,
-    "random": RandomPlanner,
-    "ring": RingPlanner,
-    "farthest": FarthestPlanner,
-    **{name: partial(VolumetricPlanner, name) for name in FORMULATIONS},
+    "support": partial(_make, "SupportPlanner"),
+    "attention": partial(_make, "AttentionPlanner"),
+    "paper": partial(_make, "PaperPlanner"),
+    "random": partial(_make, "RandomPlanner"),
+    "ring": partial(_make, "RingPlanner"),
+    "farthest": partial(_make, "FarthestPlanner"),
+    **{name: partial(_make, "VolumetricPlanner", name) for name in VOLUMETRIC},
 }
 """The planners that come with caryatid, the default first."""
 
@@ -64,6 +99,7 @@ def make_planner(name: str) -> Planner:
 __all__ = [
     "BUILT_IN",
     "ORACLE",
+    "VOLUMETRIC",
     "AttentionPlanner",
     "Decision",
     "FarthestPlanner",
@@ -77,3 +113,10 @@ __all__ = [
     "make_planner",
     "offered",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = _imported
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
