@@ -312,6 +312,53 @@ def test_with_json_stdout_holds_one_document_and_nothing_else(tmp_path, scene_fi
         assert said.err == ""
 
 
+@pytest.mark.parametrize("command", ["explore", "demo", "extract"])
+def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, recording, capsys, command):
+    options = {
+        "explore": [scene_file, "--views", 2, *SMALL],
+        "demo": ["--scene", "tower", "--views", 2, *SMALL],
+        "extract": [recording],
+    }
+    stages = ["segment", "register", "map", "fit", "infer", "fuse"]
+    if command != "extract":
+        stages = ["capture", *stages, "plan"]
+    words = [command, *options[command], "--out", tmp_path / "run", "--profile"]
+    assert run_command(*words, "--quiet") == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    rows = [line.split() for line in said.out.splitlines() if line.strip()]
+    assert [row[0] for row in rows if row[0] in (*stages, "turn")] == [*stages, "turn"]
+    assert ["view", *stages, "turn"] in rows
+    timings = [step["timings"] for step in read_run(tmp_path / "run").record["steps"]]
+    for k, timing in enumerate(timings):
+        row = next(row for row in rows if row[0] == f"{k:02d}")
+        assert row[1 + stages.index("fit")] == f"{1000.0 * timing['fit']:.1f}"
+    times = [1000.0 * timing["fit"] for timing in timings]
+    assert rows[[row[0] for row in rows].index("fit")][1:3] == [
+        f"{np.median(times):.1f}",
+        f"{max(times):.1f}",
+    ]
+
+    assert run_command(*words, "--json") == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    profile = json.loads(said.out)["profile"]
+    timings = [step["timings"] for step in read_run(tmp_path / "run").record["steps"]]
+    assert [s["stage"] for s in profile["stages"]] == stages
+    assert sum(s["share"] or 0.0 for s in profile["stages"]) == pytest.approx(1.0)
+    assert [view["fit"] for view in profile["views"]] == [timing["fit"] for timing in timings]
+    thought = [sum(v for k, v in view.items() if k not in ("view", "capture")) for view in profile["views"]]
+    assert profile["turn"]["highest"] == pytest.approx(max(thought))
+
+
+def test_without_a_profile_there_is_none(tmp_path, scene_file, capsys):
+    command = ["explore", scene_file, "--views", 1, "--no-report", *SMALL, "--out", tmp_path / "run"]
+    assert run_command(*command, "--json") == 0
+    assert json.loads(capsys.readouterr().out).keys() == {"run", "graph"}
+    assert run_command(*command) == 0
+    assert capsys.readouterr().out == ""
+
+
 def test_quiet_says_nothing(tmp_path, scene_file, recording, capsys):
     explored(scene_file, tmp_path / "a", "--views", 1, "--quiet")
     assert run_command("extract", recording, "--out", tmp_path / "b", "--quiet") == 0

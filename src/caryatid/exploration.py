@@ -114,7 +114,7 @@ def explore(
             except PlanningError as error:
                 stop = str(error)
         watch.lap("plan")
-        laps = {k: v for k, v in watch.laps.items() if k != "update"} | scene.timings
+        laps = {"capture": watch.laps["capture"]} | scene.timings | {"plan": watch.laps["plan"]}
         yield Step(
             len(visited) - 1, view, labels, graph, scene.cloud, sphere, np.array(visited),
             candidates, decision, laps, angle, path, stop,

@@ -13,6 +13,7 @@ from caryatid.commands.options import (
     DEFAULTS,
     ModellingCommand,
     OutPath,
+    Profile,
     Views,
     defaults_to,
     with_views,
@@ -36,6 +37,8 @@ class Demo(ModellingCommand):
     """A built-in scene, say tower, bridge or dense-12-0."""
     views: Annotated[Views, defaults_to(VIEWS)] = None
     """Views at the most, the first one too."""
+    profile: Profile = False
+    """Print the time of each stage when all is done; with --json into the document."""
 
     def __call__(self) -> int:
         """Run the command."""
@@ -44,6 +47,7 @@ class Demo(ModellingCommand):
             source=self.scene,
             out=self.out,
             noise="carmine",
+            profile=self.profile,
             modelling=self.modelling,
             general=self.general,
         )

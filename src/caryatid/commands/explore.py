@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from caryatid.commands.names import PlannerName
-from caryatid.commands.options import SAID, ModellingCommand, OutPath, Views, defaults_to, with_views
+from caryatid.commands.options import SAID, ModellingCommand, OutPath, Profile, Views, defaults_to, with_views
 from caryatid.config import NoiseModel, SegmentationMethod
 
 
@@ -45,6 +45,8 @@ class Explore(ModellingCommand):
     """Go on until the views are used up; without this the loop ends when a view changes nothing."""
     no_report: Annotated[bool, SAID] = False
     """Leave report.html out."""
+    profile: Profile = False
+    """Print the time of each stage when all is done; with --json into the document."""
 
     def __call__(self) -> int:
         """Run the command."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from caryatid.commands.explore import Explore
+from caryatid.commands.profile import print_profile, profile_record
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record, step_record, view_record
 from caryatid.commands.sources import Source, open_source
@@ -88,10 +89,12 @@ def run_exploration(options: Explore, config: Config) -> int:
         writer.finish(last.graph, record, report)
     if options.general.json:
         document = {"run": str(options.out), "graph": graph_to_json(last.graph)}
-        sys.stdout.write(json_text(document))
+        sys.stdout.write(json_text(document | (profile_record(steps) if options.profile else {})))
     count = "1 view" if len(steps) == 1 else f"{len(steps)} views"
     progress.say(f"{source.name}: {summary(last.graph)} after {count}")
     progress.say(f"run: {options.out}" + ("" if options.no_report else ", open its report.html"))
+    if options.profile and not options.general.json:
+        print_profile(steps)
     return 0
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from caryatid.commands.options import SAID, ModellingCommand, OutPath, defaults_to, whole_number
+from caryatid.commands.options import SAID, ModellingCommand, OutPath, Profile, defaults_to, whole_number
 from caryatid.config import SegmentationMethod
 
 
@@ -32,6 +32,8 @@ class Extract(ModellingCommand):
     """For clouds whose labels number parts: object = label // N."""
     no_report: Annotated[bool, SAID] = False
     """Leave report.html out."""
+    profile: Profile = False
+    """Print the time of each stage when all is done; with --json into the document."""
 
     def __call__(self) -> int:
         """Run the command."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from caryatid import frames
 from caryatid.commands.extract import Extract
+from caryatid.commands.profile import print_profile, profile_record
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record
 from caryatid.commands.sources import CLOUD_SUFFIXES, check_segments, open_recording
@@ -47,9 +48,11 @@ def run_extraction(options: Extract, config: Config) -> int:
         writer.finish(scene.graph, record, report)
     if options.general.json:
         document = {"run": str(options.out), "graph": graph_to_json(scene.graph)}
-        sys.stdout.write(json_text(document))
+        sys.stdout.write(json_text(document | (profile_record(steps) if options.profile else {})))
     progress.say(f"{name}: {summary(scene.graph)}")
     progress.say(f"run: {options.out}" + ("" if options.no_report else ", open its report.html"))
+    if options.profile and not options.general.json:
+        print_profile(steps)
     return 0
 
 

@@ -44,6 +44,7 @@ def whole_number(least: int) -> PrimitiveConstructorSpec[int | None]:
 Views = Annotated[int | None, whole_number(1)]
 Seed = Annotated[int, whole_number(0)]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="RUN")]
+Profile = Annotated[bool, SAID]
 
 
 @dataclass(frozen=True, kw_only=True)
