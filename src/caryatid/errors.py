@@ -24,6 +24,10 @@ class InputError(CaryatidError):
         self.remedy = remedy
         super().__init__(f"{self.source}: {reason}" + (f"; {remedy}" if remedy else ""))
 
+    def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
+        """What it is made of anew where a process hands it to another."""
+        return type(self), (self.source, self.reason, self.remedy)
+
 
 class PerceptionError(CaryatidError):
     """A view in which nothing can be perceived: no readings, or no support surface."""
