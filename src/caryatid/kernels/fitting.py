@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.frames import Array
+from caryatid.kernels.linear import solve_positive
 
 SPHERE, CYLINDER, BOX = 0, 1, 2
 """Codes of the shapes."""
@@ -137,7 +138,7 @@ def levenberg_marquardt(
             damped = H.copy()
             for a in range(size):
                 damped[a, a] += damping * (H[a, a] + ridge[a])
-            step = -np.linalg.solve(damped, g)
+            step = solve_positive(damped, -g)
             R_trial, centre_trial, half_trial = _stepped(kind, R, centre, half, step, columns, min_extent)
             trial = signed_distances(kind, R_trial, centre_trial, half_trial, points)
             trial_cost = _robust_cost(trial, scale) + shrink * _sum_of_sizes(kind, half_trial)
