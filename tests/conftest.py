@@ -13,6 +13,7 @@ import pytest
 from caryatid import cli, frames
 from caryatid.config import Config, SensorConfig
 from caryatid.formats import write_recording
+from caryatid.kernels.compiling import compile_kernels
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth, write_truth
@@ -73,6 +74,12 @@ def run_command(*arguments: object) -> int:
         return cli.main([str(a) for a in arguments])
     except SystemExit as stop:
         return int(stop.code or 0)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def compiled() -> None:
+    """What commands say in a test is not that they compile kernels."""
+    compile_kernels()
 
 
 @pytest.fixture(scope="session")

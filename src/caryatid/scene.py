@@ -16,6 +16,7 @@ from caryatid.frames import Array
 from caryatid.fusion import Evidence, absorbed, fuse, fused_graph
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.joint_registration import ViewRegistration
+from caryatid.kernels.compiling import compile_kernels
 from caryatid.object_models import ObjectModels
 from caryatid.perception import UP, Percept, label_image, perceive
 from caryatid.plausibility import reconcile
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
 
 class Scene:
     """The scene model of section III, updated view by view.
+
+    The first one after installation takes some seconds to come: kernels are compiled.
 
     Args:
         config: All stages' settings.
@@ -54,6 +57,7 @@ class Scene:
     def __init__(
         self, config: Config | None = None, *, segmentation: SegmentationMethod | None = None, seed: int = 0
     ) -> None:
+        compile_kernels()
         self.config = config or Config()
         self.segmentation = segmentation
         self.seed = seed

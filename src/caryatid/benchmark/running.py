@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import os
-import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
 from contextlib import closing, contextmanager
 from multiprocessing import active_children, get_context, parent_process
-from threading import Thread, current_thread, main_thread
+from threading import Thread
 from typing import Protocol
 
 from caryatid.benchmark.episodes import run_episode
 from caryatid.benchmark.records import Episode, Outcome
 from caryatid.benchmark.store import ResultStore
 from caryatid.errors import CaryatidError
+from caryatid.interrupts import interrupts_held
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Set to 1 in the environment of the processes, unless set already: they share the cores."""
@@ -50,7 +50,7 @@ class LocalExecutor:
         )
         killed = False
         try:
-            with _one_thread_each(), _interrupts_held():
+            with _one_thread_each(), interrupts_held():
                 futures: dict[Future[Outcome], Episode] = {pool.submit(run_episode, e): e for e in episodes}
             for future in as_completed(futures):
                 if isinstance(future.exception(), BrokenExecutor):
@@ -102,29 +102,6 @@ def _one_thread_each() -> Iterator[None]:
     finally:
         for name in added:
             del os.environ[name]
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back until the end; processes started meanwhile never get it, so that they leave quietly.
-
-    The mask is what the processes inherit. It does not hold Ctrl-C back here, where another thread may take
-    it and half-started processes would be left behind: the handler does. Where Ctrl-C is ignored, as in the
-    background of a shell, it stays so.
-    """
-    if current_thread() is not main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        yield
-        return
-    held: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, frame: held.append(number))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
-    if held:
-        raise KeyboardInterrupt
 
 
 def _end_with_parent() -> None:

@@ -25,6 +25,7 @@ from caryatid.commands.benchmark import CORES, Benchmark
 from caryatid.commands.episode_bar import EpisodeBar
 from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
+from caryatid.kernels.compiling import compile_kernels
 
 RESULTS = "results.sqlite"
 """Name of the result store in the folder."""
@@ -70,6 +71,8 @@ def _run(options: Benchmark, suite: Suite, store: ResultStore, console: Console)
         store.forget_failures()
     missing = store.plan(suite.name, suite.members())
     total = store.planned(suite.name)
+    if missing and options.scheduler is None:
+        compile_kernels(console.print)
     with EpisodeBar(console, suite.name, total, total - len(missing)) as bar:
 
         def done(episode: Episode, outcome: Outcome) -> None:

@@ -19,6 +19,7 @@ from caryatid.exploration import Step, explore
 from caryatid.formats.graph_json import graph_to_json
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
+from caryatid.kernels.compiling import compile_kernels
 from caryatid.report import ViewPage, draw_view, render_report
 
 
@@ -31,6 +32,8 @@ def run_exploration(options: Explore, config: Config) -> int:
             source = open_source(
                 options.source, config, noise=options.noise, segmentation=options.segmentation, seed=seed
             )
+        with progress.working("compiling"):
+            compile_kernels(progress.say)
         planner, camera = planner_for(
             options.planner, source.camera, source.truth, config, segmentation=options.segmentation, seed=seed
         )

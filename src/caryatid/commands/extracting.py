@@ -23,6 +23,7 @@ from caryatid.formats.json_files import json_text
 from caryatid.formats.point_clouds import read_stored_cloud
 from caryatid.formats.runs import RunWriter
 from caryatid.frames import Array
+from caryatid.kernels.compiling import compile_kernels
 from caryatid.perception import level_cloud
 from caryatid.report import ViewPage, draw_model, render_report
 from caryatid.scene import Scene
@@ -32,13 +33,12 @@ def run_extraction(options: Extract, config: Config) -> int:
     """Extract the model and write the run folder."""
     seed = options.modelling.seed
     progress = Progress(options.general.quiet or options.general.json)
-    scene = Scene(config, segmentation=options.segmentation, seed=seed)
     name = Path(options.source).name
     with RunWriter(options.out) as writer:
         if Path(options.source).suffix.lower() in CLOUD_SUFFIXES:
-            steps, pages = _extract_cloud(options, scene, writer, progress)
+            scene, steps, pages = _extract_cloud(options, config, writer, progress)
         else:
-            steps, pages = _extract_recording(options, scene, writer, progress)
+            scene, steps, pages = _extract_recording(options, config, writer, progress)
         told = {"segmentation": options.segmentation, "label_divisor": options.label_divisor}
         report = None
         if not options.no_report:
@@ -57,33 +57,34 @@ def run_extraction(options: Extract, config: Config) -> int:
 
 
 def _extract_cloud(
-    options: Extract, scene: Scene, writer: RunWriter, progress: Progress
-) -> tuple[list[dict[str, Any]], list[ViewPage]]:
-    config = scene.config
+    options: Extract, config: Config, writer: RunWriter, progress: Progress
+) -> tuple[Scene, list[dict[str, Any]], list[ViewPage]]:
     with progress.working("reading the cloud"):
         stored = read_stored_cloud(options.source, options.label_divisor)
         if options.segmentation == "labels" and stored.labels is None:
             raise InputError(options.source, "has no field label", "use --segmentation auto")
         if options.segmentation != "auto" and stored.labels is not None:
             check_segments(options.source, Counter(stored.labels[stored.kept].tolist()), config)
+    scene = _new_scene(options, config, progress)
+    with progress.working("extracting"):
         rng = np.random.default_rng(options.modelling.seed)
         cloud = stored.to_cloud(config.cloud)
         cloud = level_cloud(cloud, config, segmentation=options.segmentation, rng=rng)
-    with progress.working("extracting"):
         graph = scene.update(cloud)
     if scene.labels is None:
         raise RuntimeError("an updated scene has labels")
     writer.add_view(graph, stored.spread(scene.labels), name=stored.name)
     step = {"view": 0, "timings": scene.timings, "angle_travelled": 0.0, "path_travelled": 0.0}
-    return [step], [] if options.no_report else [draw_model(graph, scene.cloud, config=config.report)]
+    pages = [] if options.no_report else [draw_model(graph, scene.cloud, config=config.report)]
+    return scene, [step], pages
 
 
 def _extract_recording(
-    options: Extract, scene: Scene, writer: RunWriter, progress: Progress
-) -> tuple[list[dict[str, Any]], list[ViewPage]]:
-    config = scene.config
+    options: Extract, config: Config, writer: RunWriter, progress: Progress
+) -> tuple[Scene, list[dict[str, Any]], list[ViewPage]]:
     with progress.working("reading the recording"):
         recording = open_recording(options.source, config, options.segmentation)
+    scene = _new_scene(options, config, progress)
     steps: list[dict[str, Any]] = []
     pages: list[ViewPage] = []
     angle, path = 0.0, 0.0
@@ -109,4 +110,10 @@ def _extract_recording(
             page = draw_model(graph, scene.cloud, view=posed, labels=labels, config=config.report)
             page = replace(page, index=index, timings=scene.timings)
             pages.append(replace(page, angle_travelled=angle, path_travelled=path))
-    return steps, pages
+    return scene, steps, pages
+
+
+def _new_scene(options: Extract, config: Config, progress: Progress) -> Scene:
+    with progress.working("compiling"):
+        compile_kernels(progress.say)
+    return Scene(config, segmentation=options.segmentation, seed=options.modelling.seed)
