@@ -1,10 +1,20 @@
 from __future__ import annotations
 
+import tomllib
 from dataclasses import fields, replace
 
 import pytest
 
-from caryatid.config import Config, FitConfig
+from caryatid.config import (
+    Config,
+    FitConfig,
+    FusionConfig,
+    GenerationConfig,
+    MaskConfig,
+    StatisticsConfig,
+    VoxelConfig,
+)
+from caryatid.config.ranges import Stage, kinds, out_of_range
 from caryatid.errors import InputError
 from caryatid.settings import read_settings, write_settings
 
@@ -101,6 +111,69 @@ def test_a_value_of_the_wrong_type_says_what_is_wanted(flag, wanted):
     with pytest.raises(InputError, match=flag.split("=")[0].replace(".", r"\.")) as caught:
         read_settings(None, [flag])
     assert caught.value.remedy == f"give {wanted}"
+
+
+@pytest.mark.parametrize(
+    ("flag", "wanted"),
+    [
+        ("voxels.size=0", "a number above 0"),
+        ("voxels.size=-0.01", "a number above 0"),
+        ("noise.translation=-1", "a number from 0 on"),
+        ("fit.confidence=1", "a number above 0 and below 1"),
+        ("fusion.keep_share=1.01", "a number from 0 to 1"),
+        ("active.good_incidence=90", "a number from 0 to below 90"),
+        ("segmentation.hollow=-1.5", "a number from -1 to 1"),
+        ("active.max_views=0", "a whole number from 1 on"),
+        ("report.jpeg_quality=96", "a whole number from 1 to 95"),
+        ("voxels.extent=[1, 0, 1]", "a list of 3 numbers, each above 0"),
+        ("robot.pitch=[-100, 20]", "a list of 2 numbers, each from -90 to 90"),
+        ("robot.pitch=[20, -60]", "a list of 2 numbers, in rising order"),
+        ("registration.reaches=[0.1, 0.05, -1]", "a list of 3 numbers, each above 0"),
+    ],
+)
+def test_a_value_out_of_its_range_says_what_the_range_is(flag, wanted):
+    name, _, value = flag.partition("=")
+    with pytest.raises(InputError) as caught:
+        read_settings(None, [flag])
+    assert caught.value.reason == f"{name} = {tomllib.loads('x = ' + value)['x']!r} is not valid"
+    assert caught.value.remedy == f"give {wanted}"
+
+
+@pytest.mark.parametrize(
+    "flag", ["noise.translation=0", "fusion.keep_share=1", "segmentation.gap=0", "robot.pitch=[10, 10]"]
+)
+def test_the_ends_of_a_range_belong_to_it(flag):
+    read_settings(None, [flag])
+
+
+def test_settings_made_in_python_are_looked_after_too():
+    with pytest.raises(InputError, match=r"VoxelConfig\.size: 0\.0 is not valid; give a number above 0"):
+        VoxelConfig(size=0.0)
+    with pytest.raises(InputError, match=r"FitConfig\.max_points"):
+        replace(FitConfig(), max_points=0)
+    with pytest.raises(InputError, match=r"from 0 to 1"):
+        FusionConfig(keep_share=float("nan"))
+
+
+ANY = {"mask.min_score", "sensor.light"}
+"""Settings that may be any number: of the segmenter's unit, and a direction."""
+
+
+def test_every_number_says_its_range():
+    stages = {f.name: f.default_factory for f in fields(Config)} | {
+        "mask": MaskConfig,
+        "statistics": StatisticsConfig,
+        "generation": GenerationConfig,
+    }
+    for stage, kind in stages.items():
+        assert issubclass(kind, Stage)
+        for name, hint in kinds(kind).items():
+            value = getattr(kind(), name)
+            if isinstance(value, bool | str) or f"{stage}.{name}" in ANY:
+                continue
+            beyond = (-1e9,) * len(value) if isinstance(value, tuple) else -1e9
+            assert out_of_range(beyond, hint), f"{stage}.{name}"
+            assert not out_of_range(value, hint)
 
 
 @pytest.mark.parametrize("flag", ["fit", "fit.steps", "steps=3", "a.b.c=3", "=3"])

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
 from caryatid.config import Config
+from caryatid.config.ranges import kinds, out_of_range
 from caryatid.errors import InputError
 
 T = TypeVar("T")
@@ -24,7 +25,7 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
         base: What to start from.
 
     Raises:
-        InputError: The file cannot be read, or a name or value is not valid; the message lists what is.
+        InputError: The file cannot be read, or a name or value is not valid; the message says what would be.
     """
     config = base or Config()
     if file is not None:
@@ -78,6 +79,8 @@ def _changed(config: T, document: Mapping[str, Any], source: str, prefix: str) -
             values[name] = _changed(current, value, source, f"{name}.")
         else:
             values[name] = _typed(value, current, get_args(hints[name]), source, prefix + name)
+            if wanted := out_of_range(values[name], kinds(type(config))[name]):
+                raise _refused(value, wanted, source, prefix + name)
     return replace(config, **values)  # type: ignore[type-var]
 
 
@@ -104,7 +107,11 @@ def _typed(value: Any, current: Any, choices: tuple[Any, ...], source: str, name
         if isinstance(value, int):
             return value
         wanted = "a whole number"
-    raise InputError(source, f"{name} = {value!r} is not valid", f"give {wanted}")
+    raise _refused(value, wanted, source, name)
+
+
+def _refused(value: Any, wanted: str, source: str, name: str) -> InputError:
+    return InputError(source, f"{name} = {value!r} is not valid", f"give {wanted}")
 
 
 def _toml(value: Any) -> str:

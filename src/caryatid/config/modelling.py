@@ -6,233 +6,244 @@ from dataclasses import dataclass
 from typing import Literal
 
 from caryatid.config.choices import FusionMethod
+from caryatid.config.ranges import (
+    Angle,
+    Count,
+    Factor,
+    Likelihood,
+    NotNegative,
+    Positive,
+    Share,
+    Stage,
+    WholeNumber,
+)
 
 
 @dataclass(frozen=True, slots=True)
-class FitConfig:
+class FitConfig(Stage):
     """Primitive fitting."""
 
-    hypotheses: int = 100
+    hypotheses: Count = 100
     """RANSAC hypotheses a shape at the most [1]; the predecessor's iterations."""
-    confidence: float = 0.99
+    confidence: Likelihood = 0.99
     """RANSAC stops when a better sample is less likely than 1 − confidence."""
-    max_points: int = 800
+    max_points: Count = 800
     """Points a fit looks at [1]; more change sizes by less than the noise and cost time in proportion."""
-    min_points: int = 12
+    min_points: Count = 12
     """Fewer points are no object [1]; a box has nine parameters."""
-    threshold: float = 0.01
+    threshold: Positive = 0.01
     """MSAC truncation of the distance to the surface [m]; 2σ of registration error."""
-    polish: int = 3
+    polish: Count = 3
     """Best hypotheses of each shape that are refined by least squares."""
-    steps: int = 25
+    steps: WholeNumber = 25
     """Least-squares steps at the most."""
-    max_extent: float = 0.5
+    max_extent: Positive = 0.5
     """Longest extent of an object on a table [m]."""
-    min_extent: float = 0.008
+    min_extent: Positive = 0.008
     """Shortest extent [m]; below the sensor's resolution."""
-    max_radius: float = 0.15
+    max_radius: Positive = 0.15
     """Largest radius of cylinder and sphere [m]."""
-    size_penalty: float = 0.0125
+    size_penalty: NotNegative = 0.0125
     """Added to the mean residual [m] per square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
-    shrink: float = 2e-5
+    shrink: NotNegative = 2e-5
     """Pull on every extent in the search [m]: keeps sides that hold no points near; the last fit has none."""
-    trim: float = 0.005
+    trim: Share = 0.005
     """Share of the points beyond each end of an extent that count as noise in the search [1]."""
-    side_share: float = 0.02
+    side_share: Share = 0.02
     """Share of the points that must lie on a side for it to count as seen [1]."""
-    normal_weight: float = 0.004
+    normal_weight: NotNegative = 0.004
     """What a normal turned by 90° costs in model choice [m]: as much as half the registration error."""
-    bare_weight: float = 0.003
+    bare_weight: NotNegative = 0.003
     """What seen sides without any point near them cost in model choice [m]; a share of them in proportion."""
-    bare_spacing: float = 0.008
+    bare_spacing: Positive = 0.008
     """Spacing of the samples that look for points near a side [m]; 2 to 3 pixels at 1.5 m."""
-    final_points: int = 5000
+    final_points: Count = 5000
     """Points the last refinement of the chosen shape looks at [1]; a large object in one view."""
-    opening: float = 0.05
+    opening: NotNegative = 0.05
     """How far unseen sides are moved out of the way for it [m]; beyond all noise."""
-    face_width: float = 3.0
+    face_width: Positive = 3.0
     """Points within as many standard deviations of a face are the face's [1]; 99.7 % of them."""
-    stray: float = 1e-3
+    stray: Positive = 1e-3
     """Density of stray points beyond a face's rim, as a share of that on the face [1]."""
-    correlated: float = 4.0
+    correlated: Positive = 4.0
     """Neighbouring points that share one error [1]: depth is smoothed over 2 × 2 pixels."""
-    registration: float = 0.002
+    registration: NotNegative = 0.002
     """Standard deviation of where views are laid [m], which no number of points averages out."""
-    rim: float = 0.003
+    rim: NotNegative = 0.003
     """The same of where points end beside a depth edge [m]: one pixel at 1.5 m."""
-    free_weight: float = 0.01
+    free_weight: NotNegative = 0.01
     """What an inside seen free costs in model choice [m]; a share of it in proportion."""
-    free_inset: float = 1.2
+    free_inset: NotNegative = 1.2
     """How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
-    max_residual: float = 0.008
+    max_residual: Positive = 0.008
     """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
 
 
 @dataclass(frozen=True, slots=True)
-class SplitConfig:
+class SplitConfig(Stage):
     """Parting what automatic segmentation took for one object."""
 
-    cuts: int = 5
+    cuts: WholeNumber = 5
     """Cuts tried along each direction [1]; a sixth of the points apart."""
-    patches: int = 3
+    patches: WholeNumber = 3
     """Largest patches a single shape does not explain that are tried as objects of their own [1]."""
-    finalists: int = 2
+    finalists: Count = 2
     """Best starts that are settled with full fits [1]."""
-    rounds: int = 3
+    rounds: WholeNumber = 3
     """Times the points go to the shape that explains them better and the shapes are fitted anew [1]."""
-    min_points: int = 20
+    min_points: Count = 20
     """Thinned points a side needs [1]; 1.5 times what a shape needs."""
-    crumb: int = 8
+    crumb: WholeNumber = 8
     """Fewer points off the rest of their side go to the other side [1]; 2 cm square of them, thinned."""
-    reach: float = 0.02
+    reach: Positive = 0.02
     """Points further apart are not connected [m]; four times their spacing."""
 
 
 @dataclass(frozen=True, slots=True)
-class ExplanationConfig:
+class ExplanationConfig(Stage):
     """What it costs to explain points by shapes: the least cost decides what is one object and what two."""
 
-    parameter_cost: float = 4.5
+    parameter_cost: NotNegative = 4.5
     """Price of each number that an object's shape has [nats]; each is known to a ninetieth of its range."""
-    outlier: float = 4.0
+    outlier: NotNegative = 4.0
     """Cost of a point no shape explains [nats]; as likely as one 2.8σ off."""
-    irregular: float = 1.4
+    irregular: NotNegative = 1.4
     """Cost of a point on an object that is none of the shapes [nats]."""
-    normal_weight: float = 4.0
+    normal_weight: NotNegative = 4.0
     """Cost of a normal turned by 90° [nats]; blurred over edges, normals are as good as 30°."""
-    reading: float = 0.0002
+    reading: Positive = 0.0002
     """Surface whose points err alike [m²]; half of the 2 cm square a registration error shows in."""
-    border: float = 4.0
+    border: NotNegative = 4.0
     """Cost of a point with only the other object around it, on a surface without crease [nats]."""
-    smooth_border: float = 0.8
+    smooth_border: Share = 0.8
     """Share of a border without crease for two with shapes to be one irregular object [1]."""
-    free_cost: float = 0.5
+    free_cost: NotNegative = 0.5
     """Cost of a voxel inside a shape that was seen free [nats]; four points off at 5 mm spacing."""
-    usual: float = 0.9
+    usual: NotNegative = 0.9
     """Mean cost of the points around a point that is still well explained [nats]; 9 in 10 true shapes."""
-    neighbours: int = 8
+    neighbours: Count = 8
     """Points the mean around a point is taken over [1]; 2 cm square of them."""
-    spacing: float = 0.008
+    spacing: Positive = 0.008
     """Spacing the points are thinned to [m]; a third of the patch that errs alike."""
-    least_noise: float = 0.002
+    least_noise: Positive = 0.002
     """Least standard deviation of points from their surfaces [m]; what registration leaves."""
-    crease: float = 15.0
+    crease: Angle = 15.0
     """Turn between neighbouring normals from which on a crease is concave [deg]; as in segmentation."""
-    reach: float = 0.03
+    reach: Positive = 0.03
     """Objects further apart are not taken for one [m]; an occluder's shadow."""
-    sample: int = 150
+    sample: Count = 150
     """Points of an object at the most in a fit that only tells what is worth a full one [1]."""
-    hypotheses: int = 10
+    hypotheses: Count = 10
     """RANSAC hypotheses a shape in such a fit [1]."""
-    steps: int = 6
+    steps: WholeNumber = 6
     """Least-squares steps in such a fit [1]."""
-    growth: float = 1.3
+    growth: Factor = 1.3
     """What was found to be one object, or two, is looked at again when its points have grown by this [1]."""
-    layer: float = 0.009
+    layer: NotNegative = 0.009
     """Points within this of a surface may be of it [m]; a view that is off by 3σ leaves a layer of them."""
-    layer_share: float = 0.8
+    layer_share: Share = 0.8
     """Share of an object's points in such a layer, or inside the other, for it to be the other's [1]."""
-    inset: float = 1.2
+    inset: NotNegative = 1.2
     """How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
 
 
 @dataclass(frozen=True, slots=True)
-class CompletionConfig:
+class CompletionConfig(Stage):
     """How far shapes reach down where nobody looked."""
 
-    max_tilt: float = 30.0
+    max_tilt: Angle = 30.0
     """An unseen side that faces down within this angle may be extended [deg]; what rests on a face does."""
-    step: float = 0.01
+    step: Positive = 0.01
     """Step of the extension [m]; a voxel."""
-    spacing: float = 0.015
+    spacing: Positive = 0.015
     """Spacing of the points tested on the moving side [m]."""
-    inset: float = 0.01
+    inset: NotNegative = 0.01
     """How far inside the walls free space is looked for [m]; a voxel, so that a wall's noise says nothing."""
-    overlap: float = 0.004
+    overlap: NotNegative = 0.004
     """How deep the moving side may enter another shape [m]; the fits' uncertainty."""
-    flat: float = 0.02
+    flat: NotNegative = 0.02
     """Extent below which a single side's points say nothing of the depth behind it [m]; their noise."""
-    least: float = 0.0005
+    least: NotNegative = 0.0005
     """Gaps below this are none [m]."""
-    max_free: float = 0.15
+    max_free: Share = 0.15
     """The extension ends where more of its rim lies in voxels seen free [1]; half of one side of four."""
 
 
 @dataclass(frozen=True, slots=True)
-class PlausibilityConfig:
+class PlausibilityConfig(Stage):
     """Shapes that neither overlap nor float."""
 
-    rounds: int = 3
+    rounds: WholeNumber = 3
     """Corrections at the most [1]; 0 leaves shapes as they were fitted."""
-    touch: float = 0.001
+    touch: NotNegative = 0.001
     """How far from zero the gap of two shapes in contact may be [m]; roundness of edges, softness."""
-    reach: float = 0.01
+    reach: NotNegative = 0.01
     """Gap below an object that touches nothing below it that is closed [m]; as of contacts."""
-    max_tilt: float = 25.0
+    max_tilt: Angle = 25.0
     """Separating planes steeper than this carry nothing for sure [deg]; as for supports."""
-    sigmas: float = 3.0
+    sigmas: NotNegative = 3.0
     """Standard deviations of a gap beyond which the fits' uncertainty does not explain it [1]."""
-    min_extent: float = 0.008
+    min_extent: Positive = 0.008
     """Shortest extent [m]; as of the fits."""
 
 
 @dataclass(frozen=True, slots=True)
-class SupportConfig:
+class SupportConfig(Stage):
     """Support relations, section III-A."""
 
-    contact_margin: float = 0.005
+    contact_margin: NotNegative = 0.005
     """Gap up to which two shapes are in contact, however sure both are [m]; method notes section 3."""
-    margin_sigma: float = 2.0
+    margin_sigma: NotNegative = 2.0
     """The same in standard deviations of the gap, where that is more [1]; misses one contact in forty."""
-    max_margin: float = 0.01
+    max_margin: NotNegative = 0.01
     """However unsure they are, shapes further apart are not in contact [m]; method notes section 3."""
-    reach: float = 0.012
+    reach: NotNegative = 0.012
     """Gap up to which a contact is believed where an object would tip without it [m]; 2.5σ of the same."""
-    gentle_tilt: float = 25.0
+    gentle_tilt: Angle = 25.0
     """Planes steeper than this, where nothing overlaps, carry only what would tip without them [deg]."""
-    max_tilt: float = 75.0
+    max_tilt: Angle = 75.0
     """Separating planes steeper than this carry nothing [deg]: the normal is too near the horizontal."""
-    patch_depth: float = 0.003
+    patch_depth: NotNegative = 0.003
     """Surface this near to the first contact counts as touching [m]; the noise of one reading at 1.5 m."""
-    patch_tilt: float = 1.0
+    patch_tilt: Angle = 1.0
     """The same for faces that a fit turned against each other [deg]; a ball has none."""
-    min_area_ratio: float = 0.1
+    min_area_ratio: Share = 0.1
     """r_s,min of eq. 1."""
-    overhang: float = 0.003
+    overhang: NotNegative = 0.003
     """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
-    lean_angle: float = 75.0
+    lean_angle: Angle = 75.0
     """Widest angle between a sideways push and the direction straight against an object's tipping [deg]."""
     top_down: Literal["paper", "balance"] = "balance"
     """All that rests on an unstable object holds it (`paper`), or only what weighs against its tipping."""
-    max_drop: float = 0.04
+    max_drop: NotNegative = 0.04
     """How far below an unsupported object its supporter may lie, hidden gap between them [m]."""
 
 
 @dataclass(frozen=True, slots=True)
-class FusionConfig:
+class FusionConfig(Stage):
     """Fusing graphs over views, section III-B."""
 
     method: FusionMethod = "pc+sg"
     """What is fused: points (`pc`), graphs (`sg`) or both (Table I)."""
-    max_distance: float = 0.05
+    max_distance: NotNegative = 0.05
     """Centres further apart are two objects [m], beside half the smaller object's size."""
-    max_angle: float = 20.0
+    max_angle: Angle = 20.0
     """Axes further apart are two orientations [deg], up to the shape's symmetry."""
-    max_ratio: float = 1.6
+    max_ratio: Factor = 1.6
     """Sorted extents that differ by more than this factor are two objects."""
-    sigmas: float = 2.0
+    sigmas: NotNegative = 2.0
     """Standard deviations of centres and extents by which two sightings may differ beyond that [1]."""
-    settled: float = 0.005
+    settled: NotNegative = 0.005
     """A shape that moves, grows or turns by less than this has not changed [m]; σ of registration error."""
-    surface_spacing: float = 0.01
+    surface_spacing: Positive = 0.01
     """Spacing of the points on a shape that are looked for in a view that does not show the object [m]."""
-    behind: float = 0.02
+    behind: NotNegative = 0.02
     """A reading this far behind such a point contradicts it [m]; 2σ of registration and depth together."""
-    contradicting: float = 0.5
+    contradicting: Share = 0.5
     """Share of the points that must be contradicted for the view to speak against the object [1]."""
-    blind: float = 0.1
+    blind: NotNegative = 0.1
     """Weight, in sides, of a sighting of which no side was seen (`sg`) [1]; small beside any other."""
-    residual: float = 0.01
+    residual: Positive = 0.01
     """Mean distance of its points at which a sighting counts half in the merged shape (`sg`) [m]."""
-    keep_share: float = 0.5
+    keep_share: Share = 0.5
     """A support is kept while occurrences / opportunities is at least this."""

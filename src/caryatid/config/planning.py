@@ -3,42 +3,57 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from caryatid.config.ranges import (
+    Acute,
+    Angle,
+    Azimuth,
+    Count,
+    Elevation,
+    Lengths,
+    Likelihood,
+    NotNegative,
+    Positive,
+    Rising,
+    Share,
+    Stage,
+)
 
 
 @dataclass(frozen=True, slots=True)
-class VoxelConfig:
+class VoxelConfig(Stage):
     """The voxel map for the occlusion test."""
 
-    size: float = 0.01
+    size: Positive = 0.01
     """Edge of a voxel [m]; the paper's leaf size."""
-    extent: tuple[float, float, float] = (1.6, 1.6, 1.0)
+    extent: tuple[Positive, Positive, Positive] = (1.6, 1.6, 1.0)
     """Size of the map around the view sphere's centre [m]: a table with its margin."""
-    below: float = 0.1
+    below: NotNegative = 0.1
     """How far the map reaches below the sphere's centre [m]."""
-    stride: int = 2
+    stride: Count = 2
     """Pixels between the rays that are followed; 2 is 6 mm at 1.5 m, below the voxel's size."""
-    margin: float = 0.01
+    margin: NotNegative = 0.01
     """Length before a reading that a ray does not clear [m]; depth noise within it carves no surface."""
-    hit: float = 0.7
+    hit: Likelihood = 0.7
     """Occupancy one view with a reading in a voxel speaks for [1]; the usual sensor model."""
-    miss: float = 0.4
+    miss: Likelihood = 0.4
     """Occupancy one view that looks through a voxel speaks for [1]; the usual sensor model."""
-    clamp: tuple[float, float] = (0.12, 0.97)
+    clamp: Annotated[tuple[Likelihood, Likelihood], Rising()] = (0.12, 0.97)
     """Lowest and highest occupancy of a voxel the volumetric planners reckon with [1]; the usual ones."""
-    readings: int = 5
+    readings: Count = 5
     """Images one view stands for in that occupancy [1]; as many misses reach the clamp."""
 
 
 @dataclass(frozen=True, slots=True)
-class ActiveVisionConfig:
+class ActiveVisionConfig(Stage):
     """Points of interest, view sphere and the choice of the next view, section IV."""
 
-    sphere_points: int = 40_000
+    sphere_points: Count = 40_000
     """Points the view sphere is discretised to; the paper's."""
-    sphere_radius: float = 1.5
+    sphere_radius: Positive = 1.5
     """Radius of the view sphere [m]; the paper's."""
-    saliency_weight: float = 0.75
+    saliency_weight: Share = 0.75
     """λ_s of eq. 2; the paper's."""
     saliency: Literal["paper", "decreasing"] = "decreasing"
     """Eq. 2 with 2π as printed, or with π so that relations seen often matter less."""
@@ -48,73 +63,73 @@ class ActiveVisionConfig:
     """Saliency of a point is negated where it is hidden, as in the paper; or hidden points count as seen."""
     propagation: bool = True
     """Saliency spreads to neighbouring views, as in the paper; or a point's nearest view alone gets it."""
-    spread: float = 20.0
+    spread: Positive = 20.0
     """Angle on the sphere at which saliency has fallen to exp(−½) [deg]."""
-    inhibition: float = 1.0
+    inhibition: NotNegative = 1.0
     """Depth of the negative bump at every visited view [1]; 0 is no inhibition of return."""
     path_cost: Literal["angle", "path", "none"] = "path"
     """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path halves it."""
-    max_views: int = 10
+    max_views: Count = 10
     """Views at the most, the first one too; the paper's."""
-    clearance: float = 0.05
+    clearance: NotNegative = 0.05
     """Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
-    ring_views: int = 5
+    ring_views: Count = 5
     """Stops of the planner `ring` in a round [1]; two rounds are the ten views of the paper, 36° apart."""
-    look_directions: int = 1200
+    look_directions: Count = 1200
     """Directions on the whole sphere that planners look in at the most [1]; about 6° apart."""
-    surface_samples: int = 400
+    surface_samples: Count = 400
     """Points on the fitted shapes the planner `support` tests for being seen [1]."""
-    sample_clearance: float = 0.025
+    sample_clearance: NotNegative = 0.025
     """Length of a surface point's line of sight that does not count [m]; its own surface, 2½ voxels."""
-    good_incidence: float = 60.0
+    good_incidence: Acute = 60.0
     """A surface met at less than this from its normal is seen as well as can be [deg]."""
-    space_spacing: float = 0.04
+    space_spacing: Positive = 0.04
     """Spacing of the points in unseen space the planner `support` tests for being seen [m]."""
-    space_weight: float = 0.5
+    space_weight: NotNegative = 0.5
     """Worth of all the space on the table against all surfaces of objects [1]; little of it holds any."""
-    heap_weight: float = 1.0
+    heap_weight: NotNegative = 1.0
     """Worth of the space among the objects against all their surfaces [1]; objects hide in it."""
-    effort: float = 0.05
+    effort: NotNegative = 0.05
     """Share of all there is to see for which the planner `support` goes one sphere diameter [1]."""
-    relation_weight: float = 0.1
+    relation_weight: NotNegative = 0.1
     """Worth of all relations' points of interest against all the objects' surfaces [1]."""
-    ray_spacing: float = 0.02
+    ray_spacing: Positive = 0.02
     """Spacing of the volumetric planners' rays at the sphere's centre [m]; 2 voxels, no object is missed."""
-    proximity: float = 0.1
+    proximity: Positive = 0.1
     """d_max of the planner `proximity-count` [m]; a common object reaches that far behind its seen side."""
-    cost_weight: float = 1.0
+    cost_weight: NotNegative = 1.0
     """Weight w of the cost in the volumetric planners' utility [1]; the usual one."""
-    view_cone: float = 30.0
+    view_cone: Acute = 30.0
     """Angle from the optical axis within which a point is in the image [deg]; 57° × 43° sensor."""
 
 
 @dataclass(frozen=True, slots=True)
-class RobotConfig:
+class RobotConfig(Stage):
     """The simulated humanoid: holonomic platform, torso lift, head with yaw and pitch."""
 
-    footprint: float = 0.35
+    footprint: Positive = 0.35
     """Radius of the platform's disc [m]."""
-    camera_height: tuple[float, float] = (1.30, 1.90)
+    camera_height: Lengths = (1.30, 1.90)
     """Lowest and highest camera centre over the floor [m], by the torso lift."""
-    pitch: tuple[float, float] = (-60.0, 20.0)
+    pitch: Annotated[tuple[Elevation, Elevation], Rising()] = (-60.0, 20.0)
     """Head pitch, down to up [deg]."""
-    yaw: tuple[float, float] = (-80.0, 80.0)
+    yaw: Annotated[tuple[Azimuth, Azimuth], Rising()] = (-80.0, 80.0)
     """Head yaw against the platform [deg]."""
-    camera_forward: float = 0.1
+    camera_forward: NotNegative = 0.1
     """How far the camera stands before the platform's centre [m]."""
-    cell: float = 0.05
+    cell: Positive = 0.05
     """Edge of a cell of the floor grid [m]."""
-    floor: float = 3.0
+    floor: Positive = 3.0
     """Half the side of the square of floor the robot may use, around the table [m]."""
-    head_yaws: int = 9
+    head_yaws: Count = 9
     """Head yaws tried within the limits, straight ahead first, to stand clear of an obstacle."""
-    max_roll: float = 0.5
+    max_roll: Angle = 0.5
     """Camera roll beyond this cannot be reached, the head has no third joint [deg]."""
-    step: float = 0.02
+    step: NotNegative = 0.02
     """Anything on the floor lower than this is no obstacle to the platform [m]."""
-    head_room: float = 0.15
+    head_room: NotNegative = 0.15
     """What the head needs above the highest camera centre [m]; higher obstacles do not hinder."""
-    table_margin: float = 0.1
+    table_margin: NotNegative = 0.1
     """Obstacles met this near to the sphere's centre are the table, not a wall in the line of sight [m]."""
-    home: tuple[float, float] = (180.0, 35.0)
+    home: tuple[Azimuth, Elevation] = (180.0, 35.0)
     """Azimuth and elevation on the view sphere of the first view [deg]."""
