@@ -106,10 +106,10 @@ def spelt(arguments: tuple[Any, ...]) -> str:
     Raises:
         ValueError: A type has no spelling here.
     """
-    from numba.core.sigutils import normalize_signature
+    from caryatid.kernels.compiling import argument_types
 
     text = f"({', '.join(map(_spelt, arguments))},)"
-    if normalize_signature(text)[0] != arguments:
+    if argument_types(text) != arguments:
         raise ValueError(f"{arguments} is not {text}")
     return text
 
@@ -127,6 +127,15 @@ def _spelt(kind: Any) -> str:
             return f"{_spelt(kind.dtype)}[{', '.join(colons)}]"
         case types.Array(ndim=n, layout=layout):
             return f"Array({_spelt(kind.dtype)}, {n}, '{layout}', readonly=True)"
+        case types.BaseNamedTuple():
+            name = f"{kind.instance_class.__module__.rpartition('.')[2]}.{kind.instance_class.__name__}"
+            return f"Named('{name}', ({', '.join(map(_spelt, kind))},))"
+        case types.FunctionType():
+            signature: Any = kind.signature
+            given = ", ".join(map(_spelt, signature.args))
+            return f"FunctionType({_spelt(signature.return_type)}({given}))"
+        case types.NoneType():
+            return "void"
         case types.BaseTuple():
             return f"Tuple(({', '.join(map(_spelt, kind))},))"
     raise ValueError(f"no spelling for {kind}")
@@ -135,7 +144,8 @@ def _spelt(kind: Any) -> str:
 def seconds(calls: Calls) -> dict[str, float]:
     """Time each kernel takes to compile, one after the other [s]; what several call counts for the first."""
     from numba import njit
-    from numba.core.sigutils import normalize_signature
+
+    from caryatid.kernels.compiling import argument_types
 
     njit(_warm)(1.0)
     listed = dict(kernels())
@@ -143,7 +153,7 @@ def seconds(calls: Calls) -> dict[str, float]:
     for name, signatures in calls.items():
         start = time.perf_counter()
         for signature in signatures:
-            listed[name].compile(normalize_signature(signature)[0])
+            listed[name].compile(argument_types(signature))
         taken[name] = time.perf_counter() - start
     return taken
 

@@ -4,12 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, sphere, surface_points
+import reference_fits as reference
+from synthetic import box, cylinder, random_motion, sphere, surface_points
 
 from caryatid.config import FitConfig, VoxelConfig
-from caryatid.interior import free_share, interior_states
-from caryatid.primitives import candidates, fit
-from caryatid.voxels import FREE, VoxelMap
+from caryatid.interior import free_inside, free_share
+from caryatid.primitives import Oriented, candidates, fit
+from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.voxels import VoxelMap
 
 INSET = 0.012
 
@@ -38,15 +40,44 @@ def test_half_of_a_shape_in_free_space_is_half_free(kind):
 def test_the_surface_says_nothing():
     shape = box((0.0, 0.0, 0.2), (0.2, 0.2, 0.2))
     skin = map_with(lambda p: np.abs(shape.signed_distance(p)) < 0.005)
-    assert not (interior_states(shape, skin, INSET) == FREE).any()
-    assert len(interior_states(box((0.0, 0.0, 0.2), (0.2, 0.2, 0.02)), skin, INSET)) == 0
+    inside, free = free_inside(shape, skin, INSET)
+    assert inside > 1000
+    assert free == 0
+    assert free_inside(box((0.0, 0.0, 0.2), (0.2, 0.2, 0.02)), skin, INSET) == (0, 0)
+    assert free_share(box((0.0, 0.0, 0.2), (0.2, 0.2, 0.02)), skin, INSET) == 0.0
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
+def test_the_compiled_count_is_that_of_the_reference(kind):
+    """In any attitude, thinner than a voxel and partly outside the map."""
+    rng = np.random.default_rng(0)
+    nothing = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
+    hits, passes = rng.integers(0, 2, (2, *nothing.hits.shape)).astype(np.uint8)
+    known = replace(nothing, hits=hits, passes=passes)
+    edge = nothing.origin_world[0]
+    counts = []
+    for at in (0.0, edge, edge - 1.0, *rng.uniform(-0.2, 0.2, 8)):
+        pose = random_motion(rng, 0.05)
+        pose[:3, 3] += (at, 0.0, 0.2)
+        least = rng.uniform(0.025, 0.04)
+        shape = {
+            "box": Box(pose, np.array([least, *rng.uniform(0.02, 0.15, 2)])),
+            "cylinder": Cylinder(pose, rng.uniform(0.02, 0.06), least),
+            "sphere": Sphere(pose, rng.uniform(0.02, 0.06)),
+        }[kind]
+        counts.append(free_inside(shape, known, INSET))
+        assert counts[-1] == reference.free_inside(shape, known, INSET)
+    assert min(inside for inside, _ in counts) < max(inside for inside, _ in counts)
+    assert counts[2][1] == 0 < max(free for _, free in counts)
 
 
 def test_of_shapes_that_explain_the_points_the_one_that_fills_no_space_seen_free():
     can = cylinder((0.0, 0.0, 0.2), 0.06, 0.12)
     points, normals = surface_points(can, np.random.default_rng(0), eye=(-1.0, 0.3, 0.6), sigma=0.001)
     config = FitConfig(free_weight=1.0)
-    best, *others = candidates(points, normals, config=config, rng=np.random.default_rng(0))
+    ((best, *others),) = candidates(
+        [Oriented(points, normals)], config=config, rngs=[np.random.default_rng(0)]
+    )
     inside_best_alone = map_with(
         lambda p: (best.shape.signed_distance(p) < 0.0) & (others[0].shape.signed_distance(p) > -0.012)
     )
@@ -57,3 +88,24 @@ def test_of_shapes_that_explain_the_points_the_one_that_fills_no_space_seen_free
     assert fit(points, normals, **options).shape.kind == best.shape.kind
     options = {"config": config, "rng": np.random.default_rng(0), "space": inside_best_alone}
     assert fit(points, normals, **options).shape.kind != best.shape.kind
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_the_choice_weighs_what_is_filled_against_how_well_points_are_explained(weight):
+    config = FitConfig(free_weight=weight)
+    inset = config.free_inset * VoxelConfig().size
+    kinds = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        shape = box((0.0, 0.0, 0.2), rng.uniform(0.06, 0.12, 3), turn_deg=30.0)
+        if seed % 2:
+            shape = cylinder((0.0, 0.0, 0.2), rng.uniform(0.03, 0.06), rng.uniform(0.06, 0.12))
+        points, normals = surface_points(shape, rng, eye=(-1.0, 0.3, 0.6), sigma=0.001)
+        direction = rng.normal(size=3)
+        space = map_with(lambda p, d=direction: (p - (0.0, 0.0, 0.2)) @ d > 0.01)
+        (found,) = candidates([Oriented(points, normals)], config=config, rngs=[np.random.default_rng(0)])
+        costs = [f.cost + weight * free_share(f.shape, space, inset) for f in found]
+        result = fit(points, normals, config=config, rng=np.random.default_rng(0), space=space)
+        assert result.shape.kind == found[int(np.argmin(costs))].shape.kind
+        kinds.append(result.shape.kind == found[0].shape.kind)
+    assert all(kinds) == (weight == 0.0)

@@ -4,14 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import reference_fits as reference
 from scipy.special import ndtr
-from synthetic import box, cylinder, hausdorff, sphere
+from synthetic import box, cylinder, hausdorff, random_motion, sphere
 
 from caryatid import frames
 from caryatid.config import FitConfig
 from caryatid.kernels.rims import likeliest_end
-from caryatid.polish import polish
-from caryatid.refine import refine
+from caryatid.polish import Polish, polish
+from caryatid.refine import distances, refine
 from caryatid.shapes import Box, Cylinder
 
 INDEPENDENT = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
@@ -20,6 +21,12 @@ BOX = box((0.0, 0.0, 0.0), (0.1, 0.14, 0.06), turn_deg=25.0)
 CAN = cylinder((0.0, 0.0, 0.0), 0.04, 0.12)
 TWO_FACES = np.array([False, False, False, True, False, True])
 """+y and +z of a box are seen."""
+
+
+def polished(shape, seen, points, config=INDEPENDENT):
+    """One shape polished, and its uncertainty."""
+    (last,) = polish([Polish(shape, tuple(seen), points)], config)
+    return last.shape, last.uncertainty
 
 
 def face_points(shape, axis, sign, count, rng, sigma):
@@ -89,8 +96,8 @@ def test_a_few_stray_points_do_not_move_the_end():
 @pytest.mark.parametrize("seed", range(4))
 def test_unseen_sides_of_a_box_lie_where_its_faces_end(seed):
     start = box((0.002, -0.001, 0.0), (0.09, 0.13, 0.055), turn_deg=24.0)
-    polished, _ = polish(start, TWO_FACES, two_faces(seed), INDEPENDENT)
-    assert hausdorff(polished, BOX) < 0.002
+    found, _ = polished(start, TWO_FACES, two_faces(seed))
+    assert hausdorff(found, BOX) < 0.002
 
 
 def test_the_pull_of_the_search_is_gone():
@@ -98,19 +105,19 @@ def test_the_pull_of_the_search_is_gone():
     options = {"steps": 25, "min_extent": 0.008, "shrink": 2e-4}
     pulled = refine(BOX, points, **options)
     assert BOX.extents.sum() - pulled.extents.sum() > 0.002
-    polished, _ = polish(pulled, TWO_FACES, points, INDEPENDENT)
-    unpulled, _ = polish(BOX, TWO_FACES, points, INDEPENDENT)
-    np.testing.assert_allclose(polished.extents, unpulled.extents, atol=2e-4)
-    np.testing.assert_allclose(polished.extents, BOX.extents, atol=0.0015)
+    found, _ = polished(pulled, TWO_FACES, points)
+    unpulled, _ = polished(BOX, TWO_FACES, points)
+    np.testing.assert_allclose(found.extents, unpulled.extents, atol=2e-4)
+    np.testing.assert_allclose(found.extents, BOX.extents, atol=0.0015)
 
 
 def test_the_height_of_a_can_is_that_of_its_mantle():
     points = mantle_points(CAN, 1500, np.random.default_rng(0), 0.002)
     seen = np.array([True, True, False, True, False, False])
-    polished, uncertainty = polish(Cylinder(CAN.T_world_object, 0.041, 0.11), seen, points, INDEPENDENT)
-    assert isinstance(polished, Cylinder)
-    assert polished.height == pytest.approx(CAN.height, abs=0.002)
-    assert polished.radius == pytest.approx(CAN.radius, abs=0.0005)
+    found, uncertainty = polished(Cylinder(CAN.T_world_object, 0.041, 0.11), seen, points)
+    assert isinstance(found, Cylinder)
+    assert found.height == pytest.approx(CAN.height, abs=0.002)
+    assert found.radius == pytest.approx(CAN.radius, abs=0.0005)
     assert uncertainty.sizes.max() < 0.002
     assert uncertainty.rotation[2] > 0.5 > 0.02 > uncertainty.rotation[:2].max()
 
@@ -121,8 +128,8 @@ def test_the_radius_of_a_disc_is_where_it_ends():
     points = np.stack([reach * np.cos(angle), reach * np.sin(angle), np.full(1500, 0.06)], axis=1)
     points += 0.002 * rng.normal(size=points.shape)
     disc = cylinder((0.0, 0.0, 0.055), 0.042, 0.01)
-    polished, uncertainty = polish(disc, np.arange(6) == 5, points, INDEPENDENT)
-    assert polished.extents[0] == pytest.approx(0.08, abs=0.0015)
+    found, uncertainty = polished(disc, np.arange(6) == 5, points)
+    assert found.extents[0] == pytest.approx(0.08, abs=0.0015)
     assert uncertainty.sizes[0] < 0.003
     assert uncertainty.sides[4] > 0.1
 
@@ -133,8 +140,8 @@ def test_a_ball_is_told_by_any_part_of_it():
     normals = frames.unit(rng.normal(size=(3000, 3)))
     points = ball.radius * normals[normals[:, 0] > 0.0]
     points = points + 0.002 * rng.normal(size=points.shape)
-    polished, uncertainty = polish(ball, np.arange(6) == 1, points, INDEPENDENT)
-    assert polished.extents[0] == pytest.approx(0.08, abs=0.001)
+    found, uncertainty = polished(ball, np.arange(6) == 1, points)
+    assert found.extents[0] == pytest.approx(0.08, abs=0.001)
     assert uncertainty.sides.max() < 0.001
 
 
@@ -144,8 +151,8 @@ def test_errors_are_as_large_as_the_standard_deviations_say():
     for seed in range(60):
         shape = Box(BOX.T_world_object, np.random.default_rng(seed).uniform(0.05, 0.2, 3))
         points = two_faces(seed, shape=shape)
-        polished, uncertainty = polish(shape, TWO_FACES, points, INDEPENDENT)
-        errors.append(np.abs(polished.extents - shape.extents))
+        found, uncertainty = polished(shape, TWO_FACES, points)
+        errors.append(np.abs(found.extents - shape.extents))
         claims.append(uncertainty.sizes)
     within = np.mean(np.array(errors) < 2.0 * np.array(claims))
     assert 0.8 <= within <= 0.999
@@ -155,18 +162,18 @@ def test_a_side_that_nothing_bears_out_may_be_anywhere():
     rng = np.random.default_rng(0)
     top = face_points(BOX, 2, 1.0, 800, rng, 0.001)
     slab = box((0.0, 0.0, 0.025), (0.1, 0.14, 0.01), turn_deg=25.0)
-    polished, uncertainty = polish(slab, np.arange(6) == 5, top, INDEPENDENT)
+    found, uncertainty = polished(slab, np.arange(6) == 5, top)
     assert uncertainty.sides[4] > 0.1
     assert uncertainty.sizes[2] > 0.1
     assert uncertainty.sides[5] < 0.001
-    np.testing.assert_allclose(polished.extents[:2], BOX.extents[:2], atol=0.001)
+    np.testing.assert_allclose(found.extents[:2], BOX.extents[:2], atol=0.001)
 
 
 def test_what_no_number_of_points_averages_out_is_the_least_deviation():
     points = two_faces(0)
     careful = replace(INDEPENDENT, registration=0.004)
-    _, plain = polish(BOX, TWO_FACES, points, INDEPENDENT)
-    _, floored = polish(BOX, TWO_FACES, points, careful)
+    _, plain = polished(BOX, TWO_FACES, points)
+    _, floored = polished(BOX, TWO_FACES, points, careful)
     np.testing.assert_allclose(floored.sides, np.hypot(plain.sides, 0.004), rtol=1e-6)
     assert (floored.sizes > plain.sizes).all()
     assert (floored.position > plain.position).all()
@@ -175,5 +182,130 @@ def test_what_no_number_of_points_averages_out_is_the_least_deviation():
 def test_points_handed_in_stay_as_they_are():
     points = two_faces(0)
     kept = points.copy()
-    polish(BOX, TWO_FACES, points, INDEPENDENT)
+    polished(BOX, TWO_FACES, points)
     np.testing.assert_array_equal(points, kept)
+
+
+# The compiled refinement beside its reference
+
+
+def half_view(shape, seed, count=700, sigma=0.002):
+    """Points drawn evenly over what is seen of a box or a cylinder from one side, and a few stray ones."""
+    rng = np.random.default_rng(seed)
+    if isinstance(shape, Box):
+        points = [face_points(shape, a, 1.0, count, rng, sigma) for a in range(3)]
+    else:
+        angle, reach = rng.uniform(0.0, 2.0 * np.pi, count), shape.radius * np.sqrt(rng.uniform(size=count))
+        end = np.stack(
+            [reach * np.cos(angle), reach * np.sin(angle), np.full(count, shape.height / 2.0)], axis=1
+        )
+        end = frames.transform(shape.T_world_object, end) + sigma * rng.normal(size=end.shape)
+        points = [mantle_points(shape, count, rng, sigma), end]
+    stray = rng.uniform(-0.1, 0.1, (20, 3)) + shape.T_world_object[:3, 3]
+    return np.concatenate([*points, stray])
+
+
+def assert_polished_as_the_reference(shape, seen, points, config):
+    (last,) = polish([Polish(shape, tuple(seen), points)], config)
+    expected, uncertainty = reference.polish(shape, tuple(seen), points, config)
+    assert last.shape.kind == expected.kind
+    assert hausdorff(last.shape, expected) < 1e-7
+    for name in ("position", "rotation", "sizes", "sides"):
+        np.testing.assert_allclose(
+            getattr(last.uncertainty, name), getattr(uncertainty, name), rtol=1e-5, err_msg=name
+        )
+    looked_at = points
+    if len(points) > config.final_points:
+        looked_at = points[np.linspace(0, len(points) - 1, config.final_points).astype(np.intp)]
+    absolute = np.abs(distances(expected, looked_at)[0])
+    assert last.residual == pytest.approx(np.minimum(absolute, config.threshold).mean(), abs=1e-8)
+    assert last.inliers == pytest.approx((absolute < config.threshold).mean(), abs=2.0 / len(looked_at))
+    return last
+
+
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+@pytest.mark.parametrize("seed", range(8))
+def test_polished_shapes_are_those_of_the_reference_whatever_was_seen(kind, seed):
+    rng = np.random.default_rng(seed)
+    pose = random_motion(rng, 0.3)
+    shape = Box(pose, np.array([0.08, 0.12, 0.1])) if kind == "box" else Cylinder(pose, 0.045, 0.11)
+    points = half_view(shape, seed)
+    start = shape.moved(frames.rigid(np.eye(3), 0.002 * rng.normal(size=3)))
+    seen = rng.random(6) < 0.5
+    if kind == "cylinder" and seed < 4:
+        seen[:4] = False
+    last = assert_polished_as_the_reference(start, seen, points, FitConfig())
+    assert last.inliers > 0.8
+
+
+def test_a_polished_ball_is_that_of_the_reference():
+    rng = np.random.default_rng(0)
+    normals = frames.unit(rng.normal(size=(2000, 3)))
+    points = 0.04 * normals[normals[:, 0] > 0.0] + 0.002 * rng.normal(size=(np.sum(normals[:, 0] > 0.0), 3))
+    start = sphere((0.002, 0.001, 0.0), 0.043)
+    assert_polished_as_the_reference(start, np.arange(6) == 1, points, FitConfig())
+
+
+def test_of_many_points_some_are_looked_at_evenly():
+    points = np.repeat(two_faces(0), 3, axis=0) + 0.001 * np.random.default_rng(1).normal(size=(6000, 3))
+    few = replace(FitConfig(), final_points=500)
+    last = assert_polished_as_the_reference(BOX, TWO_FACES, points, few)
+    chosen = points[np.linspace(0, 5999, 500).astype(np.intp)]
+    (same,) = polish([Polish(BOX, tuple(TWO_FACES), chosen)], few)
+    np.testing.assert_array_equal(same.shape.extents, last.shape.extents)
+
+
+def test_what_would_become_too_long_stays_as_it_was():
+    """The points go on where the shape was drawn in: the end found is beyond the limit."""
+    long = box((0.0, 0.0, 0.0), (0.1, 0.5, 0.06))
+    rng = np.random.default_rng(0)
+    points = np.concatenate([face_points(long, a, 1.0, 1500, rng, 0.001) for a in (0, 2)])
+    start = box((0.0, 0.0, 0.0), (0.1, 0.3, 0.06))
+    limited = replace(FitConfig(), max_extent=0.4)
+    seen = (False, True, False, False, False, True)
+    last = assert_polished_as_the_reference(start, seen, points, limited)
+    np.testing.assert_array_equal(last.shape.extents, start.extents)
+    free = assert_polished_as_the_reference(start, seen, points, replace(FitConfig(), max_extent=0.6))
+    assert free.shape.extents[1] == pytest.approx(0.5, abs=0.004)
+
+
+def test_a_shape_that_is_near_none_of_the_points_stays_as_it_was():
+    points = two_faces(0) + (3.0, 0.0, 0.0)
+    one_step = replace(FitConfig(), steps=1)
+    last = assert_polished_as_the_reference(BOX, TWO_FACES, points, one_step)
+    np.testing.assert_array_equal(last.shape.extents, BOX.extents)
+    assert (last.inliers, last.residual) == (0.0, pytest.approx(FitConfig().threshold))
+
+
+def test_no_polished_extent_is_below_the_least():
+    rng = np.random.default_rng(0)
+    plate = box((0.0, 0.0, 0.0), (0.1, 0.12, 0.002))
+    points = np.concatenate(
+        [face_points(plate, 2, 1.0, 800, rng, 0.0005), face_points(plate, 0, 1.0, 40, rng, 0.0005)]
+    )
+    seen = np.arange(6) == 5
+    last = assert_polished_as_the_reference(
+        box((0.0, 0.0, -0.003), (0.1, 0.12, 0.008)), seen, points, FitConfig()
+    )
+    assert last.shape.extents.min() == pytest.approx(FitConfig().min_extent)
+
+
+def test_shapes_polished_together_are_as_polished_alone():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(300, 3))
+    found = [
+        Polish(BOX, tuple(TWO_FACES), two_faces(0)),
+        Polish(CAN, (True, True, False, True, False, False), mantle_points(CAN, 400, rng, 0.002)),
+        Polish(sphere((0.0, 0.0, 0.0), 0.04), (False, True) * 3, 0.04 * frames.unit(ball) + 0.001 * ball),
+    ]
+    together = polish(found, FitConfig())
+    for order in ((0, 1, 2), (2, 0, 1)):
+        for k, last in zip(order, polish([found[k] for k in order], FitConfig()), strict=True):
+            np.testing.assert_array_equal(last.shape.T_world_object, together[k].shape.T_world_object)
+            np.testing.assert_array_equal(last.shape.extents, together[k].shape.extents)
+            np.testing.assert_array_equal(last.uncertainty.sides, together[k].uncertainty.sides)
+    for k, one in enumerate(found):
+        np.testing.assert_array_equal(
+            polish([one], FitConfig())[0].shape.T_world_object, together[k].shape.T_world_object
+        )
+    assert polish([], FitConfig()) == []

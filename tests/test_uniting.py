@@ -22,9 +22,14 @@ def cloud_of(shape, eye=EYE, seed=0):
     return Cloud(points, normals)
 
 
+def alone_in(evidence, costs=COSTS):
+    """The explanation of some points as one object."""
+    return explain([evidence], costs, FIT, [np.random.default_rng(0)])[0]
+
+
 def pair_of(clouds, changed=None, apart=None, voxels=None):
     evidence = {k: gather(c, 0.003, voxels, COSTS) for k, c in clouds.items()}
-    alone = {k: explain(e, COSTS, FIT, np.random.default_rng(0)) for k, e in evidence.items()}
+    alone = {k: alone_in(e) for k, e in evidence.items()}
     everything = set(clouds) if changed is None else changed
     seen = {} if apart is None else apart
     return united(evidence, alone, everything, seen, costs=COSTS, fit_config=FIT, seed=0)
@@ -59,7 +64,7 @@ def test_not_where_the_space_between_was_seen_free():
     )
     near = ExplanationConfig(reach=0.1)
     evidence = {k: gather(c, 0.003, free, near) for k, c in {1: left, 2: right}.items()}
-    alone = {k: explain(e, near, FIT, np.random.default_rng(0)) for k, e in evidence.items()}
+    alone = {k: alone_in(e, near) for k, e in evidence.items()}
     assert united(evidence, alone, {1, 2}, {}, costs=near, fit_config=FIT, seed=0) is None
 
 
@@ -92,7 +97,7 @@ def test_two_that_have_shapes_do_not_become_one_without():
     can = cloud_of(cylinder((0.0, 0.0, 0.16), 0.03, 0.12))
     dear = replace(COSTS, parameter_cost=20.0)
     evidence = {1: gather(cloud_of(CRATE), 0.003, None, dear), 2: gather(can, 0.003, None, dear)}
-    alone = {k: explain(e, dear, FIT, np.random.default_rng(0)) for k, e in evidence.items()}
+    alone = {k: alone_in(e, dear) for k, e in evidence.items()}
     assert all(e.shape is not None for e in alone.values())
     assert united(evidence, alone, {1, 2}, {}, costs=dear, fit_config=FIT, seed=0) is None
 
@@ -119,5 +124,5 @@ def test_irregular_neighbours_stay_two_where_a_crease_parts_them():
     paper = Cloud(crumpled, np.tile((0.0, 0.0, 1.0), (len(xy), 1)))
     standing = bowl((-np.pi, np.pi))
     for cloud in (paper, standing):
-        assert explain(gather(cloud, 0.003, None, COSTS), COSTS, FIT, rng).shape is None
+        assert alone_in(gather(cloud, 0.003, None, COSTS)).shape is None
     assert pair_of({1: standing, 2: paper}) is None

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from caryatid.clouds import thin
 from caryatid.config import ExplanationConfig, FitConfig
 from caryatid.frames import Array
-from caryatid.interior import interior_states
-from caryatid.primitives import candidates
-from caryatid.refine import linearise
+from caryatid.interior import free_inside
+from caryatid.kernels import explaining as kernels
+from caryatid.primitives import Oriented, candidates
+from caryatid.refine import arrays
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.views import Cloud
-from caryatid.voxels import FREE, VoxelMap
+from caryatid.voxels import VoxelMap
 
 Solid = Box | Cylinder | Sphere
 
@@ -75,11 +76,16 @@ def price(shape: Solid | None, config: ExplanationConfig) -> float:
 
 def point_costs(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> Array:
     """Cost (N,) [nats] of each point as one of a shape's surface, before its weight."""
-    distance, J = linearise(shape, evidence.points)
-    outward = -J[:, :3] @ shape.T_world_object[:3, :3].T
-    turned = 1.0 - np.einsum("ij,ij->i", outward, evidence.normals)
-    squared = distance**2 / (2.0 * evidence.noise**2)
-    return np.minimum(squared + config.normal_weight * turned, config.outlier)
+    return np.asarray(
+        kernels.point_costs(
+            *arrays(shape),
+            evidence.points,
+            evidence.normals,
+            evidence.noise,
+            config.normal_weight,
+            config.outlier,
+        )
+    )
 
 
 def free_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> float:
@@ -87,7 +93,7 @@ def free_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> fl
     if evidence.voxels is None:
         return 0.0
     inset = max(config.inset * evidence.voxels.config.size, 3.0 * evidence.noise)
-    return config.free_cost * float((interior_states(shape, evidence.voxels, inset) == FREE).sum())
+    return config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
 
 
 def shape_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> float:
@@ -106,12 +112,28 @@ def explained_by(shape: Solid, evidence: Evidence, config: ExplanationConfig) ->
 
 
 def explain(
-    evidence: Evidence, config: ExplanationConfig, fit_config: FitConfig, rng: np.random.Generator
-) -> Explanation:
-    """Find the shape that explains points at the least cost; an irregular object has a price of its own."""
-    best = Explanation(None, config.irregular * float(evidence.weights.sum()) + price(None, config))
-    for f in candidates(evidence.points, evidence.normals, config=fit_config, rng=rng):
-        best = min(best, explained_by(f.shape, evidence, config), key=lambda e: e.cost)
+    parts: Sequence[Evidence],
+    config: ExplanationConfig,
+    fit_config: FitConfig,
+    rngs: Sequence[np.random.Generator],
+) -> list[Explanation]:
+    """Find the shape that explains points at the least cost, for each of several objects at once.
+
+    An irregular object has a price of its own.
+
+    Args:
+        parts: Their points.
+        config: What explanations cost.
+        fit_config: Settings of the fits.
+        rngs: Source of the samples of each.
+    """
+    fits = candidates([Oriented(e.points, e.normals) for e in parts], config=fit_config, rngs=rngs)
+    best = []
+    for evidence, found in zip(parts, fits, strict=True):
+        irregular = Explanation(None, config.irregular * float(evidence.weights.sum()) + price(None, config))
+        costs = (shape_cost(f.shape, evidence, config) + price(f.shape, config) for f in found)
+        regular = (Explanation(f.shape, cost) for f, cost in zip(found, costs, strict=True))
+        best.append(min([irregular, *regular], key=lambda e: e.cost))
     return best
 
 
@@ -136,36 +158,36 @@ def joined(a: Evidence, b: Evidence) -> Evidence:
     )
 
 
-def around(points: Array, neighbours: int) -> scipy.sparse.csr_array:
-    """Matrix (N, N) that takes the mean over each point's nearest neighbours, itself among them."""
+def around(points: Array, neighbours: int) -> NDArray[np.intp]:
+    """Indices (N, K) of each point's nearest neighbours among points (N, 3), itself among them."""
     count = min(neighbours, len(points))
     _, index = cKDTree(points).query(points, k=count)
-    index = index.reshape(len(points), count)
-    ends = np.arange(0, index.size + 1, count)
-    return scipy.sparse.csr_array((np.full(index.size, 1.0 / count), index.ravel(), ends))
+    return np.asarray(index, dtype=np.intp).reshape(len(points), count)
 
 
 def border_cost(
-    second: NDArray[np.bool_], evidence: Evidence, config: ExplanationConfig
+    second: NDArray[np.bool_], evidence: Evidence, near: NDArray[np.intp], config: ExplanationConfig
 ) -> tuple[float, float]:
     """Cost [nats] of a border between two objects where the surface goes on without a concave crease.
 
     Args:
         second: Which points (N,) belong to the second object.
         evidence: The points of both.
-        config: Neighbours, and the price.
+        near: Each point's nearest neighbours (N, K), as of `around`.
+        config: What counts as a crease, and the price.
 
     Returns:
         The cost, and the share of the border without a crease; nothing where they have no border.
     """
-    near = around(evidence.points, config.neighbours).tocoo()
-    across = second[near.row] != second[near.col]
-    row, col = near.row[across], near.col[across]
+    count = near.shape[1]
+    row, col = np.repeat(np.arange(len(second)), count), near.ravel()
+    across = second[row] != second[col]
+    row, col = row[across], col[across]
     between = evidence.points[col] - evidence.points[row]
     turn = evidence.normals[col] - evidence.normals[row]
     bend = np.einsum("ij,ij->i", turn, between) / np.maximum(np.linalg.norm(between, axis=1), 1e-9)
     flat = bend > -np.sin(np.radians(config.crease))
-    length = near.data[across] * evidence.weights[row]
+    length = evidence.weights[row] / count
     smooth = float(length[flat].sum())
     return config.border * smooth, smooth / max(float(length.sum()), 1e-12)
 

@@ -18,7 +18,7 @@ from caryatid.frames import Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.object_points import ObjectPoints
 from caryatid.perception import UP, Percept
-from caryatid.primitives import FitFailure, fit
+from caryatid.primitives import FitFailure, Oriented, fit_many
 from caryatid.splitting import split
 from caryatid.uniting import united
 from caryatid.views import SUPPORT_LABEL, Cloud
@@ -92,15 +92,14 @@ class ObjectModels:
     def fit_newest(self, labels: set[int]) -> None:
         """Fit objects to the newest view's points alone, and forget all other fits (`sg`)."""
         self.fits = {}
-        for label in sorted(labels):
-            self._fit(label, self.points.newest(label))
+        self._fit({label: self.points.newest(label) for label in labels})
 
     def fit_all(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to all their points so far (`pc`, `pc+sg`), where shapes fill no space seen free."""
-        for label in sorted(labels):
-            cloud = self.points.of(label)
-            thinned = cloud.select(thin(cloud.points_world, self._config.cloud.voxel))
-            self._fit(label, thinned, voxels)
+        clouds = {label: self.points.of(label) for label in labels}
+        self._fit(
+            {k: c.select(thin(c.points_world, self._config.cloud.voxel)) for k, c in clouds.items()}, voxels
+        )
 
     def divide(self, labels: set[int], voxels: VoxelMap | None = None) -> set[int]:
         """Part objects that several shapes explain better than one; returns the labels that changed.
@@ -215,17 +214,24 @@ class ObjectModels:
         spread = MEAN_TO_DEVIATION * float(np.median(residuals)) if residuals else 0.0
         return max(spread, self._config.explanation.least_noise)
 
-    def _fit(self, label: int, cloud: Cloud, voxels: VoxelMap | None = None) -> None:
-        rng = np.random.default_rng([self._seed, label])
-        result = fit(cloud.points_world, cloud.normals_world, config=self._config.fit, rng=rng, space=voxels)
-        if isinstance(result, FitFailure):
-            self.fits.pop(label, None)
-            return
-        named = SceneObject(id=object_id(label), label=label, shape=result.shape)
-        self.fits[label] = replace(
-            named,
-            residual=result.residual,
-            poor_fit=result.poor,
-            seen=result.seen,
-            uncertainty=result.uncertainty,
+    def _fit(self, clouds: Mapping[int, Cloud], voxels: VoxelMap | None = None) -> None:
+        """Fit objects, by label, to these points."""
+        labels = sorted(clouds)
+        results = fit_many(
+            [Oriented(clouds[k].points_world, clouds[k].normals_world) for k in labels],
+            config=self._config.fit,
+            rngs=[np.random.default_rng([self._seed, k]) for k in labels],
+            space=voxels,
         )
+        for label, result in zip(labels, results, strict=True):
+            if isinstance(result, FitFailure):
+                self.fits.pop(label, None)
+                continue
+            named = SceneObject(id=object_id(label), label=label, shape=result.shape)
+            self.fits[label] = replace(
+                named,
+                residual=result.residual,
+                poor_fit=result.poor,
+                seen=result.seen,
+                uncertainty=result.uncertainty,
+            )

@@ -1,21 +1,21 @@
-"""Fit a box, a cylinder or a sphere to the oriented points of one object."""
+"""Fit a box, a cylinder or a sphere to the oriented points of each object."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
 from caryatid.config import FitConfig
 from caryatid.frames import Array
 from caryatid.interior import free_share
-from caryatid.kernels.hypotheses import any_within, count_agreeing
-from caryatid.polish import polish
-from caryatid.ransac import ransac
-from caryatid.refine import distances, refine
-from caryatid.shape_models import BoxModel, CylinderModel, ShapeModel, SphereModel
+from caryatid.kernels.fits import Fitted, Job, fit_one
+from caryatid.kernels.parallel import for_each
+from caryatid.polish import Polish, polish
+from caryatid.refine import CODES, CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH, ROUGHLY, from_arrays
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.uncertainty import Uncertainty
 from caryatid.voxels import VoxelMap
@@ -57,6 +57,38 @@ class FitFailure:
     reason: str
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Oriented:
+    """The points of one object.
+
+    Attributes:
+        points: (N, 3) [m], in any frame.
+        normals: Unit normals (N, 3) towards the sensor.
+    """
+
+    points: Array
+    normals: Array
+
+    def finite(self) -> Oriented:
+        """Leave out points that are not finite, or whose normals are not; in the layout that kernels take."""
+        points = np.ascontiguousarray(self.points, dtype=np.float64)
+        normals = np.ascontiguousarray(self.normals, dtype=np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            total = points.sum() + normals.sum()
+        every = Oriented(points, normals)
+        if np.isfinite(total):
+            return every
+        finite = np.isfinite(points) & np.isfinite(normals)
+        return every.select(np.flatnonzero(finite.all(axis=1)))
+
+    def select(self, kept: NDArray[np.intp]) -> Oriented:
+        """Return some of the points."""
+        return Oriented(self.points[kept], self.normals[kept])
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
 def fit(
     points: Array,
     normals: Array,
@@ -77,222 +109,160 @@ def fit(
         rng: Source of the samples.
         space: What has been seen free, where points are in the world frame: shapes do not fill it.
     """
-    fits = candidates(points, normals, config=config, rng=rng)
-    if not fits:
-        return FitFailure(_failure_reason(len(points), config))
-    if space is not None:
-        inset = config.free_inset * space.config.size
-        fits.sort(key=lambda f: f.cost + config.free_weight * free_share(f.shape, space, inset))
-    return _polished(fits[0], points, config)
+    return fit_many([Oriented(points, normals)], config=config, rngs=[rng], space=space)[0]
 
 
-def _polished(found: Fit, points: Array, config: FitConfig) -> Fit:
-    """The fit with its shape refined on more points, and how sure it is."""
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) > config.final_points:
-        points = points[np.linspace(0, len(points) - 1, config.final_points).astype(np.intp)]
-    origin = points.mean(axis=0)
-    centred = np.ascontiguousarray(points - origin)
-    away, back = frames.rigid(np.eye(3), -origin), frames.rigid(np.eye(3), origin)
-    shape, uncertainty = polish(found.shape.moved(away), np.array(found.seen), centred, config)
-    absolute = np.abs(distances(shape, centred)[0])
-    residual = float(np.minimum(absolute, config.threshold).mean())
-    return replace(
-        found,
-        shape=shape.moved(back),
-        residual=residual,
-        inliers=float((absolute < config.threshold).mean()),
-        poor=residual > config.max_residual,
-        uncertainty=uncertainty,
-    )
+def fit_many(
+    objects: Sequence[Oriented],
+    *,
+    config: FitConfig,
+    rngs: Sequence[np.random.Generator],
+    space: VoxelMap | None = None,
+) -> list[Fit | FitFailure]:
+    """Fit a shape to each of several objects, on all cores; each is fitted as it would be alone.
 
-
-def candidates(points: Array, normals: Array, *, config: FitConfig, rng: np.random.Generator) -> list[Fit]:
-    """Return the best fit of each shape that could be fitted, least cost first (arguments as of `fit`)."""
-    keep = np.isfinite(points).all(axis=1) & np.isfinite(normals).all(axis=1)
-    points, normals = points[keep], normals[keep]
-    if len(points) < config.min_points:
-        return []
-    if len(points) > config.max_points:
-        chosen = np.sort(rng.choice(len(points), config.max_points, replace=False))
-        points, normals = points[chosen], normals[chosen]
-    origin = points.mean(axis=0)
-    centred = np.ascontiguousarray(points - origin)
-    fits: list[Fit] = []
-    for starts in _starts(centred, normals, config, rng):
-        polished = [
-            refine(s, centred, steps=config.steps, min_extent=config.min_extent, shrink=config.shrink)
-            for s in starts
-        ]
-        judged = [judge(s, centred, normals, config) for s in polished]
-        if judged:
-            fits.append(min(judged, key=lambda f: f.cost))
-    fits = [replace(f, cost=f.cost + config.bare_weight * bare_share(f, centred, config)) for f in fits]
-    back = frames.rigid(np.eye(3), origin)
-    return [
-        replace(f, shape=f.shape.moved(back))
-        for f in sorted(fits, key=lambda f: f.cost)
-        if f.shape.extents.max() <= config.max_extent
-    ]
-
-
-def judge(shape: Box | Cylinder | Sphere, points: Array, normals: Array, config: FitConfig) -> Fit:
-    """Say how well a shape explains oriented points, and draw in the sides that no point bears out."""
-    shape, seen = draw_in(shape, points, normals, config)
-    distance, outward = distances(shape, points)
-    absolute = np.minimum(np.abs(distance), config.threshold)
-    agreement = np.sum(outward * (normals @ shape.T_world_object[:3, :3]), axis=1)
-    turned = np.clip(1.0 - agreement, 0.0, 1.0)
-    residual = float(absolute.mean())
-    size = float(np.mean(shape.extents**2))
-    cost = residual + config.normal_weight * float(turned.mean()) + config.size_penalty * size
-    inliers = float((np.abs(distance) < config.threshold).mean())
-    return Fit(shape, residual, inliers, seen, cost, residual > config.max_residual)
-
-
-def bare_share(fit: Fit, points: Array, config: FitConfig) -> float:
-    """Share of the seen sides' area that has no point near it: a side that was seen should be seen whole."""
-    samples, outward = fit.shape.surface(config.bare_spacing)
-    local = outward @ fit.shape.T_world_object[:3, :3]
-    side = np.argmax(np.abs(local), axis=1)
-    side = 2 * side + (local[np.arange(len(local)), side] > 0.0)
-    on_seen = np.array(fit.seen)[side]
-    if not on_seen.any():
-        return 1.0
-    return 1.0 - float(any_within(samples[on_seen], points, 2.0 * config.bare_spacing).mean())
-
-
-def draw_in(
-    shape: Box | Cylinder | Sphere, points: Array, normals: Array, config: FitConfig
-) -> tuple[Box | Cylinder | Sphere, Seen]:
-    """Find the sides that points bear out, and move the others inwards to where the points end."""
-    distance, outward = distances(shape, points)
-    R = shape.T_world_object[:3, :3]
-    agree = (np.abs(distance) < config.threshold) & (np.sum((normals @ R) * outward, axis=1) > 0.5)
-    least = max(config.min_points / 3.0, config.side_share * len(points))
-    facing = outward[agree]
-    counts = np.stack([(facing < -0.7).sum(axis=0), (facing > 0.7).sum(axis=0)], axis=1)
-    seen = counts.ravel() >= least
-    if not isinstance(shape, Sphere):
-        near = points[np.abs(distance) < config.threshold]
-        shape = _to_points(shape, near if len(near) else points, seen, config)
-    flags = [bool(s) for s in seen]
-    return shape, (flags[0], flags[1], flags[2], flags[3], flags[4], flags[5])
-
-
-def _to_points(
-    shape: Box | Cylinder, points: Array, seen: NDArray[np.bool_], config: FitConfig
-) -> Box | Cylinder:
-    """Move every side that is not seen inwards to the trimmed end of the points."""
-    T = shape.T_world_object
-    local = (points - T[:3, 3]) @ T[:3, :3]
-    low, high = -shape.extents / 2.0, shape.extents / 2.0
-    for axis in (2,) if isinstance(shape, Cylinder) else (0, 1, 2):
-        if seen[2 * axis] and seen[2 * axis + 1]:
+    Args:
+        objects: Their points.
+        config: Limits and thresholds.
+        rngs: Source of the samples of each object.
+        space: What has been seen free, where points are in the world frame: shapes do not fill it.
+    """
+    results: list[Fit | FitFailure] = []
+    chosen: list[Polish] = []
+    for number, found in enumerate(candidates(objects, config=config, rngs=rngs)):
+        if not found:
+            results.append(FitFailure(_failure_reason(len(objects[number].finite()), config)))
             continue
-        start, end = np.quantile(local[:, axis], (config.trim, 1.0 - config.trim))
-        if not seen[2 * axis]:
-            low[axis] = min(max(low[axis], start), high[axis] - config.min_extent)
-        if not seen[2 * axis + 1]:
-            high[axis] = max(min(high[axis], end), low[axis] + config.min_extent)
-    T_moved = frames.rigid(T[:3, :3], frames.transform(T, (low + high) / 2.0))
-    if isinstance(shape, Cylinder):
-        return Cylinder(T_moved, shape.radius, float(high[2] - low[2]))
-    return Box(T_moved, high - low)
+        best = found[0] if space is None else _least_free(found, space, config)
+        results.append(best)
+        chosen.append(Polish(best.shape, best.seen, objects[number].finite().points))
+    polished = iter(polish(chosen, config))
+    for number, result in enumerate(results):
+        if isinstance(result, Fit):
+            last = next(polished)
+            results[number] = replace(
+                result,
+                shape=last.shape,
+                residual=last.residual,
+                inliers=last.inliers,
+                poor=last.residual > config.max_residual,
+                uncertainty=last.uncertainty,
+            )
+    return results
 
 
-def _starts(
-    points: Array, normals: Array, config: FitConfig, rng: np.random.Generator
-) -> list[list[Box | Cylinder | Sphere]]:
-    """The best hypotheses of each shape, to be refined."""
-    models: tuple[ShapeModel, ...] = (
-        BoxModel(config.max_extent, config.trim),
-        CylinderModel(config.max_radius, config.max_extent, config.trim),
-        SphereModel(config.max_radius),
+def candidates(
+    objects: Sequence[Oriented], *, config: FitConfig, rngs: Sequence[np.random.Generator]
+) -> list[list[Fit]]:
+    """Return, for each object, the best fit of each shape that could be fitted, least cost first.
+
+    Arguments as of `fit_many`.
+    """
+    finite = [o.finite() for o in objects]
+    large = [k for k, o in enumerate(finite) if len(o) >= config.min_points]
+    found: list[list[Fit]] = [[] for _ in objects]
+    if not large:
+        return found
+    kinds = np.array([CODES[kind] for kind in config.shapes])
+    parts, every, samples = [], [], []
+    for k in large:
+        part, rng = finite[k], rngs[k]
+        if len(part) > config.max_points:
+            part = part.select(np.sort(rng.choice(len(part), config.max_points, replace=False)))
+        parts.append(part)
+        every.append(max(1, len(part) // config.search_points))
+        searched = -(-len(part) // every[-1])
+        samples.append(rng.integers(0, searched, size=(len(kinds), config.hypotheses, 2)))
+    origins = [part.points.mean(axis=0) for part in parts]
+    rows = _empty(len(parts) * len(kinds))
+    job = Job(
+        kinds,
+        np.cumsum([0, *(len(part) for part in parts)]),
+        np.concatenate([part.points - origin for part, origin in zip(parts, origins, strict=True)]),
+        np.concatenate([part.normals for part in parts]),
+        np.array(every),
+        np.stack(samples),
+        RIDGE,
+        **_settings(config),
+        **rows._asdict(),
     )
-    main = _main_normal(normals)
-    starts: list[list[Box | Cylinder | Sphere]] = []
-    for model in models:
-        ranked = ransac(
-            points,
-            normals,
-            model,
-            threshold=config.threshold,
-            hypotheses=config.hypotheses,
-            confidence=config.confidence,
-            keep=config.polish,
-            rng=rng,
-        )
-        samples = np.array([r.sample for r in ranked], dtype=np.intp).reshape(-1, model.sample_size)
-        found = model.estimate(samples, points, normals)
-        shapes = [model.shape(found, k) for k in range(len(ranked))]
-        if isinstance(model, BoxModel):
-            shapes += _flat_boxes(points, *main, config)
-        if isinstance(model, CylinderModel):
-            shapes += _discs(points, *main, config)
-        starts.append(shapes)
-    return starts
+    for_each(fit_one, len(rows.found), job)
+    for number, (k, origin) in enumerate(zip(large, origins, strict=True)):
+        own = range(number * len(kinds), (number + 1) * len(kinds))
+        fits = [
+            _row(rows, row, config.shapes[row - own[0]], origin, config) for row in own if rows.found[row]
+        ]
+        found[k] = sorted(fits, key=lambda f: f.cost)
+    return found
 
 
-def _flat_boxes(
-    points: Array, axis: Array, agree: NDArray[np.bool_], config: FitConfig
-) -> list[Box | Cylinder | Sphere]:
-    """Boxes for points of one face: the main normal, and the least rectangle around the points along it."""
-    x = _across(points, axis)
-    y = np.cross(axis, x)
-    plane = points @ np.stack([x, y], axis=1)
-    angles = np.radians(np.arange(0.0, 90.0, 3.0))
-    u = plane @ np.stack([np.cos(angles), np.sin(angles)])
-    v = plane @ np.stack([-np.sin(angles), np.cos(angles)])
-    q = (config.trim, 1.0 - config.trim)
-    area = np.ptp(np.quantile(u, q, axis=0), axis=0) * np.ptp(np.quantile(v, q, axis=0), axis=0)
-    best = angles[int(np.argmin(area))]
-    side = np.cos(best) * x + np.sin(best) * y
-    R = np.stack([side, np.cross(axis, side), axis], axis=1)
-    low, high = np.quantile(points @ R, q, axis=0)
-    low[2], high[2] = _slab(points @ axis, agree, config)
-    if (high - low).max() > config.max_extent:
-        return []
-    return [Box(frames.rigid(R, R @ ((low + high) / 2.0)), high - low)]
+def _least_free(found: Sequence[Fit], space: VoxelMap, config: FitConfig) -> Fit:
+    """The fit of least cost (ascending) once it pays for what it fills of the space seen free."""
+    inset = config.free_inset * space.config.size
+    best, least = found[0], np.inf
+    for f in found:
+        if f.cost >= least:
+            break
+        cost = f.cost + config.free_weight * free_share(f.shape, space, inset)
+        if cost < least:
+            best, least = f, cost
+    return best
 
 
-def _discs(
-    points: Array, axis: Array, agree: NDArray[np.bool_], config: FitConfig
-) -> list[Box | Cylinder | Sphere]:
-    """Cylinders for points of one end: the main normal, and the circle that holds the points along it."""
-    x = _across(points, axis)
-    R = np.stack([x, np.cross(axis, x), axis], axis=1)
-    local = points @ R
-    low, high = np.quantile(local, (config.trim, 1.0 - config.trim), axis=0)
-    low[2], high[2] = _slab(local[:, 2], agree, config)
-    radius, height = float(np.mean(high[:2] - low[:2]) / 2.0), float(high[2] - low[2])
-    if not 1e-3 < radius <= config.max_radius or height > config.max_extent:
-        return []
-    return [Cylinder(frames.rigid(R, R @ ((low + high) / 2.0)), radius, height)]
+def _empty(count: int) -> Fitted:
+    """Rows to be written to."""
+    return Fitted(
+        np.zeros(count, dtype=np.bool_),
+        np.empty((count, 3, 3)),
+        np.empty((count, 3)),
+        np.empty((count, 3)),
+        np.zeros((count, 6), dtype=np.bool_),
+        np.full(count, np.inf),
+        np.empty(count),
+        np.empty(count),
+    )
 
 
-def _main_normal(normals: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The direction (3,) most normals agree on within 25°, their mean, and which do (N,)."""
-    least_cosine = float(np.cos(np.radians(25.0)))
-    count = count_agreeing(np.ascontiguousarray(normals), least_cosine)
-    largest = normals @ normals[int(np.argmax(count))] > least_cosine
-    return frames.unit(normals[largest].mean(axis=0)), largest
+def _row(rows: Fitted, row: int, kind: str, origin: Array, config: FitConfig) -> Fit:
+    """One row as a fit, in the frame of an object whose points were taken about an origin (3,) [m]."""
+    s = [bool(b) for b in rows.seen[row]]
+    residual = float(rows.residual[row])
+    return Fit(
+        from_arrays(kind, rows.R[row], rows.centre[row] + origin, rows.half[row]),
+        residual,
+        float(rows.inliers[row]),
+        (s[0], s[1], s[2], s[3], s[4], s[5]),
+        float(rows.cost[row]),
+        residual > config.max_residual,
+    )
 
 
-def _across(points: Array, axis: Array) -> Array:
-    """A direction (3,) across an axis that turns with the points: to the first one well off their middle."""
-    offsets = points - points.mean(axis=0)
-    offsets = offsets - (offsets @ axis)[:, None] * axis
-    reach = np.linalg.norm(offsets, axis=1)
-    if reach.max() < 1e-6:
-        return frames.perpendicular(axis)
-    return frames.unit(offsets[int(np.argmax(reach > 0.5 * reach.max()))])
-
-
-def _slab(heights: Array, on_face: NDArray[np.bool_], config: FitConfig) -> tuple[float, float]:
-    """Bottom and top [m] along a face's normal: top at the face's points, bottom where all points end."""
-    top = float(np.median(heights[on_face]))
-    return min(float(np.quantile(heights, config.trim)), top - config.min_extent), top
+def _settings(config: FitConfig) -> dict[str, Any]:
+    """Settings and constants by their names in the kernel's job."""
+    names = (
+        "threshold",
+        "trim",
+        "max_radius",
+        "max_extent",
+        "min_extent",
+        "confidence",
+        "polish",
+        "steps",
+        "shrink",
+        "min_points",
+        "side_share",
+        "normal_weight",
+        "size_penalty",
+        "bare_weight",
+        "bare_spacing",
+    )
+    constants = {
+        "robust_width": ROBUST_WIDTH,
+        "noise_floor": NOISE_FLOOR,
+        "rough": ROUGHLY,
+        "converged": CONVERGED,
+    }
+    return {name: getattr(config, name) for name in names} | constants
 
 
 def _failure_reason(count: int, config: FitConfig) -> str:

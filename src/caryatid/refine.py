@@ -22,9 +22,13 @@ RIDGE = 1e-3 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
 NOISE_FLOOR = 0.001
 """Least standard deviation the weights assume [m]: what smoothed points of several views err by. With less,
 faces that hold few of the points would be outliers of the others."""
+CONVERGED = 1e-4
+"""Least squares end with a step that lowers the cost by less than this share; the rest is far below noise."""
+ROUGHLY = 1e-3
+"""The same where another refinement follows."""
 
-
-_CODES = {"sphere": SPHERE, "cylinder": CYLINDER, "box": BOX}
+CODES = {"sphere": SPHERE, "cylinder": CYLINDER, "box": BOX}
+"""Codes of the shapes, as the kernels take them."""
 
 
 def linearise(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Array, Array]:
@@ -93,13 +97,9 @@ def refine(
         ROBUST_WIDTH,
         NOISE_FLOOR,
         RIDGE,
+        CONVERGED,
     )
-    T = frames.rigid(R, centre)
-    if isinstance(shape, Sphere):
-        return Sphere(T, float(half[0]))
-    if isinstance(shape, Cylinder):
-        return Cylinder(T, float(half[0]), 2.0 * float(half[2]))
-    return Box(T, 2.0 * half)
+    return from_arrays(shape.kind, R, centre, half)
 
 
 def refine_reference(
@@ -133,7 +133,7 @@ def refine_reference(
             return best
         best, distance, J = trial, trial_distance, trial_J
         damping = max(damping / 10.0, 1e-7)
-        if cost - trial_cost < 1e-4 * cost:
+        if cost - trial_cost < CONVERGED * cost:
             break
     return best
 
@@ -146,7 +146,17 @@ def distances(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Arra
 def arrays(shape: Box | Cylinder | Sphere) -> tuple[int, Array, Array, Array]:
     """Code, axes, centre and half extents, as the kernels take them."""
     T = shape.T_world_object
-    return _CODES[shape.kind], np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), shape.extents / 2.0
+    return CODES[shape.kind], np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), shape.extents / 2.0
+
+
+def from_arrays(kind: str, R: Array, centre: Array, half: Array) -> Box | Cylinder | Sphere:
+    """The shape with these axes (3, 3), centre (3,) [m] and half extents (3,) [m]."""
+    T = frames.rigid(R, centre)
+    if kind == "sphere":
+        return Sphere(T, float(half[0]))
+    if kind == "cylinder":
+        return Cylinder(T, float(half[0]), 2.0 * float(half[2]))
+    return Box(T, 2.0 * half)
 
 
 def _jacobian(p: Array, gradient: Array, sizes: Array) -> Array:

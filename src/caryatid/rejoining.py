@@ -13,7 +13,7 @@ from caryatid.convexity import concave_share, hollowness
 from caryatid.frames import Array
 from caryatid.kernels.gaps import hidden_gaps
 from caryatid.plain_colours import two_colours
-from caryatid.primitives import Fit, candidates
+from caryatid.primitives import Fit, Oriented, candidates
 from caryatid.refine import linearise
 from caryatid.shapes import Box, Cylinder, Sphere
 
@@ -154,7 +154,8 @@ def _touching(labels: Labels, count: int) -> NDArray[np.intp]:
 def _fit(
     samples: Samples, mask: NDArray[np.bool_], config: FitConfig, rng: np.random.Generator
 ) -> Fit | None:
-    fits = candidates(samples.points_camera[mask], samples.normals_camera[mask], config=config, rng=rng)
+    part = Oriented(samples.points_camera[mask], samples.normals_camera[mask])
+    (fits,) = candidates([part], config=config, rngs=[rng])
     return fits[0] if fits else None
 
 

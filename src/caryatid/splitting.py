@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse
@@ -28,6 +28,21 @@ from caryatid.explanation import (
 from caryatid.frames import Array
 
 Groups = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Pair:
+    """Points taken for two objects.
+
+    Attributes:
+        second: Which points (N,) are the second's.
+        explanations: Of both.
+        cost: Of both and of the border between them [nats].
+    """
+
+    second: NDArray[np.bool_]
+    explanations: tuple[Explanation, Explanation]
+    cost: float
 
 
 def split(
@@ -70,15 +85,17 @@ def split(
         found = _best_pair(part, single, kept, up, config, costs, fit_config, rng)
         if found is None:
             continue
-        second, explanations = found
-        groups[index[second]] = groups.max() + 1
-        waiting += [(index[~second], explanations[0]), (index[second], explanations[1])]
+        groups[index[found.second]] = groups.max() + 1
+        sides = (index[~found.second], index[found.second])
+        waiting += zip(sides, found.explanations, strict=True)
     return groups if groups.any() else None
 
 
-def unexplained(evidence: Evidence, whole: Explanation, costs: ExplanationConfig) -> Array:
-    """Mean cost (N,) [nats] of the points around each point, under the single explanation."""
-    return np.asarray(around(evidence.points, costs.neighbours) @ _costs(whole, evidence, costs))
+def unexplained(
+    evidence: Evidence, whole: Explanation, near: NDArray[np.intp], costs: ExplanationConfig
+) -> Array:
+    """Mean cost (N,) [nats] of the points around each point (`near`), under the single explanation."""
+    return np.asarray(_costs(whole, evidence, costs)[near].mean(axis=1))
 
 
 def _costs(explanation: Explanation, evidence: Evidence, costs: ExplanationConfig) -> Array:
@@ -97,77 +114,80 @@ def _best_pair(
     costs: ExplanationConfig,
     fit_config: FitConfig,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.bool_], tuple[Explanation, Explanation]] | None:
-    """Which points are the second of two objects, and both explanations; None where one is better."""
+) -> Pair | None:
+    """How the points are best taken for two objects; None where one is better."""
     least = config.min_points * costs.spacing**2 / costs.reading
     if evidence.weights.sum() < 2.0 * least:
         return None
     near = around(evidence.points, costs.neighbours)
-    bad = unexplained(evidence, whole, costs)
+    bad = unexplained(evidence, whole, near, costs)
     excess = float(np.maximum(bad - costs.usual, 0.0) @ evidence.weights)
     free = whole.cost - price(whole.shape, costs) - float(_costs(whole, evidence, costs) @ evidence.weights)
     if excess + free < costs.parameter_cost * min(PARAMETERS.values()):
         return None
+    starts = list(_starts(evidence, bad, hints, up, config, costs))
     quick = first_look(fit_config, costs)
-    tried: list[tuple[float, int, NDArray[np.bool_]]] = []
-    for start in _starts(evidence, bad, hints, up, config, costs):
-        pair = _settled(evidence, start, near, 0, config, costs, quick, rng)
-        if pair is not None:
-            cost = pair[1][0].cost + pair[1][1].cost + border_cost(pair[0], evidence, costs)[0]
-            tried.append((cost, len(tried), pair[0]))
+    looks = _settled(evidence, starts, near, 0, config, costs, quick, rng)
+    tried = sorted((look.cost, k) for k, look in enumerate(looks) if look is not None)[: config.finalists]
+    finalists = [starts[k] for _, k in tried]
+    full = replace(fit_config, polish=1, search_points=fit_config.max_points)
     best, least_cost = None, whole.cost
-    for _, _, start in sorted(tried, key=lambda t: t[:2])[: config.finalists]:
-        pair = _settled(
-            evidence, start, near, config.rounds, config, costs, replace(fit_config, polish=1), rng
-        )
-        if pair is None:
+    for pair in _settled(evidence, finalists, near, config.rounds, config, costs, full, rng):
+        if pair is None or pair.cost >= least_cost or _is_layer(evidence, pair, costs):
             continue
-        cost = pair[1][0].cost + pair[1][1].cost + border_cost(pair[0], evidence, costs)[0]
-        if cost < least_cost and not _is_layer(evidence, pair[0], pair[1], costs):
-            best, least_cost = pair, cost
+        best, least_cost = pair, pair.cost
     return best
 
 
-def _is_layer(
-    evidence: Evidence,
-    second: NDArray[np.bool_],
-    pair: tuple[Explanation, Explanation],
-    costs: ExplanationConfig,
-) -> bool:
+def _is_layer(evidence: Evidence, pair: Pair, costs: ExplanationConfig) -> bool:
     """Whether one side is but a layer of points on the other's surface, as a view that is off leaves them."""
     return any(
         lies_on(other.shape, evidence.points[side], costs)
-        for side, other in ((second, pair[0]), (~second, pair[1]))
+        for side, other in ((pair.second, pair.explanations[0]), (~pair.second, pair.explanations[1]))
         if other.shape is not None
     )
 
 
 def _settled(
     evidence: Evidence,
-    second: NDArray[np.bool_],
-    near: scipy.sparse.csr_array,
+    starts: Sequence[NDArray[np.bool_]],
+    near: NDArray[np.intp],
     rounds: int,
     config: SplitConfig,
     costs: ExplanationConfig,
     fit_config: FitConfig,
     rng: np.random.Generator,
-) -> tuple[NDArray[np.bool_], tuple[Explanation, Explanation]] | None:
-    """Fit both sides, give each point to the side that explains it better, and so on; None if one is left."""
+) -> list[Pair | None]:
+    """Fit both sides of each start, give each point to the side that explains it better, and so on.
+
+    Returns:
+        What each start settles at; None where one side is left with too few points.
+    """
     least = config.min_points * costs.spacing**2 / costs.reading
+    settled: list[Pair | None] = [None] * len(starts)
+    moving = dict(enumerate(starts))
     for number in range(rounds + 1):
-        sizes = [float(evidence.weights[s].sum()) for s in (~second, second)]
-        if min(sizes) < least:
-            return None
-        pair = tuple(explain(evidence.select(s), costs, fit_config, rng) for s in (~second, second))
-        if number == rounds:
-            break
-        cost = np.stack([_costs(e, evidence, costs) for e in pair])
-        cost = (cost + (near @ cost.T).T) / 2.0
-        moved = _connected(evidence.points, cost[1] < cost[0], config)
-        if (moved == second).all():
-            break
-        second = moved
-    return second, (pair[0], pair[1])
+        moving = {
+            k: second
+            for k, second in moving.items()
+            if min(float(evidence.weights[s].sum()) for s in (~second, second)) >= least
+        }
+        sides = [evidence.select(s) for second in moving.values() for s in (~second, second)]
+        found = explain(sides, costs, fit_config, rng.spawn(len(sides)))
+        pairs = zip(found[0::2], found[1::2], strict=True)
+        for (k, second), pair in zip(list(moving.items()), pairs, strict=True):
+            moved = second
+            if number < rounds:
+                cost = np.stack([_costs(e, evidence, costs) for e in pair])
+                cost = (cost + cost[:, near].mean(axis=2)) / 2.0
+                moved = _connected(evidence.points, cost[1] < cost[0], config)
+            if (moved == second).all():
+                border, _ = border_cost(second, evidence, near, costs)
+                settled[k] = Pair(second, pair, pair[0].cost + pair[1].cost + border)
+                del moving[k]
+            else:
+                moving[k] = moved
+    return settled
 
 
 def _starts(

@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.frames import Array
-from caryatid.kernels.fitting import normal_equations
-from caryatid.refine import ROBUST_WIDTH, arrays
-from caryatid.shapes import Box, Cylinder, Sphere
 
 _SIZE_COLUMN = {"box": (6, 7, 8), "cylinder": (6, 6, 8), "sphere": (6, 6, 6)}
 """Column of the normal equations that holds the half extent along x, y, z."""
@@ -48,33 +45,33 @@ class Uncertainty:
 
 
 def estimate(
-    opened: Box | Cylinder | Sphere,
+    kind: str,
     seen: NDArray[np.bool_],
     unseen: Array,
-    points: Array,
+    normal_matrix: Array,
     sigma: float,
     config: FitConfig,
 ) -> Uncertainty:
     """Standard deviations from the normal equations of the last fit.
 
     Args:
-        opened: The refined shape with the unseen sides out of the way.
+        kind: Of the shape.
         seen: Which sides (6,) points bear out.
         unseen: Standard deviation (6,) [m] of the sides that no point bears out; passed over for the others.
-        points: (N, 3) [m], same frame.
+        normal_matrix: Sum over the points of the products of their derivatives (9, 9), unseen sides out of
+            the way; rows and columns as of `kernels.fitting.normal_equations`.
         sigma: Robust standard deviation of the points' distances to the shape [m].
         config: How many points share an error, and the error of registration.
     """
-    H, _ = normal_equations(*arrays(opened), points, ROBUST_WIDTH * sigma)
-    columns = _SIZE_COLUMN[opened.kind]
-    information = H * len(points) / (config.correlated * sigma**2)
+    columns = _SIZE_COLUMN[kind]
+    information = normal_matrix / (config.correlated * sigma**2)
     prior = np.array([config.max_extent] * 3 + [_TURN] * 3 + [config.max_extent] * 3)
     covariance = np.linalg.inv(information + np.diag(prior**-2.0))
     borne_out = np.array(seen)
-    if opened.kind != "box":
+    if kind != "box":
         # What is round is one surface: any part of it tells where all of it is.
-        borne_out[:4] = opened.kind == "sphere" or seen[:4].any()
-        borne_out[4:] |= opened.kind == "sphere"
+        borne_out[:4] = kind == "sphere" or seen[:4].any()
+        borne_out[4:] |= kind == "sphere"
     sides = np.empty(6)
     position, sizes = np.empty(3), np.empty(3)
     floor = config.registration**2

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, MutableMapping
-from dataclasses import replace
+from collections.abc import Mapping, MutableMapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from caryatid.config import ExplanationConfig, FitConfig
 from caryatid.explanation import (
     Evidence,
     Explanation,
+    Solid,
+    around,
     border_cost,
     explain,
     explained_by,
@@ -21,6 +25,7 @@ from caryatid.explanation import (
     point_costs,
     price,
 )
+from caryatid.frames import Array
 
 Pair = tuple[int, int]
 
@@ -50,63 +55,125 @@ def united(
     Returns:
         The larger object and the one it takes in, or None where all are better apart.
     """
+    bounds = {k: (e.points.min(axis=0), e.points.max(axis=0)) for k, e in evidence.items()}
+    pairs = [
+        (a, b)
+        for a, b in combinations(sorted(evidence), 2)
+        if {a, b} & changed
+        and _size(evidence, (a, b)) >= costs.growth * apart.get((a, b), 0)
+        and _near(evidence[a].points, evidence[b].points, bounds[a], bounds[b], costs.reach)
+    ]
+    rngs = [np.random.default_rng([seed, a, b]) for a, b in pairs]
+    gains = _gains([_Two.of(pair, evidence, alone, costs) for pair in pairs], costs, fit_config, rngs)
     best: tuple[float, Pair] | None = None
-    for a in sorted(evidence):
-        for b in sorted(k for k in evidence if k > a):
-            size = len(evidence[a].points) + len(evidence[b].points)
-            if not {a, b} & changed or size < costs.growth * apart.get((a, b), 0):
-                continue
-            if not _near(evidence[a], evidence[b], costs.reach):
-                continue
-            rng = np.random.default_rng([seed, a, b])
-            gain = _gain((evidence[a], evidence[b]), (alone[a], alone[b]), costs, fit_config, rng)
-            if gain <= 0.0:
-                apart[a, b] = size
-            elif best is None or gain > best[0]:
-                larger = len(evidence[a].points) >= len(evidence[b].points)
-                best = gain, (a, b) if larger else (b, a)
+    for (a, b), gain in zip(pairs, gains, strict=True):
+        if gain <= 0.0:
+            apart[a, b] = _size(evidence, (a, b))
+        elif best is None or gain > best[0]:
+            larger = len(evidence[a].points) >= len(evidence[b].points)
+            best = gain, (a, b) if larger else (b, a)
     return None if best is None else best[1]
 
 
-def _gain(
-    evidence: tuple[Evidence, Evidence],
-    alone: tuple[Explanation, Explanation],
+@dataclass(frozen=True, eq=False, slots=True)
+class _Two:
+    """Two neighbours that may be one object.
+
+    Attributes:
+        both: Points of both, those of the first one first.
+        second: Which points (N,) are the second's.
+        shapes: Those of the two that have one.
+        smooth: Share of the border between them without a concave crease [1].
+        cost: Of the two as two objects [nats].
+        one_lies_on_the_other: Most points of the one may be of the other's surface.
+    """
+
+    both: Evidence
+    second: NDArray[np.bool_]
+    shapes: list[Solid]
+    smooth: float
+    cost: float
+    one_lies_on_the_other: bool
+
+    @classmethod
+    def of(
+        cls,
+        pair: Pair,
+        evidence: Mapping[int, Evidence],
+        alone: Mapping[int, Explanation],
+        costs: ExplanationConfig,
+    ) -> _Two:
+        first, other = (evidence[k] for k in pair)
+        both = joined(first, other)
+        second = np.arange(len(both.points)) >= len(first.points)
+        border, smooth = border_cost(second, both, around(both.points, costs.neighbours), costs)
+        shapes = [alone[k].shape for k in pair]
+        on = zip(shapes, (other, first), strict=True)
+        return cls(
+            both,
+            second,
+            [s for s in shapes if s is not None],
+            smooth,
+            alone[pair[0]].cost + alone[pair[1]].cost + border,
+            any(s is not None and lies_on(s, e.points, costs) for s, e in on),
+        )
+
+
+def _gains(
+    pairs: Sequence[_Two],
     costs: ExplanationConfig,
     fit_config: FitConfig,
-    rng: np.random.Generator,
-) -> float:
+    rngs: Sequence[np.random.Generator],
+) -> list[float]:
     """How much less [nats] one object costs than two; nothing where it leaves one of them unexplained.
 
     Two become one without a shape only where most of the border between them has no concave crease, so that
     one surface goes on: nearly all of it where both have shapes of their own.
     """
-    both = joined(*evidence)
-    second = np.arange(len(both.points)) >= len(evidence[0].points)
-    border, smooth = border_cost(second, both, costs)
-    two = alone[0].cost + alone[1].cost + border
-    shapes = [e.shape for e in alone if e.shape is not None]
-    for points, other in ((evidence[1].points, alone[0].shape), (evidence[0].points, alone[1].shape)):
-        if other is not None and lies_on(other, points, costs):
-            return two
-    found = [explained_by(shape, both, costs) for shape in shapes]
-    for config in (first_look(fit_config, costs), replace(fit_config, polish=1)):
-        one = min([*found, explain(both, costs, config, rng)], key=lambda e: e.cost)
-        if one.cost > two + price(None, costs):
-            return 0.0
-        found.append(one)
+    found = [[explained_by(shape, two.both, costs) for shape in two.shapes] for two in pairs]
+    open_ = [k for k, two in enumerate(pairs) if not two.one_lies_on_the_other]
+    for config in (
+        first_look(fit_config, costs),
+        replace(fit_config, polish=1, search_points=fit_config.max_points),
+    ):
+        ones = explain([pairs[k].both for k in open_], costs, config, [rngs[k] for k in open_])
+        for k, one in zip(open_, ones, strict=True):
+            found[k].append(one)
+        open_ = [k for k in open_ if min(e.cost for e in found[k]) <= pairs[k].cost + price(None, costs)]
+    gains = [two.cost if two.one_lies_on_the_other else 0.0 for two in pairs]
+    for k in open_:
+        gains[k] = _gain(pairs[k], min(found[k], key=lambda e: e.cost), costs)
+    return gains
+
+
+def _gain(two: _Two, one: Explanation, costs: ExplanationConfig) -> float:
+    """How much less one object with the best explanation costs."""
     if one.shape is None:
-        least = costs.smooth_border if len(shapes) == len(alone) else 0.5
-        return two - one.cost if smooth > least else 0.0
-    cost = point_costs(one.shape, both, costs)
-    if max(cost[second].mean(), cost[~second].mean()) > costs.irregular:
+        least = costs.smooth_border if len(two.shapes) == 2 else 0.5
+        return two.cost - one.cost if two.smooth > least else 0.0
+    cost = point_costs(one.shape, two.both, costs)
+    if max(cost[two.second].mean(), cost[~two.second].mean()) > costs.irregular:
         return 0.0
-    return two - one.cost
+    return two.cost - one.cost
 
 
-def _near(a: Evidence, b: Evidence, reach: float) -> bool:
-    """Whether some points of two objects lie within reach [m] of each other."""
-    low_a, high_a, low_b, high_b = (f(e.points, axis=0) for e in (a, b) for f in (np.min, np.max))
-    if ((low_a > high_b + reach) | (low_b > high_a + reach)).any():
+def _size(evidence: Mapping[int, Evidence], pair: Pair) -> int:
+    return len(evidence[pair[0]].points) + len(evidence[pair[1]].points)
+
+
+def _near(
+    a: Array, b: Array, bounds_a: tuple[Array, Array], bounds_b: tuple[Array, Array], reach: float
+) -> bool:
+    """Whether some of two objects' points (N, 3), with their least and greatest, lie within reach [m]."""
+    if not ((bounds_a[0] <= bounds_b[1] + reach) & (bounds_b[0] <= bounds_a[1] + reach)).all():
         return False
-    distance, _ = cKDTree(a.points).query(b.points, distance_upper_bound=reach)
-    return bool(np.isfinite(distance).any())
+    mine = _within(a, bounds_b[0] - reach, bounds_b[1] + reach)
+    theirs = _within(b, bounds_a[0] - reach, bounds_a[1] + reach)
+    if len(mine) == 0 or len(theirs) == 0:
+        return False
+    return bool(cdist(mine, theirs, "sqeuclidean").min() <= reach**2)
+
+
+def _within(points: Array, low: Array, high: Array) -> Array:
+    """Those of the points (N, 3) that lie between two corners (3,)."""
+    return points[((points >= low) & (points <= high)).all(axis=1)]

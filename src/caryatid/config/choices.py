@@ -7,3 +7,4 @@ from typing import Literal
 FusionMethod = Literal["pc", "sg", "pc+sg"]
 SegmentationMethod = Literal["labels", "auto"]
 NoiseModel = Literal["none", "carmine"]
+ShapeKind = Literal["box", "cylinder", "sphere"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from caryatid.config.choices import FusionMethod
+from caryatid.config.choices import FusionMethod, ShapeKind
 from caryatid.config.ranges import (
     Angle,
     Count,
@@ -23,12 +23,16 @@ from caryatid.config.ranges import (
 class FitConfig(Stage):
     """Primitive fitting."""
 
+    shapes: tuple[ShapeKind, ...] = ("box", "cylinder", "sphere")
+    """Shapes that are tried; the paper's three."""
     hypotheses: Count = 100
     """RANSAC hypotheses a shape at the most [1]; the predecessor's iterations."""
     confidence: Likelihood = 0.99
     """RANSAC stops when a better sample is less likely than 1 − confidence."""
     max_points: Count = 800
-    """Points a fit looks at [1]; more change sizes by less than the noise and cost time in proportion."""
+    """Points a shape is judged by [1]; 1.5 cm apart on the largest objects, as far as bare places count."""
+    search_points: Count = 250
+    """Of these the search looks at so many or nearly twice as many [1]; the best are refined on all."""
     min_points: Count = 12
     """Fewer points are no object [1]; a box has nine parameters."""
     threshold: Positive = 0.01

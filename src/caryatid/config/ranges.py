@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from caryatid.errors import InputError
 
@@ -38,6 +38,23 @@ class Range:
             return start if self.above else f"{start} on"
         end = f"{'below ' if self.below else ''}{self.most:g}"
         return f"{start} {'and' if self.above else 'to'} {end}"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A few names.
+
+    Attributes:
+        names: What may be chosen.
+    """
+
+    names: tuple[str, ...]
+
+    def __contains__(self, value: str) -> bool:
+        return value in self.names
+
+    def __str__(self) -> str:
+        return f"one of {', '.join(self.names)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +126,19 @@ def out_of_range(value: Any, kind: Any) -> str:
     if get_origin(plain) is tuple:
         broken = [f"each {rule}" for part, rule in _parts(value, plain) if part not in rule]
         broken += [str(rule) for rule in rules if value not in rule]
-        return f"a list of {len(value)} numbers, {broken[0]}" if broken else ""
+        names = value and isinstance(value[0], str)
+        return f"a list of {len(value)} {'names' if names else 'numbers'}, {broken[0]}" if broken else ""
     noun = "a whole number" if plain is int else "a number"
     return next((f"{noun} {rule}" for rule in rules if value not in rule), "")
 
 
-def _parts(values: tuple[float, ...], kind: Any) -> Iterator[tuple[float, Range]]:
-    """Numbers of a tuple, each with the ranges it is to be in."""
+def _parts(values: tuple[Any, ...], kind: Any) -> Iterator[tuple[Any, Range | Choice]]:
+    """Parts of a tuple, each with the ranges it is to be in, or what it may be."""
     kinds_of_parts = get_args(kind)
     for place, part in enumerate(values):
         own = kinds_of_parts[0] if kinds_of_parts[-1] is Ellipsis else kinds_of_parts[place]
-        for rule in get_args(own)[1:]:
-            yield part, rule
+        if get_origin(own) is Literal:
+            yield part, Choice(get_args(own))
+        elif get_origin(own) is Annotated:
+            for rule in get_args(own)[1:]:
+                yield part, rule

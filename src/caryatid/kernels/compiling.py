@@ -29,7 +29,7 @@ from typing import Any
 
 import llvmlite.binding as llvm
 import numba
-from numba.core.sigutils import normalize_signature
+from numba import types
 
 from caryatid.interrupts import interrupts_held
 from caryatid.kernels import CACHE
@@ -136,11 +136,23 @@ def compile_share(work: str, modules: Sequence[str]) -> None:
             continue
         try:
             for signature in kernel.signatures:
-                kernel.dispatcher().compile(normalize_signature(signature)[0])
+                kernel.dispatcher().compile(argument_types(signature))
         except Exception as error:
             sys.stderr.write(f"{taken.name}: {error}\n")
         else:
             taken.write_text(str(CACHE), encoding="utf-8")
+
+
+def argument_types(signature: str) -> tuple[Any, ...]:
+    """The types that a signature names in numba's words; `Named('module.Name', (…))` is a NamedTuple's."""
+    names = vars(types) | {"Named": _named}
+    arguments: tuple[Any, ...] = eval(signature, {}, names)
+    return arguments
+
+
+def _named(name: str, fields: tuple[Any, ...]) -> Any:
+    module, _, own = name.partition(".")
+    return types.BaseTuple.from_types(fields, getattr(import_module(f"{__package__}.{module}"), own))
 
 
 def _run_processes(work: Path, kernels: Sequence[Kernel]) -> None:

@@ -81,7 +81,7 @@ def distances_and_gradients(
         x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
         y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
         z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
-        distance[i], gradients[i, 0], gradients[i, 1], gradients[i, 2] = _gradient(kind, x, y, z, hx, hy, hz)
+        distance[i], gradients[i, 0], gradients[i, 1], gradients[i, 2] = gradient(kind, x, y, z, hx, hy, hz)
     return distance, gradients
 
 
@@ -98,6 +98,7 @@ def levenberg_marquardt(
     robust_width: float,
     noise_floor: float,
     ridge: NDArray[np.float64],
+    converged: float,
 ) -> Posed:
     """Minimise the Geman–McClure cost of signed distances; arguments as of `refine.refine`.
 
@@ -113,6 +114,7 @@ def levenberg_marquardt(
         robust_width: Residuals beyond this many robust standard deviations lose most of their weight.
         noise_floor: Least standard deviation the weights assume [m].
         ridge: Added to the diagonal (9,), times the damping.
+        converged: Share of the cost that the last step lowers it by at the most.
     """
     columns = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8])
     if kind == SPHERE:
@@ -150,7 +152,7 @@ def levenberg_marquardt(
         if not improved:
             break
         damping = max(damping / 10.0, 1e-7)
-        if cost - trial_cost < 1e-4 * cost:
+        if cost - trial_cost < converged * cost:
             break
     return R, centre, half
 
@@ -179,7 +181,7 @@ def normal_equations(
         x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
         y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
         z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
-        d, gx, gy, gz = _gradient(kind, x, y, z, hx, hy, hz)
+        d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
         weight = share / (1.0 + (d / scale) ** 2) ** 2
         J[0], J[1], J[2] = -gx, -gy, -gz
         J[3], J[4], J[5] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
@@ -202,7 +204,7 @@ def normal_equations(
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _gradient(
+def gradient(
     kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float
 ) -> tuple[float, float, float, float]:
     """Signed distance [m] of one point in the object's frame, and its gradient there."""
@@ -248,36 +250,27 @@ def _stepped(
     longest = 1.0
     for a in range(len(step)):
         longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
-    step = step / longest
-    x, y, z = step[3], step[4], step[5]
-    angle = np.sqrt(x * x + y * y + z * z)
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    turn = np.eye(3) + K
-    if angle >= 1e-12:
-        K = K / angle
-        turn = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * _product(K, K)
-    grown = half.copy()
+    grown, moved, turned = half.copy(), centre.copy(), np.empty((3, 3))
     for a in range(6, len(step)):
-        grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a], min_extent / 2.0)
+        grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
     if kind == SPHERE:
         grown[1] = grown[2] = grown[0]
     elif kind == CYLINDER:
         grown[1] = grown[0]
-    moved = centre.copy()
+    x, y, z = step[3] / longest, step[4] / longest, step[5] / longest
+    angle = np.sqrt(x * x + y * y + z * z)
+    # Rodrigues' formula for the rows of R: v cos + (v × k) sin + k (k · v)(1 − cos).
+    sine = np.sin(angle) / angle if angle >= 1e-12 else 1.0
+    rest = (1.0 - np.cos(angle)) / (angle * angle) if angle >= 1e-12 else 0.0
     for i in range(3):
-        for k in range(3):
-            moved[i] += R[i, k] * step[k]
-    return _product(R, turn), moved, grown
-
-
-@njit(cache=True, error_model="numpy")
-def _product(A: NDArray[np.float64], B: NDArray[np.float64]) -> Array:
-    C = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                C[i, j] += A[i, k] * B[k, j]
-    return C
+        u, v, w = R[i]
+        moved[i] += (u * step[0] + v * step[1] + w * step[2]) / longest
+        along = rest * (u * x + v * y + w * z)
+        cosine = np.cos(angle) if angle >= 1e-12 else 1.0
+        turned[i, 0] = cosine * u + sine * (v * z - w * y) + along * x
+        turned[i, 1] = cosine * v + sine * (w * x - u * z) + along * y
+        turned[i, 2] = cosine * w + sine * (u * y - v * x) + along * z
+    return turned, moved, grown
 
 
 @njit(cache=True, error_model="numpy")

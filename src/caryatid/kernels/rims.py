@@ -11,8 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.frames import Array
-
 HALVINGS = 14
 """Bisections of the search for the end: to 12 σ / 2¹⁴."""
 ROUNDS = 3
@@ -22,7 +20,7 @@ ROUNDS = 3
 @njit(cache=True, error_model="numpy")
 def likeliest_end(
     coordinates: NDArray[np.float64], start: float, sigma: float, window: float, growing: bool, stray: float
-) -> Array:
+) -> tuple[float, float]:
     """Upper end [m] of points whose density is even up to it, and its standard deviation [m].
 
     With Gaussian noise the density near an end e is c·Φ((e − u)/σ). Its likelihood is greatest where
@@ -37,7 +35,7 @@ def likeliest_end(
         stray: Density beyond the end, as a share of that within: one stray point weighs little against a rim.
 
     Returns:
-        The end and its standard deviation (2,).
+        The end and its standard deviation.
     """
     coordinates = coordinates[coordinates > start - window - 12.0 * sigma]
     end = start
@@ -65,4 +63,4 @@ def likeliest_end(
             else:
                 high = middle
         end = 0.5 * (low + high)
-    return np.array([end, np.sqrt(sigma / (0.9 * density))])
+    return end, np.sqrt(sigma / (0.9 * density))
