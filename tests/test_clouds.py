@@ -179,6 +179,17 @@ def test_thin_keeps_one_real_point_per_voxel():
     assert index[0] == nearest
 
 
+def test_thin_keeps_the_points_nearest_to_the_means_of_their_voxels():
+    points = np.random.default_rng(2).uniform(-0.1, 0.1, size=(4000, 3))
+    points = np.concatenate([points, points[:500]])
+    _, owner = np.unique(np.floor(points / 0.02), axis=0, return_inverse=True)
+    owner = owner.ravel()
+    means = np.stack([np.bincount(owner, points[:, i]) / np.bincount(owner) for i in range(3)], axis=-1)
+    order = np.lexsort((np.sum((points - means[owner]) ** 2, axis=-1), owner))
+    nearest = order[np.unique(owner[order], return_index=True)[1]]
+    np.testing.assert_array_equal(thin(points, 0.02), np.sort(nearest))
+
+
 def test_thin_bears_far_points_and_none():
     assert len(thin(np.zeros((0, 3)), 0.01)) == 0
     assert len(thin(np.array([[0.0, 0.0, 0.0], [1e6, -1e6, 1e6]]), 1e-3)) == 2

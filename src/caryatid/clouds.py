@@ -11,6 +11,7 @@ from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.frames import Array
 from caryatid.kernels.images import LocalSurface, local_surface
+from caryatid.kernels.thinning import nearest_to_means
 from caryatid.views import View
 
 CHUNK = 100_000
@@ -143,23 +144,7 @@ def thin(points: Array, voxel: float) -> NDArray[np.intp]:
     """
     if not voxel > 0.0:
         raise InputError("thin", f"voxel size {voxel:g} is not positive", "give metres above zero")
-    if len(points) == 0:
-        return np.zeros(0, dtype=np.intp)
-    cells = np.floor(np.asarray(points, dtype=np.float64) / voxel).astype(np.int64)
-    cells -= cells.min(axis=0)
-    extent = cells.max(axis=0) + 1
-    if float(extent[0]) * float(extent[1]) * float(extent[2]) < 2.0**62:
-        keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-        _, owner = np.unique(keys, return_inverse=True)
-    else:
-        _, owner = np.unique(cells, axis=0, return_inverse=True)
-        owner = owner.ravel()
-    count = np.bincount(owner)
-    mean = np.stack([np.bincount(owner, points[:, i]) / count for i in range(3)], axis=-1)
-    distance = np.sum((points - mean[owner]) ** 2, axis=-1)
-    order = np.lexsort((distance, owner))
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    return np.sort(order[first])
+    return np.flatnonzero(nearest_to_means(np.ascontiguousarray(points, dtype=np.float64), voxel))
 
 
 def _least_direction(covariance: Array) -> Array:
