@@ -13,8 +13,6 @@ from caryatid.errors import InputError
 from caryatid.kernels.images import (
     local_surface,
     local_surface_reference,
-    nearest_seeds,
-    nearest_seeds_reference,
 )
 from caryatid.views import View
 
@@ -115,18 +113,6 @@ def test_a_view_with_normals_of_its_own_is_taken_as_exact():
     depth = np.random.default_rng(0).uniform(0.9, 1.1, (48, 64)).astype(np.float32)
     points, _, _ = oriented_points(View(depth=depth, K=K, normals_camera=given), CONFIG)
     np.testing.assert_allclose(points[:, 2], depth.ravel(), rtol=1e-6)
-
-
-def test_nearest_seeds_equal_dijkstra():
-    rng = np.random.default_rng(3)
-    edges = np.unique(np.sort(rng.integers(0, 300, size=(700, 2)), axis=1), axis=0)
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    costs = rng.uniform(0.1, 1.0, size=len(edges))
-    seeds = rng.choice(300, size=12, replace=False)
-    owner = nearest_seeds(300, edges, costs, seeds)
-    np.testing.assert_array_equal(owner, nearest_seeds_reference(300, edges, costs, seeds))
-    assert (owner[seeds] == np.arange(12)).all()
-    assert (nearest_seeds(4, np.array([[0, 1]]), np.array([1.0]), np.array([0])) == [0, 0, -1, -1]).all()
 
 
 def test_oriented_points_keep_to_the_working_range_and_the_stride():

@@ -9,7 +9,7 @@ from test_segmentation import UP, found, surface_of
 
 from caryatid import frames
 from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
-from caryatid.convexity import hollowness
+from caryatid.kernels.concavity import hollowness
 from caryatid.kernels.gaps import hidden_gaps, hidden_gaps_reference
 from caryatid.segmentation import segment
 
@@ -97,9 +97,9 @@ def test_the_inside_of_a_bowl_belongs_to_the_bowl():
 def test_hollowness_knows_inside_from_outside():
     around = np.random.default_rng(0).normal(size=(500, 3)) * (1.0, 1.0, 0.3) + (0.0, 0.0, 2.0)
     outward = frames.unit(around)
-    assert hollowness(0.1 * outward, -outward) > 0.2
-    assert hollowness(0.1 * outward, outward) < -0.2
-    assert abs(hollowness(around * (1.0, 1.0, 0.0), np.tile(UP, (500, 1)))) < 1e-9
+    assert hollowness(np.hstack([0.1 * outward, -outward])) > 0.2
+    assert hollowness(np.hstack([0.1 * outward, outward])) < -0.2
+    assert abs(hollowness(np.hstack([around * (1.0, 1.0, 0.0), np.tile(UP, (500, 1))]))) < 1e-9
 
 
 def test_hidden_gaps_are_those_of_the_reference():

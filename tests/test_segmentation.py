@@ -12,9 +12,9 @@ from scipy.optimize import linear_sum_assignment
 from caryatid import frames
 from caryatid.clouds import oriented_points, thin
 from caryatid.config import CloudConfig, SegmentationConfig, SurfaceConfig
-from caryatid.convexity import cluster_by_mean, convex_parts, number_by_appearance
+from caryatid.convexity import convex_parts, number_by_appearance
 from caryatid.errors import PerceptionError
-from caryatid.kernels.planes import refine_planes, refine_planes_reference
+from caryatid.kernels.clusters import OneBody, cluster_by_mean
 from caryatid.segmentation import find_support_surface, on_surface, segment, segment_cloud
 from caryatid.views import Cloud, View
 
@@ -216,40 +216,13 @@ def test_a_grazing_face_is_cut_into_no_slivers():
     assert found(segment(view, surface_of(view), SegmentationConfig()), view.labels) == (1, 1, 1)
 
 
-def crease(noise: float):
-    """Inverse depth of two planes that meet in column 24, and each pixel's tangent plane before noise."""
-    v, u = np.mgrid[:40, :48].astype(float)
-    inverse = 0.6 + 0.002 * np.abs(u - 24.0) + 0.001 * v
-    planes = np.stack([inverse, 0.002 * np.sign(u - 24.0), np.full_like(u, 0.001)], axis=-1)
-    noisy = inverse + noise * np.random.default_rng(0).standard_normal(inverse.shape)
-    return np.where((u > 40) & (v > 30), 0.0, noisy).astype(np.float32), planes
-
-
-def test_refined_planes_agree_with_their_reference():
-    image, planes = crease(0.0015)
-    pixels = np.argwhere(image > 0.0)[::7]
-    start = planes[tuple(pixels.T)] + np.array([0.001, 0.0003, -0.0003])
-    start[:5, 0] += 10.0
-    ours = refine_planes(image, pixels, start, 4, 0.005, 2)
-    np.testing.assert_allclose(ours, refine_planes_reference(image, pixels, start, 4, 0.005, 2), atol=1e-9)
-    np.testing.assert_array_equal(ours[:5], start[:5])
-
-
-def test_refined_planes_lose_noise_and_keep_creases():
-    image, planes = crease(0.0015)
-    pixels = np.argwhere((image > 0.0) & (np.abs(np.arange(48) - 24.0) > 3.0))
-    truth = planes[tuple(pixels.T)]
-    start = truth + np.array([0.0015, 0.0006, 0.0006]) * np.random.default_rng(1).standard_normal(truth.shape)
-    error = np.abs(refine_planes(image, pixels, start, 5, 0.004, 2) - truth).mean(axis=0)
-    assert (error < np.array([0.0005, 0.0002, 0.0002])).all()
-
-
 def test_clusters_weigh_the_mean_of_their_border():
     pairs = np.array([[0, 1], [2, 3], [0, 2], [1, 3]])
     attraction = np.array([1.0, 0.9, 0.5, -0.8])
-    cluster = cluster_by_mean(4, pairs, attraction, np.ones(4))
+    patches, body = np.zeros((4, 6)), OneBody(2, 0.2, 0.01, 0.26, 0.2)
+    cluster = cluster_by_mean(pairs, attraction, np.ones(4), patches, body)
     assert cluster[0] == cluster[1] != cluster[2] == cluster[3]
-    joined = cluster_by_mean(4, pairs, attraction, np.array([1.0, 1.0, 3.0, 1.0]))
+    joined = cluster_by_mean(pairs, attraction, np.array([1.0, 1.0, 3.0, 1.0]), patches, body)
     assert len(set(joined.tolist())) == 1
 
 

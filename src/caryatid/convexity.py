@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +11,11 @@ from caryatid import frames
 from caryatid.clouds import thin
 from caryatid.config import SegmentationConfig
 from caryatid.frames import Array
-from caryatid.kernels.images import nearest_seeds
+from caryatid.kernels.clusters import OneBody, cluster_by_mean
+from caryatid.kernels.concavity import convex
+from caryatid.kernels.graphs import bent_lengths, count_borders, nearest_seeds
 
 Index = NDArray[np.intp]
-
-SAMPLED = 60
-"""Surfels of a cluster at the most that are compared with another's [1]; bounds time."""
 
 EDGES_ACROSS = 3.0
 """Sample edges that cross a border for each sample along it, on a grid with diagonals."""
@@ -68,44 +65,31 @@ def convex_parts(
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)
-    surfels = gather_surfels(points, normals, edges, config)
-    pairs, lengths = surfel_borders(surfels, edges)
-    attraction = border_attraction(surfels, pairs, config)
-    repelled = _with_steps(surfels, pairs, attraction, lengths, steps)
-
-    def convex(first: list[int], second: list[int]) -> bool:
-        return convex_together(surfels, first, second, config)
-
-    cluster = cluster_by_mean(len(surfels.sizes), *repelled, allowed=convex)
-    min_width = config.min_width / _spacing(points, edges)
+    distances, turns = bent_lengths(points, normals, edges)
+    costs = distances / config.surfel + config.crease * turns
+    surfels = gather_surfels(points, normals, edges, costs, thin(points, config.surfel))
+    count = len(surfels.sizes)
+    pairs, lengths = count_borders(surfels.owner, edges, count)
+    borders = pairs, border_attraction(surfels, pairs, config), lengths
+    if steps is not None:
+        borders = _with_steps(*borders, *count_borders(surfels.owner, steps, count), count)
+    cluster = cluster_by_mean(
+        *borders, np.column_stack([surfels.centres, surfels.normals]), _one_body(config)
+    )
+    min_width = config.min_width / _usual(distances)
     cluster = _absorb_slivers(cluster, surfels.sizes, pairs, lengths, config.min_size, min_width)
     part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
-    kept = np.flatnonzero(np.bincount(part[part >= 0], minlength=len(cluster)) >= config.min_size)
-    part = np.where(np.isin(part, kept), part, -1)
-    return number_by_appearance(part)
+    large = np.bincount(part + 1)[1:] >= config.min_size
+    return number_by_appearance(np.where((part >= 0) & np.append(large, False)[part], part, -1))
 
 
-def gather_surfels(points: Array, normals: Array, edges: Index, config: SegmentationConfig) -> Surfels:
-    """Give each sample (N, 3) to the seed nearest along the surface; turns of the normal add distance."""
-    difference = points[edges[:, 0]] - points[edges[:, 1]]
-    turn = 1.0 - np.einsum("ij,ij->i", normals[edges[:, 0]], normals[edges[:, 1]])
-    costs = np.sqrt(np.einsum("ij,ij->i", difference, difference)) / config.surfel + config.crease * turn
-    seeds = thin(points, config.surfel)
+def gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, seeds: Index) -> Surfels:
+    """Give each sample (N, 3) to the seed (S,) nearest along the edges (E, 2) at their costs (E,)."""
     owner = nearest_seeds(len(points), edges, costs, seeds)
     count = len(seeds)
-    known = owner >= 0
-    sizes = np.bincount(owner[known], minlength=count)
-    centres = _sum_by(owner[known], points[known], count) / np.maximum(sizes, 1)[:, None]
-    return Surfels(owner, centres, frames.unit(_sum_by(owner[known], normals[known], count)), sizes)
-
-
-def surfel_borders(surfels: Surfels, edges: Index) -> tuple[Index, Array]:
-    """Pairs of surfels (B, 2) that touch, i < j, and the number of sample edges across each border (B,)."""
-    ends = surfels.owner[edges]
-    across = (ends[:, 0] != ends[:, 1]) & (ends >= 0).all(axis=1)
-    low, high = ends[across].min(axis=1), ends[across].max(axis=1)
-    keys, lengths = np.unique(low * len(surfels.sizes) + high, return_counts=True)
-    return np.stack(np.divmod(keys, len(surfels.sizes)), axis=-1), lengths.astype(np.float64)
+    sizes = np.bincount(owner + 1, minlength=count + 1)[1:]
+    centres = _sum_by(owner, points, count) / np.maximum(sizes, 1)[:, None]
+    return Surfels(owner, centres, frames.unit(_sum_by(owner, normals, count)), sizes)
 
 
 def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
@@ -121,125 +105,44 @@ def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig
 
 
 def _with_steps(
-    surfels: Surfels, pairs: Index, attraction: Array, lengths: Array, steps: Index | None
+    pairs: Index, attraction: Array, lengths: Array, apart: Index, apart_lengths: Array, count: int
 ) -> tuple[Index, Array, Array]:
     """Borders with their mean attraction and length once the depth steps along them repel."""
-    if steps is None or len(steps) == 0:
+    if len(apart) == 0:
         return pairs, attraction, lengths
-    apart, count = surfel_borders(surfels, steps)
-    keys = np.concatenate([pairs, apart]) @ np.array([len(surfels.sizes), 1])
+    keys = np.concatenate([pairs, apart]) @ np.array([count, 1])
     keys, inverse = np.unique(keys, return_inverse=True)
-    total = np.bincount(inverse, np.concatenate([attraction * lengths, STEP_ATTRACTION * count]))
-    length = np.bincount(inverse, np.concatenate([lengths, count])).astype(np.float64)
-    return np.stack(np.divmod(keys, len(surfels.sizes)), axis=-1), total / length, length
+    total = np.bincount(inverse, np.concatenate([attraction * lengths, STEP_ATTRACTION * apart_lengths]))
+    length = np.bincount(inverse, np.concatenate([lengths, apart_lengths])).astype(np.float64)
+    return np.stack(np.divmod(keys, count), axis=-1), total / length, length
 
 
-def convex_together(
-    surfels: Surfels, first: list[int], second: list[int], config: SegmentationConfig
-) -> bool:
-    """Whether two clusters of surfels may be one body where their border attracts: few rise over the other's.
-
-    Too few surfels tell nothing, and two patches of the inside of a bowl rise over each other.
-    """
-    if min(len(first), len(second)) < config.least_surfels:
-        return True
-    i, j = (np.array(m[:: max(1, len(m) // SAMPLED)]) for m in (first, second))
-    if all(hollowness(surfels.centres[k], surfels.normals[k]) > config.hollow for k in (i, j)):
-        return True
-    share = concave_share(
-        (surfels.centres[i], surfels.normals[i]), (surfels.centres[j], surfels.normals[j]), config
-    )
-    return share <= config.concave_share
+def _one_body(config: SegmentationConfig) -> OneBody:
+    """When two clusters of surfels may be one body."""
+    bend = float(np.sin(np.radians(config.concavity)))
+    return OneBody(config.least_surfels, config.hollow, config.rise, bend, config.concave_share)
 
 
-def hollowness(points: Array, normals: Array) -> float:
-    """How much a patch looks inwards: mean cosine between normals (N, 3) and the way to its middle (N, 3).
-
-    0 on a plane, positive on the inside of a bowl, negative on the outside.
-    """
-    inwards = points.mean(axis=0) - points
-    length = np.maximum(np.linalg.norm(inwards, axis=-1), 1e-9)
-    return float(np.mean(np.einsum("ij,ij->i", normals, inwards) / length))
-
-
-def concave_share(
-    first: tuple[Array, Array], second: tuple[Array, Array], config: SegmentationConfig
-) -> float:
-    """Share of the pairs of points of two patches of which one rises above the other's tangent plane.
+def convex_together(first: Array, second: Array, share: float, config: SegmentationConfig) -> bool:
+    """Whether hardly a point of one patch rises above the tangent plane of a point of the other.
 
     Args:
-        first: Points (N, 3) [m] and unit normals (N, 3).
-        second: Points (M, 3) [m] and unit normals (M, 3).
+        first: Points [m] and unit normals (N, 6).
+        second: Points [m] and unit normals (M, 6).
+        share: Greatest share of the pairs of points of which one rises [1].
         config: How far counts: a height, and an angle as normals err.
     """
-    (p, n), (q, m) = first, second
-    between = q[None] - p[:, None]
-    slack = config.rise + np.linalg.norm(between, axis=-1) * np.sin(np.radians(config.concavity))
-    over_first = np.einsum("abi,ai->ab", between, n) > slack
-    over_second = -np.einsum("abi,bi->ab", between, m) > slack
-    return float((over_first | over_second).mean())
+    return convex(first, second, config.rise, float(np.sin(np.radians(config.concavity))), share)
 
 
-def cluster_by_mean(
-    count: int,
-    pairs: Index,
-    attraction: Array,
-    lengths: Array,
-    allowed: Callable[[list[int], list[int]], bool] | None = None,
-) -> Index:
-    """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
-
-    Args:
-        count: Number of nodes.
-        pairs: Borders (B, 2) between nodes.
-        attraction: Signed attraction of each border (B,).
-        lengths: Weight of each border in the mean (B,).
-        allowed: Says of the nodes of two clusters whether they may be merged; a border across which they may
-            not repels from then on.
-
-    Returns:
-        Cluster of each node (count,): the number of one of its nodes.
-    """
-    borders: list[dict[int, tuple[float, float]]] = [{} for _ in range(count)]
-    heap: list[tuple[float, int, int, float]] = []
-    for (i, j), weight, length in zip(pairs.tolist(), attraction.tolist(), lengths.tolist(), strict=True):
-        borders[i][j] = borders[j][i] = (weight * length, length)
-        if weight > 0.0:
-            heap.append((-weight, i, j, length))
-    heapq.heapify(heap)
-    parent = list(range(count))
-    members = [[k] for k in range(count)]
-    while heap:
-        _, i, j, length = heapq.heappop(heap)
-        if parent[i] != i or parent[j] != j or borders[i][j][1] != length:
-            continue
-        if allowed is not None and not allowed(members[i], members[j]):
-            borders[i][j] = borders[j][i] = (-length, length)
-            continue
-        if len(borders[i]) < len(borders[j]):
-            i, j = j, i
-        parent[j] = i
-        members[i] += members[j]
-        del borders[i][j]
-        for k, (total, size) in borders[j].items():
-            if k == i:
-                continue
-            del borders[k][j]
-            known_total, known_size = borders[i].get(k, (0.0, 0.0))
-            total, size = known_total + total, known_size + size
-            borders[i][k] = borders[k][i] = (total, size)
-            if total > 0.0:
-                heapq.heappush(heap, (-total / size, min(i, k), max(i, k), size))
-        borders[j] = {}
-    return _roots(np.array(parent, dtype=np.intp))
-
-
-def number_by_appearance(part: Index) -> NDArray[np.int32]:
+def number_by_appearance(part: NDArray[np.integer]) -> NDArray[np.int32]:
     """Number parts 1 … n in the order of their first samples; negative = 0."""
-    values, first, inverse = np.unique(part, return_index=True, return_inverse=True)
-    first = np.where(values < 0, -1, first)
-    rank = np.argsort(np.argsort(first)) + (0 if (values < 0).any() else 1)
-    return rank[inverse].astype(np.int32)
+    first = np.full(int(part.max(initial=-1)) + 2, len(part))
+    first[part[::-1] + 1] = np.arange(len(part))[::-1]
+    known = np.flatnonzero(first[1:] < len(part))
+    number = np.zeros(len(first), dtype=np.int32)
+    number[known[np.argsort(first[1:][known])] + 1] = np.arange(1, len(known) + 1)
+    return number[np.maximum(part, -1) + 1]
 
 
 def _absorb_slivers(
@@ -272,11 +175,10 @@ def _absorb_slivers(
     return cluster
 
 
-def _spacing(points: Array, edges: Index) -> float:
-    """Usual distance between neighbouring samples [m]."""
-    distance = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=-1)
-    distance = distance[distance > 0.0]
-    return float(np.median(distance)) if len(distance) else np.inf
+def _usual(distances: Array) -> float:
+    """Usual distance between neighbouring samples [m] of all there are (E,)."""
+    distances = distances[distances > 0.0]
+    return float(np.median(distances)) if len(distances) else np.inf
 
 
 def _roots(parent: Index) -> Index:
@@ -288,4 +190,6 @@ def _roots(parent: Index) -> Index:
 
 
 def _sum_by(owner: Index, vectors: Array, count: int) -> Array:
-    return np.stack([np.bincount(owner, vectors[:, axis], minlength=count) for axis in range(3)], axis=-1)
+    """Sums (count, 3) of the vectors (N, 3) of each owner; −1 = none."""
+    sums = [np.bincount(owner + 1, vectors[:, axis], minlength=count + 1)[1:] for axis in range(3)]
+    return np.stack(sums, axis=-1)

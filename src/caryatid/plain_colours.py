@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from caryatid.config import SegmentationConfig
 from caryatid.frames import Array
+from caryatid.kernels.grids import colour_patches
 
 Labels = NDArray[np.int32]
 Colours = NDArray[np.uint8]
@@ -42,15 +41,17 @@ def cut_by_colour(labels: Labels, rgb: Colours, config: SegmentationConfig) -> L
         Parts (H, W); pieces cut off have numbers above n.
     """
     result = labels.copy()
-    shares = _shares(rgb)
-    patch = _patches(labels, shares, config.other_colour / 2.0)
-    for part in range(1, int(labels.max(initial=0)) + 1):
+    patch = colour_patches(labels, rgb, config.other_colour / 2.0)
+    sizes = np.bincount(patch.ravel() + 1)[1:]
+    owner = np.zeros(len(sizes), dtype=np.intp)
+    owner[patch[labels > 0]] = labels[labels > 0]
+    large, whole_sizes = sizes >= config.min_size, np.bincount(labels.ravel())
+    several = np.bincount(owner[large], minlength=len(whole_sizes)) >= 2
+    in_pieces = np.bincount(owner[large], sizes[large], minlength=len(whole_sizes))
+    for part in np.flatnonzero(several & (in_pieces >= config.plain_share * whole_sizes)):
         mask = labels == part
-        sizes = np.bincount(patch[mask], minlength=1)
-        pieces = np.flatnonzero(sizes >= config.min_size)
-        if len(pieces) < 2 or sizes[pieces].sum() < config.plain_share * mask.sum():
-            continue
-        plain = [_plain(shares[mask & (patch == piece)]) for piece in pieces]
+        pieces = np.flatnonzero(large & (owner == part))
+        plain = [_plain(_shares(rgb[mask & (patch == piece)])) for piece in pieces]
         if max(spread for _, spread in plain) > config.plain_colour:
             continue
         whole = np.where(mask, np.where(np.isin(patch, pieces), patch, -1), -2)
@@ -73,21 +74,6 @@ def _plain(shares: Array) -> tuple[Array, float]:
     """Mean colour (3,) of samples (N, 3), and the usual distance from it."""
     mean = shares.mean(axis=0)
     return mean, float(np.sqrt(np.mean(np.sum((shares - mean) ** 2, axis=-1))))
-
-
-def _patches(labels: Labels, shares: Array, step: float) -> NDArray[np.intp]:
-    """Patches (H, W) of one part within which neighbours differ in colour by less than a step."""
-    number = np.arange(labels.size).reshape(labels.shape)
-    pairs = []
-    for down, right in ((0, 1), (1, 0)):
-        here = (slice(0, labels.shape[0] - down), slice(0, labels.shape[1] - right))
-        there = (slice(down, None), slice(right, None))
-        same = (labels[here] == labels[there]) & (labels[here] > 0)
-        same &= np.linalg.norm(shares[here] - shares[there], axis=-1) < step
-        pairs.append(np.stack([number[here][same], number[there][same]]))
-    ends = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(labels.size, labels.size))
-    return connected_components(graph, directed=False)[1].reshape(labels.shape).astype(np.intp)
 
 
 def _clean(

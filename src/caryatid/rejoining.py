@@ -2,49 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from caryatid.config import FitConfig, SegmentationConfig
-from caryatid.convexity import concave_share, hollowness
+from caryatid.convexity import convex_together
 from caryatid.frames import Array
+from caryatid.kernels.concavity import hollowness
 from caryatid.kernels.gaps import hidden_gaps
 from caryatid.plain_colours import two_colours
 from caryatid.primitives import Fit, Oriented, candidates
 from caryatid.refine import linearise
+from caryatid.samples import Samples
 from caryatid.shapes import Box, Cylinder, Sphere
 
 Labels = NDArray[np.int32]
+Mask = NDArray[np.bool_]
 
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Samples:
-    """A depth image as segmentation samples it.
-
-    Attributes:
-        labels: Part of each sample (H, W), 0 = none.
-        points_camera: (H, W, 3) [m].
-        normals_camera: Unit normals (H, W, 3).
-        height: Over the support surface (H, W) [m].
-        depth: Readings (H, W) [m], 0 = none; of all that is seen, not of parts only.
-        K: Pinhole matrix (3, 3) of this grid [px].
-        rgb: Colours (H, W, 3), or None.
-    """
-
-    labels: Labels
-    points_camera: Array
-    normals_camera: Array
-    height: Array
-    depth: NDArray[np.float32]
-    K: Array
-    rgb: NDArray[np.uint8] | None
+COMPARED = 60
+"""Samples of a part, about, that are compared with another's [1]; bounds time."""
 
 
 def rejoin(
-    samples: Samples, config: SegmentationConfig, fit_config: FitConfig, rng: np.random.Generator
+    samples: Samples,
+    part: Labels,
+    config: SegmentationConfig,
+    fit_config: FitConfig,
+    rng: np.random.Generator,
 ) -> Labels:
     """Join parts that one shape explains as well as each alone.
 
@@ -55,85 +42,83 @@ def rejoin(
     two colours are two objects.
 
     Args:
-        samples: The view's parts.
+        samples: Samples N of a view.
+        part: Part of each (N,), 0 = none.
         config: Tolerances.
         fit_config: Limits of the shapes.
         rng: Draws the samples of the fits.
 
     Returns:
-        The parts (H, W) with the label of the larger where two were joined.
+        The parts (N,) with the number of the larger where two were joined.
     """
-    labels = _insides_joined(samples, config)
+    part = _insides_joined(samples, part, config)
+    inverse_depth = _inverse_depth(samples, part > 0)
     quick = replace(
         fit_config, hypotheses=config.rejoin_hypotheses, polish=1, max_points=config.rejoin_points
     )
-    fits: dict[int, Fit | None] = {}
+    fits: dict[tuple[int, ...], Fit | None] = {}
     refused: set[tuple[int, int]] = set()
-
-    def fitted(part: int) -> Fit | None:
-        if part not in fits:
-            fits[part] = _fit(samples, labels == part, quick, rng)
-        return fits[part]
-
     while True:
-        for small, large in _pairs(replace(samples, labels=labels), config):
-            if (small, large) in refused:
-                continue
+        pairs = [pair for pair in _pairs(samples, part, inverse_depth, config) if pair not in refused]
+        pairs = [pair for pair in pairs if _may_be_one(samples, part, pair, config)]
+        asked = [key for pair in pairs for key in ((pair[0],), (pair[1],), pair)]
+        needed = [key for key in dict.fromkeys(asked) if key not in fits]
+        found = _fits(samples, [np.isin(part, key) for key in needed], quick, rng)
+        fits.update(zip(needed, found, strict=True))
+        for small, large in pairs:
+            alone = [(part == number, fits[number,]) for number in (small, large)]
+            if _is_one(fits[small, large], alone, samples, config):
+                break
             refused.add((small, large))
-            mine, theirs = labels == small, labels == large
-            if not _convex(samples, mine, theirs, config) or (
-                samples.rgb is not None and two_colours(samples.rgb[mine], samples.rgb[theirs], config)
-            ):
-                continue
-            alone = fitted(small), fitted(large)
-            joint = _fit(samples, mine | theirs, quick, rng)
-            if joint is None or alone[0] is None or alone[1] is None:
-                continue
-            if not _explains(joint, samples, (mine, theirs), (alone[0], alone[1]), config):
-                continue
-            if _seen_empty(joint.shape, samples) > config.rejoin_empty:
-                continue
-            labels[mine] = large
-            fits[large] = joint
-            refused = {pair for pair in refused if large not in pair}
-            break
         else:
-            return labels
+            return part
+        part[part == small] = large
+        refused = {pair for pair in refused if large not in pair}
+        joint = {(large,): fits[small, large]}
+        fits = {key: fit for key, fit in fits.items() if large not in key} | joint
 
 
-def _insides_joined(samples: Samples, config: SegmentationConfig) -> Labels:
+def _insides_joined(samples: Samples, part: Labels, config: SegmentationConfig) -> Labels:
     """Give each hollow part to the neighbour with the longest common border whose top is as high."""
-    labels = samples.labels.copy()
-    count = int(labels.max(initial=0)) + 1
-    masks = [labels == part for part in range(count)]
-    hollow = [hollowness(samples.points_camera[m], samples.normals_camera[m]) for m in masks]
-    top = np.array([np.quantile(samples.height[m], 0.95) if m.any() else 0.0 for m in masks])
-    for part in range(1, count):
-        if not hollow[part] > config.hollow:
-            continue
-        around = ndimage.binary_dilation(masks[part], np.ones((3, 3)), iterations=2) & (labels > 0)
-        border = np.bincount(labels[around], minlength=count)
-        level = (np.abs(top - top[part]) < config.rim) & ~(np.array(hollow) > config.hollow)
-        border[~level] = 0
+    joined, count = part.copy(), int(part.max(initial=0)) + 1
+    hollow = np.zeros(count, dtype=bool)
+    for number in range(1, count):
+        hollow[number] = hollowness(samples.patch(part == number)) > config.hollow
+    if not hollow.any():
+        return joined
+    top = np.array([np.quantile(samples.height[part == k], 0.95) if k else 0.0 for k in range(count)])
+    for number in np.flatnonzero(hollow).tolist():
+        image = samples.image(joined)
+        around = ndimage.binary_dilation(samples.image(part) == number, np.ones((3, 3)), iterations=2)
+        border = np.bincount(image[around], minlength=count)
+        border[hollow | (np.abs(top - top[number]) >= config.rim)] = 0
         border[0] = 0
         if border.max() >= config.rejoin_votes:
-            labels[masks[part]] = int(np.argmax(border))
-    return labels
+            joined[part == number] = np.argmax(border)
+    return joined
 
 
-def _pairs(samples: Samples, config: SegmentationConfig) -> list[tuple[int, int]]:
-    """Pairs (small, large) of parts that may be one, the best connected first."""
-    labels = samples.labels
-    sizes = np.bincount(labels.ravel())
-    inverse_depth = np.zeros(labels.shape)
+def _inverse_depth(samples: Samples, own: Mask) -> Array:
+    """1/z (H, W) [1/m] of all that is seen, 0 = no reading; of the parts' samples as they are evened out."""
+    inverse_depth = np.zeros(samples.depth.shape)
     np.divide(1.0, samples.depth, out=inverse_depth, where=samples.depth > 0.0)
-    own = labels > 0
-    inverse_depth[own] = 1.0 / samples.points_camera[own][:, 2]
-    usual = float(np.median(samples.points_camera[own][:, 2])) if own.any() else 1.0
+    places = samples.places.copy()
+    places[places] = own
+    inverse_depth[places] = 1.0 / samples.points_camera[own, 2]
+    return inverse_depth
+
+
+def _pairs(
+    samples: Samples, part: Labels, inverse_depth: Array, config: SegmentationConfig
+) -> list[tuple[int, int]]:
+    """Pairs (small, large) of parts that may be one, the best connected first."""
+    image, sizes = samples.image(part), np.bincount(part)
+    own = part > 0
+    usual = float(np.median(samples.points_camera[own, 2])) if own.any() else 1.0
     longest = int(config.rejoin_gap * samples.K[0, 0] / usual)
-    votes = hidden_gaps(labels, inverse_depth, config.edge_jump, longest)
+    votes = hidden_gaps(image, inverse_depth, config.edge_jump, longest)
     votes[votes < config.rejoin_votes] = 0
-    touching = _touching(labels, len(sizes))
+    touching = _touching(image, len(sizes))
     small = np.minimum(sizes[:, None], sizes) < config.rejoin_share * (sizes[:, None] + sizes)
     votes += np.where(small & (touching >= config.rejoin_votes), touching, 0)
     first, second = np.nonzero(np.triu(votes[1:, 1:], k=1))
@@ -142,59 +127,58 @@ def _pairs(samples: Samples, config: SegmentationConfig) -> list[tuple[int, int]
     return [(a, b) if (sizes[a], b) < (sizes[b], a) else (b, a) for a, b in pairs]
 
 
-def _touching(labels: Labels, count: int) -> NDArray[np.intp]:
+def _touching(image: Labels, count: int) -> NDArray[np.intp]:
     """Samples (n+1, n+1) along which two parts touch in the image."""
-    votes = np.zeros((count, count), dtype=np.intp)
-    for here, there in ((labels[:, :-1], labels[:, 1:]), (labels[:-1], labels[1:])):
+    votes = np.zeros(count * count, dtype=np.intp)
+    for here, there in ((image[:, :-1], image[:, 1:]), (image[:-1], image[1:])):
         across = (here > 0) & (there > 0) & (here != there)
-        np.add.at(votes, (here[across], there[across]), 1)
-    return votes + votes.T
+        votes += np.bincount(here[across] * count + there[across], minlength=count * count)
+    table = votes.reshape(count, count)
+    return table + table.T
 
 
-def _fit(
-    samples: Samples, mask: NDArray[np.bool_], config: FitConfig, rng: np.random.Generator
-) -> Fit | None:
-    part = Oriented(samples.points_camera[mask], samples.normals_camera[mask])
-    (fits,) = candidates([part], config=config, rngs=[rng])
-    return fits[0] if fits else None
+def _may_be_one(samples: Samples, part: Labels, pair: tuple[int, int], config: SegmentationConfig) -> bool:
+    """Whether hardly a sample of one part rises above the planes of the other, nor their colours differ."""
+    own = [np.flatnonzero(part == number) for number in pair]
+    first, second = (samples.patch(index[:: max(1, len(index) // COMPARED)]) for index in own)
+    if not convex_together(first, second, config.rejoin_concave, config):
+        return False
+    if samples.rgb is None:
+        return True
+    colours = samples.rgb[samples.places]
+    return not two_colours(colours[own[0]], colours[own[1]], config)
 
 
-def _convex(
-    samples: Samples, first: NDArray[np.bool_], second: NDArray[np.bool_], config: SegmentationConfig
+def _fits(
+    samples: Samples, masks: list[Mask], config: FitConfig, rng: np.random.Generator
+) -> list[Fit | None]:
+    """The best shape for each choice (N,) of samples, each from a generator of its own."""
+    parts = [Oriented(samples.points_camera[own], samples.normals_camera[own]) for own in masks]
+    rngs = [np.random.default_rng(seed) for seed in rng.integers(2**63, size=len(masks))]
+    return [found[0] if found else None for found in candidates(parts, config=config, rngs=rngs)]
+
+
+def _is_one(
+    joint: Fit | None, alone: list[tuple[Mask, Fit | None]], samples: Samples, config: SegmentationConfig
 ) -> bool:
-    """Whether hardly a sample of one part rises above the tangent planes of the other."""
-    patches = _thinned(samples, first), _thinned(samples, second)
-    return concave_share(*patches, config) <= config.rejoin_concave
-
-
-def _thinned(samples: Samples, mask: NDArray[np.bool_]) -> tuple[Array, Array]:
-    chosen = np.flatnonzero(mask)
-    chosen = chosen[:: max(1, len(chosen) // 60)]
-    return samples.points_camera.reshape(-1, 3)[chosen], samples.normals_camera.reshape(-1, 3)[chosen]
-
-
-def _explains(
-    joint: Fit,
-    samples: Samples,
-    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]],
-    alone: tuple[Fit, Fit],
-    config: SegmentationConfig,
-) -> bool:
-    """Whether a shape explains nearly as many samples of each part as the part's own shape does."""
+    """Whether a shape explains about as many samples of each part as its own and fills nothing seen empty."""
+    if joint is None or _seen_empty(joint.shape, samples) > config.rejoin_empty:
+        return False
     return all(
-        _explained(joint.shape, samples, mask, config)
-        >= _explained(own.shape, samples, mask, config) - config.rejoin_loss
-        for mask, own in zip(masks, alone, strict=True)
+        fit is not None
+        and _explained(joint.shape, samples, own, config)
+        >= _explained(fit.shape, samples, own, config) - config.rejoin_loss
+        for own, fit in alone
     )
 
 
 def _explained(
-    shape: Box | Cylinder | Sphere, samples: Samples, mask: NDArray[np.bool_], config: SegmentationConfig
+    shape: Box | Cylinder | Sphere, samples: Samples, own: Mask, config: SegmentationConfig
 ) -> float:
     """Share of a part's samples that lie at a shape and face as it does."""
-    distance, J = linearise(shape, samples.points_camera[mask])
+    distance, J = linearise(shape, samples.points_camera[own])
     outward = -J[:, :3] @ shape.T_world_object[:3, :3].T
-    cosine = np.sum(outward * samples.normals_camera[mask], axis=1)
+    cosine = np.sum(outward * samples.normals_camera[own], axis=1)
     return float(((np.abs(distance) < config.rejoin_distance) & (cosine > config.rejoin_cosine)).mean())
 
 
@@ -204,7 +188,7 @@ def _seen_empty(shape: Box | Cylinder | Sphere, samples: Samples) -> float:
     facing = np.einsum("ij,ij->i", points, outward) < 0.0
     points = points[facing & (points[:, 2] > 0.0)]
     u, v = np.rint((points @ samples.K.T)[:, :2] / points[:, 2:]).astype(np.intp).T
-    height, width = samples.labels.shape
+    height, width = samples.depth.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     if not inside.any():
         return 1.0

@@ -1,4 +1,4 @@
-"""Compiled loops over depth images and sample graphs, each beside the plain reference it is held to."""
+"""Compiled loops over depth images, each beside the plain reference it is held to."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from caryatid.frames import Array
 
@@ -226,65 +224,3 @@ def _steadiest(image, planes, radius, limit, trusted):  # type: ignore[no-untype
                         chosen[1, row, col] = slope_v
                         chosen[2, row, col] = here
     return chosen
-
-
-def nearest_seeds(
-    count: int, edges: NDArray[np.intp], costs: Array, seeds: NDArray[np.intp]
-) -> NDArray[np.intp]:
-    """For each node of an undirected graph, which seed (0 … S−1) is nearest along the edges, −1 = none.
-
-    Args:
-        count: Number of nodes N.
-        edges: Pairs of nodes (E, 2).
-        costs: Length of each edge (E,), ≥ 0.
-        seeds: Nodes (S,) to start from.
-    """
-    start, neighbour, length = _adjacency(count, edges, costs)
-    return _spread(start, neighbour, length, np.asarray(seeds, dtype=np.intp))
-
-
-def nearest_seeds_reference(
-    count: int, edges: NDArray[np.intp], costs: Array, seeds: NDArray[np.intp]
-) -> NDArray[np.intp]:
-    """Do as `nearest_seeds` does, by one Dijkstra a seed."""
-    graph = coo_array((np.maximum(costs, 1e-12), (edges[:, 0], edges[:, 1])), shape=(count, count)).tocsr()
-    distance = dijkstra(graph, directed=False, indices=seeds)
-    return np.where(np.isfinite(distance).any(axis=0), np.argmin(distance, axis=0), -1)
-
-
-def _adjacency(
-    count: int, edges: NDArray[np.intp], costs: Array
-) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Neighbour lists: those of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them."""
-    both = coo_array(
-        (np.concatenate([costs, costs]), (edges.T.ravel(), edges[:, ::-1].T.ravel())), shape=(count, count)
-    ).tocsr()
-    return both.indptr.astype(np.intp), both.indices.astype(np.intp), both.data.astype(np.float64)
-
-
-@njit(cache=True)
-def _spread(start, neighbour, length, seeds):  # type: ignore[no-untyped-def]
-    """Relax edges in sweeps back and forth until nothing changes (Bellman and Ford)."""
-    count = len(start) - 1
-    distance = np.full(count, np.inf)
-    owner = np.full(count, -1, np.intp)
-    for k in range(len(seeds)):
-        if distance[seeds[k]] > 0.0:
-            distance[seeds[k]] = 0.0
-            owner[seeds[k]] = k
-    changed, forward = True, True
-    while changed:
-        changed = False
-        for step in range(count):
-            node = step if forward else count - 1 - step
-            best, best_owner = distance[node], owner[node]
-            for j in range(start[node], start[node + 1]):
-                other = neighbour[j]
-                through = distance[other] + length[j]
-                if through < best:
-                    best, best_owner = through, owner[other]
-            if best < distance[node]:
-                distance[node], owner[node] = best, best_owner
-                changed = True
-        forward = not forward
-    return owner
