@@ -1,14 +1,17 @@
 from __future__ import annotations
 
 import time
+from concurrent.futures import ThreadPoolExecutor
 
+import mujoco
 import numpy as np
 import pytest
 
 from caryatid import frames
-from caryatid.contacts import find_contacts, find_gap
+from caryatid.contacts import find_contacts, find_gap, local_frames
 from caryatid.errors import InputError
 from caryatid.frames import Array, rigid
+from caryatid.shape_arrays import shape_arrays
 from caryatid.shapes import Box, Cylinder, Shape, Sphere
 
 
@@ -27,6 +30,34 @@ def random_shapes(count: int, rng: np.random.Generator, side: float) -> list[Sha
         a, b, c = rng.uniform(0.04, 0.15, 3)
         shapes.append([Box(T, np.array([a, b, c])), Cylinder(T, a / 2.0, b), Sphere(T, a / 2.0)][k % 3])
     return shapes
+
+
+def compiled_for(shapes: list[Shape], margins: Array) -> list[tuple[int, int, float]]:
+    """What MuJoCo finds in a model made of these very shapes: (a, b, smallest distance)."""
+    spec = mujoco.MjSpec()
+    for shape, extra in zip(shapes, margins, strict=True):
+        quaternion = np.empty(4)
+        mujoco.mju_mat2Quat(quaternion, shape.T_world_object[:3, :3].ravel())
+        body = spec.worldbody.add_body(pos=shape.T_world_object[:3, 3], quat=quaternion)
+        body.add_freejoint()
+        half = shape.extents / 2.0
+        size = {"box": half, "cylinder": (half[0], half[2], 0.0), "sphere": half}[shape.kind]
+        kind = {"box": mujoco.mjtGeom.mjGEOM_BOX, "cylinder": mujoco.mjtGeom.mjGEOM_CYLINDER}
+        body.add_geom(type=kind.get(shape.kind, mujoco.mjtGeom.mjGEOM_SPHERE), size=size, margin=extra / 2.0)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    found: dict[tuple[int, int], float] = {}
+    for geoms, distance in zip(np.sort(data.contact.geom, axis=1).tolist(), data.contact.dist, strict=True):
+        pair = (geoms[0], geoms[1])
+        found[pair] = min(found.get(pair, np.inf), float(distance))
+    return [(a, b, found[a, b]) for a, b in sorted(found)]
+
+
+def gaps(shapes: list[Shape], margin: float | Array) -> list[tuple[int, int, float]]:
+    return [(c.a, c.b, c.distance) for c in find_contacts(shapes, margin)]
 
 
 def pairs(shapes: list[Shape], margin: float | list[float]) -> list[tuple[int, int]]:
@@ -104,6 +135,53 @@ def test_distance_and_points_agree_with_signed_distance() -> None:
                 apart = a.signed_distance(contact.points_world) + b.signed_distance(contact.points_world)
                 assert apart.min() == pytest.approx(contact.distance, abs=5e-4)
     assert seen > 10
+
+
+def test_one_search_after_another_finds_what_a_model_of_the_shapes_alone_does() -> None:
+    rng = np.random.default_rng(11)
+    touching = 0
+    for count in (30, 3, 17, 2, 70, 16):
+        shapes = random_shapes(count, rng, 0.05 * count ** (1.0 / 3.0))
+        margins = rng.uniform(0.0, 0.02, count)
+        expected = compiled_for(shapes, margins)
+        found = gaps(shapes, margins)
+        assert [f[:2] for f in found] == [e[:2] for e in expected]
+        np.testing.assert_allclose([f[2] for f in found], [e[2] for e in expected], atol=1e-12)
+        touching += len(found)
+    assert touching > 100
+
+
+def test_threads_do_not_disturb_each_other() -> None:
+    rng = np.random.default_rng(12)
+    scenes = [random_shapes(25, rng, 0.15) for _ in range(40)]
+    alone = [gaps(shapes, 0.01) for shapes in scenes]
+    with ThreadPoolExecutor(4) as pool:
+        assert list(pool.map(lambda shapes: gaps(shapes, 0.01), scenes)) == alone
+
+
+def test_the_point_of_a_contact_is_in_the_middle_of_its_points() -> None:
+    (contact,) = find_contacts([cube(0, 0, 0), cube(0.03, 0.02, 0.1)], 0.005)
+    assert len(contact.points_world) > 1
+    np.testing.assert_allclose(contact.point_world, contact.points_world.mean(axis=0))
+
+
+def test_contacts_in_the_frames_of_both_shapes() -> None:
+    rng = np.random.default_rng(13)
+    shapes = random_shapes(12, rng, 0.1)
+    contacts = find_contacts(shapes, 0.02)
+    points, outward = local_frames(
+        shape_arrays(shapes),
+        np.array([(c.a, c.b) for c in contacts]),
+        np.array([c.point_world for c in contacts]),
+        np.array([c.normal_world for c in contacts]),
+    )
+    for k, contact in enumerate(contacts):
+        for side, (index, sign) in enumerate(((contact.a, 1.0), (contact.b, -1.0))):
+            T = frames.invert(shapes[index].T_world_object)
+            np.testing.assert_allclose(points[k, side], frames.transform(T, contact.point_world), atol=1e-12)
+            np.testing.assert_allclose(
+                outward[k, side], sign * frames.rotate(T, contact.normal_world), atol=1e-12
+            )
 
 
 def test_gap_of_shapes_far_apart() -> None:
