@@ -10,7 +10,7 @@ from caryatid import frames
 from caryatid.config import PlausibilityConfig
 from caryatid.contacts import find_contacts, find_gap
 from caryatid.graph import SceneObject
-from caryatid.plausibility import reconcile
+from caryatid.plausibility import closing, reconcile
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.uncertainty import Uncertainty
 
@@ -92,6 +92,34 @@ def test_without_uncertainty_or_rounds_nothing_moves():
     sure = [TABLE, block(1, (0, 0, 0.048), (0.1, 0.1, 0.1), unsure(0.01))]
     off = replace(CONFIG, rounds=0)
     np.testing.assert_array_equal(reconcile(sure, off)[1].centre_world, sure[1].centre_world)
+
+
+@pytest.mark.parametrize("count", [5, 60, 250])
+def test_gaps_close_as_the_dense_filter_says(count):
+    rng = np.random.default_rng(count)
+    objects = count // 2 + 2
+    first = rng.integers(0, objects - 1, count)
+    pairs = np.stack([first, first + rng.integers(1, objects - first)], axis=1)
+    rows, gaps = rng.normal(size=(count, 2, 9)), rng.normal(0.0, 0.003, count)
+    variance = rng.uniform(0.0, 1e-5, (objects, 9))
+    variance[0] = 0.0
+    J = np.zeros((count, objects, 9))
+    for k, pair in enumerate(pairs):
+        J[k, pair] = rows[k]
+    J = J.reshape(count, -1)
+    scatter = (J * variance.ravel()) @ J.T + 1e-6 * np.eye(count)
+    expected = variance * (J.T @ np.linalg.solve(scatter, gaps)).reshape(objects, 9)
+    change = closing(pairs, rows, variance, gaps, 1e-6)
+    np.testing.assert_allclose(change, expected, atol=1e-12)
+    np.testing.assert_array_equal(change[0], 0.0)
+
+
+def test_what_is_not_in_the_wrong_place_stays_the_object_it_is():
+    aside = block(3, (0.4, 0.4, 0.05), (0.1, 0.1, 0.1), unsure())
+    sunk = block(1, (0.0, 0.0, 0.048), (0.1, 0.1, 0.1), unsure(0.003))
+    _, moved, same = reconcile([TABLE, sunk, aside], CONFIG)
+    assert moved.shape is not sunk.shape
+    assert same is aside
 
 
 def test_the_correction_moves_with_the_scene():

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.linalg import spsolve
 
 from caryatid import frames
 from caryatid.config import PlausibilityConfig
-from caryatid.contacts import Contact, find_contacts
+from caryatid.contacts import Contact, find_contacts, local_frames
 from caryatid.frames import Array
 from caryatid.graph import SceneObject
+from caryatid.shape_arrays import shape_arrays
 from caryatid.shapes import Box, Cylinder, Sphere
 
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Freedom:
-    """How an object may change: V independent variables, what they do to its pose and size, and by how much.
-
-    Attributes:
-        effect: Translation [m], rotation [rad] and change of the half extents [m], in the object's frame,
-            of each variable (9, V).
-        sigma: Standard deviation of each (V,).
-    """
-
-    effect: Array
-    sigma: Array
+_FEW = 100
+"""Gaps up to which a dense matrix is solved faster than a sparse one, whose cost follows their number [1]."""
 
 
 def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> list[SceneObject]:
@@ -45,53 +38,68 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
         The objects in the same order, `doubt` telling what could not be explained.
     """
     done = list(objects)
-    freedoms = [_freedom(o) for o in objects]
+    sigma = np.array([_sigma(o) for o in objects]).reshape(-1, 9)
+    variance = sigma**2
     doubts: dict[int, str] = {}
     for number in range(config.rounds):
         contacts = find_contacts([o.shape for o in done], config.reach)
         wrong = [c for c in contacts if c.distance < -config.touch] + _floating(done, contacts, config)
         if not wrong:
             break
-        rows = np.stack([_row(done, freedoms, c) for c in wrong])
-        variance = np.concatenate([f.sigma for f in freedoms]) ** 2
+        pairs = np.array([(c.a, c.b) for c in wrong], dtype=np.intp)
         gaps = np.array([c.distance for c in wrong])
-        explained = np.abs(gaps) <= config.sigmas * np.sqrt((rows**2) @ variance + config.touch**2)
+        rows = _rows(done, wrong, pairs)
+        scatter = np.einsum("kpv,kpv->k", rows**2, variance[pairs]) + config.touch**2
+        explained = np.abs(gaps) <= config.sigmas * np.sqrt(scatter)
         if number == 0:
             doubts = _doubts(done, [c for c, fine in zip(wrong, explained, strict=True) if not fine])
         if not explained.any():
             break
-        rows, gaps = rows[explained], gaps[explained]
-        scatter = (rows * variance) @ rows.T + config.touch**2 * np.eye(len(rows))
-        change = variance * (rows.T @ np.linalg.solve(scatter, gaps))
-        ends = np.cumsum([len(f.sigma) for f in freedoms])
-        for k, part in enumerate(np.split(change, ends[:-1])):
-            if len(part):
-                done[k] = replace(done[k], shape=_changed(done[k].shape, freedoms[k].effect @ part, config))
-    return [replace(o, doubt=doubts.get(k, "")) for k, o in enumerate(done)]
+        change = closing(pairs[explained], rows[explained], variance, gaps[explained], config.touch**2)
+        for k in np.flatnonzero(change.any(axis=1)):
+            shape = done[k].shape
+            done[k] = replace(done[k], shape=_changed(shape, _EFFECT[shape.kind] @ change[k], config))
+    said = [doubts.get(k, "") for k in range(len(done))]
+    return [o if o.doubt == doubt else replace(o, doubt=doubt) for o, doubt in zip(done, said, strict=True)]
 
 
-def _freedom(o: SceneObject) -> _Freedom:
-    known = o.uncertainty
-    if known is None or o.role == "support_surface":
-        return _Freedom(np.zeros((9, 0)), np.zeros(0))
-    effect, sigma = np.zeros((9, 9)), np.empty(9)
-    effect[3:6, 3:6], sigma[3:6] = np.eye(3), known.rotation
-    for axis, round_ in enumerate(_ROUND[o.shape.kind]):
+def _effect(kind: str) -> Array:
+    """What each of an object's independent variables (9,) does to it.
+
+    Returns:
+        Translation [m], rotation [rad] and change of the half extents [m], in the object's frame (9, 9).
+    """
+    effect = np.zeros((9, 9))
+    effect[3:6, 3:6] = np.eye(3)
+    for axis, round_ in enumerate(_ROUND[kind]):
         if round_:
             # What is round moves as a whole, and its radius is one number.
-            effect[axis, axis], sigma[axis] = 1.0, known.position[axis]
-            sigma[6 + axis] = 0.0 if axis else known.sizes[0] / 2.0
+            effect[axis, axis] = 1.0
         else:
             effect[[axis, 6 + axis], axis] = -0.5, 0.5
             effect[[axis, 6 + axis], 6 + axis] = 0.5, 0.5
-            sigma[axis], sigma[6 + axis] = known.sides[2 * axis], known.sides[2 * axis + 1]
-    if _ROUND[o.shape.kind][0]:
-        effect[6:9, 6] = _ROUND[o.shape.kind]
-    return _Freedom(effect, sigma)
+    if _ROUND[kind][0]:
+        effect[6:9, 6] = _ROUND[kind]
+    return effect
 
 
 _ROUND = {"box": (False, False, False), "cylinder": (True, True, False), "sphere": (True, True, True)}
 """Along which axes a shape's two sides are one round surface."""
+_EFFECT = {kind: _effect(kind) for kind in _ROUND}
+
+
+def _sigma(o: SceneObject) -> Array:
+    """Standard deviation of each of an object's independent variables (9,); zero where it cannot change."""
+    sigma = np.zeros(9)
+    known = o.uncertainty
+    if known is None or o.role == "support_surface":
+        return sigma
+    sigma[0:3], sigma[3:6], sigma[6:9] = known.sides[0::2], known.rotation, known.sides[1::2]
+    round_ = sum(_ROUND[o.shape.kind])
+    if round_:
+        sigma[:round_], sigma[6 : 6 + round_] = known.position[:round_], 0.0
+        sigma[6] = known.sizes[0] / 2.0
+    return sigma
 
 
 def _floating(
@@ -108,20 +116,52 @@ def _floating(
     return [c for c in nearest.values() if c.distance > config.touch]
 
 
-def _row(objects: Sequence[SceneObject], freedoms: Sequence[_Freedom], contact: Contact) -> Array:
-    """How much (all V,) each variable of each object closes the gap of a contact."""
-    parts = [np.zeros(len(f.sigma)) for f in freedoms]
-    point_world = contact.points_world.mean(axis=0)
-    for k, outward_world in ((contact.a, contact.normal_world), (contact.b, -contact.normal_world)):
-        shape = objects[k].shape
-        T_object_world = frames.invert(shape.T_world_object)
-        p, u = frames.transform(T_object_world, point_world), frames.rotate(T_object_world, outward_world)
-        sizes = np.abs(u)
-        if any(_ROUND[shape.kind]):
-            round_ = np.array(_ROUND[shape.kind])
-            sizes[round_] = (np.linalg.norm(u[round_]), 0.0, 0.0)[: round_.sum()]
-        parts[k] = np.concatenate([u, np.cross(p, u), sizes]) @ freedoms[k].effect
-    return np.concatenate(parts)
+def _rows(objects: Sequence[SceneObject], contacts: Sequence[Contact], pairs: NDArray[np.intp]) -> Array:
+    """How much (K, 2, 9) each variable of the two objects of a contact closes its gap."""
+    points_world = np.array([c.point_world for c in contacts])
+    normals_world = np.array([c.normal_world for c in contacts])
+    shapes = [o.shape for o in objects]
+    p, u = local_frames(shape_arrays(shapes), pairs, points_world, normals_world)
+    round_ = np.array([_ROUND[s.kind] for s in shapes])[pairs]
+    sizes = np.where(round_, 0.0, np.abs(u))
+    sizes[..., 0] += np.linalg.norm(np.where(round_, u, 0.0), axis=-1)
+    effects = np.array([_EFFECT[s.kind] for s in shapes])[pairs]
+    rows: Array = np.einsum("kpi,kpij->kpj", np.concatenate([u, np.cross(p, u), sizes], axis=-1), effects)
+    return rows
+
+
+def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, noise: float) -> Array:
+    """Most likely change (N, V) of N objects' variables that closes gaps: the update of a Kalman filter.
+
+    Args:
+        pairs: The two objects of each gap (K, 2).
+        rows: How much (K, 2, V) each variable of the two closes it.
+        variance: Of each variable (N, V); zero for what cannot change.
+        gaps: (K,).
+        noise: Variance of a gap that is closed.
+    """
+    weighted = rows * variance[pairs]
+    if len(pairs) <= _FEW:
+        ends = pairs.ravel()
+        shared = np.where(ends[:, None] == ends, _ends(weighted) @ _ends(rows).T, 0.0)
+        scatter = shared.reshape(len(pairs), 2, len(pairs), 2).sum(axis=(1, 3)) + noise * np.eye(len(pairs))
+        solved = np.linalg.solve(scatter, gaps)
+    else:
+        size = variance.shape[1]
+        columns = (pairs[:, :, None] * size + np.arange(size)).ravel()
+        starts = np.arange(0, rows.size + 1, 2 * size)
+        left, right = (
+            csr_array((a.ravel(), columns, starts), (len(pairs), variance.size)) for a in (weighted, rows)
+        )
+        solved = spsolve((left @ right.T + noise * eye_array(len(pairs))).tocsc(), gaps)
+    change = np.zeros(variance.shape)
+    np.add.at(change, pairs, weighted * solved[:, None, None])
+    return change
+
+
+def _ends(rows: Array) -> Array:
+    """Both ends of each pair one after another (2 K, V)."""
+    return rows.reshape(-1, rows.shape[-1])
 
 
 def _changed(
