@@ -12,9 +12,13 @@ from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.frames import Array, rigid
 from caryatid.graph import SceneObject, SupportGraph
+from caryatid.kernels.polygons import area, hull
+from caryatid.shape_arrays import shape_arrays
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.stability import (
     assess,
+    beneath,
+    centroid,
     contact_patch,
     drop_distance,
     find_tipping,
@@ -310,9 +314,10 @@ def test_inputs_stay_as_they_were() -> None:
 def test_contact_patch_is_the_common_area() -> None:
     lower, upper = block(0, 0, 0, (0.1, 0.1, 0.1)), block(0.06, 0.02, 0.1, (0.1, 0.1, 0.05))
     patch = contact_patch(upper, lower, np.array([0.0, 0.0, 1.0]), np.zeros((1, 3)), CONFIG)
-    assert patch.bounds == pytest.approx((0.01, -0.03, 0.05, 0.05))
-    assert ground_outline(upper).area == pytest.approx(0.01)
-    verdict = assess(upper, [patch], CONFIG)
+    assert (*patch.min(axis=0), *patch.max(axis=0)) == pytest.approx((0.01, -0.03, 0.05, 0.05))
+    assert area(ground_outline(upper)) == pytest.approx(0.01)
+    polygon = support_polygon([patch])
+    verdict = assess(upper, polygon, find_tipping(upper, polygon), CONFIG)
     assert verdict.ratio == pytest.approx(0.32)
     assert verdict.overhang == pytest.approx(0.01)
     assert verdict.tips
@@ -323,17 +328,53 @@ def test_contact_patch_of_a_ball_is_a_small_disc() -> None:
     ball = Sphere(at(0, 0, 0.04), 0.04)
     patch = contact_patch(ball, TABLE, np.array([0.0, 0.0, 1.0]), np.zeros((1, 3)), CONFIG)
     depth = CONFIG.patch_depth
-    assert patch.area == pytest.approx(np.pi * depth * (0.08 - depth), rel=0.01)
+    assert area(patch) == pytest.approx(np.pi * depth * (0.08 - depth), rel=0.01)
     assert find_tipping(ball, patch).overhang < 0.0
 
 
 def test_tipping_points_away_from_the_polygon() -> None:
     plank = counterweight()[2].shape
-    tipping = find_tipping(plank, support_polygon([shapely.box(-0.05, -0.03, 0.05, 0.03)]))
+    square = np.array([[0.05, -0.03], [0.05, 0.03], [-0.05, 0.03], [-0.05, -0.03]])
+    tipping = find_tipping(plank, support_polygon([square]))
     np.testing.assert_allclose(tipping.pivot_xy, (0.05, 0.0), atol=1e-9)
     np.testing.assert_allclose(tipping.direction_xy, (1.0, 0.0), atol=1e-9)
-    inside = find_tipping(plank, support_polygon([shapely.box(0.0, -0.03, 0.2, 0.03)]))
+    inside = find_tipping(plank, support_polygon([square * (2.0, 1.0) + (0.1, 0.0)]))
     assert inside.overhang == pytest.approx(-0.03)
+    nothing = find_tipping(plank, support_polygon([]))
+    assert nothing.overhang == np.inf
+    assert not nothing.direction_xy.any()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8])
+def test_the_centre_of_a_polygon_is_that_of_its_area_or_else_of_its_border(count: int) -> None:
+    points = np.random.default_rng(count).normal(size=(count, 2))
+    exact = shapely.MultiPoint(points).convex_hull
+    np.testing.assert_allclose(centroid(hull(points)), exact.centroid.coords[0], atol=1e-12)
+    line = np.arange(count)[:, None] * (0.5, 0.25)
+    np.testing.assert_allclose(centroid(hull(line)), line.mean(axis=0))
+
+
+def test_what_a_falling_shape_meets_lies_beneath_it() -> None:
+    rng = np.random.default_rng(4)
+    met = spared = 0
+    for _ in range(10):
+        shapes = [
+            (Box, Cylinder, Sphere)[k % 3](
+                rigid(frames.random_rotation(rng), rng.uniform(-0.15, 0.15, 3)),
+                *((rng.uniform(0.03, 0.1, 3),), (0.03, 0.08), (0.04,))[k % 3],
+            )
+            for k in range(8)
+        ]
+        for k, shape in enumerate(shapes):
+            below = beneath(shape_arrays(shapes), k, 0.05)
+            assert k not in below
+            for m, other in enumerate(shapes):
+                if m != k and np.isfinite(drop_distance(shape, other, 0.05)):
+                    assert m in below
+                    met += 1
+            spared += len(shapes) - 1 - len(below)
+    assert met > 20
+    assert spared > met
 
 
 def test_drop_distance() -> None:

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
-import shapely.ops
-from shapely.geometry.base import BaseGeometry
+from numpy.typing import NDArray
 
 from caryatid import frames
 from caryatid.config import SupportConfig
 from caryatid.frames import Array
 from caryatid.graph import Stability
+from caryatid.kernels import polygons
+from caryatid.kernels.fitting import signed_distances
+from caryatid.shape_arrays import ShapeArrays, boxes_around, shape_arrays
 from caryatid.shapes import Shape
 
-_RING = 48
-"""Corners of the polygon that stands for the rim of a ball's cap; 0.2 % of its radius off."""
+_UP = np.array([0.0, 0.0, 1.0])
+_NO_AREA = 1e-12
+"""Contact areas below this are lines and points, blurred by rounding [m²]; a micrometre squared."""
+_CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in 2.0 * np.pi * np.arange(48) / 48])
+"""Polygon (48, 2) that stands for the rim of a ball's cap; 0.2 % of its radius off."""
+_SIDES = 24
+"""Sides of the prism that stands for a cylinder; 1 % of its radius off."""
 _MARCH_POINTS = 16
 """Surface points along the longest side of a shape that is let down."""
 _MARCH_STEPS = 40
@@ -41,15 +48,36 @@ class Tipping:
     direction_xy: Array
 
 
-def ground_outline(shape: Shape) -> BaseGeometry:
-    """P_A: the polygon [m] the shape's extent projects to on the ground."""
-    return _hull(_cap(shape, np.array([0.0, 0.0, 1.0]), np.inf))
+def _cube() -> tuple[Array, NDArray[np.int64]]:
+    """Corners (8, 3) and edges (12, 2) of a cube of half extent 1."""
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    return corners, np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+
+
+def _prism() -> tuple[Array, NDArray[np.int64]]:
+    """Corners (48, 3) and edges (72, 2) of a prism of radius and half height 1."""
+    angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    ring = np.stack([np.cos(angle), np.sin(angle), np.ones(_SIDES)], axis=-1)
+    low, after = np.arange(_SIDES) + _SIDES, (np.arange(_SIDES) + 1) % _SIDES
+    ends = [(low - _SIDES, low), (low - _SIDES, after), (low, after + _SIDES)]
+    return np.concatenate([ring, ring * (1.0, 1.0, -1.0)]), np.concatenate(
+        [np.stack(e, axis=-1) for e in ends]
+    )
+
+
+_SOLIDS = {"box": _cube(), "cylinder": _prism()}
+"""Corners, in half extents, and edges of the solids that stand for shapes."""
+
+
+def ground_outline(shape: Shape) -> Array:
+    """P_A: the polygon (M, 2) [m] the shape's extent projects to on the ground."""
+    return _cap(shape, _UP, np.inf)
 
 
 def contact_patch(
     shape: Shape, other: Shape, normal_world: Array, points_world: Array, config: SupportConfig
-) -> BaseGeometry:
-    """Project to the ground the area [m] over which two shapes touch.
+) -> Array:
+    """Project to the ground the area over which two shapes touch: a polygon (M, 2) [m].
 
     What of each shape lies within `patch_depth` of its extreme point along the normal counts as touching, and
     a little more on long shapes, so that faces a fit has turned against each other still touch all over.
@@ -62,9 +90,11 @@ def contact_patch(
         config: `patch_depth` and `patch_tilt`.
     """
     depth = _touching_depth(shape, config)
-    cap = _hull(_cap(shape, -normal_world, depth))
-    patch = cap.intersection(_hull(_cap(other, normal_world, min(depth, _touching_depth(other, config)))))
-    return patch if patch.area > 0.0 else _hull(points_world)
+    upper = _cap(shape, -normal_world, depth)
+    patch = polygons.intersection(
+        upper, _cap(other, normal_world, min(depth, _touching_depth(other, config)))
+    )
+    return patch if polygons.area(patch) > _NO_AREA else polygons.hull(points_world)
 
 
 def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
@@ -76,37 +106,50 @@ def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
     apart = float(np.linalg.norm(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3]))
     if apart > (np.linalg.norm(shape.extents) + np.linalg.norm(other.extents)) / 2.0:
         return float(np.inf)
-    down, up = np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])
-    return min(_march(shape, other, down, limit), _march(other, shape, up, limit))
+    return min(_march(shape, other, -_UP, limit), _march(other, shape, _UP, limit))
 
 
-def support_polygon(patches: Sequence[BaseGeometry]) -> BaseGeometry:
-    """P_s: the convex hull of the contact areas."""
-    return shapely.GeometryCollection(list(patches)).convex_hull
+def beneath(shapes: ShapeArrays, index: int, limit: float) -> list[int]:
+    """Indices of the shapes that one could meet, by their boxes, when it falls down by a limit [m]."""
+    low, high = boxes_around(shapes)
+    near = 2.0 * _MARCH_HIT
+    below = (low[index, 2] - limit <= high[:, 2] + near) & (high[index, 2] >= low[:, 2] - near)
+    apart = np.maximum(low[:, :2] - high[index, :2], low[index, :2] - high[:, :2]).max(axis=1)
+    return [int(k) for k in np.flatnonzero(below & (apart <= near)) if k != index]
 
 
-def find_tipping(shape: Shape, polygon: BaseGeometry) -> Tipping:
-    """Where the centre of mass (the shape's centre) projects against the support polygon."""
+def support_polygon(patches: Sequence[Array]) -> Array:
+    """P_s: the convex hull (M, 2) [m] of the contact areas."""
+    return polygons.hull(np.concatenate([np.empty((0, 2)), *patches]))
+
+
+def find_tipping(shape: Shape, polygon: Array) -> Tipping:
+    """Where the centre of mass (the shape's centre) projects against the support polygon (M, 2) [m]."""
     centre_xy = shape.T_world_object[:2, 3]
-    if polygon.is_empty:
+    if not len(polygon):
         return Tipping(np.inf, centre_xy, np.zeros(2))
-    point = shapely.Point(centre_xy)
-    border = polygon.exterior if polygon.geom_type == "Polygon" else polygon
-    pivot = shapely.get_coordinates(shapely.ops.nearest_points(border, point)[0])[0]
-    outward = 1.0 if polygon.distance(point) > 0.0 or polygon.geom_type != "Polygon" else -1.0
-    return Tipping(outward * float(border.distance(point)), pivot, frames.unit(outward * (centre_xy - pivot)))
+    distance, x, y, inside = polygons.nearest_on_border(polygon, centre_xy[0], centre_xy[1])
+    overhang, pivot_xy = -distance if inside else distance, np.array([x, y])
+    direction_xy = (centre_xy - pivot_xy) / overhang if overhang else np.zeros(2)
+    return Tipping(overhang, pivot_xy, direction_xy)
 
 
-def assess(shape: Shape, patches: Sequence[BaseGeometry], config: SupportConfig) -> Stability:
-    """Both tests of an object that rests on these contact areas: r_s of eq. 1 and the centre of mass."""
-    polygon = support_polygon(patches)
-    ratio = min(1.0, polygon.area / ground_outline(shape).area)
-    overhang = find_tipping(shape, polygon).overhang
+def assess(shape: Shape, polygon: Array, tipping: Tipping, config: SupportConfig) -> Stability:
+    """Both tests of an object that rests on a support polygon: r_s of eq. 1 and the centre of mass."""
+    ratio = min(1.0, polygons.area(polygon) / polygons.area(ground_outline(shape)))
+    overhang = tipping.overhang
     return Stability(ratio, overhang, ratio < config.min_area_ratio, overhang > config.overhang)
 
 
-def _hull(points_world: Array) -> BaseGeometry:
-    return shapely.MultiPoint(points_world[:, :2]).convex_hull
+def centroid(polygon: Array) -> Array:
+    """Centre (2,) [m] of a polygon (M, 2), or of the border of one without area."""
+    x, y = polygon.T - polygon[:1].T
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    after = np.roll(polygon, -1, axis=0)
+    if cross.sum() > 2.0 * _NO_AREA:
+        return polygon[0] + cross @ (polygon + after - 2.0 * polygon[0]) / (3.0 * cross.sum())
+    length = np.linalg.norm(after - polygon, axis=1)
+    return length @ (polygon + after) / (2.0 * length.sum()) if length.sum() > 0.0 else polygon[0]
 
 
 def _touching_depth(shape: Shape, config: SupportConfig) -> float:
@@ -118,15 +161,16 @@ def _touching_depth(shape: Shape, config: SupportConfig) -> float:
 
 def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) -> float:
     """Way [m] until the first surface point meets the target; what touches at once lies beside it."""
+    own, aim = zip(*shape_arrays([shape, target]), strict=True)
     spacing = float(shape.extents.max()) / _MARCH_POINTS
     corners_world = shape.outline() if shape.kind != "sphere" else np.empty((0, 3))
     points_world = np.concatenate([shape.surface(spacing)[0], corners_world])
-    in_front = shape.signed_distance(points_world + 2.0 * _MARCH_HIT * direction_world) > _MARCH_HIT
-    points_world = points_world[in_front & (target.signed_distance(points_world) > _MARCH_HIT)]
+    in_front = signed_distances(*own, points_world + 2.0 * _MARCH_HIT * direction_world) > _MARCH_HIT
+    points_world = points_world[in_front & (signed_distances(*aim, points_world) > _MARCH_HIT)]
     travelled = np.zeros(len(points_world))
     step = np.full(len(points_world), np.inf)
     for _ in range(_MARCH_STEPS):
-        step = target.signed_distance(points_world + travelled[:, None] * direction_world)
+        step = signed_distances(*aim, points_world + travelled[:, None] * direction_world)
         on_its_way = (travelled + step <= limit) & (step > -_MARCH_HIT)
         points_world, step = points_world[on_its_way], step[on_its_way]
         travelled = travelled[on_its_way] + step
@@ -136,26 +180,26 @@ def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) ->
 
 
 def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
-    """Points (N, 3) [m] whose hull is the part of the shape within `depth` of its extreme point that way."""
+    """Outline on the ground (M, 2) [m] of what lies within `depth` of a shape's extreme point that way."""
     if shape.kind == "sphere":
-        return _ball_cap(shape, direction_world, depth)
-    corners_world = shape.outline()
-    below = (corners_world @ direction_world) - (corners_world @ direction_world).max() + depth
-    inside, outside = corners_world[below >= 0.0], corners_world[below < 0.0]
-    if not len(outside):
-        return inside
-    above, under = below[below >= 0.0][:, None, None], below[below < 0.0][None, :, None]
-    share = above / (above - under)
-    rim = inside[:, None] + share * (outside[None] - inside[:, None])
-    return np.concatenate([inside, rim.reshape(-1, 3)])
+        return polygons.hull(_ball_cap(shape, direction_world, depth))
+    corners, edges = _SOLIDS[shape.kind]
+    corners_world = frames.transform(shape.T_world_object, corners * (shape.extents / 2.0))
+    return polygons.cap(corners_world, edges, direction_world, depth)
 
 
-def _ball_cap(shape: Shape, direction_world: Array, depth: float) -> Array:
-    radius = float(shape.extents[0]) / 2.0
+def _ball_cap(ball: Shape, direction_world: Array, depth: float) -> Array:
+    """Rim (48, 2) [m] of a ball's cap, or of its middle where the cap is deeper, laid onto the ground."""
+    radius = float(ball.extents[0]) / 2.0
     depth = min(depth, radius)
-    R_world_object = shape.T_world_object[:3, :3]
-    u = R_world_object @ frames.perpendicular(direction_world @ R_world_object)
-    v = np.cross(direction_world, u)
-    angle = 2.0 * np.pi * np.arange(_RING)[:, None] / _RING
-    rim = np.sqrt(depth * (2.0 * radius - depth)) * (np.cos(angle) * u + np.sin(angle) * v)
-    return shape.T_world_object[:3, 3] + (radius - depth) * direction_world + rim
+    x, y, z = direction_world.tolist()
+    R_world_object = ball.T_world_object[:3, :3]
+    turned = direction_world @ R_world_object
+    least = int(np.argmin(np.abs(turned)))
+    across = np.zeros(3)
+    across[(least + 1) % 3], across[(least + 2) % 3] = turned[(least + 2) % 3], -turned[(least + 1) % 3]
+    u = R_world_object @ across / math.sqrt(across @ across)
+    v_xy = np.array([y * u[2] - z * u[1], z * u[0] - x * u[2]])
+    wide = math.sqrt(depth * (2.0 * radius - depth))
+    middle_xy = ball.T_world_object[:2, 3] + (radius - depth) * direction_world[:2]
+    return middle_xy + wide * (_CIRCLE @ np.stack([u[:2], v_xy]))

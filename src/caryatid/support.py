@@ -6,17 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from shapely.geometry.base import BaseGeometry
 
 from caryatid import frames
 from caryatid.config import SupportConfig
-from caryatid.contacts import Contact, find_contacts, find_gap
+from caryatid.contacts import Contact, find_contacts, find_gap, local_frames
 from caryatid.errors import InputError
 from caryatid.frames import Array, rigid
 from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.shape_arrays import shape_arrays
 from caryatid.stability import (
     Tipping,
     assess,
+    beneath,
+    centroid,
     contact_patch,
     drop_distance,
     find_tipping,
@@ -33,8 +35,8 @@ class Touch:
         normal_world: Unit normal (3,) of the separating plane, pointing away from `other`.
         gap: [m], negative where they overlap.
         tilt: Angle of the normal to the vertical [deg]; below 90 where `other` is the lower one.
+        points_world: Contact points (K, 3) [m].
         point_world: Centre (3,) [m] of the contact.
-        patch: Contact area projected to the ground [m].
         margin: Gap up to which the two are taken to touch [m].
     """
 
@@ -42,8 +44,8 @@ class Touch:
     normal_world: Array
     gap: float
     tilt: float
+    points_world: Array
     point_world: Array
-    patch: BaseGeometry
     margin: float
 
     def __str__(self) -> str:
@@ -68,6 +70,7 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
     if len({o.id for o in objects}) < len(objects):
         raise InputError("objects", "two of them have the same id", "give every object an id of its own")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
+    shapes = shape_arrays([o.shape for o in ordered])
     touches = _find_touches(ordered, config)
     supported = [o for o in ordered if o.role != "support_surface"]
     carried: dict[str, tuple[list[Support], Tipping]] = {}
@@ -75,9 +78,12 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
     for o in supported:
         supports, patches = _from_below(o, touches[o.id], config)
         if not supports:
-            supports, patches = _let_down(o, ordered, config)
-        carried[o.id] = supports, find_tipping(o.shape, support_polygon(patches))
-        stability[o.id] = assess(o.shape, patches, config)
+            near = [ordered[k] for k in beneath(shapes, ordered.index(o), config.max_drop)]
+            supports, patches = _let_down(o, near, config)
+        polygon = support_polygon(patches)
+        tipping = find_tipping(o.shape, polygon)
+        carried[o.id] = supports, tipping
+        stability[o.id] = assess(o.shape, polygon, tipping, config)
     edges: list[Support] = []
     for o in supported:
         supports, tipping = carried[o.id]
@@ -118,13 +124,12 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
     a, b = graph[supporter], graph[supported]
     if b.role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
-    contact = next(iter(find_contacts([a.shape, b.shape], config.reach)), None)
+    touch = next(iter(_find_touches([a, b], config)[b.id]), None)
     head = f"{supporter} does not support {supported}: "
-    if contact is None:
+    if touch is None:
         gap = _gap(find_gap(a.shape, b.shape))
         limits = f"margin {_mm(config.contact_margin)}, {_mm(config.reach)} where it is needed"
         return f"{head}they do not touch, {gap} ({limits})."
-    touch = _touch(a, b, contact, config)
     stability = graph.stability.get(supported)
     verdict = _verdict(supported, stability, config) if stability else f"how {supported} stands is not known"
     if touch.tilt >= 180.0 - config.max_tilt:
@@ -136,38 +141,51 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
 
 
 def _find_touches(objects: Sequence[SceneObject], config: SupportConfig) -> dict[str, list[Touch]]:
+    """What touches each object, by id."""
     touches: dict[str, list[Touch]] = {o.id: [] for o in objects}
-    for contact in find_contacts([o.shape for o in objects], config.reach):
-        a, b = objects[contact.a], objects[contact.b]
-        touches[b.id].append(_touch(a, b, contact, config))
-        touches[a.id].append(_touch(b, a, _swapped(contact), config))
+    for a, b, touch in _touching(objects, find_contacts([o.shape for o in objects], config.reach), config):
+        touches[b.id].append(touch)
+        touches[a.id].append(
+            replace(touch, other=b, normal_world=-touch.normal_world, tilt=180.0 - touch.tilt)
+        )
     return touches
 
 
-def _swapped(contact: Contact) -> Contact:
-    return Contact(contact.b, contact.a, contact.points_world, -contact.normal_world, contact.distance)
+def _touching(
+    objects: Sequence[SceneObject], contacts: Sequence[Contact], config: SupportConfig
+) -> list[tuple[SceneObject, SceneObject, Touch]]:
+    """Both objects of each contact, and the contact as the second of them feels it."""
+    pairs = [(objects[c.a], objects[c.b]) for c in contacts]
+    normals_world = [_plane_normal(a, b, c) for (a, b), c in zip(pairs, contacts, strict=True)]
+    tilts = np.degrees(frames.angle_between(np.array(normals_world).reshape(-1, 3), (0.0, 0.0, 1.0)))
+    margins = _margins(objects, contacts, normals_world, config)
+    rows = zip(pairs, contacts, normals_world, tilts.tolist(), margins, strict=True)
+    return [
+        (a, b, Touch(a, normal_world, c.distance, tilt, c.points_world, c.point_world, margin))
+        for (a, b), c, normal_world, tilt, margin in rows
+    ]
 
 
-def _touch(other: SceneObject, o: SceneObject, contact: Contact, config: SupportConfig) -> Touch:
-    normal_world = _plane_normal(other, o, contact)
-    tilt = float(np.degrees(frames.angle_between(normal_world, (0.0, 0.0, 1.0))))
-    patch = contact_patch(o.shape, other.shape, normal_world, contact.points_world, config)
-    point_world = contact.points_world.mean(axis=0)
-    margin = _margin(other, o, point_world, normal_world, config)
-    return Touch(other, normal_world, contact.distance, tilt, point_world, patch, margin)
-
-
-def _margin(
-    other: SceneObject, o: SceneObject, point_world: Array, normal_world: Array, config: SupportConfig
-) -> float:
-    """Gap [m] up to which two shapes touch: what their fits' uncertainty across the contact explains."""
-    variance = 0.0
-    for each, outward_world in ((other, normal_world), (o, -normal_world)):
-        if each.uncertainty is not None:
-            T_object_world = frames.invert(each.shape.T_world_object)
-            point = frames.transform(T_object_world, point_world)
-            variance += each.uncertainty.along(point, frames.rotate(T_object_world, outward_world)) ** 2
-    return float(np.clip(config.margin_sigma * np.sqrt(variance), config.contact_margin, config.max_margin))
+def _margins(
+    objects: Sequence[SceneObject],
+    contacts: Sequence[Contact],
+    normals_world: Sequence[Array],
+    config: SupportConfig,
+) -> list[float]:
+    """Gaps [m] up to which shapes touch: what their fits' uncertainty across each contact explains."""
+    sides, rotation = np.zeros((len(objects), 3, 2)), np.zeros((len(objects), 3))
+    for k, o in enumerate(objects):
+        if o.uncertainty is not None:
+            sides[k], rotation[k] = o.uncertainty.sides.reshape(3, 2), o.uncertainty.rotation
+    pairs = np.array([(c.a, c.b) for c in contacts], dtype=np.intp).reshape(-1, 2)
+    points_world = np.array([c.point_world for c in contacts]).reshape(-1, 3)
+    normals = np.array(normals_world).reshape(-1, 3)
+    points, outward = local_frames(shape_arrays([o.shape for o in objects]), pairs, points_world, normals)
+    facing = np.where(outward > 0.0, sides[pairs, :, 1], sides[pairs, :, 0])
+    spread = (outward * facing) ** 2 + (np.cross(points, outward) * rotation[pairs]) ** 2
+    margins = config.margin_sigma * np.sqrt(spread.sum(axis=(1, 2)))
+    explained: list[float] = np.clip(margins, config.contact_margin, config.max_margin).tolist()
+    return explained
 
 
 def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:
@@ -180,49 +198,58 @@ def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array
     return contact.normal_world
 
 
+def _patch(t: Touch, o: SceneObject, config: SupportConfig) -> Array:
+    """Contact area projected to the ground: a polygon (M, 2) [m]."""
+    return contact_patch(o.shape, t.other.shape, t.normal_world, t.points_world, config)
+
+
 def _from_below(
     o: SceneObject, touches: list[Touch], config: SupportConfig
-) -> tuple[list[Support], list[BaseGeometry]]:
+) -> tuple[list[Support], list[Array]]:
     """Bottom-up supports, and the contact areas they carry the object by."""
     below = [t for t in touches if t.tilt <= config.max_tilt]
     sure = [t for t in below if t.gap <= (t.margin if t.tilt <= config.gentle_tilt else 0.0)]
     supports = [_support(t, o, "bottom-up", True, f"{_below_text(t, o)}.") for t in sure]
-    patches = [t.patch for t in sure]
-    overhang = find_tipping(o.shape, support_polygon(patches)).overhang
-    for t in sorted((t for t in below if t not in sure), key=lambda t: t.gap):
+    patches = [_patch(t, o, config) for t in sure]
+    doubtful = sorted((t for t in below if t not in sure), key=lambda t: t.gap)
+    overhang = find_tipping(o.shape, support_polygon(patches)).overhang if doubtful else 0.0
+    for t in doubtful:
         if overhang <= config.overhang:
             break
-        gained = find_tipping(o.shape, support_polygon([*patches, t.patch])).overhang
+        patch = _patch(t, o, config)
+        gained = find_tipping(o.shape, support_polygon([*patches, patch])).overhang
         if gained < overhang:
             why = f"{_below_text(t, o)}; without it {_overhang_text(o.id, overhang)}."
             supports.append(_support(t, o, "bottom-up", t.gap <= t.margin, why))
-            patches.append(t.patch)
+            patches.append(patch)
             overhang = gained
     return supports, patches
 
 
 def _let_down(
-    o: SceneObject, objects: Sequence[SceneObject], config: SupportConfig
-) -> tuple[list[Support], list[BaseGeometry]]:
+    o: SceneObject, near: Sequence[SceneObject], config: SupportConfig
+) -> tuple[list[Support], list[Array]]:
     """Supports of an object that touches nothing below it: what it lands on first when let straight down."""
-    landings: list[tuple[float, Touch]] = []
-    for other in objects:
-        drop = drop_distance(o.shape, other.shape, config.max_drop) if other is not o else np.inf
+    landings: list[tuple[float, SceneObject, Touch]] = []
+    for other in near:
+        drop = drop_distance(o.shape, other.shape, config.max_drop)
         if np.isfinite(drop):
             lowered = replace(o, shape=o.shape.moved(rigid(np.eye(3), (0.0, 0.0, -drop))))
             contacts = find_contacts([other.shape, lowered.shape], config.contact_margin)
-            landings += [(drop, _touch(other, lowered, contact, config)) for contact in contacts]
-    landings = [(drop, t) for drop, t in landings if t.tilt <= config.max_tilt]
-    first = min((drop for drop, _ in landings), default=np.inf)
-    landings = [(drop, t) for drop, t in landings if drop <= first + config.contact_margin]
+            landings += [
+                (drop, lowered, touch) for _, _, touch in _touching([other, lowered], contacts, config)
+            ]
+    landings = [landing for landing in landings if landing[2].tilt <= config.max_tilt]
+    first = min((drop for drop, _, _ in landings), default=np.inf)
+    landings = [landing for landing in landings if landing[0] <= first + config.contact_margin]
     head = f"{o.id} touches nothing below it; let down"
     supports = [
         _support(
             t, o, "bottom-up", drop <= config.contact_margin, f"{head} {_mm(drop)} it meets {t.other.id}."
         )
-        for drop, t in landings
+        for drop, _, t in landings
     ]
-    return supports, [t.patch for _, t in landings]
+    return supports, [_patch(t, lowered, config) for _, lowered, t in landings]
 
 
 def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
@@ -245,7 +272,7 @@ def _weighed_down(
     head = _verdict(o.id, stability, config)
     found = []
     for t in riders:
-        load_xy = np.asarray(t.patch.centroid.coords[0])
+        load_xy = centroid(_patch(t, o, config))
         lever = float((tipping.pivot_xy - load_xy) @ tipping.direction_xy)
         if config.top_down == "paper":
             found.append(_support(t, o, "top-down", False, f"{head}; {t.other.id} rests on it."))

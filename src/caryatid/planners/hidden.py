@@ -122,7 +122,7 @@ def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConf
     on_table = (np.abs(local[:, :2]) <= table.shape.extents[:2] / 2.0).all(axis=1)
     lowness = np.where(on_table, 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2]), 0.0)
     outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
-    heap = shapely.GeometryCollection(outlines).convex_hull
+    heap = shapely.MultiPoint(np.concatenate([np.empty((0, 2)), *outlines])).convex_hull
     among = np.where(shapely.contains_xy(heap, points[:, 0], points[:, 1]), lowness, 0.0)
     weights = config.space_weight * _shares(lowness) + config.heap_weight * _shares(among)
     unseen = on_table & (solid.state_at(points) == UNKNOWN)
