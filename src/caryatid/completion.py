@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,9 +11,30 @@ from caryatid import frames
 from caryatid.config import CompletionConfig
 from caryatid.frames import Array
 from caryatid.graph import SceneObject
-from caryatid.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.kernels.sweeps import way_to_shapes
+from caryatid.shape_arrays import ShapeArrays, boxes_around, shape_arrays
+from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.surface import SupportSurface
 from caryatid.voxels import FREE, VoxelMap
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Face:
+    """One side of a box, or one end of a cylinder.
+
+    Attributes:
+        axis: Of the object, which the face is across.
+        sign: Of the axis, along which the face is outermost.
+        outward_world: Its normal (3,).
+        points_world: Points (N, 3) [m] all over it, rim included.
+        rim_world: Its rim (M, 3) [m], drawn in to lie inside the shape's walls.
+    """
+
+    axis: int
+    sign: float
+    outward_world: Array
+    points_world: Array
+    rim_world: Array
 
 
 def complete(
@@ -31,20 +52,24 @@ def complete(
         voxels: What has been seen free.
         config: Steps and tolerances.
     """
-    done: dict[str, SceneObject] = {}
-    for candidate in sorted(objects, key=lambda o: (_lowest(o.shape), o.label)):
-        others = [done.get(o.id, o).shape for o in objects if o.id != candidate.id]
-        done[candidate.id] = _extended(candidate, others, surface, voxels, config)
-    return [done[o.id] for o in objects]
+    done = list(objects)
+    shapes = shape_arrays([o.shape for o in objects])
+    lowest = boxes_around(shapes)[0][:, 2]
+    for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
+        done[k] = _extended(done[k], k, shapes, surface, voxels, config)
+        shapes.centres[k], shapes.half[k] = done[k].centre_world, done[k].shape.extents / 2.0
+    return done
 
 
 def _extended(
     candidate: SceneObject,
-    others: Sequence[Shape],
+    index: int,
+    shapes: ShapeArrays,
     surface: SupportSurface,
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
+    """Extend an object, the one with this index among the shapes."""
     shape = candidate.shape
     if isinstance(shape, Sphere):
         return candidate
@@ -52,51 +77,49 @@ def _extended(
     down_world = sign * shape.T_world_object[:3, axis]
     upright = -down_world[2] >= np.cos(np.radians(config.max_tilt))
     if upright and not candidate.seen[2 * axis + (sign > 0)]:
-        bottom = _face_grid(shape, axis, sign, config.spacing)
-        to_table = float(np.min(surface.height(bottom) / -(down_world @ surface.normal_world)))
+        bottom = _face(shape, axis, sign, config)
+        lowest = float(surface.height(bottom.points_world).min())
+        to_table = lowest / -float(down_world @ surface.normal_world)
         if to_table <= 0.0:
             candidate = replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
         else:
-            candidate = _moved_out(
-                candidate, axis, sign, to_table, "down to the table", others, voxels, config
-            )
+            aim = "down to the table"
+            candidate = _moved_out(candidate, bottom, to_table, aim, index, shapes, voxels, config)
     hidden = _depth_side(candidate, config)
-    if hidden is None or (upright and hidden[0] == axis):
+    if hidden is None or isinstance(candidate.shape, Sphere) or (upright and hidden[0] == axis):
         return candidate
-    guess = float(np.delete(candidate.shape.extents, hidden[0]).min()) - float(
-        candidate.shape.extents[hidden[0]]
-    )
-    return _moved_out(candidate, *hidden, guess, "as deep as it is wide", others, voxels, config)
+    extents = candidate.shape.extents
+    guess = float(np.delete(extents, hidden[0]).min()) - float(extents[hidden[0]])
+    back = _face(candidate.shape, *hidden, config)
+    return _moved_out(candidate, back, guess, "as deep as it is wide", index, shapes, voxels, config)
 
 
 def _moved_out(
     candidate: SceneObject,
-    axis: int,
-    sign: float,
+    face: _Face,
     limit: float,
     aim: str,
-    others: Sequence[Shape],
+    index: int,
+    shapes: ShapeArrays,
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
     """Move one side outwards up to a limit [m], another shape or free space, whichever comes first."""
     shape = candidate.shape
-    if isinstance(shape, Sphere):
+    if isinstance(shape, Sphere) or limit < config.least:
         return candidate
-    outward_world = sign * shape.T_world_object[:3, axis]
-    face = _face_grid(shape, axis, sign, config.spacing)
     length, reason = limit, f"is taken to reach {aim}"
-    to_object = _gap_before(face, outward_world, others, limit, config)
+    to_object = _way_to_others(face, limit, index, shapes, config)
     if to_object < length:
         length, reason = to_object, "ends at the next object"
-    to_free = _free_before(shape, face, axis, outward_world, length, voxels, config)
+    to_free = _free_before(face, length, voxels, config)
     if to_free < length:
         length, reason = to_free, "ends where free space was seen"
     if length < config.least:
         return candidate
     why = f"a side that was not seen {reason}, {1000 * length:.0f} mm further"
     why = f"{candidate.why}; {why}" if candidate.why else why
-    return replace(candidate, shape=_lengthened(shape, axis, sign, length), why=why)
+    return replace(candidate, shape=_lengthened(shape, face.axis, face.sign, length), why=why)
 
 
 def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, float] | None:
@@ -112,38 +135,31 @@ def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, 
     return axis, -1.0 if side else 1.0
 
 
-def _gap_before(
-    face: Array, outward_world: Array, others: Sequence[Shape], limit: float, config: CompletionConfig
+def _way_to_others(
+    face: _Face, limit: float, index: int, shapes: ShapeArrays, config: CompletionConfig
 ) -> float:
-    """How far [m] a face can move before it meets another shape, by sphere tracing."""
-    length = 0.0
-    while others and length < limit:
-        moved = face + length * outward_world
-        nearest = min(float(o.signed_distance(moved).min()) for o in others) + config.overlap
-        if nearest < config.least:
-            return max(length - config.overlap, 0.0)
-        length += nearest
-    return limit
+    """How far [m] the face of one of the shapes can move before it meets another one, by sphere tracing."""
+    points, outward = face.points_world, face.outward_world
+    middle = points.mean(axis=0)
+    to_centres = shapes.centres - middle
+    ahead = np.clip(to_centres @ outward, 0.0, limit)
+    aside = np.linalg.norm(to_centres - ahead[:, None] * outward, axis=1)
+    # No ball around a shape that is further than the limit from the one around the face ever bounds a step.
+    reach = np.linalg.norm(points - middle, axis=1).max() + np.linalg.norm(shapes.half, axis=1)
+    near = np.flatnonzero(aside < limit + reach)
+    return way_to_shapes(points, outward, limit, config.overlap, config.least, near[near != index], *shapes)
 
 
-def _free_before(
-    shape: Box | Cylinder,
-    face: Array,
-    axis: int,
-    outward_world: Array,
-    limit: float,
-    voxels: VoxelMap,
-    config: CompletionConfig,
-) -> float:
+def _free_before(face: _Face, limit: float, voxels: VoxelMap, config: CompletionConfig) -> float:
     """How far [m] a face can move before its rim lies in space seen free."""
-    ring = _rim(shape, face, axis, config.inset)
-    length = 0.0
-    while limit - length > config.step:
-        free = voxels.state_at(ring + (length + config.step / 2.0) * outward_world) == FREE
-        if float(free.mean()) > config.max_free:
-            return length
-        length += config.step
-    return limit
+    lengths = np.append(0.0, np.cumsum(np.full(int(limit / config.step) + 1, config.step)))
+    lengths = lengths[limit - lengths > config.step]
+    if not len(lengths):
+        return limit
+    middles = face.rim_world + (lengths[:, None] + config.step / 2.0)[:, None] * face.outward_world
+    free = voxels.state_at(middles.reshape(-1, 3)).reshape(len(lengths), -1) == FREE
+    stops = np.flatnonzero(free.mean(axis=1) > config.max_free)
+    return float(lengths[stops[0]]) if len(stops) else limit
 
 
 def _downward_side(shape: Box | Cylinder) -> tuple[int, float]:
@@ -152,35 +168,28 @@ def _downward_side(shape: Box | Cylinder) -> tuple[int, float]:
     return axis, 1.0 if down[axis] >= 0.0 else -1.0
 
 
-def _face_grid(shape: Box | Cylinder, axis: int, sign: float, spacing: float) -> Array:
-    """Points (N, 3) [m] all over one face, its rim included."""
-    u, v = (axis + 1) % 3, (axis + 2) % 3
+def _face(shape: Box | Cylinder, axis: int, sign: float, config: CompletionConfig) -> _Face:
+    across = [(axis + 1) % 3, (axis + 2) % 3]
     half = shape.extents / 2.0
-    ticks = [
-        np.linspace(-half[k], half[k], max(3, 1 + int(np.ceil(2.0 * half[k] / spacing)))) for k in (u, v)
-    ]
-    grid_u, grid_v = (g.ravel() for g in np.meshgrid(*ticks, indexing="ij"))
-    local = np.zeros((len(grid_u), 3))
-    local[:, axis], local[:, u], local[:, v] = sign * half[axis], grid_u, grid_v
+    u, v = (_ticks(half[k], config.spacing) for k in across)
+    grid = np.empty((len(u), len(v), 3))
+    grid[..., axis], grid[..., across[0]], grid[..., across[1]] = sign * half[axis], u[:, None], v
+    points = grid.reshape(-1, 3)
     if isinstance(shape, Cylinder):
-        reach = np.hypot(grid_u, grid_v)
-        outside = reach > shape.radius
-        local[outside, :2] *= (shape.radius / reach[outside])[:, None]
-    return frames.transform(shape.T_world_object, local)
-
-
-def _rim(shape: Box | Cylinder, face: Array, axis: int, inset: float) -> Array:
-    """The outermost points of a face grid, drawn in by `inset` [m] to lie inside the shape's walls."""
-    local = frames.transform(frames.invert(shape.T_world_object), face)
-    across = [k for k in range(3) if k != axis]
-    half = shape.extents / 2.0
-    if isinstance(shape, Cylinder):
-        on_rim = np.hypot(local[:, 0], local[:, 1]) > 0.99 * shape.radius
+        outward = np.hypot(points[:, 0], points[:, 1]) / shape.radius
+        points[:, :2] /= np.maximum(outward, 1.0)[:, None]
     else:
-        on_rim = np.max(np.abs(local[:, across]) / half[across], axis=1) > 0.99
-    drawn = local[on_rim]
-    drawn[:, across] *= np.maximum(1.0 - inset / half[across], 0.0)
-    return frames.transform(shape.T_world_object, drawn)
+        outward = np.abs(points[:, across] / half[across]).max(axis=1)
+    rim = points[outward > 0.99]
+    rim[:, across] *= np.maximum(1.0 - config.inset / half[across], 0.0)
+    T = shape.T_world_object
+    return _Face(axis, sign, sign * T[:3, axis], frames.transform(T, points), frames.transform(T, rim))
+
+
+def _ticks(half: float, spacing: float) -> Array:
+    """Evenly spaced numbers from −half to half, both included, at most `spacing` apart."""
+    count = max(2, int(np.ceil(2.0 * half / spacing)))
+    return half * (2.0 * np.arange(count + 1) / count - 1.0)
 
 
 def _lengthened(shape: Box | Cylinder, axis: int, sign: float, length: float) -> Box | Cylinder:
@@ -194,7 +203,3 @@ def _lengthened(shape: Box | Cylinder, axis: int, sign: float, length: float) ->
     grown = extents.copy()
     grown[axis] += length
     return Box(T, grown)
-
-
-def _lowest(shape: Shape) -> float:
-    return float(shape.T_world_object[2, 3] - shape.support(np.array([[0.0, 0.0, -1.0]]))[0])
