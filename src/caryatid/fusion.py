@@ -46,9 +46,10 @@ def fuse(
     Returns:
         The evidence with this view, and the fused id of each of the graph's objects.
     """
-    known = {i: _vertex(list(seen.values()), config) for i, seen in evidence.sightings.items()}
-    names = match(list(known.values()), list(graph.objects), config, same_labels=same_labels)
-    taken = {*known, *names.values()}
+    # By label alone, any sighting will do.
+    known = [_newest(seen) if same_labels else _vertex(seen, config) for seen in evidence.sightings.values()]
+    names = match(known, list(graph.objects), config, same_labels=same_labels)
+    taken = {*evidence.sightings, *names.values()}
     for o in graph.objects:
         if o.id not in names:
             names[o.id] = _fresh_id(o, taken)
@@ -71,6 +72,8 @@ def absorbed(evidence: Evidence, names: Mapping[str, str]) -> Evidence:
         evidence: All views so far.
         names: Id to give up → id that takes its place; a support between the two is dropped.
     """
+    if not names:
+        return evidence
     sightings: dict[str, dict[int, SceneObject]] = {}
     for i, seen in evidence.sightings.items():
         new_id = names.get(i, i)
@@ -112,7 +115,7 @@ def fused_graph(
         occurrences = shown.get(i, len(seen))
         opportunities = occurrences + contradicted.get(i, 0)
         if occurrences >= config.keep_share * opportunities:
-            vertex = _vertex([seen[v] for v in sorted(seen)], config)
+            vertex = _vertex(seen, config)
             objects[i] = replace(vertex, occurrences=occurrences, opportunities=opportunities)
     supports = []
     for pair, found in evidence.supports.items():
@@ -155,21 +158,33 @@ def match(
     if same_labels:
         by_label = {(k.role, k.label): k.id for k in known}
         return {s.id: by_label[s.role, s.label] for s in seen if (s.role, s.label) in by_label}
-    cost = np.array([[_difference(k, s, config) for s in seen] for k in known])
+    distances = _distances(known, seen, config)
+    cost = np.full(distances.shape, np.inf)
+    for r, c in np.argwhere(distances <= 1.0):
+        cost[r, c] = _difference(known[r], seen[c], float(distances[r, c]), config)
     rows, columns = linear_sum_assignment(np.where(np.isfinite(cost), cost, 1e6))
     return {seen[c].id: known[r].id for r, c in zip(rows, columns, strict=True) if np.isfinite(cost[r, c])}
 
 
-def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> float:
+def _distances(known: list[SceneObject], seen: list[SceneObject], config: FusionConfig) -> Array:
+    """Distances (K, S) of the centres, as shares of what is tolerated; a table is only ever a table."""
+    centres = [np.array([o.centre_world for o in objects]) for objects in (known, seen)]
+    half = [np.array([o.shape.extents.min() / 2.0 for o in objects]) for objects in (known, seen)]
+    sigma = [np.array([np.linalg.norm(_position(o)) for o in objects]) for objects in (known, seen)]
+    table = [np.array([o.role == "support_surface" for o in objects]) for objects in (known, seen)]
+    reach = np.maximum(config.max_distance, np.minimum(half[0][:, None], half[1]))
+    reach += config.sigmas * np.hypot(sigma[0][:, None], sigma[1])
+    distances = np.linalg.norm(centres[0][:, None] - centres[1], axis=-1) / reach
+    distances[table[0][:, None] & table[1]] = 0.0
+    distances[table[0][:, None] != table[1]] = np.inf
+    return distances
+
+
+def _difference(known: SceneObject, seen: SceneObject, distance: float, config: FusionConfig) -> float:
     """How different two sightings are: 0 the same, up to 4 within the tolerances, infinite beyond."""
-    if known.role != seen.role:
-        return np.inf
     if known.role == "support_surface":
         return 0.0
     a, b = known.shape, seen.shape
-    reach = max(config.max_distance, float(min(a.extents.min(), b.extents.min())) / 2.0)
-    unsure = config.sigmas * np.hypot(np.linalg.norm(_position(known)), np.linalg.norm(_position(seen)))
-    distance = float(np.linalg.norm(known.centre_world - seen.centre_world)) / (reach + unsure)
     ratio = _extent_ratio(known, seen, config)
     kind_differs = a.kind != b.kind
     angle = 0.0 if kind_differs or _is_round(a) else np.degrees(axes_rotation(b, a)[1]) / config.max_angle
@@ -204,8 +219,12 @@ def _is_round(shape: Shape) -> bool:
     return isinstance(shape, Sphere)
 
 
-def _vertex(sightings: list[SceneObject], config: FusionConfig) -> SceneObject:
-    return merge(sightings, config) if config.method == "sg" else sightings[-1]
+def _vertex(seen: Mapping[int, SceneObject], config: FusionConfig) -> SceneObject:
+    return merge([seen[v] for v in sorted(seen)], config) if config.method == "sg" else _newest(seen)
+
+
+def _newest(seen: Mapping[int, SceneObject]) -> SceneObject:
+    return seen[max(seen)]
 
 
 def _named(o: SceneObject, new_id: str) -> SceneObject:

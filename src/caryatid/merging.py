@@ -68,16 +68,15 @@ def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
         The turn (3, 3), to be applied on the right of the shape's rotation, and the angle left [rad]; of a
         sphere, to which no turn matters, the identity and 0.
     """
-    R, R_reference = shape.T_world_object[:3, :3], reference.T_world_object[:3, :3]
     if isinstance(shape, Sphere):
         return np.eye(3), 0.0
-    if isinstance(shape, Cylinder):
-        flip = np.diag([1.0, -1.0, -1.0]) if R[:, 2] @ R_reference[:, 2] < 0.0 else np.eye(3)
-        return flip, float(frames.angle_between((R @ flip)[:, 2], R_reference[:, 2]))
-    turned = R @ _TURNS
-    traces = np.einsum("ij,kij->k", R_reference, turned)
-    best = int(np.argmax(traces))
-    return _TURNS[best], float(np.arccos(np.clip((traces[best] - 1.0) / 2.0, -1.0, 1.0)))
+    R, R_reference = shape.T_world_object[:3, :3], reference.T_world_object[:3, :3]
+    round_ = isinstance(shape, Cylinder)
+    turn = _turns(R[None], R_reference, round_)[0]
+    if round_:
+        return turn, float(frames.angle_between((R @ turn)[:, 2], R_reference[:, 2]))
+    trace = float(np.sum((R @ turn) * R_reference))
+    return turn, float(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
 def _evidence(o: SceneObject, config: FusionConfig) -> float:
@@ -95,42 +94,45 @@ def _merged_sides(
     same: Sequence[SceneObject], weights: Array, best: SceneObject
 ) -> tuple[Box | Cylinder, tuple[bool, bool, bool, bool, bool, bool]]:
     """Average axes, then each of the six sides along them."""
-    turns = [axes_rotation(o.shape, best.shape)[0] for o in same]
-    rotations = [o.shape.T_world_object[:3, :3] @ t for o, t in zip(same, turns, strict=True)]
-    R = _mean_axes(rotations, weights, isinstance(best.shape, Cylinder))
-    ends = np.zeros((len(same), 6))
-    seen = np.zeros((len(same), 6), dtype=bool)
-    for k, (o, turn) in enumerate(zip(same, turns, strict=True)):
-        middle = R.T @ o.shape.T_world_object[:3, 3]
-        half = np.abs(turn.T @ o.shape.extents) / 2.0
-        flags = np.array(o.seen).reshape(3, 2)
-        for axis in range(3):
-            source = int(np.argmax(np.abs(turn[:, axis])))
-            pair = flags[source] if turn[source, axis] > 0.0 else flags[source][::-1]
-            seen[k, 2 * axis : 2 * axis + 2] = pair
-            ends[k, 2 * axis], ends[k, 2 * axis + 1] = middle[axis] - half[axis], middle[axis] + half[axis]
-    merged = np.empty(6)
-    for side in range(6):
-        if seen[:, side].any():
-            merged[side] = np.average(ends[seen[:, side], side], weights=weights[seen[:, side]])
-        else:
-            merged[side] = ends[:, side].max() if side % 2 else ends[:, side].min()
-    low, high = merged[0::2], merged[1::2]
-    any_seen = [bool(side.any()) for side in seen.T]
-    flags6 = (any_seen[0], any_seen[1], any_seen[2], any_seen[3], any_seen[4], any_seen[5])
-    if isinstance(best.shape, Cylinder):
-        centres = np.array([R.T @ o.shape.T_world_object[:3, 3] for o in same])
-        centre = np.average(centres, axis=0, weights=weights)
+    T = np.array([o.shape.T_world_object for o in same])
+    extents = np.array([o.shape.extents for o in same])
+    round_ = isinstance(best.shape, Cylinder)
+    turns = _turns(T[:, :3, :3], best.shape.T_world_object[:3, :3], round_)
+    R = _mean_axes(np.average(T[:, :3, :3] @ turns, axis=0, weights=weights), round_)
+    middles = T[:, :3, 3] @ R
+    half = np.abs(np.einsum("kij,ki->kj", turns, extents))[:, :, None] / 2.0
+    ends = middles[:, :, None] + half * (-1.0, 1.0)
+    # The sides along a new axis are those along one of the old axes, in the other order where it points back.
+    sources = np.abs(turns).argmax(axis=1)
+    seen = np.take_along_axis(np.array([o.seen for o in same]).reshape(-1, 3, 2), sources[:, :, None], axis=1)
+    ahead = turns.sum(axis=1)[:, :, None] > 0.0
+    seen = np.where(ahead, seen, seen[:, :, ::-1])
+    share = weights[:, None, None] * seen
+    known = seen.any(axis=0)
+    mean = (share * ends).sum(axis=0) / np.where(known, share.sum(axis=0), 1.0)
+    widest = np.stack([ends[:, :, 0].min(axis=0), ends[:, :, 1].max(axis=0)], axis=1)
+    low, high = np.where(known, mean, widest).T
+    sides = known.ravel().tolist()
+    flags = (sides[0], sides[1], sides[2], sides[3], sides[4], sides[5])
+    if round_:
+        centre = np.average(middles, axis=0, weights=weights)
         centre[2] = (low[2] + high[2]) / 2.0
-        radius = float(np.average([o.shape.extents[0] / 2.0 for o in same], weights=weights))
-        return Cylinder(frames.rigid(R, R @ centre), radius, float(max(high[2] - low[2], 1e-3))), flags6
-    T = frames.rigid(R, R @ ((low + high) / 2.0))
-    return Box(T, np.maximum(high - low, 1e-3)), flags6
+        radius = float(np.average(extents[:, 0] / 2.0, weights=weights))
+        return Cylinder(frames.rigid(R, R @ centre), radius, float(max(high[2] - low[2], 1e-3))), flags
+    return Box(frames.rigid(R, R @ ((low + high) / 2.0)), np.maximum(high - low, 1e-3)), flags
 
 
-def _mean_axes(rotations: Sequence[Array], weights: Array, axis_only: bool) -> Array:
-    """Weighted chordal mean of rotations; of a cylinder only the axis means something."""
-    mean = np.average(rotations, axis=0, weights=weights)
+def _turns(R: Array, R_reference: Array, axis_only: bool) -> Array:
+    """Turns (K, 3, 3) within a shape's symmetry that bring axes (K, 3, 3) nearest to a reference's (3, 3)."""
+    if axis_only:
+        flipped = R[:, :, 2] @ R_reference[:, 2] < 0.0
+        return np.where(flipped[:, None, None], np.diag([1.0, -1.0, -1.0]), np.eye(3))
+    traces = (np.swapaxes(R, 1, 2) @ R_reference).reshape(-1, 9) @ _TURNS.reshape(-1, 9).T
+    return _TURNS[traces.argmax(axis=1)]
+
+
+def _mean_axes(mean: Array, axis_only: bool) -> Array:
+    """Chordal mean of rotations from their average; of a cylinder only the axis means something."""
     if axis_only:
         z = frames.unit(mean[:, 2])
         x = frames.perpendicular(z)
