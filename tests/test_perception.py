@@ -35,6 +35,16 @@ def test_given_labels_stay_and_the_table_gets_its_own():
     assert (percept.labels[on_table] == SUPPORT_LABEL).mean() > 0.98
 
 
+def test_what_is_shown_is_each_label_once():
+    percept = percept_of(VIEW, "labels")
+    assert percept.shown == np.unique(percept.labels).tolist()
+    renamed = percept.relabelled({percept.shown[1]: 99})
+    assert 99 in renamed.shown
+    assert percept.shown[1] not in renamed.shown
+    assert percept.with_labels(percept.labels[:1]).shown == [int(percept.labels[0])]
+    assert percept.with_labels(percept.labels[:0]).shown == []
+
+
 def test_the_floor_belongs_to_nothing():
     percept = percept_of(VIEW)
     floor = percept.cloud.points_world[:, 2] < 0.1

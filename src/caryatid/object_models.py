@@ -78,7 +78,7 @@ class ObjectModels:
     def add(self, percept: Percept, view: int) -> set[int]:
         """Add a view's points, thinned, and return the labels of the objects among them."""
         config = self._config
-        shown = {int(k) for k in np.unique(percept.labels) if k != 0}
+        shown = set(percept.shown) - {0}
         for label in sorted(shown):
             part = percept.cloud.select(percept.labels == label)
             voxel = config.surface.spacing if label == SUPPORT_LABEL else config.cloud.voxel

@@ -42,8 +42,17 @@ class Percept:
             raise ValueError("a percept's cloud is labelled")
         return self.cloud.labels
 
+    @property
+    def shown(self) -> list[int]:
+        """Labels that points carry, each once, in ascending order."""
+        last_of_run = np.append(self.labels[1:] != self.labels[:-1], True)[: len(self.labels)]
+        labels: list[int] = np.unique(self.labels[last_of_run]).tolist()
+        return labels
+
     def relabelled(self, names: dict[int, int]) -> Percept:
         """Return the percept with some labels changed: old → new."""
+        if not names:
+            return self
         labels = self.labels.copy()
         for old, new in names.items():
             labels[self.labels == old] = new

@@ -203,9 +203,7 @@ class Scene:
         same_labels = given or config.method != "sg"
         self._evidence, names = fuse(self._evidence, newest, config, same_labels=same_labels)
         percept = percept.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
-        seen = {
-            SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(int(k)) for k in np.unique(percept.labels)
-        }
+        seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in percept.shown}
         self._shown.update(seen)
         if percept.view is not None:
             for o in self.graph.objects:
