@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test check accuracy-gate format clean
+.PHONY: install demo test check accuracy-gate bench bench-gate format clean
 
 install: $(VENV)/.installed
 
@@ -25,6 +25,19 @@ check: install
 
 accuracy-gate: install
 	$(BIN)/python benchmarks/accuracy.py suite --gate
+
+# A peer that cannot be installed is a row of the benchmark that says so, and is tried again next time.
+$(VENV)/.peers: $(VENV)/.installed
+	for peer in open3d pyransac3d cgal; do \
+		$(BIN)/python -m pip install --quiet --constraint constraints.txt $$peer || failed="$$failed $$peer"; \
+	done; \
+	if test -z "$$failed"; then touch $@; else echo "could not be installed:$$failed"; fi
+
+bench: $(VENV)/.peers
+	$(BIN)/python benchmarks/bench.py --docs docs/performance.md --out bench.json --update
+
+bench-gate: $(VENV)/.peers
+	$(BIN)/python benchmarks/bench.py --gate
 
 format: install
 	$(BIN)/ruff check --fix-only .
