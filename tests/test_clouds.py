@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,10 +11,7 @@ from caryatid import frames
 from caryatid.clouds import estimate_normals, normals_from_depth, oriented_points, thin
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
-from caryatid.kernels.images import (
-    local_surface,
-    local_surface_reference,
-)
+from caryatid.kernels.local_planes import local_surface, local_surface_reference
 from caryatid.views import View
 
 CONFIG = CloudConfig()
@@ -68,15 +66,31 @@ def test_local_surface_kernel_equals_its_reference():
     inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
     inverse[::7, ::5] = 0.0
     for radius in (2, 4):
-        fast = local_surface(inverse, K, radius, 0.01, 0.004)
-        plain = local_surface_reference(inverse, K, radius, 0.01, 0.004)
-        assert fast.noise == pytest.approx(plain.noise, rel=1e-3)
-        alike = np.isclose(fast.normals, plain.normals, atol=2e-3).all(axis=-1)
-        alike &= np.isclose(fast.inverse_depth, plain.inverse_depth, atol=1e-5)
-        known = np.linalg.norm(plain.normals, axis=-1) > 0
+        fast = local_surface(inverse, radius, 0.01, 0.004)
+        smoothed, directions, noise = local_surface_reference(inverse, K, radius, 0.01, 0.004)
+        assert fast.noise == pytest.approx(noise, rel=1e-3)
+        known = fast.planes[2] > 0.0
         assert known.mean() > 0.9
+        points, normals = fast.oriented(np.flatnonzero(known), K, np.eye(4))
+        alike = np.isclose(normals, directions[known], atol=2e-3).all(axis=-1)
+        alike &= np.isclose(1.0 / points[:, 2], smoothed[known], atol=1e-5)
         # Two windows that vary alike but for rounding may be chosen differently.
         assert alike.mean() > 0.999
+        assert (known == (smoothed > 0.0)).mean() > 0.999
+
+
+def test_oriented_planes_lie_on_the_pixels_rays_in_the_world():
+    depth = table_scene(from_the_side(), spheres=[SPHERE]).depth[150:270, 200:360]
+    surface = local_surface((1.0 / depth).astype(np.float32), 3, 0.01, 0.004)
+    pixels = np.flatnonzero(surface.planes[2])[::7]
+    points, normals = surface.oriented(pixels, K, np.eye(4))
+    row, column = np.divmod(pixels, depth.shape[1])
+    in_image = points @ K.T
+    np.testing.assert_allclose(in_image[:, :2] / in_image[:, 2:], np.stack([column, row], axis=-1), atol=1e-9)
+    T = frames.rigid(frames.random_rotation(np.random.default_rng(0)), (0.3, -0.2, 0.5))
+    moved, turned = surface.oriented(pixels, K, T)
+    np.testing.assert_allclose(moved, frames.transform(T, points), atol=1e-12)
+    np.testing.assert_allclose(turned, frames.rotate(T, normals), atol=1e-12)
 
 
 def roof(sigma):
@@ -90,9 +104,9 @@ def roof(sigma):
 def test_smoothing_takes_noise_off_and_leaves_a_ridge_sharp():
     sigma = 0.002
     true, noisy = roof(sigma)
-    surface = local_surface(noisy, K, 3, 0.02, 0.004)
+    surface = local_surface(noisy, 3, 0.02, 0.004)
     inner = (slice(6, -6), slice(6, -6))
-    error = np.abs(surface.inverse_depth - true)[inner]
+    error = np.abs(surface.planes[2] - true)[inner]
     assert surface.noise == pytest.approx(sigma, rel=0.1)
     assert np.sqrt(np.mean(error**2)) < sigma / 3.0
     ridge = error[:, 33:36].mean()
@@ -125,6 +139,19 @@ def test_oriented_points_keep_to_the_working_range_and_the_stride():
     assert view.depth.ravel()[pixels].max() <= 1.2
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1.0, atol=1e-5)
     assert points[view.labels.ravel()[pixels] == 0][:, 2].max() < 0.7501
+
+
+def test_readings_left_out_are_no_points_and_bear_on_none():
+    view = table_scene(from_the_side(), spheres=[SPHERE], sigma=0.001)
+    ball = view.labels == 1
+    points, _, pixels = oriented_points(view, CONFIG, among=ball)
+    alone = replace(view, depth=np.where(ball, view.depth, 0.0))
+    expected, _, _ = oriented_points(alone, CONFIG)
+    assert ball.ravel()[pixels].all()
+    assert len(points) > 0.9 * ball.sum()
+    np.testing.assert_allclose(points, expected, atol=0.002)
+    given = replace(view, normals_camera=np.tile(np.float32([0.0, 0.0, -1.0]), (480, 640, 1)))
+    assert (oriented_points(given, CONFIG, among=ball)[2] == np.flatnonzero(ball)).all()
 
 
 def test_normals_of_a_cloud_follow_rigid_motion_and_face_the_viewpoint():

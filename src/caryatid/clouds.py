@@ -10,12 +10,15 @@ from caryatid import frames
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.frames import Array
-from caryatid.kernels.images import LocalSurface, local_surface
+from caryatid.kernels.local_planes import LocalSurface, local_surface
 from caryatid.kernels.thinning import nearest_to_means
 from caryatid.views import View
 
 CHUNK = 100_000
 """Points whose neighbourhoods are held in memory at once [1]; bounds memory, changes no result."""
+
+SPARSE = 4
+"""Every fourth row and column of an image give its median depth [px]."""
 
 
 def normals_from_depth(view: View, config: CloudConfig) -> NDArray[np.float32]:
@@ -29,10 +32,16 @@ def normals_from_depth(view: View, config: CloudConfig) -> NDArray[np.float32]:
     """
     if view.normals_camera is not None:
         return view.normals_camera
-    return surface_from_depth(view, config, sharp=False).normals
+    surface = surface_from_depth(view, config, sharp=False)
+    normals = np.zeros((*view.depth.shape, 3), dtype=np.float32)
+    pixels = np.flatnonzero(surface.planes[2])
+    normals.reshape(-1, 3)[pixels] = surface.oriented(pixels, view.K, np.eye(4))[1]
+    return normals
 
 
-def surface_from_depth(view: View, config: CloudConfig, *, sharp: bool = True) -> LocalSurface:
+def surface_from_depth(
+    view: View, config: CloudConfig, *, among: NDArray[np.bool_] | None = None, sharp: bool = True
+) -> LocalSurface:
     """Smooth a view's depth by local planes that end at creases and depth edges, and measure its noise.
 
     A plane is linear in inverse depth over the image, and the noise of a structured-light sensor nearly even
@@ -41,20 +50,17 @@ def surface_from_depth(view: View, config: CloudConfig, *, sharp: bool = True) -
     Args:
         view: Depth [m] and intrinsics [px]; no pose needed.
         config: Window, working range and depth edges.
+        among: Which readings (H, W) to take, or None for all of them.
         sharp: Whether creases stay sharp (`local_surface`).
     """
-    in_range = (view.depth >= config.min_depth) & (view.depth <= config.max_depth)
-    inverse_depth = np.zeros_like(view.depth)
-    np.divide(np.float32(1.0), view.depth, out=inverse_depth, where=in_range)
-    radius = config.normal_window // 2
-    if in_range.any():
-        width = config.normal_size * view.K[0, 0] / float(np.median(view.depth[in_range]))
-        radius = min(radius, max(1, round((width - 1.0) / 2.0)))
-    return local_surface(inverse_depth, view.K, radius, config.edge_jump, config.max_slope, sharp=sharp)
+    inverse_depth, radius = _inverse_depth(view, config)
+    if among is not None:
+        inverse_depth[~among] = 0.0
+    return local_surface(inverse_depth, radius, config.edge_jump, config.max_slope, sharp=sharp)
 
 
 def oriented_points(
-    view: View, config: CloudConfig, stride: int = 1
+    view: View, config: CloudConfig, stride: int = 1, *, among: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array, NDArray[np.intp]]:
     """Oriented points of a view: the readings in working range that have a normal, smoothed by local planes.
 
@@ -64,29 +70,24 @@ def oriented_points(
         view: The view; without a pose, "world" below is the camera frame.
         config: Working range and normal estimation.
         stride: Take every stride-th row and column [px].
+        among: Which readings (H, W) to take, or None for all of them.
 
     Returns:
         Points (N, 3) [m] and unit normals (N, 3) in the world frame, and the flat pixel index (N,) of each.
     """
-    normals, depth = view.normals_camera, view.depth
-    if normals is None:
-        surface = surface_from_depth(view, config)
-        normals = surface.normals
-        known = surface.inverse_depth > 0.0
-        depth = np.where(known, 1.0 / np.where(known, surface.inverse_depth, 1.0), 0.0)
-    keep = np.zeros(view.depth.shape, dtype=bool)
-    sampled = view.depth[::stride, ::stride]
-    keep[::stride, ::stride] = (sampled >= config.min_depth) & (sampled <= config.max_depth)
-    pixels = np.flatnonzero(keep)
-    normals_camera = normals.reshape(-1, 3)[pixels].astype(np.float64)
-    oriented = np.einsum("ij,ij->i", normals_camera, normals_camera) > 0.5
-    pixels, normals_camera = pixels[oriented], normals_camera[oriented]
-    points_camera = view.points_camera.reshape(-1, 3)[pixels]
-    points_camera = points_camera * (depth.ravel()[pixels] / view.depth.ravel()[pixels])[:, None]
-    if view.T_world_camera is None:
-        return points_camera, normals_camera, pixels
-    T = view.T_world_camera
-    return frames.transform(T, points_camera), frames.rotate(T, normals_camera), pixels
+    T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
+    if view.normals_camera is None:
+        surface = surface_from_depth(view, config, among=among)
+        pixels = _strided(surface.planes[2] > 0.0, stride)
+        return *surface.oriented(pixels, view.K, T), pixels
+    given = view.normals_camera
+    kept = _in_range(view, config) & (np.einsum("hwi,hwi->hw", given, given) > 0.5)
+    pixels = _strided(kept if among is None else kept & among, stride)
+    row, column = np.divmod(pixels, view.depth.shape[1])
+    z = np.take(view.depth, pixels).astype(np.float64)
+    x, y = (column - view.K[0, 2]) / view.K[0, 0] * z, (row - view.K[1, 2]) / view.K[1, 1] * z
+    normals_camera = np.take(given.reshape(-1, 3), pixels, axis=0).astype(np.float64)
+    return frames.transform(T, np.stack([x, y, z], axis=-1)), frames.rotate(T, normals_camera), pixels
 
 
 def estimate_normals(points: Array, viewpoint: Array, neighbours: int) -> Array:
@@ -145,6 +146,30 @@ def thin(points: Array, voxel: float) -> NDArray[np.intp]:
     if not voxel > 0.0:
         raise InputError("thin", f"voxel size {voxel:g} is not positive", "give metres above zero")
     return np.flatnonzero(nearest_to_means(np.ascontiguousarray(points, dtype=np.float64), voxel))
+
+
+def _in_range(view: View, config: CloudConfig) -> NDArray[np.bool_]:
+    return (view.depth >= config.min_depth) & (view.depth <= config.max_depth)
+
+
+def _strided(mask: NDArray[np.bool_], stride: int) -> NDArray[np.intp]:
+    """Flat indices of the pixels of a mask (H, W) in every stride-th row and column."""
+    sampled = np.zeros_like(mask)
+    sampled[::stride, ::stride] = mask[::stride, ::stride]
+    return np.flatnonzero(sampled)
+
+
+def _inverse_depth(view: View, config: CloudConfig) -> tuple[NDArray[np.float32], int]:
+    """1/z (H, W) [1/m] of the readings in range, else 0, and the radius [px] of their windows."""
+    inverse_depth = np.divide(
+        np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=_in_range(view, config)
+    )
+    radius = config.normal_window // 2
+    readings = view.depth[::SPARSE, ::SPARSE][inverse_depth[::SPARSE, ::SPARSE] > 0.0]
+    if len(readings) > 0:
+        width = config.normal_size * view.K[0, 0] / float(np.median(readings))
+        radius = min(radius, max(1, round((width - 1.0) / 2.0)))
+    return inverse_depth, radius
 
 
 def _least_direction(covariance: Array) -> Array:
