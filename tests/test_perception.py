@@ -52,6 +52,36 @@ def test_the_floor_belongs_to_nothing():
     assert (percept.labels[floor] == 0).all()
 
 
+def test_what_is_below_the_known_table_is_not_looked_at():
+    first = percept_of(VIEW, "labels")
+    again = percept_of(VIEW, "labels", known=first.surface)
+    assert again.cloud.points_world[:, 2].min() > TABLE_TOP - 0.1
+    shared = np.isin(first.pixels, again.pixels)
+    np.testing.assert_array_equal(first.pixels[shared], again.pixels)
+    np.testing.assert_allclose(first.cloud.points_world[shared], again.cloud.points_world)
+    above = first.cloud.points_world[:, 2] > TABLE_TOP - 0.04
+    assert shared[above].all()
+    assert (first.labels[shared] == again.labels).mean() > 0.999
+
+
+def test_labelled_points_below_the_known_table_are_kept():
+    known = percept_of(VIEW).surface
+    floor = percept_of(VIEW, "labels")
+    pixels = floor.pixels[floor.cloud.points_world[:, 2] < 0.1][:500]
+    labels = VIEW.labels.copy()
+    labels.ravel()[pixels] = 77
+    assert (percept_of(replace(VIEW, labels=labels), "labels", known=known).labels == 77).sum() == 500
+
+
+def test_a_view_of_nothing_but_the_floor_keeps_the_known_table():
+    known = percept_of(VIEW).surface
+    T = VIEW.pose.copy()
+    T[2, 3] -= 2.0
+    below = percept_of(replace(VIEW, T_world_camera=T, labels=None), "auto", known=known)
+    assert below.surface is known
+    assert not below.labels.any()
+
+
 def test_points_are_where_their_pixels_see_them():
     percept = percept_of(VIEW)
     expected = frames.transform(VIEW.pose, VIEW.points_camera.reshape(-1, 3)[percept.pixels])

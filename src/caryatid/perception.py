@@ -96,22 +96,18 @@ def perceive(
         if known is not None:
             raise InputError(source.name, "has no camera pose", "only a single view may come without one")
         source = _levelled(source, config, use_labels, rng)
-    cloud, pixels = _points(source, config)
-    given = source.labels.ravel()[pixels] if use_labels and source.labels is not None else None
-    surface = _surface(cloud, given, known, config, rng)
+    cloud, pixels = _points(source, config, known)
+    given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
+    surface = _surface(cloud, given, known, UP, config, rng)
     if given is not None:
         labels = given
     elif isinstance(source, View):
         labels = segment(source, surface, config.segmentation, config.cloud, config.fit, rng).ravel()[pixels]
     else:
         labels = segment_cloud(cloud, surface, config.segmentation)
-    labels = labels.astype(np.int32)
-    on_surface = (
-        (labels == 0)
-        & (np.abs(surface.height(cloud.points_world)) < config.surface.tolerance)
-        & (surface.distance_outside(cloud.points_world) < config.surface.tolerance)
-    )
-    labels[on_surface] = SUPPORT_LABEL
+    reach = config.surface.tolerance
+    on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
+    labels = np.where(on_surface, np.int32(SUPPORT_LABEL), labels)
     view = source if isinstance(source, View) else None
     return Percept(view, replace(cloud, labels=labels), pixels, surface)
 
@@ -127,7 +123,7 @@ def level_cloud(
     if len(cloud) == 0:
         raise PerceptionError(f"{cloud.name}: holds no points")
     given = None if segmentation == "auto" else cloud.labels
-    surface = _found(cloud, _loose(cloud, given, config), None, config, rng)
+    surface = _surface(cloud, given, None, None, config, rng)
     T = frames.level_world(surface.normal_world, surface.point_world)
     return cloud.moved(T)
 
@@ -141,26 +137,45 @@ def label_image(percept: Percept, source: View | Cloud) -> NDArray[np.int32]:
     return image
 
 
-def _points(source: View | Cloud, config: Config) -> tuple[Cloud, NDArray[np.intp]]:
+def _points(
+    source: View | Cloud, config: Config, known: SupportSurface | None = None
+) -> tuple[Cloud, NDArray[np.intp]]:
+    """Oriented points of a view, and their pixels; of a cloud, all there are.
+
+    What is further below the known support surface than that may be sought is left out.
+    """
     if isinstance(source, Cloud):
         if len(source) == 0:
             raise PerceptionError(f"{source.name}: holds no points")
         return source, np.arange(len(source), dtype=np.intp)
-    points, normals, pixels = oriented_points(source, config.cloud)
+    among = None if known is None else _not_below(source, known, config.surface.search)
+    points, normals, pixels = oriented_points(source, config.cloud, among=among)
     if len(points) == 0:
         limits = f"{config.cloud.min_depth:g}–{config.cloud.max_depth:g} m"
         raise PerceptionError(f"{source.name}: holds no depth readings within {limits}")
-    rgb = None if source.rgb is None else source.rgb.reshape(-1, 3)[pixels]
+    rgb = None if source.rgb is None else np.take(source.rgb.reshape(-1, 3), pixels, axis=0)
     eye = None if source.T_world_camera is None else source.T_world_camera[:3, 3]
     return Cloud(points, normals, None, rgb, eye, source.name), pixels
+
+
+def _not_below(view: View, surface: SupportSurface, depth: float) -> NDArray[np.bool_] | None:
+    """Pixels (H, W) that are labelled, or not this far [m] below a surface; None where there are none."""
+    x, y, z = frames.rotate(frames.invert(view.pose), surface.normal_world).astype(np.float32)
+    rows, columns = (np.arange(n, dtype=np.float32) for n in view.depth.shape)
+    across = x * (columns - np.float32(view.K[0, 2])) / np.float32(view.K[0, 0])
+    along = y * (rows - np.float32(view.K[1, 2])) / np.float32(view.K[1, 1]) + z
+    height = view.depth * (across + along[:, None])
+    among = (height > np.float32(-depth - surface.height(view.pose[:3, 3]))) & view.valid
+    if view.labels is not None:
+        among |= view.labels > 0
+    return among if among.any() else None
 
 
 def _levelled(view: View, config: Config, use_labels: bool, rng: np.random.Generator) -> View:
     """Give a view without a pose the world frame of its support plane."""
     cloud, pixels = _points(view, config)
-    given = view.labels.ravel()[pixels] if use_labels and view.labels is not None else None
-    loose = _loose(cloud, given, config)
-    surface = _found(cloud, loose, None, config, rng)
+    given = np.take(view.labels, pixels) if use_labels and view.labels is not None else None
+    surface = _surface(cloud, given, None, None, config, rng)
     return view.with_pose(frames.level_world(surface.normal_world, surface.point_world))
 
 
@@ -168,30 +183,29 @@ def _surface(
     cloud: Cloud,
     given: NDArray[np.int32] | None,
     known: SupportSurface | None,
+    up: Array | None,
     config: Config,
     rng: np.random.Generator,
 ) -> SupportSurface:
-    loose = _loose(cloud, given, config)
+    """Find the support surface in points that belong to no given object: near the known one, or anywhere."""
+    loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
     if known is None:
-        return _found(cloud, loose, UP, config, rng)
-    near = loose[np.abs(known.height(cloud.points_world[loose])) < config.surface.search]
+        return _found(_spread(cloud, loose, config.surface.max_points), up, config, rng)
+    near = np.abs(known.height(cloud.points_world)) < config.surface.search
     try:
-        return _found(cloud, near, UP, config, rng)
+        return _found(_spread(cloud, loose & near, config.surface.max_points_known), up, config, rng)
     except PerceptionError:
         return known
 
 
-def _loose(cloud: Cloud, given: NDArray[np.int32] | None, config: Config) -> NDArray[np.intp]:
-    """Indices of at most `max_points` points that belong to no given object."""
-    loose = np.arange(len(cloud)) if given is None else np.flatnonzero(given == 0)
-    return loose[:: max(1, len(loose) // config.surface.max_points)]
+def _spread(cloud: Cloud, among: NDArray[np.bool_], count: int) -> Cloud:
+    """About this many, and less than twice as many, of some points (N,), spread evenly."""
+    index = np.flatnonzero(among)
+    return cloud.select(index[:: max(1, len(index) // count)])
 
 
-def _found(
-    cloud: Cloud, loose: NDArray[np.intp], up: Array | None, config: Config, rng: np.random.Generator
-) -> SupportSurface:
-    points, normals = cloud.points_world[loose], cloud.normals_world[loose]
+def _found(cloud: Cloud, up: Array | None, config: Config, rng: np.random.Generator) -> SupportSurface:
     try:
-        return find_support_surface(points, normals, up, config.surface, rng)
+        return find_support_surface(cloud.points_world, cloud.normals_world, up, config.surface, rng)
     except PerceptionError as error:
         raise PerceptionError(f"{cloud.name}: {error}") from None

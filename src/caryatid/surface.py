@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.spatial import ConvexHull, QhullError
 
 from caryatid import frames
 from caryatid.config import SurfaceConfig
 from caryatid.errors import PerceptionError
 from caryatid.frames import Array
+from caryatid.kernels.outlines import within_prism
+from caryatid.kernels.polygons import hull
+from caryatid.kernels.surface import Mask, plane_gains, plane_inliers
 from caryatid.shapes import Box
-
-Mask = NDArray[np.bool_]
 
 MAX_CELLS = 1000
 """Cells along a plane's grid at the most [1]; bounds memory where a cloud is not in metres."""
@@ -46,13 +45,28 @@ class SupportSurface:
 
         Beside a corner this is the distance to the nearer of the two edges' lines: a mitred margin.
         """
-        basis = _basis(self.normal_world)
-        corners = (self.outline_world - self.point_world) @ basis.T
+        sides = self._sides()
+        flat = (points_world - self.point_world) @ _basis(self.normal_world).T
+        return np.max(flat @ sides[:, :2].T - sides[:, 2], axis=-1)
+
+    def over(self, points_world: Array, low: float, high: float, margin: float) -> Mask:
+        """Which points (N, 3) [m] are over the outline, or no further than the margin [m] outside it.
+
+        Args:
+            points_world: (N, 3) [m].
+            low: Least height [m].
+            high: Greatest height [m].
+            margin: Greatest `distance_outside` [m].
+        """
+        axes = np.concatenate([_basis(self.normal_world), self.normal_world[None]])
+        return within_prism(points_world, self.point_world, axes, self._sides(), low, high, margin)
+
+    def _sides(self) -> Array:
+        """Outward unit normal, in the plane's coordinates, and offset [m] of each side (M, 3)."""
+        corners = (self.outline_world - self.point_world) @ _basis(self.normal_world).T
         edges = frames.unit(np.roll(corners, -1, axis=0) - corners)
         outward = np.stack([edges[:, 1], -edges[:, 0]], axis=-1)
-        offsets = np.einsum("ij,ij->i", outward, corners)
-        flat = (points_world - self.point_world) @ basis.T
-        return np.max(flat @ outward.T - offsets, axis=-1)
+        return np.concatenate([outward, np.einsum("ij,ij->i", outward, corners)[:, None]], axis=-1)
 
     def moved(self, T: Array) -> SupportSurface:
         """Return the surface moved by a rigid transform of the world."""
@@ -176,12 +190,8 @@ def _largest_plane(
     if len(directions) == 0:
         return None
     offsets = np.einsum("ij,ij->i", directions, anchors)
-    signed = p @ directions.T - offsets
-    agree = n @ directions.T > np.cos(np.radians(config.max_deviation))
-    gain = np.where(agree, np.maximum(1.0 - (signed / config.tolerance) ** 2, 0.0), 0.0).sum(axis=0)
-    if up is None:
-        gain = gain - (signed < -3.0 * config.tolerance).sum(axis=0)
-    best = int(np.argmax(gain))
+    agree, behind = np.cos(np.radians(config.max_deviation)), 0.0 if up is not None else 1.0
+    best = int(np.argmax(plane_gains(p, n, directions, offsets, config.tolerance, agree, behind)))
     return _refine(points, normals, among, directions[best], float(offsets[best]), up, config)
 
 
@@ -198,13 +208,12 @@ def _refine(
     agree = np.cos(np.radians(config.max_deviation))
     inliers = among
     for _ in range(4):
-        inliers = among & (np.abs(points @ normal - offset) <= config.tolerance) & (normals @ normal > agree)
-        if inliers.sum() < max(config.min_points, 3):
+        inliers, count, centre, scatter = plane_inliers(
+            points, normals, among, (normal, offset), config.tolerance, agree
+        )
+        if count < max(config.min_points, 3):
             return None
-        on_plane = points[inliers]
-        centre = on_plane.mean(axis=0)
-        spread = on_plane - centre
-        refined = np.linalg.eigh(spread.T @ spread)[1][:, 0]
+        refined = np.linalg.eigh(scatter)[1][:, 0]
         normal = refined if refined @ normal > 0 else -refined
         offset = float(normal @ centre)
     if up is not None and normal @ up < np.cos(np.radians(config.max_tilt)):
@@ -216,31 +225,31 @@ def _refine(
 def _main_part(points: Array, normal: Array, inliers: Mask, config: SurfaceConfig) -> tuple[Mask, float]:
     """Keep the largest part of a plane that holds together over gaps, and say how much of it is seen [m²]."""
     index = np.flatnonzero(inliers)
-    flat = points[index] @ _basis(normal).T
-    cell = max(config.cell, float(np.ptp(flat, axis=0).max()) / MAX_CELLS)
+    flat = _basis(normal) @ np.take(points, index, axis=0).T
+    cell = max(config.cell, float((flat.max(axis=1) - flat.min(axis=1)).max()) / MAX_CELLS)
     cells = np.floor(flat / cell).astype(np.intp)
-    cells -= cells.min(axis=0)
-    count = np.zeros(cells.max(axis=0) + 1, dtype=np.intp)
-    np.add.at(count, (cells[:, 0], cells[:, 1]), 1)
+    cells -= cells.min(axis=1, keepdims=True)
+    size = cells.max(axis=1) + 1
+    owner = cells[0] * size[1] + cells[1]
+    count = np.bincount(owner, minlength=int(size.prod())).reshape(size)
     reach = int(np.ceil(config.gap / cell / 2.0))
     near = ndimage.distance_transform_edt(np.pad(count == 0, reach))[reach:-reach, reach:-reach] <= reach
     part, _ = ndimage.label(near)
     main = int(np.argmax(np.bincount(part.ravel(), weights=count.ravel())))
     kept = np.zeros_like(inliers)
-    kept[index[part[cells[:, 0], cells[:, 1]] == main]] = True
+    kept[index[part.ravel()[owner] == main]] = True
     return kept, float(np.count_nonzero((count > 0) & (part == main))) * cell**2
 
 
 def _surface(points: Array, plane: _Plane, config: SurfaceConfig) -> SupportSurface:
-    on_plane = points[plane.inliers]
-    centroid = on_plane.mean(axis=0)
+    on_plane = np.compress(plane.inliers, points, axis=0)
+    centroid = np.array([x.mean() for x in on_plane.T])
     centroid = centroid - (plane.normal @ centroid - plane.offset) * plane.normal
     basis = _basis(plane.normal)
     flat = (on_plane - centroid) @ basis.T
-    try:
-        corners = flat[ConvexHull(flat).vertices]
-    except QhullError as error:
-        raise PerceptionError("the points of the support surface lie on one line") from error
+    corners = hull(np.ascontiguousarray(flat))
+    if len(corners) < 3:
+        raise PerceptionError("the points of the support surface lie on one line")
     outline = centroid + corners @ basis
     return SupportSurface(
         plane.normal, centroid, outline, _top_box(corners, centroid, basis, config.thickness)

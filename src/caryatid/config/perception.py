@@ -60,6 +60,8 @@ class SurfaceConfig(Stage):
     """Fewer inliers are no table [points]."""
     max_points: Count = 20_000
     """Points of a view the surface is looked for in [1]; spread evenly, they give its height to 0.1 mm."""
+    max_points_known: Count = 5000
+    """The same once the table is known [1]: as many of a first view's are the table's, the rest is floor."""
     search: Positive = 0.05
     """Once known, the table is looked for within this height of itself [m]; 5σ of registration and tilt."""
     spacing: Positive = 0.02
