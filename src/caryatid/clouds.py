@@ -11,7 +11,7 @@ from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.frames import Array
 from caryatid.kernels.local_planes import LocalSurface, local_surface
-from caryatid.kernels.thinning import nearest_to_means
+from caryatid.kernels.voxels import most_central
 from caryatid.views import View
 
 CHUNK = 100_000
@@ -145,7 +145,8 @@ def thin(points: Array, voxel: float) -> NDArray[np.intp]:
     """
     if not voxel > 0.0:
         raise InputError("thin", f"voxel size {voxel:g} is not positive", "give metres above zero")
-    return np.flatnonzero(nearest_to_means(np.ascontiguousarray(points, dtype=np.float64), voxel))
+    points = np.asarray(points, dtype=np.float64)
+    return most_central(points, np.zeros(len(points), dtype=np.int32), np.array([voxel]))
 
 
 def _in_range(view: View, config: CloudConfig) -> NDArray[np.bool_]:

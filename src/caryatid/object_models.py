@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from caryatid.config import Config
 from caryatid.explanation import explained_by, gather
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, object_id
+from caryatid.kernels.voxels import most_central
 from caryatid.object_points import ObjectPoints
 from caryatid.perception import UP, Percept
 from caryatid.primitives import FitFailure, Oriented, fit_many
@@ -26,6 +28,18 @@ from caryatid.voxels import VoxelMap
 
 MEAN_TO_DEVIATION = 1.25
 """Standard deviation of a normal distribution over its mean absolute value."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Parts:
+    """What segmentation took for parts in one view: points (N, 3) [m] and the part (N,) each is of."""
+
+    points: Array
+    labels: NDArray[np.int32]
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        return cKDTree(self.points)
 
 
 class ObjectModels:
@@ -46,7 +60,7 @@ class ObjectModels:
         self._config = config
         self._seed = seed
         self._undivided: dict[int, int] = {}
-        self._parts: list[tuple[cKDTree, NDArray[np.int32]]] = []
+        self._parts: list[_Parts] = []
         self._apart: dict[tuple[int, int], int] = {}
 
     def copy(self) -> ObjectModels:
@@ -63,7 +77,7 @@ class ObjectModels:
         """Give a view's automatic parts the labels of the objects they belong to, or new ones."""
         kept = np.flatnonzero((percept.labels != 0) & (percept.labels != SUPPORT_LABEL))
         kept = kept[thin(percept.cloud.points_world[kept], self._config.explanation.spacing)]
-        self._parts.append((cKDTree(percept.cloud.points_world[kept]), percept.labels[kept]))
+        self._parts.append(_Parts(percept.cloud.points_world[kept], percept.labels[kept]))
         labels = association.associate(
             percept.cloud.points_world,
             np.where(percept.labels == SUPPORT_LABEL, 0, percept.labels),
@@ -79,10 +93,14 @@ class ObjectModels:
         """Add a view's points, thinned, and return the labels of the objects among them."""
         config = self._config
         shown = set(percept.shown) - {0}
+        voxels = np.full(max(shown, default=0) + 1, config.cloud.voxel)
+        voxels[0] = 0.0
+        voxels[SUPPORT_LABEL:] = config.surface.spacing
+        kept = most_central(percept.cloud.points_world, percept.labels, voxels)
+        labels = percept.labels[kept]
         for label in sorted(shown):
-            part = percept.cloud.select(percept.labels == label)
-            voxel = config.surface.spacing if label == SUPPORT_LABEL else config.cloud.voxel
-            self.points.add(label, part.select(thin(part.points_world, voxel)), view)
+            self.points.add(label, percept.cloud.select(kept[labels == label]), view)
+            self.points.bound(label, voxels[label], config.cloud.depth)
         return shown - {SUPPORT_LABEL}
 
     def move(self, T: Mapping[int, Array]) -> set[int]:
@@ -194,9 +212,9 @@ class ObjectModels:
         """Points (N,) that segmentation took for a part of its own in one of the views."""
         config = self._config
         hints = []
-        for tree, labels in self._parts:
-            gap, index = tree.query(points, distance_upper_bound=config.split.reach)
-            owner = np.where(np.isfinite(gap), np.append(labels, 0)[index], 0)
+        for parts in self._parts:
+            gap, index = parts.tree.query(points, distance_upper_bound=config.split.reach)
+            owner = np.where(np.isfinite(gap), np.append(parts.labels, 0)[index], 0)
             for part in np.unique(owner[owner > 0]):
                 own = owner == part
                 if config.split.min_points <= own.sum() < 0.9 * (owner > 0).sum():

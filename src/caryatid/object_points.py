@@ -1,14 +1,40 @@
-"""The points of each object, view by view."""
+"""The points of each object, and which view showed each of them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.frames import Array
+from caryatid.kernels import points as kernels
+from caryatid.kernels.voxels import last_in_voxels
 from caryatid.views import SUPPORT_LABEL, Cloud
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Seen:
+    """Points of one object, those of later views behind those of earlier ones, and the view (N,) of each."""
+
+    cloud: Cloud
+    views: NDArray[np.intp]
+
+    def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> _Seen:
+        return _Seen(self.cloud.select(kept), self.views[kept])
+
+    def relabelled(self, label: int) -> _Seen:
+        return replace(self, cloud=relabelled(self.cloud, label))
+
+    def moved(self, T: Mapping[int, Array]) -> _Seen:
+        poses = np.array([T.get(view, np.eye(4)) for view in range(int(self.views.max()) + 1)])
+        points = kernels.transform(poses, self.views, self.cloud.points_world)
+        normals = kernels.rotate(poses, self.views, self.cloud.normals_world)
+        return replace(self, cloud=replace(self.cloud, points_world=points, normals_world=normals))
+
+    def followed_by(self, other: _Seen) -> _Seen:
+        return _Seen(joined([self.cloud, other.cloud]), np.concatenate([self.views, other.views]))
 
 
 class ObjectPoints:
@@ -20,54 +46,66 @@ class ObjectPoints:
 
     def __init__(self) -> None:
         self.labels_used = 0
-        self._clouds: dict[int, list[tuple[int, Cloud]]] = {}
+        self._seen: dict[int, _Seen] = {}
 
     def copy(self) -> ObjectPoints:
-        """Return points that go on growing by themselves; the clouds so far are shared."""
+        """Return points that go on growing by themselves; the points so far are shared."""
         other = ObjectPoints()
         other.labels_used = self.labels_used
-        other._clouds = {label: list(clouds) for label, clouds in self._clouds.items()}
+        other._seen = self._seen.copy()
         return other
 
     def add(self, label: int, cloud: Cloud, view: int) -> None:
         """Add a view's points of an object, or of the support surface."""
-        self._clouds.setdefault(label, []).append((view, cloud))
+        self._append(label, _Seen(joined([cloud]), np.full(len(cloud), view)))
         if label != SUPPORT_LABEL:
             self.labels_used = max(self.labels_used, label)
 
     def __contains__(self, label: int) -> bool:
-        return label in self._clouds
+        return label in self._seen
 
     @property
     def objects(self) -> list[int]:
         """Labels of the objects, the support surface left out."""
-        return sorted(k for k in self._clouds if k != SUPPORT_LABEL)
+        return sorted(k for k in self._seen if k != SUPPORT_LABEL)
 
     def of(self, label: int) -> Cloud:
         """All points of an object."""
-        return joined(cloud for _, cloud in self._clouds.get(label, []))
+        return self._seen[label].cloud if label in self._seen else joined([])
 
     def newest(self, label: int) -> Cloud:
         """Points of an object in the newest view that showed it."""
-        return self._clouds[label][-1][1]
+        seen = self._seen[label]
+        return seen.cloud.select(seen.views == seen.views[-1])
 
     def everything(self) -> Cloud:
         """All points of all objects and of the support surface, with labels."""
-        return joined(c for label in sorted(self._clouds) for _, c in self._clouds[label])
+        return joined(self._seen[label].cloud for label in sorted(self._seen))
+
+    def bound(self, label: int, voxel: float, depth: int) -> None:
+        """Leave an object the newest points in each voxel, once more than twice as many views have shown it.
+
+        Args:
+            label: Which.
+            voxel: Edge length of a voxel [m].
+            depth: Points left in each.
+        """
+        seen = self._seen[label]
+        if len(seen.views) > 0 and len(np.unique(seen.views)) > 2 * depth:
+            self._seen[label] = seen.select(last_in_voxels(seen.cloud.points_world, voxel, depth))
 
     def move(self, T: Mapping[int, Array]) -> set[int]:
         """Move the points of some views, view → (4, 4); returns the labels that have such points."""
-        moved: set[int] = set()
-        for label, clouds in self._clouds.items():
-            if any(view in T for view, _ in clouds):
-                moved.add(label)
-                self._clouds[label] = [(view, c.moved(T[view]) if view in T else c) for view, c in clouds]
-        return moved
+        if not T:
+            return set()
+        moving = [k for k, seen in self._seen.items() if np.isin(seen.views, list(T)).any()]
+        for label in moving:
+            self._seen[label] = self._seen[label].moved(T)
+        return set(moving)
 
     def merge(self, old: int, new: int) -> None:
         """Give the points of one object to another."""
-        taken = [(view, relabelled(c, new)) for view, c in self._clouds.pop(old)]
-        self._clouds[new] = [*self._clouds[new], *taken]
+        self._append(new, self._seen.pop(old).relabelled(new))
 
     def divide(self, label: int, groups: NDArray[np.intp]) -> list[int]:
         """Make several objects of one.
@@ -79,14 +117,15 @@ class ObjectPoints:
         Returns:
             Label of each group; the first keeps the old one.
         """
-        clouds = self._clouds.pop(label)
-        ends = np.cumsum([len(c) for _, c in clouds])
+        seen = self._seen.pop(label)
         names = [label, *range(self.labels_used + 1, self.labels_used + 1 + int(groups.max()))]
-        for (view, cloud), part in zip(clouds, np.split(groups, ends[:-1]), strict=True):
-            for number, name in enumerate(names):
-                if (part == number).any():
-                    self.add(name, relabelled(cloud.select(part == number), name), view)
+        for number, name in enumerate(names):
+            self._seen[name] = seen.select(groups == number).relabelled(name)
+        self.labels_used = max(self.labels_used, *names)
         return names
+
+    def _append(self, label: int, seen: _Seen) -> None:
+        self._seen[label] = self._seen[label].followed_by(seen) if label in self._seen else seen
 
 
 def relabelled(cloud: Cloud, label: int) -> Cloud:

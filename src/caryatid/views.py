@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.frames import Array
+from caryatid.kernels import points as kernels
 
 SUPPORT_LABEL = 65535
 """The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
@@ -101,7 +103,10 @@ class View:
 
     def with_pose(self, T_world_camera: Array) -> View:
         """Return the same view seen from another pose."""
-        return replace(self, T_world_camera=T_world_camera)
+        other = copy.copy(self)
+        T = frames.as_rigid(T_world_camera, f"{self.name}: T_world_camera")
+        object.__setattr__(other, "T_world_camera", T)
+        return other
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -129,22 +134,25 @@ class Cloud:
 
     def select(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Cloud:
         """Return the points picked by a mask (N,) or by indices."""
+        index = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep
         return Cloud(
-            self.points_world[keep],
-            self.normals_world[keep],
-            None if self.labels is None else self.labels[keep],
-            None if self.rgb is None else self.rgb[keep],
+            np.take(self.points_world, index, axis=0),
+            np.take(self.normals_world, index, axis=0),
+            None if self.labels is None else np.take(self.labels, index),
+            None if self.rgb is None else np.take(self.rgb, index, axis=0),
             self.viewpoint_world,
             self.name,
         )
 
     def moved(self, T: Array) -> Cloud:
         """Return the cloud moved by a rigid transform (4, 4) of the world."""
-        eye = self.viewpoint_world
+        if np.array_equal(T, np.eye(4)):
+            return self
+        eye, only = self.viewpoint_world, np.zeros(len(self), dtype=np.intp)
         return replace(
             self,
-            points_world=frames.transform(T, self.points_world),
-            normals_world=frames.rotate(T, self.normals_world),
+            points_world=kernels.transform(T[None], only, self.points_world),
+            normals_world=kernels.rotate(T[None], only, self.normals_world),
             viewpoint_world=None if eye is None else frames.transform(T, eye),
         )
 

@@ -26,6 +26,9 @@ class CloudConfig(Stage):
     """Change of inverse depth within one surface beyond edge_jump [1/m per px]; a tilt of 80° at 2.7 m."""
     voxel: Positive = 0.005
     """Spacing the pooled points of an object are thinned to [m]; about the noise of one reading at 1.5 m."""
+    depth: Count = 5
+    """Points kept in a voxel once more than twice as many views have shown it [1]; their mean errs by less
+    than half the noise of one."""
     neighbours: Count = 16
     """Neighbours a normal of an unorganised cloud is estimated from."""
 
