@@ -10,7 +10,12 @@ from scipy.spatial import cKDTree
 
 from caryatid.config import SegmentationConfig
 from caryatid.frames import Array
+from caryatid.kernels.nearness import KnownObjects, gaps_to_objects
+from caryatid.kernels.voxels import most_central
 from caryatid.shapes import Shape
+
+DENSITY = 4
+"""Points of a part, and of an object, along the distance that counts as overlap [1]; others are left out."""
 
 
 def associate(
@@ -36,40 +41,49 @@ def associate(
     Returns:
         Label of the object (N,) of each point; 0 where there was no part.
     """
-    result = np.zeros_like(labels)
-    fresh = max(labels_used, *known_points, 0)
-    trees = {k: cKDTree(p) for k, p in known_points.items()}
-    for part in (int(k) for k in np.unique(labels) if k != 0):
-        index = np.flatnonzero(labels == part)
-        points = points_world[index]
-        neighbours = [
-            k for k in trees if may_touch(points, known_points[k], known_shapes.get(k), config.overlap_reach)
-        ]
-        gaps = np.array([_gaps(points, trees[k], known_shapes.get(k)) for k in neighbours])
-        near = gaps < config.overlap_reach
-        if not neighbours or near.any(axis=0).mean() < config.overlap:
+    names = sorted(known_points)
+    spacing = config.overlap_reach / DENSITY
+    known = _thinned(
+        KnownObjects.of([known_points[k] for k in names], [known_shapes.get(k) for k in names]), spacing
+    )
+    counts = np.bincount(labels, minlength=1)
+    kept = most_central(points_world, labels, np.where(np.arange(len(counts)) > 0, spacing, 0.0))
+    gaps = gaps_to_objects(np.take(points_world, kept, axis=0), known, config.overlap_reach)
+    part_of = labels[kept]
+    fresh = max(labels_used, *names, 0)
+    name_of: NDArray[np.int32] = np.zeros(len(counts), dtype=np.int32)
+    divided: dict[int, NDArray[np.intp]] = {}
+    for part in (int(k) for k in np.flatnonzero(counts) if k != 0):
+        own = gaps[part_of == part]
+        near = np.isfinite(own).any(axis=1) if names else np.zeros(len(own), dtype=bool)
+        if near.mean() < config.overlap or not near.any():
             fresh += 1
-            result[index] = fresh
+            name_of[part] = fresh
             continue
-        nearest = np.where(near.any(axis=0), np.argmin(gaps, axis=0), -1)
-        shares = np.bincount(nearest[nearest >= 0], minlength=len(neighbours)) / len(points)
+        shares = np.bincount(np.argmin(own[near], axis=1), minlength=len(names)) / len(own)
         owners = np.flatnonzero(shares >= min(config.divide_share, shares.max()))
-        result[index] = np.array(neighbours)[owners[np.argmin(gaps[owners], axis=0)]]
+        name_of[part] = names[owners[0]]
+        if len(owners) > 1:
+            divided[part] = owners
+    result = np.take(name_of, labels)
+    for part, owners in divided.items():
+        index = np.flatnonzero(labels == part)
+        nearest = _nearest(np.take(points_world, index, axis=0), known.select(owners), config.overlap_reach)
+        result[index] = np.array(names)[owners[nearest]]
     return result
 
 
-def may_touch(points: Array, others: Array, shape: Shape | None, reach: float) -> bool:
-    """Whether the axis-aligned boxes around points (N, 3) and around an object come within reach [m]."""
-    low, high = others.min(axis=0), others.max(axis=0)
-    if shape is not None:
-        centre, half = shape.T_world_object[:3, 3], shape.support(np.eye(3))
-        low, high = np.minimum(low, centre - half), np.maximum(high, centre + half)
-    return bool(((points.min(axis=0) <= high + reach) & (points.max(axis=0) >= low - reach)).all())
+def _thinned(known: KnownObjects, spacing: float) -> KnownObjects:
+    edges = np.full(len(known.kinds), spacing)
+    return known.keep(most_central(known.points, known.owners.astype(np.int32), edges))
 
 
-def _gaps(points: Array, tree: cKDTree, shape: Shape | None) -> Array:
-    """Distance (N,) [m] of points to an object: to its points, or its shape's surface if nearer."""
-    gap, _ = tree.query(points)
-    if shape is None:
-        return np.asarray(gap)
-    return np.minimum(gap, np.abs(shape.signed_distance(points)))
+def _nearest(points: Array, known: KnownObjects, reach: float) -> NDArray[np.intp]:
+    """Which of some objects is nearest to each point (N, 3) [m]; beyond the reach, to whose points."""
+    gaps = gaps_to_objects(points, known, reach)
+    nearest = np.argmin(gaps, axis=1)
+    far = np.flatnonzero(~np.isfinite(gaps).any(axis=1))
+    if len(far) > 0:
+        _, index = cKDTree(known.points).query(points[far])
+        nearest[far] = known.owners[index]
+    return nearest
