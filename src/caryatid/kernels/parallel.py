@@ -26,19 +26,24 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
         data: Arrays and numbers, best a `NamedTuple`; results are written to arrays among them.
     """
     layout = (work, *map(_layout, data))
-    entry = _entries.get(layout)
-    if entry is None:
+    entries = _entries.get(layout)
+    if entries is None:
         kind = numba.typeof(data)
         one = types.void(types.int64, kind)
         signature = (types.FunctionType(one), types.int64, kind)
         work.compile(one.args)
         _loop.compile(signature)
-        entry = _entries[layout] = _loop.overloads[signature].entry_point
-    entry(work, count, data)
+        entries = work.overloads[one.args].entry_point, _loop.overloads[signature].entry_point
+        _entries[layout] = entries
+    alone, loop = entries
+    if count == 1:
+        alone(0, data)
+    else:
+        loop(work, count, data)
 
 
-_entries: dict[tuple[Any, ...], Callable[[Any, int, tuple[Any, ...]], None]] = {}
-"""The loop as compiled for each work and layout of data; `numba.typeof` takes a quarter of a millisecond."""
+_entries: dict[tuple[Any, ...], tuple[Callable[..., None], Callable[..., None]]] = {}
+"""Work and loop as compiled for each layout of data; `numba.typeof` takes a quarter of a millisecond."""
 
 
 def _layout(value: object) -> object:
