@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -192,6 +193,58 @@ def test_the_sample_is_even_over_sides():
     np.testing.assert_array_equal(even_sample(surfels, 10**6), np.arange(len(surfels)))
 
 
+def test_a_view_that_is_refused_changes_nothing_for_the_others():
+    small, large = motion(translation_mm=(4.0, -3.0, 5.0)), motion(translation_mm=(30.0, -20.0, 12.0))
+    views = [seen_from(a, seed=k) for k, a in enumerate((180.0, 140.0, 100.0, 60.0))]
+    views = [put_right(v, e) for v, e in zip(views, (np.eye(4), small, large, small), strict=True)]
+    limited = replace(CONFIG, max_translation=0.03)
+    result, without = registered(views, limited), registered([views[0], views[1], views[3]], limited)
+    assert [p.outcome for p in result.placements[1:]] == ["aligned", "beyond the limits", "aligned"]
+    np.testing.assert_array_equal(result.placements[2].twist, 0.0)
+    for k, alone in ((1, 1), (3, 2)):
+        assert left(result, k, small) < 0.002
+        assert result.placements[k].twist.tobytes() == without.placements[alone].twist.tobytes()
+
+
+def test_views_beyond_those_kept_are_laid_as_well_and_then_stay():
+    rng = np.random.default_rng(4)
+    angles = (180.0, 150.0, 110.0, 70.0, 30.0, -10.0, -50.0, -90.0, -130.0, -155.0, 165.0, 95.0)
+    errors = [np.eye(4), *(drawn_error(rng, 5.0, 0.3) for _ in angles[1:])]
+    views = [put_right(seen_from(a, seed=k), e) for k, (a, e) in enumerate(zip(angles, errors, strict=True))]
+    few, many = ViewRegistration(PIVOT, replace(CONFIG, kept=4)), ViewRegistration(PIVOT, CONFIG)
+    sizes = []
+    for view in views:
+        few.add(view, same_labels=True)
+        many.add(view, same_labels=True)
+        sizes.append([len(pickle.dumps(r)) for r in (few, many)])
+    assert sizes[-1][0] < 1.1 * sizes[4][0]
+    assert sizes[-1][1] > 2.0 * sizes[4][1]
+    assert [p.outcome for p in few.placements[1:]] == ["aligned"] * 11
+    off = [[left(r, k, e) for k, e in enumerate(errors)] for r in (few, many)]
+    assert max(off[0]) < 0.003
+    assert np.mean(off[0]) < 1.5 * np.mean(off[1])
+
+
+def test_a_copy_goes_on_by_itself_and_alike():
+    rng = np.random.default_rng(3)
+    views = [
+        put_right(seen_from(a, BOXES, seed=k), drawn_error(rng) if k else np.eye(4))
+        for k, a in enumerate((180.0, 0.0, 90.0, 270.0))
+    ]
+    first = registered(views[:2])
+    before = [p.twist.tobytes() for p in first.placements]
+    second = first.copy()
+    moves = [second.add(view, same_labels=True) for view in views[2:]]
+    assert [p.twist.tobytes() for p in first.placements] == before
+    for view, expected in zip(views[2:], moves, strict=True):
+        found = first.add(view, same_labels=True)
+        assert {v: T.tobytes() for v, T in found.items()} == {v: T.tobytes() for v, T in expected.items()}
+    for a, b in zip(first.placements, second.placements, strict=True):
+        assert a.outcome == b.outcome
+        assert a.twist.tobytes() == b.twist.tobytes()
+        assert a.covariance.tobytes() == b.covariance.tobytes()
+
+
 def test_the_same_views_give_the_same_bytes():
     error = drawn_error(np.random.default_rng(0))
     views = [seen_from(180.0, seed=1), put_right(seen_from(120.0, seed=2), error)]
@@ -203,3 +256,15 @@ def test_a_twist_turns_about_its_pivot():
     T = twist_transform(np.array([0.01, 0.02, 0.03, 0.0, 0.0, 0.5]), PIVOT)
     np.testing.assert_allclose(frames.transform(T, PIVOT), PIVOT + (0.01, 0.02, 0.03))
     np.testing.assert_allclose(T[:3, :3], frames.rotation_from_vector((0.0, 0.0, 0.5)))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 3.0])
+def test_many_twists_at_once_turn_like_each_of_them(angle):
+    rng = np.random.default_rng(0)
+    twists = rng.normal(size=(2, 3, 6))
+    twists[..., 3:] = angle * frames.unit(twists[..., 3:])
+    for found, twist in zip(
+        twist_transform(twists, PIVOT).reshape(-1, 4, 4), twists.reshape(-1, 6), strict=True
+    ):
+        R = frames.rotation_from_vector(twist[3:])
+        np.testing.assert_allclose(found, frames.rigid(R, PIVOT - R @ PIVOT + twist[:3]), atol=1e-14)

@@ -2,33 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from caryatid import frames
 from caryatid.config import RegistrationConfig
 from caryatid.frames import Array
+from caryatid.kernels.descent import normal_equations, step_down
+from caryatid.kernels.parallel import for_each
+from caryatid.kernels.partners import CHUNK, Search, find_partners, index_patches
+from caryatid.pose_graph import Index, Ties
 from caryatid.surfels import Surfels, even_sample
+
+UPPER = np.triu_indices(6)
+"""Rows and columns of the upper half of a matrix (6, 6), row by row."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RegisteredView:
-    """One view as registration keeps it.
+    """One view as registration keeps it; patches are rows as `kernels.partners.COLUMNS` says.
 
     Attributes:
-        surfels: Its patches, in the world as reported.
-        sample: Indices of the patches that look for partners in other views.
-        tree: Finds the patch nearest in place, direction and label.
+        patches: Its patches (P, 8), in the world as reported, sorted to be found.
+        starts: Where in them the list of each bucket begins (BUCKETS + 1,).
+        sample: Those (S, 8) that look for partners in other views.
         information: Inverse covariance (6, 6) of the reported pose's error, as a twist about the pivot.
     """
 
-    surfels: Surfels
-    sample: NDArray[np.intp]
-    tree: cKDTree
+    patches: Array
+    starts: NDArray[np.int64]
+    sample: Array
     information: Array
 
     @classmethod
@@ -48,176 +54,190 @@ class RegisteredView:
         at_camera[:3, 3:] = -frames.skew(arm)
         sigma = np.repeat([config.translation, np.radians(config.rotation)], 3)
         information = at_camera.T @ (at_camera / sigma[:, None] ** 2)
-        sample = even_sample(surfels, config.sample)
-        tree = cKDTree(_features(surfels.points_world, surfels.normals_world, surfels.labels, config))
-        return cls(surfels, sample, tree, information)
+        rows = np.column_stack(
+            [surfels.points_world, surfels.normals_world, surfels.variance, surfels.labels.astype(np.float64)]
+        )
+        patches, starts = index_patches(rows, _edge(config))
+        return cls(patches, starts, rows[even_sample(surfels, config.sample)], information)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Matches:
-    """Patches of one view and their partners in another, each in its view's world as reported.
+class Descent:
+    """Where a view came to lie.
 
     Attributes:
-        moving: The view that looked for partners.
-        still: The view they are in.
-        points: (N, 3) [m], of the moving view.
-        normals: Unit normals (N, 3) of the moving view.
-        partners: (N, 3) [m].
-        partner_normals: (N, 3).
-        variance: Of the distance between partners (N,) [m²].
+        twist: Its move (6,) from where it was reported.
+        misfit_before: Mean distance [m] over the patches that looked for a partner, those without one being
+            outliers, where it started.
+        misfit: The same where it came to lie.
     """
 
-    moving: int
-    still: int
-    points: Array
-    normals: Array
-    partners: Array
-    partner_normals: Array
-    variance: Array
+    twist: Array
+    misfit_before: float
+    misfit: float
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solution:
-    """Where views are, after some rounds.
+class Gathering:
+    """Several views put together, to look for partners between them.
 
     Attributes:
-        twists: Move (V, 6) of each view from where it was reported: 3 × m, 3 × rad, about the pivot.
-        hessian: Inverse covariance (6·F, 6·F) of the free views' twists, the reports among the evidence.
+        numbers: Their numbers (V,), ascending.
+        patches: Those of all views (P, 8), view by view.
+        starts: Where in them the list of each bucket of each view begins (V, BUCKETS + 1).
+        samples: Those of all views (S, 8) that look for partners.
+        first: Where in them those of each view begin (V + 1,).
     """
 
-    twists: Array
-    hessian: Array
+    numbers: Index
+    patches: Array
+    starts: NDArray[np.int64]
+    samples: Array
+    first: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, views: Mapping[int, RegisteredView]) -> Gathering:
+        """Put views together.
+
+        Args:
+            views: Number → view, ascending.
+        """
+        before = np.cumsum([0, *(len(v.patches) for v in views.values())])
+        return cls(
+            np.array(list(views), dtype=np.intp),
+            np.concatenate([v.patches for v in views.values()]),
+            np.stack([v.starts + n for v, n in zip(views.values(), before[:-1], strict=True)]),
+            np.concatenate([v.sample for v in views.values()]),
+            np.cumsum([0, *(len(v.sample) for v in views.values())]),
+        )
+
+    def sample(self, number: int) -> Array:
+        """Patches (S, 8) of a view that look for partners."""
+        slot = int(np.searchsorted(self.numbers, number))
+        return self.samples[self.first[slot] : self.first[slot + 1]]
+
+    def match(
+        self,
+        still: Index,
+        moving: Index,
+        twists: Array,
+        pivot_world: Array,
+        outlier: float,
+        config: RegistrationConfig,
+    ) -> Ties:
+        """Find the partners of views' whole samples in other views, within the shortest reach.
+
+        Args:
+            still: Number (E,) of the view in which each pair's are looked for.
+            moving: Number (E,) of the one whose sample looks for them.
+            twists: Move of all views from where they were reported, whether here or not (≥ V, 6).
+            pivot_world: What twists turn about (3,) [m].
+            outlier: Distance beyond which partners lose their weight [m].
+            config: Noise, reach, and how much directions may differ.
+        """
+        tasks, pairs, asked = self._tasks(still, moving, 1)
+        search = self._search(tasks, len(tasks), twists, pivot_world, config.reaches[-1], config)
+        for_each(find_partners, search.shares, search)
+        sums = normal_equations(search.rows, pairs, len(still), outlier)
+        sums[:, 2:] *= config.independent
+        information = np.empty((len(sums), 6, 6))
+        information[:, UPPER[0], UPPER[1]] = sums[:, 8:]
+        information[:, UPPER[1], UPPER[0]] = sums[:, 8:]
+        apart = twists[moving] - twists[still]
+        return Ties(still, moving, apart, asked, sums[:, 0], sums[:, 1], sums[:, 2:8], information)
+
+    def descend(
+        self, twists: Array, information: Array, pivot_world: Array, reach: float, config: RegistrationConfig
+    ) -> Descent:
+        """Move the last view such that partners come to lie in each other's planes; the others stay.
+
+        Gauss–Newton on the robust, symmetric point-to-plane distance, maximum a posteriori.
+
+        Args:
+            twists: Move of all views from where they were reported, whether here or not (≥ V, 6).
+            information: Inverse covariance (6, 6) of the last one's reported pose.
+            pivot_world: What twists turn about (3,) [m].
+            reach: How far away a partner may be [m].
+            config: Noise, rounds, and how many patches look for partners; the fewer they are, the more of
+                them err independently.
+        """
+        others, new = self.numbers[:-1], self.numbers[-1:]
+        size = int(self.first[-1] - self.first[-2])
+        stride = max(1, size * len(others) // config.descent)
+        tasks, _, asked = self._tasks(others, np.repeat(new, len(others)), stride)
+        outlier = config.outlier * reach
+        search = self._search(tasks, 1, twists, pivot_world, reach, config)
+        twist, ends = search.twists[-1], []
+        for _ in range(config.rounds):
+            for_each(find_partners, search.shares, search)
+            result = step_down(
+                *(search.rows, twist, information, min(1.0, stride * config.independent), outlier),
+                *(config.steps, config.converged * outlier),
+            )
+            twist += result[:6]
+            ends += [result[6:8], result[8:]]
+            if np.abs(result[:6]).max() < config.converged * outlier:
+                break
+        total = max(int(asked.sum()), 1)
+        before, after = (float(far + (total - found) * outlier) / total for found, far in (ends[0], ends[-1]))
+        return Descent(twist, before, after)
+
+    def _search(
+        self,
+        tasks: NDArray[np.int64],
+        shares: int,
+        twists: Array,
+        pivot_world: Array,
+        reach: float,
+        config: RegistrationConfig,
+    ) -> Search:
+        """Tasks (R, 5) in so many shares, and place for what they find; twists of all views (≥ V, 6)."""
+        return Search(
+            *(self.patches, self.starts, self.samples, tasks, shares, twists[self.numbers], pivot_world),
+            *(_edge(config), reach, config.min_cosine, config.normal_reach, config.noise),
+            np.zeros((len(tasks), CHUNK, 8)),
+        )
+
+    def _tasks(
+        self, still: Index, moving: Index, stride: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Tasks (R, 5) for `find_partners`, the pair (R,) each is of, and how many patches (E,) they ask."""
+        still, moving = np.searchsorted(self.numbers, still), np.searchsorted(self.numbers, moving)
+        first, last = self.first[moving], self.first[moving + 1]
+        asked = -((first - last) // stride)
+        chunks = -(-asked // CHUNK)
+        pairs = np.repeat(np.arange(len(still)), chunks)
+        number = np.arange(len(pairs)) - np.repeat(np.cumsum(chunks) - chunks, chunks)
+        begin = first[pairs] + number * CHUNK * stride
+        end = np.minimum(begin + CHUNK * stride, last[pairs])
+        step = np.full(len(pairs), stride)
+        return np.stack([begin, end, step, still[pairs], moving[pairs]], axis=1), pairs, asked
 
 
 def twist_transform(twist: Array, pivot_world: Array) -> Array:
-    """The rigid transform (4, 4) that turns about a pivot (3,) [m] and moves: twist = [3 × m, 3 × rad]."""
-    R = frames.rotation_from_vector(twist[3:])
-    return frames.rigid(R, pivot_world - R @ pivot_world + twist[:3])
-
-
-def match(
-    views: Sequence[RegisteredView],
-    moving: int,
-    still: int,
-    T: Sequence[Array],
-    reach: float,
-    config: RegistrationConfig,
-) -> Matches:
-    """Find the partners of a view's sample in another view.
+    """The rigid transform that turns about a pivot (3,) [m] and moves; leading axes (..., 6) are kept.
 
     Args:
-        views: All views.
-        moving: Whose sample looks for partners.
-        still: In which view.
-        T: Move (4, 4) of each view from where it was reported.
-        reach: How far away a partner may be [m].
-        config: How much directions may differ.
+        twist: 3 × m, 3 × rad.
+        pivot_world: What is turned about (3,) [m].
+
+    Returns:
+        (..., 4, 4).
     """
-    a, b = views[moving], views[still]
-    T_still_moving = frames.invert(T[still]) @ T[moving]
-    points, normals = a.surfels.points_world[a.sample], a.surfels.normals_world[a.sample]
-    there, facing = frames.transform(T_still_moving, points), frames.rotate(T_still_moving, normals)
-    labels = a.surfels.labels[a.sample]
-    bound = np.hypot(reach, config.normal_reach * np.sqrt(2.0 - 2.0 * config.min_cosine))
-    gap, partner = b.tree.query(_features(there, facing, labels, config), distance_upper_bound=bound)
-    found = np.flatnonzero(np.isfinite(gap))
-    partner = partner[found]
-    near = np.linalg.norm(there[found] - b.surfels.points_world[partner], axis=1) < reach
-    near &= np.sum(facing[found] * b.surfels.normals_world[partner], axis=1) > config.min_cosine
-    found, partner = found[near], partner[near]
-    return Matches(
-        moving,
-        still,
-        points[found],
-        normals[found],
-        b.surfels.points_world[partner],
-        b.surfels.normals_world[partner],
-        a.surfels.variance[a.sample[found]] + b.surfels.variance[partner] + config.noise**2,
-    )
+    x, y, z = np.moveaxis(twist[..., 3:], -1, 0)
+    angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
+    K = np.zeros((*twist.shape[:-1], 3, 3))
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -z, y, -x
+    K -= K.swapaxes(-1, -2)
+    # sin(a)/a and (1 - cos(a))/a²; numpy's sinc is sin(πx)/(πx).
+    half = np.sinc(angle / (2.0 * np.pi))
+    T = np.zeros((*twist.shape[:-1], 4, 4))
+    T[..., :3, :3] = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half * half * (K @ K)
+    T[..., :3, 3] = twist[..., :3] + pivot_world - T[..., :3, :3] @ pivot_world
+    T[..., 3, 3] = 1.0
+    return T
 
 
-def solve(
-    views: Sequence[RegisteredView],
-    pairs: Sequence[Matches],
-    twists: Array,
-    free: Sequence[int],
-    pivot_world: Array,
-    outlier: float,
-    config: RegistrationConfig,
-) -> Solution:
-    """Move the free views such that partners come to lie in each other's planes.
-
-    Gauss–Newton on the robust, symmetric point-to-plane distance, maximum a posteriori.
-
-    Args:
-        views: All views.
-        pairs: Their partners.
-        twists: Where the views are (V, 6).
-        free: The views that may move.
-        pivot_world: What twists turn about (3,) [m].
-        outlier: Distance beyond which partners lose their weight [m].
-        config: Noise and rounds.
-    """
-    column = {v: 6 * k for k, v in enumerate(free)}
-    for _ in range(config.steps):
-        T = [twist_transform(t, pivot_world) for t in twists]
-        hessian = np.zeros((6 * len(free), 6 * len(free)))
-        gradient = np.zeros(6 * len(free))
-        for v, k in column.items():
-            hessian[k : k + 6, k : k + 6] += views[v].information
-            gradient[k : k + 6] += views[v].information @ twists[v]
-        for pair in pairs:
-            residual, jacobians = _linearised(pair, T, pivot_world)
-            weight = config.independent / pair.variance / (1.0 + (residual / outlier) ** 2) ** 2
-            for v, J in jacobians.items():
-                if v not in column:
-                    continue
-                gradient[column[v] : column[v] + 6] += J.T @ (weight * residual)
-                for w, other in jacobians.items():
-                    if w in column:
-                        block = np.s_[column[v] : column[v] + 6, column[w] : column[w] + 6]
-                        hessian[block] += J.T @ (weight[:, None] * other)
-        step = -np.linalg.solve(hessian, gradient).reshape(-1, 6)
-        if np.abs(step).max(initial=0.0) < config.converged:
-            break
-        twists = twists.copy()
-        twists[list(free)] += step
-    return Solution(twists, hessian)
-
-
-def misfit(
-    pairs: Sequence[Matches], asked: int | None, twists: Array, pivot_world: Array, outlier: float
-) -> float:
-    """Mean distance [m] of partners from each other's planes, none counting more than an outlier.
-
-    Args:
-        pairs: The partners.
-        asked: How many patches looked for a partner: those that found none count as outliers; None =
-            only those that found one count.
-        twists: Where the views are (V, 6).
-        pivot_world: What twists turn about (3,) [m].
-        outlier: The largest distance that counts [m].
-    """
-    T = [twist_transform(t, pivot_world) for t in twists]
-    distances = [np.minimum(np.abs(_linearised(pair, T, pivot_world)[0]), outlier) for pair in pairs]
-    found = sum(len(d) for d in distances)
-    asked = found if asked is None else asked
-    return float(sum(d.sum() for d in distances) + (asked - found) * outlier) / max(asked, 1)
-
-
-def _linearised(pair: Matches, T: Sequence[Array], pivot_world: Array) -> tuple[Array, dict[int, Array]]:
-    """Distances (N,) [m] of partners along their normal, and derivatives (N, 6) by each view's twist."""
-    p, q = frames.transform(T[pair.moving], pair.points), frames.transform(T[pair.still], pair.partners)
-    n = frames.rotate(T[pair.moving], pair.normals) + frames.rotate(T[pair.still], pair.partner_normals)
-    n = frames.unit(n)
-    residual = np.sum((p - q) * n, axis=1)
-    return residual, {
-        pair.moving: np.concatenate([n, np.cross(p - pivot_world, n)], axis=1),
-        pair.still: -np.concatenate([n, np.cross(q - pivot_world, n)], axis=1),
-    }
-
-
-def _features(points: Array, normals: Array, labels: NDArray[np.int32], config: RegistrationConfig) -> Array:
-    """Place (N, 7) in which partners are near each other: equal labels, near in place and direction."""
-    apart = labels.astype(np.float64)[:, None]
-    return np.concatenate([points, config.normal_reach * normals, apart], axis=1)
+def _edge(config: RegistrationConfig) -> float:
+    """Edge of the cells partners are looked for in [m]: the widest search spans two on either side."""
+    return max(config.reaches) / 2.0

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
 from caryatid.config import RegistrationConfig
 from caryatid.frames import Array
+from caryatid.kernels.patches import fit_planes, gather_patches
 from caryatid.views import SUPPORT_LABEL, Cloud
 
 
@@ -48,37 +48,27 @@ def surfels_of(cloud: Cloud, config: RegistrationConfig, *, same_labels: bool) -
     """
     if cloud.labels is None:
         raise ValueError("surfels are made of labelled points")
-    parts = cloud.labels[cloud.labels != 0]
-    cloud = cloud.select(cloud.labels != 0)
-    far = parts == SUPPORT_LABEL
-    labels = parts if same_labels else np.where(far, SUPPORT_LABEL, 1)
-    spacing = np.where(far, config.spacing_far, config.spacing)
-    cells = np.floor(cloud.points_world / spacing[:, None]).astype(np.int64)
-    cells -= cells.min(axis=0, initial=np.iinfo(np.int64).max)
-    facing = np.argmax(np.abs(cloud.normals_world), axis=1)
-    facing += 3 * (cloud.normals_world[np.arange(len(cloud)), facing] < 0.0)
-    _, part = np.unique(parts, return_inverse=True)
-    size = cells.max(axis=0, initial=0) + 1
-    keys = np.ravel_multi_index((*cells.T, facing, part), (*size, 6, part.max(initial=0) + 1))
-    _, first, owner, count = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    mean = [np.bincount(owner, x) / count for x in (*cloud.points_world.T, *cloud.normals_world.T)]
-    points, normals = np.stack(mean[:3], axis=1), np.stack(mean[3:], axis=1)
-    length = np.linalg.norm(normals, axis=1)
-    normals = frames.unit(normals)
-    height = np.sum((cloud.points_world - points[owner]) * normals[owner], axis=1)
-    enough = np.full(len(count), float(config.min_readings))
-    for kind in (False, True):
-        alike = far[first] == kind
+    voxels, kinds, rows = gather_patches(
+        cloud.points_world,
+        cloud.normals_world,
+        cloud.labels,
+        config.spacing,
+        config.spacing_far,
+        SUPPORT_LABEL,
+    )
+    far = kinds // 6 == SUPPORT_LABEL
+    enough = np.full(len(far), float(config.min_readings))
+    for alike in (far, ~far):
         if alike.any():
-            enough[alike] = min(config.min_readings, config.min_share * np.percentile(count[alike], 90.0))
-    keep = (length > config.min_flatness) & (count >= enough)
-    variance = np.bincount(owner, height**2) / count**2
+            fullest = np.percentile(rows[alike, 0], 90.0)
+            enough[alike] = min(config.min_readings, config.min_share * fullest)
+    keep = np.flatnonzero((rows[:, 7] > config.min_flatness) & (rows[:, 0] >= enough))
+    keep = keep[np.lexsort((kinds[keep], voxels[keep]))]
+    labels = kinds[keep] // 6 if same_labels else np.where(far[keep], SUPPORT_LABEL, 1)
+    _, sides = np.unique(kinds[keep], return_inverse=True)
+    rows = rows[keep]
     found = Surfels(
-        points[keep],
-        normals[keep],
-        labels[first[keep]].astype(np.int32),
-        (6 * part + facing)[first[keep]],
-        variance[keep],
+        rows[:, 1:4].copy(), rows[:, 4:7].copy(), labels.astype(np.int32), sides, rows[:, 8].copy()
     )
     return _flattened(found, config)
 
@@ -89,30 +79,20 @@ def _flattened(surfels: Surfels, config: RegistrationConfig) -> Surfels:
     A single patch's normal errs by degrees, and more near edges, which many patches of one plane would sum
     up to the belief that they say something of positions in the plane.
     """
-    _, side = np.unique(surfels.sides, return_inverse=True)
-    points, normals = surfels.points_world, surfels.normals_world.copy()
-    weight = np.ones(len(points))
-    for _ in range(config.plane_rounds):
-        total = np.maximum(np.bincount(side, weight), 1e-9)
-        centre = np.stack([np.bincount(side, weight * x) / total for x in points.T], axis=1)
-        offset = points - centre[side]
-        spread = np.array(
-            [[np.bincount(side, weight * a * b) / total for a in offset.T] for b in offset.T]
-        ).transpose(2, 0, 1)
-        values, vectors = np.linalg.eigh(spread)
-        plane = vectors[side, :, 0]
-        height = np.sum(offset * plane, axis=1)
-        weight = 1.0 / (1.0 + (height / config.flat) ** 2) ** 2
-    lies_in = np.abs(height) < 2.0 * config.flat
-    agrees = np.abs(np.sum(plane * normals, axis=1)) > config.min_cosine
-    share = np.bincount(side, lies_in & agrees) / np.bincount(side)
-    wide = values[:, 1] > config.min_side**2
-    flat = ((share > config.flat_share) & wide)[side]
-    towards = np.where(np.sum(plane * normals, axis=1) < 0.0, -1.0, 1.0)
-    normals[flat] = (plane * towards[:, None])[flat]
-    keep = (~flat | (lies_in & agrees)) & (np.bincount(side) >= config.min_patches)[side]
+    side, normals = surfels.sides, surfels.normals_world.copy()
+    patches = np.bincount(side)
+    planes, widths, heights = fit_planes(
+        surfels.points_world, side, len(patches), config.flat, config.plane_rounds
+    )
+    plane = planes[side]
+    agreement = np.sum(plane * normals, axis=1)
+    lies_in = (np.abs(heights) < 2.0 * config.flat) & (np.abs(agreement) > config.min_cosine)
+    share = np.bincount(side, lies_in) / np.maximum(patches, 1)
+    flat = ((share > config.flat_share) & (widths > config.min_side**2))[side]
+    normals[flat] = (plane * np.where(agreement < 0.0, -1.0, 1.0)[:, None])[flat]
+    keep = (~flat | lies_in) & (patches >= config.min_patches)[side]
     return Surfels(
-        points[keep], normals[keep], surfels.labels[keep], surfels.sides[keep], surfels.variance[keep]
+        surfels.points_world[keep], normals[keep], surfels.labels[keep], side[keep], surfels.variance[keep]
     )
 
 
@@ -130,10 +110,12 @@ def even_sample(surfels: Surfels, count: int) -> NDArray[np.intp]:
     """
     if len(surfels) <= count:
         return np.arange(len(surfels))
-    _, side = np.unique(surfels.sides, return_inverse=True)
+    sizes = np.bincount(surfels.sides)
     # Within a side the surfels take turns in an order that spreads them evenly whatever the count.
     spread = np.mod(np.arange(len(surfels)) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
-    order = np.lexsort((spread, side))
-    sizes = np.bincount(side)
+    order = np.lexsort((spread, surfels.sides))
     turn = np.arange(len(surfels)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
-    return np.sort(order[np.argsort(turn, kind="stable")[:count]])
+    taken = np.cumsum(np.bincount(turn))
+    last = np.searchsorted(taken, count)
+    rest = count - (taken[last - 1] if last > 0 else 0)
+    return np.sort(np.concatenate([order[turn < last], order[turn == last][:rest]]))

@@ -109,14 +109,18 @@ class RegistrationConfig(Stage):
     """Sides of fewer patches are left out [1]; blurred edges."""
     sample: Count = 600
     """Patches of a view that look for partners in another [1]."""
+    descent: Count = 250
+    """Patches that look for partners while a new view is laid onto all earlier ones together [1]; its pose is
+    then made exact with the whole samples."""
     reaches: tuple[Positive, ...] = (0.1, 0.05, 0.025)
     """Partners further away are none [m], coarse to fine."""
-    rounds: WholeNumber = 3
+    rounds: Count = 3
     """Rounds of matching at each reach [1]."""
     steps: WholeNumber = 4
     """Gauss-Newton steps between two rounds of matching at the most [1]."""
-    converged: NotNegative = 2e-5
-    """Steps below this end the rounds [m, rad]."""
+    converged: NotNegative = 0.1
+    """Steps below this share of the distance at which partners lose their weight end a round, and the rounds
+    [1]; what is left, the next reach or the joint solution takes."""
     normal_reach: Positive = 0.05
     """How far apart [m] directions at right angles count when partners are looked for, by 1/√2."""
     min_cosine: Cosine = 0.9
@@ -129,6 +133,11 @@ class RegistrationConfig(Stage):
     """A view that fits better than this as reported is not moved [m]; exact ones leave 0.1 mm, noisy 1 mm."""
     settled: NotNegative = 0.0003
     """Views whose points would move less than this stay where they are [m]."""
+    rematch: NotNegative = 0.002
+    """Partners are looked for anew between views that moved by more than this against each other [m, rad];
+    a quarter of the distance at which they lose their weight."""
+    kept: Count = 12
+    """Views that later ones are laid onto and that move with them [1]; 30° apart on a full turn."""
     max_translation: NotNegative = 0.1
     """A longer move is refused [m]."""
     max_rotation: Angle = 5.0
