@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from caryatid import frames
 from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
@@ -54,6 +54,7 @@ def points_of_interest(
         config: λ_s, the period of eq. 2 and where a relation's point lies.
     """
     middle = largest_arc(visited)
+    centres = {o.id: o.centre_world for o in graph.objects}
     points = []
     for supported in graph.objects:
         if supported.role == "support_surface":
@@ -62,7 +63,8 @@ def points_of_interest(
         if not supports:
             points.append(_unsupported(supported, sphere, middle))
         for support in supports:
-            points.append(_relation(graph, support, sphere, views, config))
+            between = (centres[support.supporter] + centres[support.supported]) / 2.0
+            points.append(_relation(support, between, sphere, views, config))
     return points
 
 
@@ -101,7 +103,7 @@ def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) 
     """
     period = 2.0 * np.pi if config.saliency == "paper" else np.pi
     share = min(1.0, occurrences / max(1, views))
-    return float(config.saliency_weight + (1.0 - config.saliency_weight) * np.cos(period * share))
+    return config.saliency_weight + (1.0 - config.saliency_weight) * math.cos(period * share)
 
 
 def surface_point(shape: Shape, towards_world: Array) -> Array:
@@ -149,14 +151,14 @@ def _looked_at(subject: SceneObject, sphere: ViewSphere, azimuth: float, reason:
 
 
 def _relation(
-    graph: SupportGraph, support: Support, sphere: ViewSphere, views: int, config: ActiveVisionConfig
+    support: Support, between: Array, sphere: ViewSphere, views: int, config: ActiveVisionConfig
 ) -> PointOfInterest:
-    supporter, supported = graph[support.supporter].centre_world, graph[support.supported].centre_world
-    position = supported + 0.5 * (supporter - supported)
-    if config.edge_point == "contact" and support.contact_world is not None:
-        position = support.contact_world
+    """Where two objects meet, `between` (3,) [m] the middle of their centres."""
+    touch = support.contact_world if config.edge_point == "contact" else None
+    position = between if touch is None else touch
     offset = position - sphere.centre_world
-    direction = frames.unit(offset) if np.linalg.norm(offset) > 1e-6 else np.array([0.0, 0.0, 1.0])
+    length = math.sqrt(offset @ offset)
+    direction = offset / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
     saliency = relation_saliency(support.occurrences, views, config)
     why = f"{support.supporter} supports {support.supported}: found in {support.occurrences} of {views} views"
     return PointOfInterest(position, direction, saliency, support.pair, why)

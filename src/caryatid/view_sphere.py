@@ -52,11 +52,14 @@ class ViewSphere:
         forward = -directions
         right = np.stack([forward[:, 1], -forward[:, 0], np.zeros(len(forward))], axis=-1)
         vertical = np.linalg.norm(right, axis=-1) < 1e-6
-        right[vertical] = np.cross(forward[vertical], (1.0, 0.0, 0.0))
+        if vertical.any():
+            right[vertical] = np.cross(forward[vertical], (1.0, 0.0, 0.0))
         right = frames.unit(right)
         T_world_camera = np.zeros((len(directions), 4, 4))
         T_world_camera[:, :3, 0] = right
-        T_world_camera[:, :3, 1] = np.cross(forward, right)
+        for n in range(3):
+            a, b = (n + 1) % 3, (n + 2) % 3
+            T_world_camera[:, n, 1] = forward[:, a] * right[:, b] - forward[:, b] * right[:, a]
         T_world_camera[:, :3, 2] = forward
         T_world_camera[:, :3, 3] = self.centre_world + self.radius * directions
         T_world_camera[:, 3, 3] = 1.0
