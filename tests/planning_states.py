@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from caryatid import frames
+from caryatid.candidates import Candidates
 from caryatid.config import ActiveVisionConfig, RobotConfig, VoxelConfig
 from caryatid.floor import FloorGrid
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.planners import PlanningState
-from caryatid.robot import Candidates, HumanoidRobot
+from caryatid.robot import HumanoidRobot
 from caryatid.shapes import Box
 from caryatid.view_sphere import ViewSphere, direction
 from caryatid.voxels import VoxelMap
@@ -43,8 +44,11 @@ OPEN = candidates()
 def known(objects: list[SceneObject]) -> VoxelMap:
     """A map that has seen every voxel: the objects occupied, the rest free."""
     voxels = VoxelMap.around(SPHERE.centre_world, VoxelConfig())
-    free = VoxelMap(voxels.origin_world, voxels.hits, np.ones_like(voxels.passes), voxels.config)
-    return free.with_shapes([o.shape for o in objects])
+    solid = voxels.solid([o.shape for o in objects])
+    low = np.rint((solid.origin_world - voxels.origin_world) / voxels.config.size).astype(int)
+    hits = np.zeros_like(voxels.hits)
+    hits[tuple(slice(a, a + n) for a, n in zip(low, solid.grid.shape, strict=True))] = solid.grid
+    return VoxelMap(voxels.origin_world, hits, 1 - hits, voxels.config)
 
 
 def state(

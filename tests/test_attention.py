@@ -153,7 +153,7 @@ def test_without_inhibition_nothing_keeps_it_from_where_it_was():
 
 def test_the_default_planner_sees_through_walls_where_occlusion_is_ignored():
     wall = box(2, (0.0, 0.16, 0.95), (0.5, 0.02, 0.4))
-    solid = known([TABLE, CUBE, wall])
+    solid = known([TABLE, CUBE, wall]).solid()
     samples = surface_samples(SupportGraph((TABLE, CUBE)), solid, CONFIG)
     beyond = SPHERE.poses(direction(np.pi / 2.0, np.deg2rad(35.0))[None])
     seen, through = (

@@ -9,13 +9,13 @@ import pytest
 from planning_states import CONFIG, CUBE, HOME, ON_TABLE, OPEN, SPHERE, TABLE, box, candidates, known, state
 
 from caryatid import frames, planners
+from caryatid.candidates import Candidates
 from caryatid.config import VoxelConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.graph import Support, SupportGraph
 from caryatid.planners import BUILT_IN, make_planner
 from caryatid.planners.hidden import SPACE, space_samples, surface_samples, unseen_shares, visibility
 from caryatid.recording_robot import RecordingRobot
-from caryatid.robot import Candidates
 from caryatid.view_sphere import direction
 from caryatid.voxels import VoxelMap
 
@@ -145,7 +145,7 @@ class TestSupport:
         decision = make_planner("support").plan(
             state([CUBE, screen], visited=np.stack([HOME, other_side])), np.random.default_rng(0)
         )
-        solid = known([TABLE, CUBE, screen])
+        solid = known([TABLE, CUBE, screen]).solid()
         samples = surface_samples(SupportGraph((TABLE, CUBE)), solid, CONFIG)
         shown = visibility(samples, decision.T_world_camera[None], solid, CONFIG)[:, 0]
         assert decision.T_world_camera[1, 3] < 0.0
@@ -182,8 +182,8 @@ class TestSupport:
 
     def test_space_that_has_been_seen_is_worth_nothing(self):
         graph = SupportGraph((TABLE, CUBE))
-        seen = space_samples(graph, known([TABLE, CUBE]), CONFIG)
-        nothing_known = VoxelMap.around(SPHERE.centre_world, VoxelConfig()).with_shapes([CUBE.shape])
+        seen = space_samples(graph, known([TABLE, CUBE]).solid(), CONFIG)
+        nothing_known = VoxelMap.around(SPHERE.centre_world, VoxelConfig()).solid([CUBE.shape])
         unseen = space_samples(graph, nothing_known, CONFIG)
         assert len(seen.points_world) == 0
         assert 0.9 * CONFIG.space_weight < unseen.weights.sum() <= CONFIG.space_weight + CONFIG.heap_weight
@@ -191,9 +191,7 @@ class TestSupport:
 
     def test_space_among_the_objects_weighs_most(self):
         corners = [box(i, (x, y, 0.8), (0.06, 0.06, 0.1)) for i, (x, y) in enumerate(CORNERS, start=1)]
-        nothing_known = VoxelMap.around(SPHERE.centre_world, VoxelConfig()).with_shapes(
-            [o.shape for o in corners]
-        )
+        nothing_known = VoxelMap.around(SPHERE.centre_world, VoxelConfig()).solid([o.shape for o in corners])
         samples = space_samples(SupportGraph((TABLE, *corners)), nothing_known, CONFIG)
         among = np.abs(samples.points_world[:, :2]).max(axis=1) < 0.1
         beyond = np.abs(samples.points_world[:, :2]).max(axis=1) > 0.15
@@ -202,7 +200,7 @@ class TestSupport:
 
     def test_objects_of_which_little_was_seen_are_worth_more(self):
         graph = SupportGraph((TABLE, CUBE, box(2, (0.0, 0.3, 0.8), (0.1, 0.1, 0.1))))
-        samples = surface_samples(graph, known(list(graph.objects)), CONFIG)
+        samples = surface_samples(graph, known(list(graph.objects)).solid(), CONFIG)
         seen = np.where(samples.subjects == 0, 1.0, 0.25)
         np.testing.assert_allclose(unseen_shares(samples, seen), np.where(samples.subjects == 0, 0.0, 0.75))
 
@@ -218,13 +216,13 @@ class TestSupport:
 
     def test_surfaces_in_contact_are_not_asked_for(self):
         graph = SupportGraph((TABLE, CUBE))
-        samples = surface_samples(graph, known([TABLE, CUBE]), CONFIG)
+        samples = surface_samples(graph, known([TABLE, CUBE]).solid(), CONFIG)
         assert len(samples.points_world) > 100
         assert samples.normals_world[:, 2].min() > -0.5, "the face on the table"
         assert samples.weights.sum() == pytest.approx(5.0 / 6.0, abs=0.01)
 
     def test_a_surface_is_seen_from_before_and_not_from_behind(self):
-        solid = known([TABLE, CUBE])
+        solid = known([TABLE, CUBE]).solid()
         samples = surface_samples(SupportGraph((TABLE, CUBE)), solid, CONFIG)
         seen = visibility(samples, SPHERE.poses(HOME[None]), solid, CONFIG)[:, 0]
         front = samples.normals_world[:, 0] < -0.9

@@ -5,8 +5,8 @@ import pytest
 from planning_states import CONFIG, CUBE, HOME, OPEN, candidates, state
 
 from caryatid import frames
+from caryatid.candidates import Candidates
 from caryatid.planners import make_planner
-from caryatid.robot import Candidates
 
 
 def tour(name: str, views: int, offered: Candidates = OPEN, **settings: object) -> np.ndarray:

@@ -236,7 +236,8 @@ def test_unknown_space_outside_the_box_over_the_table_counts_for_nothing():
     )
     poses = OPEN.T_world_camera[::300]
     np.testing.assert_array_equal(
-        ray_information(inside, poses), ray_information(replace(inside, voxels=nothing_there), poses)
+        ray_information(inside, poses, 0.1),
+        ray_information(replace(inside, voxels=nothing_there), poses, 0.1),
     )
     assert ray_information(state([]), poses).max() == 0.0
 
@@ -259,6 +260,14 @@ def test_occupancy_follows_the_evidence_within_the_clamp():
     np.testing.assert_allclose(found, [0.5, 0.7, 0.4, both / (1.0 + both), 0.97, 0.12], rtol=1e-6)
     often = VoxelMap(np.zeros(3), hits, passes, VoxelConfig(readings=5)).occupancy[:, 0, 0]
     np.testing.assert_allclose(often[[0, 1, 2]], [0.5, 0.97, 0.12], atol=0.005)
+
+
+def test_nearness_is_reckoned_for_those_who_ask_for_it():
+    situation, poses = beside_screen(1.0), OPEN.T_world_camera[::300]
+    near, asked = ray_information(situation, poses, 0.1), ray_information(situation, poses)
+    column = FORMULATIONS.index("proximity-count")
+    np.testing.assert_array_equal(np.delete(near, column, axis=1), np.delete(asked, column, axis=1))
+    assert near[:, column].max() > 0.0 == asked[:, column].max()
 
 
 def test_a_decision_is_quick():

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from caryatid import frames
+from caryatid.candidates import Candidates
 from caryatid.config import ReportConfig
 from caryatid.evaluation.scores import Score
 from caryatid.exploration import Step
@@ -25,7 +26,6 @@ from caryatid.report.images import draw_image
 from caryatid.report.layout import arrange, layers
 from caryatid.report.svg import keep_apart
 from caryatid.report.wireframes import Projection, wireframe
-from caryatid.robot import Candidates
 from caryatid.shapes import Box, Cylinder, Sphere, fibonacci_sphere
 from caryatid.view_sphere import ViewSphere
 from caryatid.views import SUPPORT_LABEL, Cloud, View

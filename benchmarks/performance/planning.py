@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from caryatid import Config, Scene, SceneObject, Support, SupportGraph
+from caryatid.candidates import Candidates
 from caryatid.frames import Array
 from caryatid.interest import points_of_interest
 from caryatid.planners import Decision, PlanningState, make_planner
-from caryatid.robot import Candidates
 from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from performance import limits

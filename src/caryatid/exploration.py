@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid import frames
+from caryatid.candidates import Candidates
 from caryatid.change import changed
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.planners import Decision, Planner, PlanningState, make_planner
-from caryatid.robot import Candidates, Robot
+from caryatid.robot import Robot
 from caryatid.scene import Scene
 from caryatid.stopwatch import Stopwatch
 from caryatid.threads import one_blas_thread

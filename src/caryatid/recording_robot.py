@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from caryatid import frames
+from caryatid.candidates import Candidates
 from caryatid.errors import InputError, PlanningError
 from caryatid.frames import Array
-from caryatid.robot import Candidates, Posture, Unreachable
+from caryatid.robot import Posture, Unreachable
 from caryatid.view_sphere import ViewSphere
 
 SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid import frames
+from caryatid.candidates import Candidates
 from caryatid.config import RobotConfig
 from caryatid.errors import PlanningError
 from caryatid.floor import FloorGrid
@@ -56,28 +57,6 @@ class Unreachable:
     reason: str
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Candidates:
-    """The views a robot can reach.
-
-    Attributes:
-        T_world_camera: Camera poses (N, 4, 4).
-        directions: Unit vectors (N, 3) from the view sphere's centre.
-        path_length: Way (N,) [m] over the floor from where the robot stands.
-        rejected: Reason → how many views of the sphere were refused for it.
-        indices: Which point of the view sphere each candidate is (N,), or None where they lie elsewhere.
-    """
-
-    T_world_camera: Array
-    directions: Array
-    path_length: Array
-    rejected: dict[str, int]
-    indices: NDArray[np.intp] | None = None
-
-    def __len__(self) -> int:
-        return len(self.directions)
-
-
 class Robot(Protocol):
     """What carries the camera."""
 
@@ -117,6 +96,7 @@ class HumanoidRobot:
         self._config = config
         self._T_world_camera: Array | None = None
         self._path_lengths = np.where(floor.free, 0.0, np.inf)
+        self._offer: _Offer | None = None
         if T_world_camera is not None:
             self.move_to(T_world_camera)
 
@@ -148,7 +128,18 @@ class HumanoidRobot:
         )
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Return the views of the sphere that can be reached and see its centre past the furniture."""
+        """Return the views of the sphere that can be reached and see its centre past the furniture.
+
+        They are found anew for another sphere, or where ways lead to other places; else only the ways are.
+        """
+        lengths = self._path_lengths.ravel()
+        led_to = np.isfinite(lengths)
+        offer = self._offer
+        if offer is None or offer.sphere is not sphere or not np.array_equal(offer.led_to, led_to):
+            offer = self._offer = self._offered(sphere, led_to)
+        return offer.candidates.from_elsewhere(lengths[offer.cells])
+
+    def _offered(self, sphere: ViewSphere, led_to: NDArray[np.bool_]) -> _Offer:
         height = sphere.positions_world[:, 2]
         low, high = self._config.camera_height
         indices = np.flatnonzero((height >= low) & (height <= high))
@@ -158,9 +149,12 @@ class HumanoidRobot:
         counts[:2] += (height < low).sum(), (height > high).sum()
         rejected = {reason: int(n) for reason, n in zip(REASONS, counts, strict=True) if n}
         good = reach.code < 0
-        return Candidates(
-            poses[good], sphere.directions[indices[good]], reach.path_length[good], rejected, indices[good]
+        cells = reach.cell[good]
+        lengths = self._path_lengths.ravel()[cells]
+        candidates = Candidates(
+            poses[good], sphere.directions[indices[good]], lengths, rejected, indices[good]
         )
+        return _Offer(sphere, led_to, candidates, cells)
 
     def move_to(self, T_world_camera: Array) -> float:
         """Go there and return the length of the way over the floor [m].
@@ -191,18 +185,16 @@ class HumanoidRobot:
 
         yaws = np.deg2rad(np.linspace(*config.yaw, config.head_yaws))
         yaws = yaws[np.argsort(np.abs(yaws), kind="stable")]
-        platform_yaw = heading[:, None] - yaws
-        offset = config.camera_forward * np.stack([np.cos(platform_yaw), np.sin(platform_yaw)], axis=-1)
-        platform = eyes[:, None, :2] - offset
-        cell, inside = self._floor.cells(platform.reshape(-1, 2))
-        shape = platform_yaw.shape
-        inside = inside.reshape(shape)
-        free = self._floor.free.ravel()[cell].reshape(shape) & inside
-        path = np.where(free, self._path_lengths.ravel()[cell].reshape(shape), np.inf)
-        quality = np.where(np.isfinite(path), 3, np.where(free, 2, np.where(inside, 1, 0)))
-        best = np.argmax(quality, axis=1)
-        rows = np.arange(len(eyes))
-        quality = quality[rows, best]
+        lengths = self._path_lengths.ravel()
+        quality, best = np.full(len(eyes), -1), np.zeros(len(eyes), dtype=np.intp)
+        cell = np.zeros(len(eyes), dtype=np.intp)
+        left = np.arange(len(eyes))
+        for n, head_yaw in enumerate(yaws):
+            found, here = self._standing(eyes[left], heading[left] - head_yaw, lengths)
+            better = found > quality[left]
+            rows = left[better]
+            quality[rows], best[rows], cell[rows] = found[better], n, here[better]
+            left = left[quality[left] < 3]
 
         tolerance = 1e-9
         tests = (
@@ -220,9 +212,22 @@ class HumanoidRobot:
         )
         refused = np.stack(tests)
         code = np.where(refused.any(axis=0), refused.argmax(axis=0), -1)
-        yaw = _wrap(platform_yaw[rows, best])
-        platform_world = np.column_stack([platform[rows, best], yaw])
-        return _Reach(code, platform_world, yaws[best], pitch, path[rows, best])
+        head_yaw = yaws[best]
+        yaw = heading - head_yaw
+        platform_world = np.column_stack([eyes[:, :2] - self._forward(yaw), _wrap(yaw)])
+        return _Reach(code, platform_world, head_yaw, pitch, cell)
+
+    def _standing(
+        self, eyes_world: Array, yaw: Array, lengths: Array
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """How well the platform stands with a yaw (N,), from 0 outside the floor to 3, and in which cell."""
+        cell, inside = self._floor.cells(eyes_world[:, :2] - self._forward(yaw))
+        free = self._floor.free.ravel()[cell] & inside
+        return inside.astype(np.intp) + free + (free & np.isfinite(lengths[cell])), cell
+
+    def _forward(self, yaw: Array) -> Array:
+        """How far (N, 2) [m] the camera stands before the platform's centre with a yaw (N,)."""
+        return self._config.camera_forward * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
 
     def _figures(self, code: int, T_world_camera: Array) -> str:
         """The numbers behind a reason."""
@@ -241,13 +246,23 @@ class HumanoidRobot:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Reach:
-    """Reachability of N poses: index of the reason or −1, platform, gaze, and the way there."""
+    """Reachability of N poses: index of the reason or −1, platform, gaze, and the cell it stands in."""
 
     code: NDArray[np.intp]
     platform_world: Array
     head_yaw: Array
     head_pitch: Array
-    path_length: Array
+    cell: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Offer:
+    """What can be reached of a sphere while ways lead to the same cells, and the cell of each view (N,)."""
+
+    sphere: ViewSphere
+    led_to: NDArray[np.bool_]
+    candidates: Candidates
+    cells: NDArray[np.intp]
 
 
 def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:

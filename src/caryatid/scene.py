@@ -171,14 +171,13 @@ class Scene:
             centre = percept.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
             self.voxels = VoxelMap.around(centre, self.config.voxels)
-        nothing = VoxelMap.around(self.sphere.centre_world, self.config.voxels)
+        max_depth = self.config.cloud.max_depth
         if percept.view is not None:
-            self.voxels = self.voxels.integrate(percept.view, self.config.cloud.max_depth)
+            self.voxels = self.voxels.integrate(percept.view, max_depth)
         if self.config.fusion.method != "sg":
             return self.surface or percept.surface, self.voxels
-        if percept.view is None:
-            return percept.surface, nothing
-        return percept.surface, nothing.integrate(percept.view, self.config.cloud.max_depth)
+        newest = VoxelMap.around(self.sphere.centre_world, self.config.voxels)
+        return percept.surface, newest if percept.view is None else newest.integrate(percept.view, max_depth)
 
     def _fitted(self, percept: Percept, shown: set[int], given: bool) -> Percept:
         """Fit what this view changed; automatic parts are divided and united as the shapes suggest."""

@@ -10,18 +10,21 @@ noise in depth never carves the surface it hits.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from caryatid import frames
 from caryatid.config import VoxelConfig
 from caryatid.frames import Array
-from caryatid.kernels import rays
+from caryatid.kernels.parallel import for_each
+from caryatid.kernels.sights import shown
+from caryatid.kernels.solids import Filling, fill_layer
+from caryatid.kernels.voxel_maps import enter_view, voxels_at
+from caryatid.shape_arrays import boxes_around, shape_arrays
 from caryatid.shapes import Shape
 from caryatid.views import View
 
@@ -60,9 +63,18 @@ class VoxelMap:
     @cached_property
     def states(self) -> NDArray[np.int8]:
         """State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied."""
-        table = np.where(self._log_odds() <= 0.0, FREE, OCCUPIED).astype(np.int8)
-        table[0, 0] = UNKNOWN
-        return self._looked_up(table)
+        states = np.greater(self.hits | self.passes, 0, order="C").view(np.int8)
+        hit = np.flatnonzero(self.hits > 0)
+        states.reshape(-1)[hit] = _states(self.config)[
+            self.passes.reshape(-1)[hit], self.hits.reshape(-1)[hit]
+        ]
+        return states
+
+    @cached_property
+    def occupied(self) -> tuple[NDArray[np.intp], ...]:
+        """Indices x, y, z (N,) of the occupied voxels."""
+        index = np.unravel_index(np.flatnonzero(self.states == OCCUPIED), self.states.shape)
+        return tuple(np.asarray(i) for i in index)
 
     @property
     def occupancy(self) -> NDArray[np.float32]:
@@ -71,7 +83,7 @@ class VoxelMap:
         A view weighs as much as `config.readings` readings.
         """
         low, high = (np.log(p / (1.0 - p)) for p in self.config.clamp)
-        log_odds = np.clip(self.config.readings * self._log_odds(), low, high)
+        log_odds = np.clip(self.config.readings * _log_odds(self.config), low, high)
         return self._looked_up((1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32))
 
     @property
@@ -86,45 +98,43 @@ class VoxelMap:
             view: A view with a pose. Pixels without a reading say nothing.
             max_depth: Readings beyond this count as free space up to this depth [m].
         """
-        T_world_camera = view.pose
-        stride = self.config.stride
-        points_camera = view.points_camera[::stride, ::stride].reshape(-1, 3)
-        points_camera = points_camera[points_camera[:, 2] > 0.0]
-        depth = points_camera[:, 2]
-        near = depth <= max_depth
-        ends_world = frames.transform(T_world_camera, points_camera)
-        length = np.linalg.norm(points_camera, axis=-1)
-        share = np.where(near, 1.0 - self.config.margin / length, max_depth / depth)
-        passed = np.zeros(self.hits.shape, dtype=np.uint8)
-        eye_world = np.ascontiguousarray(T_world_camera[:3, 3])
-        rays.carve(passed, eye_world, ends_world, share, self.origin_world, self.config.size)
-        hit = np.zeros(self.hits.shape, dtype=np.uint8)
-        index, inside = self._index(ends_world[near])
-        hit[tuple(index[inside].T)] = 1
-        passed[hit > 0] = 0
-        return VoxelMap(self.origin_world, _count(self.hits, hit), _count(self.passes, passed), self.config)
+        hits, passes = enter_view(
+            self.hits,
+            self.passes,
+            view.depth,
+            view.K,
+            np.ascontiguousarray(view.pose),
+            self.origin_world,
+            self.config.size,
+            self.config.stride,
+            self.config.margin,
+            float(max_depth),
+        )
+        return VoxelMap(self.origin_world, hits, passes, self.config)
 
-    def with_shapes(self, shapes: Iterable[Shape]) -> VoxelMap:
-        """Return the map with everything inside the shapes occupied, as if seen from everywhere.
+    def solid(self, shapes: Sequence[Shape] = ()) -> Solid:
+        """What blocks lines of sight: the voxels seen occupied, and everything inside the shapes.
 
         Args:
             shapes: Fitted shapes in the world frame: what is hidden of them hides what is behind.
         """
-        hits, passes = self.hits.copy(), self.passes.copy()
-        axes = np.eye(3)
-        for shape in shapes:
-            centre, reach = shape.T_world_object[:3, 3], shape.support(axes)
-            low = np.floor((centre - reach - self.origin_world) / self.config.size).astype(int)
-            high = np.ceil((centre + reach - self.origin_world) / self.config.size).astype(int)
-            low, high = np.clip(low, 0, hits.shape), np.clip(high, 0, hits.shape)
-            if (low >= high).any():
-                continue
-            window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-            points_world = self.centres_world(np.indices(high - low).reshape(3, -1).T + low)
-            inside = (shape.signed_distance(points_world) < 0.0).reshape(high - low)
-            hits[window][inside] = 1
-            passes[window][inside] = 0
-        return VoxelMap(self.origin_world, hits, passes, self.config)
+        arrays, size = shape_arrays(shapes), self.config.size
+        low, high = ((corner - self.origin_world) / size for corner in boxes_around(arrays))
+        low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
+        high = np.clip(np.ceil(high).astype(np.int64), 0, self.hits.shape)
+        some = (low < high).all(axis=1)
+        beyond = max(self.hits.shape)
+        lowest = low[some].min(axis=0, initial=beyond)
+        lowest = np.minimum(lowest, [i.min(initial=beyond) for i in self.occupied])
+        highest = high[some].max(axis=0, initial=0)
+        highest = np.maximum(highest, [i.max(initial=-1) + 1 for i in self.occupied])
+        grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
+        grid[tuple(i - first for i, first in zip(self.occupied, lowest, strict=True))] = 1
+        origin_world = self.origin_world + size * lowest
+        for_each(
+            fill_layer, len(grid), Filling(grid, origin_world, size, *arrays, low - lowest, high - lowest)
+        )
+        return Solid(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
         """Return the part of the map whose voxels lie, all or in part, between two corners (3,) [m]."""
@@ -133,7 +143,8 @@ class VoxelMap:
         high = np.clip(np.ceil(ends[1] / self.config.size - 1e-9).astype(int), low, self.hits.shape)
         window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
         origin_world = self.origin_world + self.config.size * low
-        return VoxelMap(origin_world, self.hits[window], self.passes[window], self.config)
+        hits, passes = (np.ascontiguousarray(counts[window]) for counts in (self.hits, self.passes))
+        return VoxelMap(origin_world, hits, passes, self.config)
 
     def centres_world(self, index: NDArray[np.integer]) -> Array:
         """Centres (N, 3) [m] of the voxels with these indices (N, 3)."""
@@ -141,62 +152,74 @@ class VoxelMap:
 
     def state_at(self, points_world: Array) -> NDArray[np.int8]:
         """State (N,) of the voxels that hold points (N, 3) [m]; 0 outside the map."""
-        index, inside = self._index(points_world)
-        state = np.zeros(len(points_world), dtype=np.int8)
-        state[inside] = self.states[tuple(index[inside].T)]
-        return state
-
-    def blocked(
-        self,
-        points_world: Array,
-        targets_world: Array,
-        clearance: float,
-        asked: NDArray[np.bool_] | None = None,
-    ) -> NDArray[np.bool_]:
-        """Test lines of sight against the occupied voxels.
-
-        Args:
-            points_world: Points of interest (P, 3) [m].
-            targets_world: Camera positions (T, 3) [m].
-            clearance: Occupied voxels this near to the point do not count [m]: its own surface.
-            asked: Which lines to test (P, T), or None for all; the others count as free.
-
-        Returns:
-            (P, T), True where something stands between.
-        """
-        grid, origin_world = self._occupied
-        points, targets = (np.ascontiguousarray(a, dtype=np.float64) for a in (points_world, targets_world))
-        if asked is None:
-            asked = np.ones((len(points), len(targets)), dtype=np.bool_)
-        return rays.blocked(grid, points, targets, asked, float(clearance), origin_world, self.config.size)
-
-    @cached_property
-    def _occupied(self) -> tuple[NDArray[np.uint8], Array]:
-        """The occupied voxels, cut to the box around them, and that box's corner (3,) [m]."""
-        occupied = self.states == OCCUPIED
-        window = []
-        for axis in range(3):
-            filled = np.flatnonzero(occupied.any(axis=tuple({0, 1, 2} - {axis})))
-            window.append(slice(filled[0], filled[-1] + 1) if len(filled) else slice(0, 1))
-        corner = self.origin_world + self.config.size * np.array([w.start for w in window])
-        return np.ascontiguousarray(occupied[tuple(window)], dtype=np.uint8), corner
-
-    def _log_odds(self) -> Array:
-        """Log-odds of being occupied (256, 256) by how many views looked through and how many hit."""
-        hit = np.log(self.config.hit / (1.0 - self.config.hit))
-        miss = np.log(self.config.miss / (1.0 - self.config.miss))
-        return np.arange(256) * hit + np.arange(256)[:, None] * miss
+        points = np.ascontiguousarray(points_world)
+        index = voxels_at(points, self.origin_world, self.config.size, self.hits.shape)
+        inside = index >= 0
+        held = index[inside]
+        states = np.full(len(index), UNKNOWN, dtype=np.int8)
+        states[inside] = self.states.reshape(-1)[held]
+        return states
 
     def _looked_up(self, table: NDArray[Number]) -> NDArray[Number]:
         """Value of each voxel (X, Y, Z) in a table (256, 256) as `_log_odds`."""
         return np.take(table.ravel(), self.passes.astype(np.uint16) * np.uint16(256) + self.hits)
 
-    def _index(self, points_world: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-        index = np.floor((points_world - self.origin_world) / self.config.size).astype(np.intp)
-        inside = np.logical_and(index >= 0, index < self.hits.shape)
-        return index, np.all(inside, axis=-1)
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solid:
+    """What stands in the way of looks.
+
+    Attributes:
+        origin_world: Corner (3,) [m] of voxel [0, 0, 0] of the grid.
+        grid: 1 where a voxel is solid (X, Y, Z), 0 elsewhere; outside nothing is.
+        voxels: The map it is of.
+    """
+
+    origin_world: Array
+    grid: NDArray[np.uint8]
+    voxels: VoxelMap
+
+    def holds(self, points_world: Array) -> NDArray[np.bool_]:
+        """Whether points (N, 3) [m] lie in solid voxels (N,)."""
+        points = np.ascontiguousarray(points_world)
+        index = voxels_at(points, self.origin_world, self.voxels.config.size, self.grid.shape)
+        inside = index >= 0
+        inside[inside] = self.grid.ravel()[index[inside]] > 0
+        return inside
+
+    def blocked(self, points_world: Array, targets_world: Array, clearance: float) -> NDArray[np.bool_]:
+        """Test lines of sight.
+
+        Args:
+            points_world: Points of interest (P, 3) [m].
+            targets_world: Camera positions (T, 3) [m].
+            clearance: Solid voxels this near to the point do not count [m]: its own surface.
+
+        Returns:
+            (P, T), True where something stands between.
+        """
+        points = np.ascontiguousarray(points_world, dtype=np.float64)
+        targets = np.ascontiguousarray(np.transpose(targets_world), dtype=np.float64)
+        anywhere, known, worth = np.zeros_like(points), np.zeros(len(points)), np.ones(len(points))
+        free = shown(
+            self.grid, self.origin_world, self.voxels.config.size, points, anywhere, known, worth,
+            targets, np.zeros_like(targets), float(clearance), 1.0, -1.0,
+        )  # fmt: skip
+        return free == 0.0
 
 
-def _count(total: NDArray[np.uint8], once: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Add, staying at 255."""
-    return total + np.minimum(once, 255 - total)
+@cache
+def _log_odds(config: VoxelConfig) -> Array:
+    """Log-odds of being occupied (256, 256) by how many views looked through and how many hit."""
+    hit = np.log(config.hit / (1.0 - config.hit))
+    miss = np.log(config.miss / (1.0 - config.miss))
+    return np.arange(256) * hit + np.arange(256)[:, None] * miss
+
+
+@cache
+def _states(config: VoxelConfig) -> NDArray[np.int8]:
+    """State (256, 256) by how many views looked through and how many hit; without a hit none is occupied."""
+    states = np.where(_log_odds(config) <= 0.0, FREE, OCCUPIED).astype(np.int8)
+    states[:, 0] = FREE
+    states[0, 0] = UNKNOWN
+    return states

@@ -6,11 +6,14 @@ it leaves the grid. The visibility of a voxel is the product of 1 − occupancy 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.frames import Array
+from caryatid.kernels.parallel import for_each
 from caryatid.kernels.rays import Triple, advance, enter, traversed_reference, within
 from caryatid.voxels import OCCUPIED, UNKNOWN
 
@@ -22,6 +25,28 @@ FORMULATIONS = (
     "proximity-count",
 )
 """Columns of what `gather` returns."""
+
+
+class Views(NamedTuple):
+    """Candidate views of a voxel grid.
+
+    Attributes:
+        states: State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied.
+        layers: Occupancy [1], its entropy [bit] and the nearness to a surface of each voxel (X, Y, Z, 3).
+        T_world_camera: Candidates (C, 4, 4).
+        rays_camera: Unit directions (R, 3) of the rays in the camera.
+        origin: Corner (3,) [m] of voxel [0, 0, 0].
+        size: Edge of a voxel [m].
+        gathered: What the rays of each gather (C, 5), 0 at first; written to.
+    """
+
+    states: NDArray[np.int8]
+    layers: NDArray[np.float32]
+    T_world_camera: Array
+    rays_camera: Array
+    origin: Array
+    size: float
+    gathered: Array
 
 
 @njit(cache=True)
@@ -52,7 +77,6 @@ def _gather_ray(
         voxel, ahead = advance(voxel, ray, step, ahead)
 
 
-@njit(cache=True, parallel=True)
 def gather(
     states: NDArray[np.int8],
     layers: NDArray[np.float32],
@@ -63,30 +87,33 @@ def gather(
 ) -> Array:
     """Sum the information the rays of each candidate gather. Every candidate has a sum of its own.
 
-    Args:
-        states: State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied.
-        layers: Occupancy [1], its entropy [bit] and the nearness to a surface of each voxel (X, Y, Z, 3).
-        T_world_camera: Candidates (C, 4, 4).
-        rays_camera: Unit directions (R, 3) of the rays in the camera.
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        size: Edge of a voxel [m].
+    The arguments are as in `Views`.
 
     Returns:
         (C, 5), a column each of `FORMULATIONS`.
     """
-    result = np.zeros((len(T_world_camera), 5))
-    for c in prange(len(T_world_camera)):
-        T = T_world_camera[c]
-        start = ((T[0, 3] - origin[0]) / size, (T[1, 3] - origin[1]) / size, (T[2, 3] - origin[2]) / size)
-        for r in range(len(rays_camera)):
-            x, y, z = rays_camera[r]
-            ray = (
-                (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) / size,
-                (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) / size,
-                (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) / size,
-            )
-            _gather_ray(states, layers, start, ray, result[c])
-    return result
+    gathered = np.zeros((len(T_world_camera), len(FORMULATIONS)))
+    for_each(
+        gather_one,
+        len(T_world_camera),
+        Views(states, layers, T_world_camera, rays_camera, origin, size, gathered),
+    )
+    return gathered
+
+
+@njit(cache=True)
+def gather_one(c: int, views: Views) -> None:
+    """Sum what the rays of one candidate gather."""
+    T, size, origin = views.T_world_camera[c], views.size, views.origin
+    start = ((T[0, 3] - origin[0]) / size, (T[1, 3] - origin[1]) / size, (T[2, 3] - origin[2]) / size)
+    for r in range(len(views.rays_camera)):
+        x, y, z = views.rays_camera[r, 0], views.rays_camera[r, 1], views.rays_camera[r, 2]
+        ray = (
+            (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) / size,
+            (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) / size,
+            (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) / size,
+        )
+        _gather_ray(views.states, views.layers, start, ray, views.gathered[c])
 
 
 def gather_reference(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array
 from caryatid.interest import PointOfInterest, inhibition_of_return, painted, points_of_interest
-from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, decide, path_cost
 
 
 class AttentionPlanner:
@@ -31,36 +32,34 @@ class AttentionPlanner:
         config, candidates, sphere = state.config, state.candidates, state.sphere
         points = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
 
-        saliency = np.zeros(len(candidates))
-        sphere_saliency = np.zeros(len(sphere.directions))
-        why = "no point of interest is left; the nearest new view"
-        strongest = np.full(len(candidates), -1)
+        saliency, strongest = np.zeros(len(candidates)), np.full(len(candidates), -1)
         if points:
             given, reached = _given(points, candidates.directions, config)
             signed = np.where(_hidden(points, state), -1.0, 1.0) * given
             saliency, strongest = _largest(signed, reached)
-            sphere_saliency, _ = _largest(*_given(points, sphere.directions, config))
         saliency = saliency + inhibition_of_return(state.visited, candidates.directions, config)
-        sphere_saliency = sphere_saliency + inhibition_of_return(state.visited, sphere.directions, config)
-        if candidates.indices is not None:
-            sphere_saliency[candidates.indices] = saliency
 
-        cost = path_cost(state)
-        score = saliency - cost
-        best = int(np.argmax(score))
-        if strongest[best] >= 0:
-            why = points[strongest[best]].why
-        return Decision(
-            candidates.T_world_camera[best],
-            best,
-            float(saliency[best]),
-            float(cost[best]),
-            float(score[best]),
-            why,
-            tuple(points),
+        def why(best: int) -> str:
+            if strongest[best] < 0:
+                return "no point of interest is left; the nearest new view"
+            return points[strongest[best]].why
+
+        return decide(
+            candidates,
             saliency,
-            sphere_saliency,
+            path_cost(state),
+            why,
+            points=tuple(points),
+            elsewhere=partial(_on_sphere, tuple(points), state.visited, sphere.directions, config),
         )
+
+
+def _on_sphere(
+    points: Sequence[PointOfInterest], visited: Array, directions: Array, config: ActiveVisionConfig
+) -> Array:
+    """Saliency (M,) of views that are not asked whether points are hidden from them."""
+    inhibition = inhibition_of_return(visited, directions, config)
+    return _largest(*_given(points, directions, config))[0] + inhibition if points else inhibition
 
 
 def _given(
@@ -82,7 +81,7 @@ def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[
         return np.zeros((len(state.candidates), len(points)), dtype=np.bool_)
     positions = np.stack([p.position_world for p in points])
     eyes_world = state.candidates.T_world_camera[:, :3, 3]
-    return state.voxels.blocked(positions, eyes_world, state.config.clearance).T
+    return state.voxels.solid().blocked(positions, eyes_world, state.config.clearance).T
 
 
 def _largest(given: Array, reached: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:

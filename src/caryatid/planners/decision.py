@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from caryatid import frames
+from caryatid.candidates import Candidates, Looks
 from caryatid.config import ActiveVisionConfig
 from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.interest import PointOfInterest
-from caryatid.robot import Candidates
-from caryatid.shapes import fibonacci_sphere
+from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from caryatid.voxels import VoxelMap
 
@@ -42,7 +43,25 @@ class PlanningState:
     config: ActiveVisionConfig
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+class Painted:
+    """A field whose value is given, or painted when it is first looked at: most pictures are never drawn."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._key = f"_{name}"
+
+    def __get__(self, holder: object, owner: type | None = None) -> Array | None:
+        if holder is None:
+            return None
+        value = holder.__dict__[self._key]
+        if callable(value):
+            value = holder.__dict__[self._key] = value()
+        return value
+
+    def __set__(self, holder: object, value: Array | Callable[[], Array] | None) -> None:
+        holder.__dict__[self._key] = value
+
+
+@dataclass(frozen=True, eq=False)
 class Decision:
     """The next best view and why.
 
@@ -55,7 +74,8 @@ class Decision:
         why: One sentence for a person to read.
         points_of_interest: What the planner took into account.
         candidate_saliency: s (N,) of every candidate, or None.
-        sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None.
+        sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None; may be given as what
+            paints it.
     """
 
     T_world_camera: Array
@@ -66,7 +86,7 @@ class Decision:
     why: str
     points_of_interest: tuple[PointOfInterest, ...] = ()
     candidate_saliency: Array | None = None
-    sphere_saliency: Array | None = None
+    sphere_saliency: Painted = Painted()
 
 
 class Planner(Protocol):
@@ -108,10 +128,54 @@ def path_cost(state: PlanningState) -> Array:
             return np.zeros(len(state.candidates))
 
 
-def thin(directions: Array, count: int) -> NDArray[np.intp]:
-    """Pick the candidates nearest to those of `count` directions all over the sphere that have one near."""
-    if len(directions) <= count // 8:
-        return np.arange(len(directions))
-    distance, nearest = KDTree(directions).query(fibonacci_sphere(count))
-    near = distance < np.sqrt(4.0 * np.pi / count)
-    return np.unique(nearest[near]) if near.any() else np.unique(nearest)
+def decide(
+    candidates: Candidates,
+    saliency: Array,
+    cost: Array,
+    why: Callable[[int], str],
+    *,
+    looks: Looks | None = None,
+    points: tuple[PointOfInterest, ...] = (),
+    elsewhere: Callable[[], Array],
+) -> Decision:
+    """Choose the view with the largest c = s − h, eq. 3; of equal ones the first.
+
+    Args:
+        candidates: The views that can be reached.
+        saliency: s (C,) of each view that was judged.
+        cost: h (C,) of each.
+        why: Gives the reason for one of these.
+        looks: Which of the candidates were judged, and stand for the others; None = all.
+        points: What was taken into account.
+        elsewhere: Gives s (M,) of the points of the view sphere, as a new array, but for the candidates.
+    """
+    score = saliency - cost
+    best = int(np.argmax(score))
+    index = best if looks is None else int(looks.chosen[best])
+    candidate_saliency = saliency if looks is None else saliency[looks.nearest]
+    return Decision(
+        candidates.T_world_camera[index],
+        index,
+        float(saliency[best]),
+        float(cost[best]),
+        float(score[best]),
+        why(best),
+        points,
+        candidate_saliency,
+        partial(_paint, elsewhere, candidates.indices, candidate_saliency),
+    )
+
+
+def go_to(state: PlanningState, index: int, why: str) -> Decision:
+    """Take a candidate whatever there is to see: the decision of planners that do not look at the scene."""
+    cost = float(path_cost(state)[index])
+    return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
+
+
+@one_blas_thread
+def _paint(elsewhere: Callable[[], Array], indices: NDArray[np.intp] | None, saliency: Array) -> Array:
+    """Saliency (M,) of the view sphere with that of the candidates at their points."""
+    painted = elsewhere()
+    if indices is not None:
+        painted[indices] = saliency
+    return painted

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from caryatid import frames
-from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, go_to
 
 
 class FarthestPlanner:
@@ -18,6 +18,4 @@ class FarthestPlanner:
         nearest = (directions @ state.visited.T).max(axis=1)
         index = int(np.argmin(nearest))
         angle = np.rad2deg(frames.angle_between(state.visited, directions[index]).min())
-        cost = float(path_cost(state)[index])
-        why = f"{angle:.0f}° from the nearest earlier view, farther than any other"
-        return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
+        return go_to(state, index, f"{angle:.0f}° from the nearest earlier view, farther than any other")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -13,8 +13,12 @@ from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.interest import PointOfInterest
+from caryatid.kernels.sights import shown
+from caryatid.kernels.spaces import unseen_space
+from caryatid.kernels.surfaces import sample_surfaces
+from caryatid.shape_arrays import shape_arrays
 from caryatid.stability import ground_outline
-from caryatid.voxels import OCCUPIED, UNKNOWN, VoxelMap
+from caryatid.voxels import Solid, VoxelMap
 
 SPACE = "unseen space"
 """What a sample of unseen space is about."""
@@ -51,7 +55,7 @@ def join(parts: Sequence[Samples]) -> Samples:
     )
 
 
-def surface_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConfig) -> Samples:
+def surface_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig) -> Samples:
     """Spread points over the objects' surfaces; together they weigh 1.
 
     Every object weighs the same, small or large: each is one vertex of the graph. What touches another
@@ -59,20 +63,21 @@ def surface_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionCo
 
     Args:
         graph: The objects.
-        solid: The voxel map with the shapes filled in.
+        solid: What was seen occupied, and the shapes.
         config: How many points.
     """
     objects = [o for o in graph.objects if o.role == "object"]
-    parts = []
-    for o in objects:
-        spacing = np.sqrt(_area(o) * len(objects) / config.surface_samples)
-        points, normals = o.shape.surface(max(float(spacing), solid.config.size))
-        before = solid.state_at(points + 1.5 * solid.config.size * normals)
-        keep = before != OCCUPIED
-        share = 1.0 / (len(objects) * len(points))
-        zeros = np.zeros(keep.sum(), dtype=np.intp)
-        parts.append(Samples(points[keep], normals[keep], np.full(keep.sum(), share), zeros, (o.id,)))
-    return join(parts) if parts else _nothing()
+    if not objects:
+        return _nothing()
+    size = solid.voxels.config.size
+    areas = np.array([_area(o) for o in objects])
+    spacings = np.maximum(np.sqrt(areas * len(objects) / config.surface_samples), size)
+    points, normals, counts = sample_surfaces(*shape_arrays([o.shape for o in objects]), spacings)
+    subjects = np.repeat(np.arange(len(objects)), counts)
+    open_ = np.flatnonzero(~solid.holds(points + 1.5 * size * normals))
+    subjects = subjects[open_]
+    weights = (1.0 / (len(objects) * counts))[subjects]
+    return Samples(points[open_], normals[open_], weights, subjects, tuple(o.id for o in objects))
 
 
 def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
@@ -98,7 +103,7 @@ def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | 
     return None if (high <= low).any() else (low, high)
 
 
-def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConfig) -> Samples:
+def space_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig) -> Samples:
     """Spread points over the unseen space on the table, where something may stand.
 
     Space counts up to the height of the highest object, fully at the table and less the higher it is: what
@@ -108,27 +113,24 @@ def space_samples(graph: SupportGraph, solid: VoxelMap, config: ActiveVisionConf
 
     Args:
         graph: The objects and the table.
-        solid: The voxel map with the shapes filled in.
+        solid: What was seen occupied, and the shapes.
         config: Spacing of the points, and their worth.
     """
     table = graph.support_surface
-    corners = space_above(graph, solid)
+    corners = space_above(graph, solid.voxels)
     if table is None or corners is None:
         return _nothing()
     low, high = corners
-    grid = np.meshgrid(*(np.arange(a, b, config.space_spacing) for a, b in zip(low, high, strict=True)))
-    points = np.stack([g.ravel() for g in grid], axis=-1)
-    local = (points - table.centre_world) @ table.shape.T_world_object[:3, :3]
-    on_table = (np.abs(local[:, :2]) <= table.shape.extents[:2] / 2.0).all(axis=1)
-    lowness = np.where(on_table, 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2]), 0.0)
+    x, y, z = (np.arange(a, b, config.space_spacing) for a, b in zip(low, high, strict=True))
     outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
-    heap = shapely.MultiPoint(np.concatenate([np.empty((0, 2)), *outlines])).convex_hull
-    among = np.where(shapely.contains_xy(heap, points[:, 0], points[:, 1]), lowness, 0.0)
-    weights = config.space_weight * _shares(lowness) + config.heap_weight * _shares(among)
-    unseen = on_table & (solid.state_at(points) == UNKNOWN)
-    points = points[unseen]
-    zeros = np.zeros(len(points), dtype=np.intp)
-    return Samples(points, np.zeros_like(points), weights[unseen], zeros, (SPACE,))
+    heap = shapely.get_coordinates(shapely.MultiPoint(np.concatenate(outlines)).convex_hull)
+    voxels = solid.voxels
+    points, on_table, in_heap = unseen_space(
+        x, y, z, float(high[2] - low[2]), table.shape.T_world_object, table.shape.extents[:2] / 2.0, heap,
+        voxels.states, voxels.origin_world, solid.grid.view(np.int8), solid.origin_world, voxels.config.size,
+    )  # fmt: skip
+    weights = config.space_weight * on_table + config.heap_weight * in_heap
+    return Samples(points, np.zeros_like(points), weights, np.zeros(len(points), dtype=np.intp), (SPACE,))
 
 
 def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
@@ -144,38 +146,42 @@ def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
 
 def weighted(samples: Samples, weight: float | Array) -> Samples:
     """Scale all weights, by one number or each by its own (K,)."""
-    return Samples(
-        samples.points_world,
-        samples.normals_world,
-        samples.weights * weight,
-        samples.subjects,
-        samples.names,
-    )
+    return replace(samples, weights=samples.weights * weight)
 
 
-def visibility(samples: Samples, T_world_camera: Array, solid: VoxelMap, config: ActiveVisionConfig) -> Array:
+def visibility(samples: Samples, T_world_camera: Array, solid: Solid, config: ActiveVisionConfig) -> Array:
     """How well each camera (T, 4, 4) sees each sample: (K, T) from 0 hidden to 1.
 
     A sample is seen when its line of sight is free and within the image; surface turned away by more than
     `config.good_incidence` is seen less well, as the cosine. Lines of sight are all free where
     `config.occlusion` is `ignore`.
     """
-    origin = samples.points_world.mean(axis=0) if len(samples.points_world) else np.zeros(3)
-    points, eyes = samples.points_world - origin, T_world_camera[:, :3, 3] - origin
-    axes, normals = T_world_camera[:, :3, 2], samples.normals_world
-    squared = (points**2).sum(axis=1)[:, None] + (eyes**2).sum(axis=1) - 2.0 * points @ eyes.T
-    distance = np.sqrt(np.maximum(squared, 1e-12))
-    facing = (normals @ eyes.T - (normals * points).sum(axis=1)[:, None]) / distance
-    facing = np.clip(facing / np.cos(np.deg2rad(config.good_incidence)), 0.0, 1.0)
-    facing[~normals.any(axis=1)] = 1.0
-    along = (points @ axes.T - (eyes * axes).sum(axis=1)) / distance
-    facing[along < np.cos(np.deg2rad(config.view_cone))] = 0.0
-    if config.occlusion == "ignore":
-        return facing
-    eyes_world = T_world_camera[:, :3, 3]
-    hidden = solid.blocked(samples.points_world, eyes_world, config.sample_clearance, facing > 0.0)
-    facing[hidden] = 0.0
-    return facing
+    alike = replace(samples, weights=np.ones_like(samples.weights))
+    return shown_anew(alike, np.zeros_like(samples.weights), T_world_camera, solid, config)
+
+
+def shown_anew(
+    samples: Samples, before: Array, T_world_camera: Array, solid: Solid, config: ActiveVisionConfig
+) -> Array:
+    """Worth (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).
+
+    Lines of sight that could show nothing new are not followed.
+    """
+    see_through = config.occlusion == "ignore"
+    return shown(
+        np.zeros((0, 0, 0), dtype=np.uint8) if see_through else solid.grid,
+        solid.origin_world,
+        solid.voxels.config.size,
+        samples.points_world,
+        samples.normals_world,
+        before,
+        samples.weights,
+        np.ascontiguousarray(T_world_camera[:, :3, 3].T),
+        np.ascontiguousarray(T_world_camera[:, :3, 2].T),
+        float(config.sample_clearance),
+        float(np.cos(np.deg2rad(config.good_incidence))),
+        float(np.cos(np.deg2rad(config.view_cone))),
+    )
 
 
 def unseen_shares(samples: Samples, seen: Array) -> Array:
@@ -188,10 +194,6 @@ def unseen_shares(samples: Samples, seen: Array) -> Array:
     count = np.bincount(samples.subjects, minlength=len(samples.names))
     left = np.bincount(samples.subjects, weights=1.0 - seen, minlength=len(samples.names))
     return (left / np.maximum(count, 1))[samples.subjects]
-
-
-def _shares(weights: Array) -> Array:
-    return weights / max(float(weights.sum()), 1e-9)
 
 
 def _area(subject: SceneObject) -> float:
@@ -209,6 +211,7 @@ __all__ = [
     "Samples",
     "join",
     "relation_samples",
+    "shown_anew",
     "space_above",
     "space_samples",
     "surface_samples",

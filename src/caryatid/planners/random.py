@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, go_to
 
 
 class RandomPlanner:
@@ -14,6 +14,4 @@ class RandomPlanner:
         """Choose one of the candidates at random."""
         check_candidates(state)
         index = int(rng.integers(len(state.candidates)))
-        cost = float(path_cost(state)[index])
-        why = f"one of {len(state.candidates)} reachable views, drawn at random"
-        return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
+        return go_to(state, index, f"one of {len(state.candidates)} reachable views, drawn at random")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, go_to
 from caryatid.view_sphere import direction
 
 
@@ -25,9 +25,8 @@ class RingPlanner:
         azimuth = float(np.arctan2(first[1], first[0]) + turned)
         wanted = direction(azimuth, float(np.arcsin(np.clip(first[2], -1.0, 1.0))))
         index = int(np.argmax(state.candidates.directions @ wanted))
-        cost = float(path_cost(state)[index])
         why = f"stop {stop + 1} of {stops} around the scene, {np.rad2deg(turned):.0f}° from the first view"
-        return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
+        return go_to(state, index, why)
 
 
 def _halving(n: int) -> float:

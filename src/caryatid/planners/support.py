@@ -9,11 +9,13 @@ free of what was seen occupied and of the fitted shapes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from caryatid import frames
+from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array
 from caryatid.interest import (
     PointOfInterest,
@@ -22,12 +24,13 @@ from caryatid.interest import (
     points_of_doubt,
     points_of_interest,
 )
-from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost, thin
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, decide, path_cost
 from caryatid.planners.hidden import (
     SPACE,
     Samples,
     join,
     relation_samples,
+    shown_anew,
     space_samples,
     surface_samples,
     unseen_shares,
@@ -50,55 +53,47 @@ class SupportPlanner:
         """
         check_candidates(state)
         config, sphere, candidates = state.config, state.sphere, state.candidates
+        looks = candidates.looks(config.look_directions)
         relations = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
         relations += points_of_doubt(state.graph, sphere, state.visited)
-        samples, gain, chosen = _expected_gain(state, relations)
+        samples, gain = _expected_gain(state, relations, candidates.T_world_camera[looks.chosen])
 
-        inhibition = inhibition_of_return(state.visited, candidates.directions[chosen], config)
-        saliency = gain.sum(axis=0) + config.effort * inhibition
-        cost = config.effort * path_cost(state)
-        score = saliency - cost[chosen]
-        best = int(np.argmax(score))
-        index = int(chosen[best])
-
+        inhibition = inhibition_of_return(state.visited, candidates.directions[looks.chosen], config)
         points = (*relations, *_hidden_points(state, samples, gain))
-        nearest = KDTree(candidates.directions[chosen]).query(candidates.directions)[1]
-        candidate_saliency = saliency[nearest]
-        sphere_saliency = painted(points, sphere.directions, float(np.deg2rad(config.spread))).max(
-            axis=1, initial=0.0
-        ) + inhibition_of_return(state.visited, sphere.directions, config)
-        if candidates.indices is not None:
-            sphere_saliency[candidates.indices] = candidate_saliency
-        return Decision(
-            candidates.T_world_camera[index],
-            index,
-            float(saliency[best]),
-            float(cost[index]),
-            float(score[best]),
-            _why(samples, gain[:, best]),
-            points,
-            candidate_saliency,
-            sphere_saliency,
+        return decide(
+            candidates,
+            gain.sum(axis=0) + config.effort * inhibition,
+            config.effort * path_cost(state)[looks.chosen],
+            lambda best: _why(samples, gain[:, best]),
+            looks=looks,
+            points=points,
+            elsewhere=partial(_on_sphere, points, state.visited, sphere.directions, config),
         )
 
 
 def _expected_gain(
-    state: PlanningState, relations: list[PointOfInterest]
-) -> tuple[Samples, Array, NDArray[np.intp]]:
-    """Samples, what some candidates show of them anew (K, C), and which candidates those are (C,)."""
-    config, sphere, candidates = state.config, state.sphere, state.candidates
-    solid = state.voxels.with_shapes([o.shape for o in state.graph.objects])
-    T_world_visited = sphere.poses(state.visited)
+    state: PlanningState, relations: list[PointOfInterest], T_world_camera: Array
+) -> tuple[Samples, Array]:
+    """Samples, and what cameras (C, 4, 4) show of them anew (K, C)."""
+    config = state.config
+    solid = state.voxels.solid([o.shape for o in state.graph.objects])
     surfaces = surface_samples(state.graph, solid, config)
     points = relation_samples(relations)
+    T_world_visited = state.sphere.poses(state.visited)
     seen = visibility(join([surfaces, points]), T_world_visited, solid, config).max(axis=1, initial=0.0)
     surfaces = weighted(surfaces, unseen_shares(surfaces, seen[: len(surfaces.weights)]))
     space = space_samples(state.graph, solid, config)
     samples = join([surfaces, weighted(points, config.relation_weight), space])
     before = np.concatenate([seen, np.zeros(len(space.weights))])
-    chosen = thin(candidates.directions, config.look_directions)
-    now = visibility(samples, candidates.T_world_camera[chosen], solid, config)
-    return samples, samples.weights[:, None] * np.maximum(now - before[:, None], 0.0), chosen
+    return samples, shown_anew(samples, before, T_world_camera, solid, config)
+
+
+def _on_sphere(
+    points: Sequence[PointOfInterest], visited: Array, directions: Array, config: ActiveVisionConfig
+) -> Array:
+    """Saliency (M,) the points and the earlier views alone give directions (M, 3)."""
+    own = painted(points, directions, float(np.deg2rad(config.spread))).max(axis=1, initial=0.0)
+    return own + inhibition_of_return(visited, directions, config)
 
 
 def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[PointOfInterest]:
@@ -107,14 +102,16 @@ def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[
     Its saliency is how much of that there is, in shares of the subject with most of it.
     """
     left = gain.max(axis=1, initial=0.0)
-    worth = np.bincount(samples.subjects, weights=left, minlength=len(samples.names))
+    about, count = samples.subjects, len(samples.names)
+    worth = np.bincount(about, weights=left, minlength=count)
+    shown = np.bincount(about, weights=left > 0.0, minlength=count)
+    spots, ways = (
+        np.stack([np.bincount(about, weights=left * v, minlength=count) for v in vectors.T], axis=-1)
+        for vectors in (samples.points_world, samples.normals_world)
+    )
     points = []
-    for i, name in enumerate(samples.names):
-        share = left * (samples.subjects == i)
-        if worth[i] <= WORTH_SAYING * worth.max() or np.count_nonzero(share) < 2:
-            continue
-        middle = np.average(samples.points_world, axis=0, weights=share)
-        outward = share @ samples.normals_world
+    for i in np.flatnonzero((worth > WORTH_SAYING * worth.max(initial=0.0)) & (shown > 1)):
+        name, middle, outward = samples.names[i], spots[i] / worth[i], ways[i]
         if np.linalg.norm(outward) < 1e-9:
             outward = middle - state.sphere.centre_world
         subject = () if name == SPACE else (name,)
@@ -130,8 +127,9 @@ def _why(samples: Samples, gain: Array) -> str:
     if total <= 0.0:
         return "nothing hidden is expected to come into sight; the cheapest new view"
     worth: dict[str, float] = {}
-    for i, name in enumerate(samples.names):
-        worth[name] = worth.get(name, 0.0) + float(gain[samples.subjects == i].sum())
+    shares = np.bincount(samples.subjects, weights=gain, minlength=len(samples.names))
+    for name, share in zip(samples.names, shares, strict=True):
+        worth[name] = worth.get(name, 0.0) + float(share)
     ranked = sorted(worth.items(), key=lambda item: -item[1])[:3]
     parts = [f"{name} ({share / total:.0%})" for name, share in ranked if share > WORTH_SAYING * total]
     return "shows most of what is still hidden: " + ", ".join(parts)

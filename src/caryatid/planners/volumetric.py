@@ -22,14 +22,17 @@ planners know of no shapes.
 
 from __future__ import annotations
 
+from functools import cache, partial
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from caryatid.candidates import Looks
 from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array, unit
 from caryatid.kernels.information import FORMULATIONS, gather
-from caryatid.planners.decision import Decision, PlanningState, check_candidates, path_cost, thin
+from caryatid.planners.decision import Decision, PlanningState, check_candidates, decide, path_cost
 from caryatid.planners.hidden import space_above
 from caryatid.voxels import OCCUPIED, UNKNOWN, VoxelMap
 
@@ -54,31 +57,20 @@ class VolumetricPlanner:
         """
         check_candidates(state)
         candidates, config = state.candidates, state.config
-        chosen = _new_views(state, thin(candidates.directions, config.look_directions))
-        gain = ray_information(state, candidates.T_world_camera[chosen])[:, self._column]
+        looks = _new_views(state, candidates.looks(config.look_directions))
+        T_world_camera = candidates.T_world_camera[looks.chosen]
+        proximity = config.proximity if self.formulation == "proximity-count" else 0.0
+        gain = ray_information(state, T_world_camera, proximity)[:, self._column]
         largest = float(gain.max())
         saliency = gain / largest if largest > 0.0 else gain
-        cost = config.cost_weight * _shares(path_cost(state)[chosen])
-        cost = cost * float(saliency.sum()) if largest > 0.0 else cost
-        score = saliency - cost
-        best = int(np.argmax(score))
-        index = int(chosen[best])
-
-        nearest = np.argmax(candidates.directions @ candidates.directions[chosen].T, axis=1)
-        candidate_saliency = saliency[nearest]
-        sphere_saliency = np.zeros(len(state.sphere.directions))
-        if candidates.indices is not None:
-            sphere_saliency[candidates.indices] = candidate_saliency
-        return Decision(
-            candidates.T_world_camera[index],
-            index,
-            float(saliency[best]),
-            float(cost[best]),
-            float(score[best]),
-            self._why(gain, best),
-            (),
-            candidate_saliency,
-            sphere_saliency,
+        cost = config.cost_weight * _shares(path_cost(state)[looks.chosen])
+        return decide(
+            candidates,
+            saliency,
+            cost * float(saliency.sum()) if largest > 0.0 else cost,
+            lambda best: self._why(gain, best),
+            looks=looks,
+            elsewhere=partial(np.zeros, len(state.sphere.directions)),
         )
 
     def _why(self, gain: Array, best: int) -> str:
@@ -89,20 +81,21 @@ class VolumetricPlanner:
         return f"{ratio:.1f} times the views' mean {self.formulation} information, {share:.0%} of the most"
 
 
-def ray_information(state: PlanningState, T_world_camera: Array) -> Array:
+def ray_information(state: PlanningState, T_world_camera: Array, proximity: float = 0.0) -> Array:
     """What the rays of cameras (C, 4, 4) gather (C, 5), a column each of `FORMULATIONS`.
 
-    Without a table or objects there is no box to look into, and nothing is gathered.
+    Without a table or objects there is no box to look into, and nothing is gathered; without a `proximity`,
+    d_max [m], nothing is near.
     """
     corners = space_above(state.graph, state.voxels)
     if corners is None:
         return np.zeros((len(T_world_camera), len(FORMULATIONS)))
-    box = state.voxels.cut(*corners)
+    box, config = state.voxels.cut(*corners), state.config
     return gather(
         np.ascontiguousarray(box.states),
-        layers(box, state.config.proximity),
+        layers(box, proximity),
         np.ascontiguousarray(T_world_camera),
-        image_rays(state.config),
+        image_rays(config),
         box.origin_world,
         box.config.size,
     )
@@ -113,19 +106,20 @@ def layers(voxels: VoxelMap, proximity: float) -> NDArray[np.float32]:
 
     Args:
         voxels: The map.
-        proximity: d_max: nearness is d_max − d where that is more than 0 [m].
+        proximity: d_max: nearness is d_max − d where that is more than 0 [m]; 0 where it is not asked for.
     """
     occupancy = voxels.occupancy
     entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
     nearness = np.zeros_like(occupancy)
     occupied = voxels.states == OCCUPIED
-    if occupied.any():
+    if proximity > 0.0 and occupied.any():
         distance = voxels.config.size * distance_transform_edt(~occupied)
         unknown = voxels.states == UNKNOWN
         nearness[unknown] = np.maximum(proximity - distance[unknown], 0.0)
     return np.stack([occupancy, entropy, nearness], axis=-1)
 
 
+@cache
 def image_rays(config: ActiveVisionConfig) -> Array:
     """Directions (R, 3) in the camera, unit: a square grid over the image within `config.view_cone`.
 
@@ -138,11 +132,12 @@ def image_rays(config: ActiveVisionConfig) -> Array:
     return unit(np.column_stack([x[inside], y[inside], np.ones(inside.sum())]))
 
 
-def _new_views(state: PlanningState, chosen: NDArray[np.intp]) -> NDArray[np.intp]:
+def _new_views(state: PlanningState, looks: Looks) -> Looks:
     """Leave out what is nearer to an earlier view than candidates are to one another, unless that is all."""
-    cosine = state.candidates.directions[chosen] @ state.visited.T
-    new = cosine.max(axis=1) < np.cos(np.sqrt(4.0 * np.pi / state.config.look_directions))
-    return chosen[new] if new.any() else chosen
+    directions = state.candidates.directions
+    cosine = directions[looks.chosen] @ state.visited.T
+    old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / state.config.look_directions))
+    return looks if old.all() else looks.without(old, directions)
 
 
 def _shares(values: Array) -> Array:
