@@ -51,9 +51,13 @@ class Evidence:
 
 def gather(cloud: Cloud, noise: float, voxels: VoxelMap | None, config: ExplanationConfig) -> Evidence:
     """Thin an object's points to evidence: a place counts once, as all that is seen there errs alike."""
-    kept = thin(cloud.points_world, config.spacing)
-    weights = np.full(len(kept), config.spacing**2 / config.reading)
-    return Evidence(cloud.points_world[kept], cloud.normals_world[kept], weights, noise, voxels)
+    return evidence_of(cloud.select(thin(cloud.points_world, config.spacing)), noise, voxels, config)
+
+
+def evidence_of(cloud: Cloud, noise: float, voxels: VoxelMap | None, config: ExplanationConfig) -> Evidence:
+    """Take points that are thinned already for evidence."""
+    weights = np.full(len(cloud), config.spacing**2 / config.reading)
+    return Evidence(cloud.points_world, cloud.normals_world, weights, noise, voxels)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from caryatid import association
 from caryatid.clouds import thin
 from caryatid.config import Config
-from caryatid.explanation import explained_by, gather
+from caryatid.explanation import Evidence, evidence_of, explained_by
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.kernels.voxels import most_central
@@ -114,10 +114,7 @@ class ObjectModels:
 
     def fit_all(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to all their points so far (`pc`, `pc+sg`), where shapes fill no space seen free."""
-        clouds = {label: self.points.of(label) for label in labels}
-        self._fit(
-            {k: c.select(thin(c.points_world, self._config.cloud.voxel)) for k, c in clouds.items()}, voxels
-        )
+        self._fit(self.points.thinned(labels, self._config.cloud.voxel), voxels)
 
     def divide(self, labels: set[int], voxels: VoxelMap | None = None) -> set[int]:
         """Part objects that several shapes explain better than one; returns the labels that changed.
@@ -128,16 +125,17 @@ class ObjectModels:
         """
         config = self._config
         changed: set[int] = set()
-        noise = self._noise()
-        for label in sorted(labels & self.fits.keys()):
+        grown = [
+            k
+            for k in sorted(labels & self.fits.keys())
+            if len(self.points.of(k)) >= config.explanation.growth * self._undivided.get(k, 0)
+        ]
+        for label, evidence in self._gathered(grown, self._noise(), voxels).items():
             cloud = self.points.of(label)
-            if len(cloud) < config.explanation.growth * self._undivided.get(label, 0):
-                continue
-            evidence = gather(cloud, noise, voxels, config.explanation)
             groups = split(
                 evidence,
                 explained_by(self.fits[label].shape, evidence, config.explanation),
-                self._hints(evidence.points),
+                partial(self._hints, evidence.points),
                 up=UP,
                 config=config.split,
                 costs=config.explanation,
@@ -165,9 +163,7 @@ class ObjectModels:
         """
         config = self._config
         noise = self._noise()
-        evidence = {
-            k: gather(self.points.of(k), noise, voxels, config.explanation) for k in sorted(self.fits)
-        }
+        evidence = self._gathered(sorted(self.fits), noise, voxels)
         given_up: dict[int, int] = {}
         alone = {k: explained_by(self.fits[k].shape, e, config.explanation) for k, e in evidence.items()}
         while True:
@@ -188,7 +184,7 @@ class ObjectModels:
             del self.fits[old], evidence[old], alone[old]
             given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
             self.fit_all({new}, voxels)
-            evidence[new] = gather(self.points.of(new), noise, voxels, config.explanation)
+            evidence |= self._gathered([new], noise, voxels)
             alone[new] = explained_by(self.fits[new].shape, evidence[new], config.explanation)
             labels = labels | {new}
 
@@ -207,6 +203,12 @@ class ObjectModels:
     def objects(self) -> list[SceneObject]:
         """The fitted objects in the order of their labels."""
         return [self.fits[k] for k in sorted(self.fits)]
+
+    def _gathered(self, labels: Sequence[int], noise: float, voxels: VoxelMap | None) -> dict[int, Evidence]:
+        """What explanations of objects go by; points that have not changed are not thinned again."""
+        config = self._config.explanation
+        clouds = self.points.thinned(labels, config.spacing)
+        return {k: evidence_of(cloud, noise, voxels, config) for k, cloud in clouds.items()}
 
     def _hints(self, points: Array) -> list[NDArray[np.bool_]]:
         """Points (N,) that segmentation took for a part of its own in one of the views."""

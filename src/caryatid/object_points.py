@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from caryatid.frames import Array
 from caryatid.kernels import points as kernels
-from caryatid.kernels.voxels import last_in_voxels
+from caryatid.kernels.voxels import last_in_voxels, most_central
 from caryatid.views import SUPPORT_LABEL, Cloud
 
 
@@ -47,12 +47,14 @@ class ObjectPoints:
     def __init__(self) -> None:
         self.labels_used = 0
         self._seen: dict[int, _Seen] = {}
+        self._thinned: dict[tuple[int, float], tuple[Cloud, Cloud]] = {}
 
     def copy(self) -> ObjectPoints:
         """Return points that go on growing by themselves; the points so far are shared."""
         other = ObjectPoints()
         other.labels_used = self.labels_used
         other._seen = self._seen.copy()
+        other._thinned = self._thinned.copy()
         return other
 
     def add(self, label: int, cloud: Cloud, view: int) -> None:
@@ -72,6 +74,26 @@ class ObjectPoints:
     def of(self, label: int) -> Cloud:
         """All points of an object."""
         return self._seen[label].cloud if label in self._seen else joined([])
+
+    def thinned(self, labels: Iterable[int], edge: float) -> dict[int, Cloud]:
+        """All points of objects, of those in a voxel of this edge length [m] the one nearest to their mean.
+
+        Objects whose points are the same as when this was last asked for are not looked at again.
+        """
+        clouds = {label: self.of(label) for label in labels}
+        held = {k: self._thinned.get((k, edge), (None, None)) for k in clouds}
+        changed = [k for k, cloud in clouds.items() if held[k][0] is not cloud]
+        if changed:
+            sizes = [len(clouds[k]) for k in changed]
+            owners = np.repeat(np.arange(len(changed), dtype=np.int32), sizes)
+            points = np.concatenate([clouds[k].points_world for k in changed])
+            kept = most_central(points, owners, np.full(len(changed), edge))
+            first = np.cumsum([0, *sizes])
+            ends = np.searchsorted(kept, first)
+            for n, k in enumerate(changed):
+                own = kept[ends[n] : ends[n + 1]] - first[n]
+                self._thinned[k, edge] = clouds[k], clouds[k].select(own)
+        return {k: self._thinned[k, edge][1] for k in clouds}
 
     def newest(self, label: int) -> Cloud:
         """Points of an object in the newest view that showed it."""
@@ -105,7 +127,7 @@ class ObjectPoints:
 
     def merge(self, old: int, new: int) -> None:
         """Give the points of one object to another."""
-        self._append(new, self._seen.pop(old).relabelled(new))
+        self._append(new, self._taken(old).relabelled(new))
 
     def divide(self, label: int, groups: NDArray[np.intp]) -> list[int]:
         """Make several objects of one.
@@ -117,12 +139,16 @@ class ObjectPoints:
         Returns:
             Label of each group; the first keeps the old one.
         """
-        seen = self._seen.pop(label)
+        seen = self._taken(label)
         names = [label, *range(self.labels_used + 1, self.labels_used + 1 + int(groups.max()))]
         for number, name in enumerate(names):
             self._seen[name] = seen.select(groups == number).relabelled(name)
         self.labels_used = max(self.labels_used, *names)
         return names
+
+    def _taken(self, label: int) -> _Seen:
+        self._thinned = {key: held for key, held in self._thinned.items() if key[0] != label}
+        return self._seen.pop(label)
 
     def _append(self, label: int, seen: _Seen) -> None:
         self._seen[label] = self._seen[label].followed_by(seen) if label in self._seen else seen

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import scipy.sparse
@@ -28,6 +29,7 @@ from caryatid.explanation import (
 from caryatid.frames import Array
 
 Groups = NDArray[np.intp]
+Hints = Callable[[], Sequence[NDArray[np.bool_]]]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -48,7 +50,7 @@ class Pair:
 def split(
     evidence: Evidence,
     whole: Explanation,
-    hints: Sequence[NDArray[np.bool_]] = (),
+    hints: Hints = list,
     *,
     up: Array,
     config: SplitConfig,
@@ -66,7 +68,7 @@ def split(
     Args:
         evidence: The points of what is taken for one object.
         whole: Its best single explanation.
-        hints: Points (N,) that may be an object of their own.
+        hints: Gives points (N,) that may be an object of their own; asked only where something is tried.
         up: Unit vector (3,) upwards.
         config: What is tried.
         costs: What explanations cost.
@@ -76,13 +78,17 @@ def split(
     Returns:
         Group of each point (N,), from 0, or None where one object is the better explanation.
     """
+    all_hints = cache(hints)
     groups = np.zeros(len(evidence.points), dtype=np.intp)
     waiting = [(np.arange(len(groups)), whole)]
     while waiting:
         index, single = waiting.pop()
         part = evidence.select(index)
-        kept = [h[index] for h in hints]
-        found = _best_pair(part, single, kept, up, config, costs, fit_config, rng)
+
+        def own_hints(index: Groups = index) -> list[NDArray[np.bool_]]:
+            return [h[index] for h in all_hints()]
+
+        found = _best_pair(part, single, own_hints, up, config, costs, fit_config, rng)
         if found is None:
             continue
         groups[index[found.second]] = groups.max() + 1
@@ -108,7 +114,7 @@ def _costs(explanation: Explanation, evidence: Evidence, costs: ExplanationConfi
 def _best_pair(
     evidence: Evidence,
     whole: Explanation,
-    hints: Sequence[NDArray[np.bool_]],
+    hints: Hints,
     up: Array,
     config: SplitConfig,
     costs: ExplanationConfig,
@@ -125,7 +131,7 @@ def _best_pair(
     free = whole.cost - price(whole.shape, costs) - float(_costs(whole, evidence, costs) @ evidence.weights)
     if excess + free < costs.parameter_cost * min(PARAMETERS.values()):
         return None
-    starts = list(_starts(evidence, bad, hints, up, config, costs))
+    starts = list(_starts(evidence, bad, hints(), up, config, costs))
     quick = first_look(fit_config, costs)
     looks = _settled(evidence, starts, near, 0, config, costs, quick, rng)
     tried = sorted((look.cost, k) for k, look in enumerate(looks) if look is not None)[: config.finalists]
