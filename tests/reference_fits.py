@@ -13,7 +13,15 @@ from caryatid import frames, refine
 from caryatid.frames import Array
 from caryatid.kernels.ransac import BATCH
 from caryatid.kernels.rims import likeliest_end
-from caryatid.refine import NOISE_FLOOR, ROBUST_WIDTH, ROUGHLY, from_arrays, linearise, refine_reference
+from caryatid.refine import (
+    CONVERGED,
+    NOISE_FLOOR,
+    ROBUST_WIDTH,
+    ROUGHLY,
+    from_arrays,
+    linearise,
+    refine_reference,
+)
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.uncertainty import estimate
 from caryatid.voxels import FREE
@@ -192,7 +200,7 @@ def misfit(shape, points, normals, config):
     return float(np.minimum(away, config.threshold).mean()), float(turned.mean()), float(near)
 
 
-def cost(shape, seen, points, normals, config):
+def cost(shape, points, normals, config):
     """What model choice compares, but for the bare share."""
     residual, turned, _ = misfit(shape, points, normals, config)
     return residual + config.normal_weight * turned + config.size_penalty * float(np.mean(shape.extents**2))
@@ -212,28 +220,35 @@ def bare_share(shape, seen, points, config):
 
 
 def candidates(points, normals, config, rng):
-    """For each kind: cost, shape, seen sides; the cheapest first. At most `max_points` points."""
+    """For each kind the cost but for bare sides, the shape, and the sides seen."""
+    if len(points) > config.max_points:
+        some = np.sort(rng.choice(len(points), config.max_points, replace=False))
+        points, normals = points[some], normals[some]
     origin = points.mean(axis=0)
     points = points - origin
     every = max(1, len(points) // config.search_points)
     some, facing = points[::every], normals[::every]
     samples = rng.integers(0, len(some), size=(len(config.shapes), config.hypotheses, 2))
     settings = {"steps": config.steps, "min_extent": config.min_extent, "shrink": config.shrink}
-    found = []
+
+    def judged(start, on, converged):
+        shape, seen = draw_in(_refined(start, on, converged=converged, **settings), points, normals, config)
+        return cost(shape, points, normals, config), shape, seen
+
+    found = {}
     for kind, drawn in zip(config.shapes, samples, strict=True):
         starts = search(kind, some, facing, drawn, config)[0].shapes(kind)
         flat = None if kind == "sphere" else of_one_face(kind, some, facing, config)
-        judged = []
-        for start in starts + [flat] * (flat is not None):
-            shape, seen = draw_in(
-                _refined(start, some, converged=ROUGHLY, **settings), points, normals, config
-            )
-            judged.append((cost(shape, seen, points, normals, config), shape, seen))
-        if judged:
-            price, shape, seen = min(judged, key=lambda j: j[0])
-            if shape.extents.max() <= config.max_extent:
-                found.append((price, shape.moved(frames.rigid(np.eye(3), origin)), seen))
-    return sorted(found, key=lambda f: f[0])
+        tried = [judged(start, some, ROUGHLY) for start in starts + [flat] * (flat is not None)]
+        if not tried:
+            continue
+        best = min(tried, key=lambda j: j[0])
+        if best[1].extents.max() > config.max_extent:
+            continue
+        price, shape, seen = min(best, judged(best[1], points, CONVERGED), key=lambda j: j[0])
+        if shape.extents.max() <= config.max_extent:
+            found[kind] = price, shape.moved(frames.rigid(np.eye(3), origin)), seen
+    return found
 
 
 def _refined(shape, points, *, converged, **settings):

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import reference_fits as reference
 from synthetic import box, cylinder, random_motion, sphere, surface_points
+from test_degenerate_fits import POINTS, UP
 
 from caryatid import frames
-from caryatid.config import ExplanationConfig, FitConfig, VoxelConfig
+from caryatid.config import ExplanationConfig, FitConfig, SplitConfig, VoxelConfig
 from caryatid.explanation import (
     Evidence,
     around,
@@ -24,6 +25,7 @@ from caryatid.explanation import (
     point_costs,
     price,
 )
+from caryatid.splitting import split
 from caryatid.views import Cloud
 from caryatid.voxels import VoxelMap
 
@@ -156,3 +158,26 @@ def test_points_in_a_layer_on_a_shape_or_inside_it_may_be_of_it():
     assert lies_on(crate, points + off, COSTS)
     off = np.where(np.arange(len(points))[:, None] < most - 0.1 * len(points), 0.0, 0.05) * normals
     assert not lies_on(crate, points + off, COSTS)
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_that_determine_nothing_have_a_finite_cost():
+    finite = {
+        k: p for k, p in POINTS.items() if len(p) > 0 and np.isfinite(p).all() and np.abs(p).max() < 1e6
+    }
+    assert len(finite) > 8
+    parts = [Evidence(p, UP[: len(p)], np.ones(len(p)), 0.003, None) for p in finite.values()]
+    for best in explain(parts, COSTS, FIT, [np.random.default_rng(0)] * len(parts)):
+        assert np.isfinite(best.cost)
+    for part in parts:
+        whole = explained_by(SHAPES[0], part, COSTS)
+        groups = split(
+            part,
+            whole,
+            up=np.array([0.0, 0.0, 1.0]),
+            config=SplitConfig(),
+            costs=COSTS,
+            fit_config=FIT,
+            rng=np.random.default_rng(0),
+        )
+        assert groups is None or len(groups) == len(part.points)

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, hausdorff, sphere, surface_points
+import reference_fits as reference
+from synthetic import box, cylinder, hausdorff, random_motion, sphere, surface_points
 
 from caryatid import frames
 from caryatid.config import FitConfig
@@ -30,6 +31,11 @@ def fit_of(points, normals, config=CONFIG, seed=0):
     result = fit(points, normals, config=config, rng=np.random.default_rng(seed))
     assert isinstance(result, Fit)
     return result
+
+
+def candidates_of(points, normals, config=CONFIG, seed=0):
+    (found,) = candidates([Oriented(points, normals)], config=config, rngs=[np.random.default_rng(seed)])
+    return found
 
 
 def noisy_normals(normals, rng, degrees=5.0):
@@ -121,10 +127,30 @@ def test_a_small_box_is_preferred_to_a_big_one_that_explains_no_more():
 
 def test_the_candidates_are_one_of_each_kind_the_cheapest_first():
     points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE, sigma=0.001)
-    (fits,) = candidates([Oriented(points, normals)], config=CONFIG, rngs=[np.random.default_rng(0)])
+    fits = candidates_of(points, normals)
     assert [f.cost for f in fits] == sorted(f.cost for f in fits)
     assert len({f.shape.kind for f in fits}) == len(fits) >= 2
     assert fits[0].shape.kind == "box"
+
+
+@each
+def test_model_choice_weighs_distance_normals_size_and_bareness(shape):
+    """As the references do, of the shapes that were found."""
+    rng = np.random.default_rng(0)
+    points, normals = surface_points(shape, rng, eye=EYE, spacing=0.007, sigma=0.002)
+    assert CONFIG.search_points < len(points) < CONFIG.max_points or shape.extents.max() < 0.1
+    normals = noisy_normals(normals, rng)
+    bare = []
+    for f in candidates_of(points, normals):
+        residual, turned, inliers = reference.misfit(f.shape, points, normals, CONFIG)
+        assert f.residual == pytest.approx(residual, rel=1e-9)
+        assert f.inliers == pytest.approx(inliers, rel=1e-9)
+        size = float(np.mean(f.shape.extents**2))
+        expected = residual + CONFIG.normal_weight * turned + CONFIG.size_penalty * size
+        bare.append((f.cost - expected) / CONFIG.bare_weight)
+        assert bare[-1] == pytest.approx(reference.bare_share(f.shape, f.seen, points, CONFIG), abs=0.06)
+    assert len(bare) == 3
+    assert max(bare) > 0.1
 
 
 def test_what_is_no_single_shape_is_called_a_poor_fit():
@@ -162,19 +188,6 @@ def test_points_that_are_no_numbers_are_passed_over():
     assert hausdorff(result.shape, clean) == 0.0
 
 
-@pytest.mark.parametrize("degenerate", ["a spot", "a line"])
-def test_points_without_extent_do_not_break_it(degenerate):
-    rng = np.random.default_rng(0)
-    points = np.zeros((40, 3))
-    if degenerate == "a line":
-        points[:, 0] = np.linspace(0.0, 0.1, 40)
-    normals = np.tile((0.0, 0.0, 1.0), (40, 1))
-    result = fit(points, normals, config=CONFIG, rng=rng)
-    if isinstance(result, Fit):
-        assert np.isfinite(result.shape.T_world_object).all()
-        assert (result.shape.extents >= 0.9 * CONFIG.min_extent).all()
-
-
 def test_the_same_seed_gives_the_same_shape_to_the_last_bit():
     points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE, sigma=0.003, spacing=0.003)
     assert len(points) > CONFIG.max_points
@@ -192,28 +205,148 @@ def test_points_handed_in_stay_as_they_are():
     np.testing.assert_array_equal(normals, kept[1])
 
 
-def test_objects_are_fitted_together_as_each_would_be_alone():
-    clouds = [surface_points(s, np.random.default_rng(k), eye=EYE, sigma=0.001) for k, s in enumerate(SHAPES)]
-    clouds.insert(2, (np.zeros((0, 3)), np.zeros((0, 3))))
-    for order in (range(len(clouds)), [4, 2, 0, 6, 1, 5, 3]):
-        together = fit_many(
-            [Oriented(*clouds[k]) for k in order],
-            config=CONFIG,
-            rngs=[np.random.default_rng(k) for k in order],
+# The compiled fit beside its reference
+
+
+@each
+@pytest.mark.parametrize("spacing", [0.004, 0.012])
+def test_candidates_are_those_of_the_reference(shape, spacing):
+    """With more points than are judged and with few, in any frame; the search takes the same samples."""
+    rng = np.random.default_rng(0)
+    shape = shape.moved(random_motion(rng, 2.0))
+    eye = shape.T_world_object[:3, 3] + rng.normal(size=3)
+    points, normals = surface_points(shape, rng, eye=eye, spacing=spacing, sigma=0.002)
+    normals = noisy_normals(normals, rng)
+    found = {f.shape.kind: f for f in candidates_of(points, normals, seed=3)}
+    expected = reference.candidates(points, normals, CONFIG, np.random.default_rng(3))
+    assert found.keys() == expected.keys()
+    assert shape.kind in found
+    for kind, (cost, theirs, seen) in expected.items():
+        mine = found[kind]
+        assert hausdorff(mine.shape, theirs) < 1e-6
+        assert mine.seen == tuple(bool(s) for s in seen)
+        assert 0.0 <= mine.cost - cost + 1e-7 < CONFIG.bare_weight
+
+
+@each
+def test_the_chosen_shape_is_polished_on_all_the_points(shape):
+    rng = np.random.default_rng(0)
+    points, normals = surface_points(shape, rng, eye=EYE, spacing=0.003, sigma=0.002)
+    best = candidates_of(points, normals)[0]
+    result = fit_of(points, normals)
+    expected, uncertainty = reference.polish(best.shape, best.seen, points, CONFIG)
+    assert hausdorff(result.shape, expected) < 1e-7
+    assert result.seen == best.seen
+    np.testing.assert_allclose(result.uncertainty.sides, uncertainty.sides, rtol=1e-4)
+    distance = np.abs(expected.signed_distance(points))
+    assert result.residual == pytest.approx(np.minimum(distance, CONFIG.threshold).mean(), abs=1e-8)
+
+
+# Many objects at once
+
+
+def heap():
+    """Objects of all kinds and numbers of points, one of which has too few and one none."""
+    objects = []
+    for k in range(7):
+        rng = np.random.default_rng(k)
+        shape = SHAPES[k % len(SHAPES)].moved(random_motion(rng, 1.0))
+        eye = shape.T_world_object[:3, 3] + rng.normal(size=3)
+        points, normals = surface_points(
+            shape, rng, eye=eye, spacing=(0.004, 0.008, 0.02)[k % 3], sigma=0.001
         )
-        for k, result in zip(order, together, strict=True):
-            alone = fit(*clouds[k], config=CONFIG, rng=np.random.default_rng(k))
-            if isinstance(alone, FitFailure):
-                assert result == alone
-                continue
-            assert isinstance(result, Fit)
-            np.testing.assert_array_equal(result.shape.T_world_object, alone.shape.T_world_object)
-            np.testing.assert_array_equal(result.shape.extents, alone.shape.extents)
-            assert (result.cost, result.seen, result.residual) == (alone.cost, alone.seen, alone.residual)
+        objects.append(Oriented(points, noisy_normals(normals, rng)))
+    objects[3] = objects[3].select(np.arange(5))
+    objects[5] = objects[5].select(np.arange(0))
+    return objects
+
+
+def same(a, b):
+    """Whether two results are the same to the last bit."""
+    if isinstance(a, FitFailure) or isinstance(b, FitFailure):
+        return a == b
+    return (
+        a.shape.kind == b.shape.kind
+        and np.array_equal(a.shape.T_world_object, b.shape.T_world_object)
+        and np.array_equal(a.shape.extents, b.shape.extents)
+        and np.array_equal(a.uncertainty.sides, b.uncertainty.sides)
+        and (a.residual, a.inliers, a.seen, a.cost) == (b.residual, b.inliers, b.seen, b.cost)
+    )
+
+
+def fits_of(objects, seeds, config=CONFIG):
+    return fit_many(objects, config=config, rngs=[np.random.default_rng(s) for s in seeds])
+
+
+def test_each_of_many_objects_is_fitted_as_it_would_be_alone():
+    objects = heap()
+    together = fits_of(objects, range(7))
+    assert [isinstance(r, Fit) for r in together] == [True, True, True, False, True, False, True]
+    for k, o in enumerate(objects):
+        alone = fit(o.points, o.normals, config=CONFIG, rng=np.random.default_rng(k))
+        assert same(together[k], alone)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_their_order_and_company_make_no_difference(seed):
+    objects = heap()
+    together = fits_of(objects, range(7))
+    order = np.random.default_rng(seed).permutation(7)[: 5 + seed]
+    for k, result in zip(order, fits_of([objects[k] for k in order], order), strict=True):
+        assert same(result, together[k])
+
+
+def test_no_objects_have_no_fits():
+    assert fit_many([], config=CONFIG, rngs=[]) == []
+    assert candidates([], config=CONFIG, rngs=[]) == []
+    nothing = Oriented(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert candidates([nothing, nothing], config=CONFIG, rngs=[np.random.default_rng(0)] * 2) == [[], []]
+
+
+# Only some of the shapes
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
-def test_only_the_shapes_asked_for_are_tried(kind):
+@each
+def test_only_the_shapes_that_are_asked_for_are_tried(kind, shape):
+    points, normals = surface_points(shape, np.random.default_rng(0), eye=EYE, sigma=0.001)
+    only = replace(CONFIG, shapes=(kind,))
+    assert [f.shape.kind for f in candidates_of(points, normals, only)] == [kind]
+    assert fit_of(points, normals, only).shape.kind == kind
+
+
+def test_the_order_in_which_shapes_are_named_decides_nothing_but_the_samples():
     points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE, sigma=0.001)
-    config = replace(CONFIG, shapes=(kind,))
-    assert fit_of(points, normals, config).shape.kind == kind
+    two = replace(CONFIG, shapes=("sphere", "box"))
+    assert sorted(f.shape.kind for f in candidates_of(points, normals, two)) == ["box", "sphere"]
+    assert fit_of(points, normals, two).shape.kind == "box"
+
+
+# Other frames and layouts
+
+
+@each
+def test_a_kilometre_away_it_is_the_same_shape(shape):
+    """Coordinates have 1e-13 m of rounding there, and the shape moves with them."""
+    rng = np.random.default_rng(0)
+    points, normals = surface_points(shape, rng, eye=EYE, sigma=0.002)
+    normals = noisy_normals(normals, rng)
+    far = frames.rigid(np.eye(3), (1000.0, -1000.0, 1000.0))
+    here, there = fit_of(points, normals).shape, fit_of(frames.transform(far, points), normals).shape
+    assert there.kind == here.kind
+    assert hausdorff(there, here.moved(far)) < 1e-6
+
+
+def test_arrays_of_any_layout_give_the_same_fit():
+    points, normals = surface_points(SHAPES[2], np.random.default_rng(0), eye=EYE, sigma=0.001)
+    expected = fit_of(points, normals)
+    points.flags.writeable = normals.flags.writeable = False
+    strided = np.repeat(points, 2, axis=0)[::2]
+    for p, n in (
+        (points, normals),
+        (np.asfortranarray(points), np.asfortranarray(normals)),
+        (strided, normals),
+    ):
+        assert same(fit_of(p, n), expected)
+    single = fit_of(points.astype(np.float32), normals.astype(np.float32))
+    assert hausdorff(single.shape, expected.shape) < 0.0005
