@@ -221,12 +221,13 @@ def bare_share(shape, seen, points, config):
 
 def candidates(points, normals, config, rng):
     """For each kind the cost but for bare sides, the shape, and the sides seen."""
-    if len(points) > config.max_points:
-        some = np.sort(rng.choice(len(points), config.max_points, replace=False))
+    count = min(len(points), config.max_points)
+    every = max(1, count // config.search_points)
+    if every > 1 or count < len(points):
+        some = rng.choice(len(points), count, replace=False)
         points, normals = points[some], normals[some]
     origin = points.mean(axis=0)
     points = points - origin
-    every = max(1, len(points) // config.search_points)
     some, facing = points[::every], normals[::every]
     samples = rng.integers(0, len(some), size=(len(config.shapes), config.hypotheses, 2))
     settings = {"steps": config.steps, "min_extent": config.min_extent, "shrink": config.shrink}

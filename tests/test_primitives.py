@@ -103,6 +103,18 @@ def test_one_face_alone_makes_a_slab_behind_it():
     assert sum(result.seen) == 1
 
 
+@pytest.mark.parametrize("columns", [16, 24, 30, 40])
+def test_that_points_come_in_rows_does_not_show(columns):
+    """Every second, third or fourth point of a face would leave out its last columns."""
+    u, v = np.meshgrid(np.linspace(-0.06, 0.06, columns), np.linspace(-0.05, 0.05, 20))
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        rows = np.stack([u.ravel(), v.ravel(), 0.0005 * rng.normal(size=u.size)], axis=1)
+        up = noisy_normals(np.tile((0.0, 0.0, 1.0), (u.size, 1)), rng)
+        boxes = [f for f in candidates_of(rows, up, seed=seed) if f.shape.kind == "box"]
+        np.testing.assert_allclose(np.sort(boxes[0].shape.extents)[1:], (0.1, 0.12), atol=0.002)
+
+
 def test_a_round_end_alone_makes_a_disc_more_often_than_not():
     """A square slab costs hardly more: what tells them apart is in the twelfth of the points at the rim."""
     shape = cylinder((0.0, 0.0, 0.0), 0.05, 0.1)

@@ -167,10 +167,12 @@ def candidates(
     parts, every, samples = [], [], []
     for k in large:
         part, rng = finite[k], rngs[k]
-        if len(part) > config.max_points:
-            part = part.select(np.sort(rng.choice(len(part), config.max_points, replace=False)))
+        count = min(len(part), config.max_points)
+        every.append(max(1, count // config.search_points))
+        if every[-1] > 1 or count < len(part):
+            # Shuffled: points come row by row, and every so many of a row would leave out whole columns.
+            part = part.select(rng.choice(len(part), count, replace=False))
         parts.append(part)
-        every.append(max(1, len(part) // config.search_points))
         searched = -(-len(part) // every[-1])
         samples.append(rng.integers(0, searched, size=(len(kinds), config.hypotheses, 2)))
     origins = [part.points.mean(axis=0) for part in parts]
