@@ -252,13 +252,3 @@ def test_half_a_side_is_half_bare():
     assert bare_share(shape, only, lower) == pytest.approx(0.5 - reach, abs=0.06)
     fine = replace(CONFIG, bare_spacing=0.004)
     assert bare_share(shape, only, lower, fine) == pytest.approx(0.5 - reach / 2.0, abs=0.03)
-
-
-# Quantiles
-
-
-@pytest.mark.parametrize("count", [1, 2, 7, 200])
-def test_quantiles_are_numpys(count):
-    numbers = np.random.default_rng(count).normal(size=count)
-    for share in (0.0, 0.005, 0.31, 0.5, 0.995, 1.0):
-        assert judging.quantile(np.sort(numbers), share) == pytest.approx(np.quantile(numbers, share))

@@ -107,7 +107,8 @@ def test_compiled_normal_equations_are_those_of_the_reference(shape):
     distance, J = linearise(shape, points)
     scale = 0.01
     weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2 / len(points)
-    H, g = normal_equations(*arrays(shape), points, scale)
+    H, g = np.empty((9, 9)), np.empty(9)
+    normal_equations(*arrays(shape), points, scale, H, g)
     columns = list(COLUMNS[shape.kind])
     np.testing.assert_allclose(H[np.ix_(columns, columns)], J.T @ (weight[:, None] * J), atol=1e-12)
     np.testing.assert_allclose(g[columns], J.T @ (weight * distance), atol=1e-12)

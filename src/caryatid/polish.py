@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.frames import Array
+from caryatid.kernels.fitting import BOX, CYLINDER, RefineJob, refine_one
 from caryatid.kernels.parallel import for_each
 from caryatid.kernels.polishing import Polished, PolishJob, polish_one
-from caryatid.refine import CODES, CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH, arrays, from_arrays
+from caryatid.refine import CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH, arrays, from_arrays
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.uncertainty import Uncertainty, estimate
 
@@ -69,6 +71,9 @@ def polish(found: Sequence[Polish], config: FitConfig) -> list[Refined]:
     origins = [p.mean(axis=0) for p in points]
     posed = [arrays(one.shape) for one in found]
     count = len(found)
+    kinds = np.array([kind for kind, *_ in posed])
+    first = np.cumsum([0, *(len(p) for p in points)])
+    together = np.concatenate([p - origin for p, origin in zip(points, origins, strict=True)])
     rows = Polished(
         np.stack([R for _, R, _, _ in posed]),
         np.stack([centre - origin for (_, _, centre, _), origin in zip(posed, origins, strict=True)]),
@@ -80,15 +85,28 @@ def polish(found: Sequence[Polish], config: FitConfig) -> list[Refined]:
         np.empty(count),
     )
     seen = np.array([one.seen for one in found])
-    job = PolishJob(
-        np.array([CODES[one.shape.kind] for one in found]),
-        seen,
-        np.cumsum([0, *(len(p) for p in points)]),
-        np.concatenate([p - origin for p, origin in zip(points, origins, strict=True)]),
+    R = rows.R.copy()
+    centre, half = _opened(kinds, R, rows.centre, rows.half, seen, config.opening)
+    refined = RefineJob(
+        np.arange(count),
+        kinds,
+        first[:-1].copy(),
+        first[1:].copy(),
+        np.ones(count, dtype=np.intp),
+        together,
         RIDGE,
-        **_settings(config),
-        **rows._asdict(),
+        config.steps,
+        config.min_extent,
+        0.0,
+        ROBUST_WIDTH,
+        NOISE_FLOOR,
+        CONVERGED,
+        R,
+        centre,
+        half,
     )
+    for_each(refine_one, count, refined)
+    job = PolishJob(kinds, seen, first, together, R, centre, half, **_settings(config), **rows._asdict())
     for_each(polish_one, count, job)
     return [
         Refined(
@@ -108,6 +126,21 @@ def polish(found: Sequence[Polish], config: FitConfig) -> list[Refined]:
     ]
 
 
+def _opened(
+    kinds: NDArray[np.intp], R: Array, centre: Array, half: Array, seen: NDArray[np.bool_], opening: float
+) -> tuple[Array, Array]:
+    """Centres (P, 3) and half extents (P, 3) once unseen sides are moved out of the way.
+
+    A round side is seen as a whole; a sphere stays.
+    """
+    flat = (kinds == BOX)[:, None] | ((kinds == CYLINDER)[:, None] & (np.arange(3) == 2))
+    low, high = (np.where(flat, opening * ~seen[:, side::2], 0.0) for side in range(2))
+    unseen = (kinds == CYLINDER) & ~seen[:, :4].any(axis=1)
+    grown = half + (low + high) / 2.0
+    grown[unseen, :2] += opening
+    return centre + np.einsum("pab,pb->pa", R, (high - low) / 2.0), grown
+
+
 def _some(points: Array, count: int) -> Array:
     """Of points (N, 3) at most `count`, evenly chosen."""
     if len(points) <= count:
@@ -123,12 +156,10 @@ def _settings(config: FitConfig) -> dict[str, Any]:
         "max_extent",
         "min_extent",
         "min_points",
-        "steps",
-        "opening",
         "face_width",
         "stray",
         "correlated",
         "rim",
     )
-    constants = {"robust_width": ROBUST_WIDTH, "noise_floor": NOISE_FLOOR, "converged": CONVERGED}
+    constants = {"robust_width": ROBUST_WIDTH, "noise_floor": NOISE_FLOOR}
     return {name: getattr(config, name) for name in names} | constants

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,8 @@ from numpy.typing import NDArray
 from caryatid.config import FitConfig
 from caryatid.frames import Array
 from caryatid.interior import free_share
-from caryatid.kernels.fits import Fitted, Job, fit_one
+from caryatid.kernels.fits import FitJob, bare_one, judge_one, search_one
+from caryatid.kernels.fitting import RefineJob, refine_one
 from caryatid.kernels.parallel import for_each
 from caryatid.polish import Polish, polish
 from caryatid.refine import CODES, CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH, ROUGHLY, from_arrays
@@ -21,6 +21,9 @@ from caryatid.uncertainty import Uncertainty
 from caryatid.voxels import VoxelMap
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
+
+SETTINGS = tuple(name for name in FitJob._fields if hasattr(FitConfig, name))
+"""What the kernels are told of the settings."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -176,26 +179,80 @@ def candidates(
         searched = -(-len(part) // every[-1])
         samples.append(rng.integers(0, searched, size=(len(kinds), config.hypotheses, 2)))
     origins = [part.points.mean(axis=0) for part in parts]
-    rows = _empty(len(parts) * len(kinds))
-    job = Job(
+    job = _job(
         kinds,
         np.cumsum([0, *(len(part) for part in parts)]),
         np.concatenate([part.points - origin for part, origin in zip(parts, origins, strict=True)]),
         np.concatenate([part.normals for part in parts]),
         np.array(every),
         np.stack(samples),
-        RIDGE,
-        **_settings(config),
-        **rows._asdict(),
+        config,
     )
-    for_each(fit_one, len(rows.found), job)
+    best = _fitted(job, config)
     for number, (k, origin) in enumerate(zip(large, origins, strict=True)):
-        own = range(number * len(kinds), (number + 1) * len(kinds))
         fits = [
-            _row(rows, row, config.shapes[row - own[0]], origin, config) for row in own if rows.found[row]
+            _row(job, (group, best[group]), config.shapes[group - number * len(kinds)], origin, config)
+            for group in range(number * len(kinds), (number + 1) * len(kinds))
+            if best[group] >= 0
         ]
         found[k] = sorted(fits, key=lambda f: f.cost)
     return found
+
+
+def _fitted(job: FitJob, config: FitConfig) -> NDArray[np.intp]:
+    """Fit the shapes of a job, and tell which one of each object and kind is best (P · K,); -1 is none."""
+    groups, room = job.cost.shape
+    for_each(search_one, groups, job)
+    _improve(job, np.flatnonzero(job.cost.ravel() < np.inf), job.every, ROUGHLY, config)
+    best = np.argmin(job.cost, axis=1)
+    found = np.flatnonzero(_within(job, best, config))
+    # Kinds are compared once least squares on all the points have nothing left to gain.
+    last = (best + 1) % room
+    for part in (job.R, job.centre, job.half):
+        part[found, last[found]] = part[found, best[found]]
+    _improve(job, found * room + last[found], np.ones_like(job.every), CONVERGED, config)
+    better = found[job.cost[found, last[found]] < job.cost[found, best[found]]]
+    best[better] = last[better]
+    best[~_within(job, best, config)] = -1
+    found = np.flatnonzero(best >= 0)
+    for_each(bare_one, len(found), job._replace(rows=found * room + best[found]))
+    return best
+
+
+def _improve(
+    job: FitJob, rows: NDArray[np.intp], every: NDArray[np.intp], converged: float, config: FitConfig
+) -> None:
+    """Refine some of a job's shapes on every so many points of their objects (P,), and judge them by all."""
+    groups, room = job.cost.shape
+    each = groups // len(every) * room
+    refined = RefineJob(
+        rows,
+        np.tile(np.repeat(job.kinds, room), len(every)),
+        np.repeat(job.first[:-1], each),
+        np.repeat(job.first[1:], each),
+        np.repeat(every, each),
+        job.points,
+        RIDGE,
+        config.steps,
+        config.min_extent,
+        config.shrink,
+        ROBUST_WIDTH,
+        NOISE_FLOOR,
+        converged,
+        job.R.reshape(-1, 3, 3),
+        job.centre.reshape(-1, 3),
+        job.half.reshape(-1, 3),
+    )
+    for_each(refine_one, len(rows), refined)
+    for_each(judge_one, len(rows), job._replace(rows=rows))
+    job.cost[np.isnan(job.cost)] = np.inf
+
+
+def _within(job: FitJob, best: NDArray[np.intp], config: FitConfig) -> NDArray[np.bool_]:
+    """Whether the best shape of each object and kind (P · K,) is one, and no longer than allowed."""
+    every = np.arange(len(best))
+    fits = 2.0 * job.half[every, best].max(axis=1) <= config.max_extent
+    return np.asarray(fits & (job.cost[every, best] < np.inf))
 
 
 def _least_free(found: Sequence[Fit], space: VoxelMap, config: FitConfig) -> Fit:
@@ -211,60 +268,48 @@ def _least_free(found: Sequence[Fit], space: VoxelMap, config: FitConfig) -> Fit
     return best
 
 
-def _empty(count: int) -> Fitted:
-    """Rows to be written to."""
-    return Fitted(
-        np.zeros(count, dtype=np.bool_),
-        np.empty((count, 3, 3)),
-        np.empty((count, 3)),
-        np.empty((count, 3)),
-        np.zeros((count, 6), dtype=np.bool_),
-        np.full(count, np.inf),
-        np.empty(count),
-        np.empty(count),
+def _job(
+    kinds: NDArray[np.intp],
+    first: NDArray[np.intp],
+    points: Array,
+    normals: Array,
+    every: NDArray[np.intp],
+    samples: NDArray[np.intp],
+    config: FitConfig,
+) -> FitJob:
+    """Objects' points, and room for the shapes that are tried."""
+    shapes = len(every) * len(kinds), config.polish + 1
+    return FitJob(
+        np.zeros(0, dtype=np.intp),
+        kinds,
+        first,
+        points,
+        normals,
+        every,
+        samples,
+        **{name: getattr(config, name) for name in SETTINGS},
+        R=np.empty((*shapes, 3, 3)),
+        centre=np.empty((*shapes, 3)),
+        half=np.empty((*shapes, 3)),
+        seen=np.zeros((*shapes, 6), dtype=np.bool_),
+        cost=np.full(shapes, np.inf),
+        residual=np.empty(shapes),
+        inliers=np.empty(shapes),
     )
 
 
-def _row(rows: Fitted, row: int, kind: str, origin: Array, config: FitConfig) -> Fit:
-    """One row as a fit, in the frame of an object whose points were taken about an origin (3,) [m]."""
-    s = [bool(b) for b in rows.seen[row]]
-    residual = float(rows.residual[row])
+def _row(job: FitJob, row: tuple[int, int], kind: str, origin: Array, config: FitConfig) -> Fit:
+    """One of a job's shapes as a fit, in the frame of the object's points before they were centred."""
+    s = [bool(b) for b in job.seen[row]]
+    residual = float(job.residual[row])
     return Fit(
-        from_arrays(kind, rows.R[row], rows.centre[row] + origin, rows.half[row]),
+        from_arrays(kind, job.R[row], job.centre[row] + origin, job.half[row]),
         residual,
-        float(rows.inliers[row]),
+        float(job.inliers[row]),
         (s[0], s[1], s[2], s[3], s[4], s[5]),
-        float(rows.cost[row]),
+        float(job.cost[row]),
         residual > config.max_residual,
     )
-
-
-def _settings(config: FitConfig) -> dict[str, Any]:
-    """Settings and constants by their names in the kernel's job."""
-    names = (
-        "threshold",
-        "trim",
-        "max_radius",
-        "max_extent",
-        "min_extent",
-        "confidence",
-        "polish",
-        "steps",
-        "shrink",
-        "min_points",
-        "side_share",
-        "normal_weight",
-        "size_penalty",
-        "bare_weight",
-        "bare_spacing",
-    )
-    constants = {
-        "robust_width": ROBUST_WIDTH,
-        "noise_floor": NOISE_FLOOR,
-        "rough": ROUGHLY,
-        "converged": CONVERGED,
-    }
-    return {name: getattr(config, name) for name in names} | constants
 
 
 def _failure_reason(count: int, config: FitConfig) -> str:

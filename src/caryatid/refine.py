@@ -85,7 +85,7 @@ def refine(
     """
     kind, R, centre, half = arrays(shape)
     points = np.ascontiguousarray(points_world)
-    R, centre, half = levenberg_marquardt(
+    levenberg_marquardt(
         kind,
         R,
         centre,

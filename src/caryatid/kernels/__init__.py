@@ -1,4 +1,8 @@
-"""Compiled kernels, the only place with numba; each stands beside a plain NumPy reference."""
+"""Compiled kernels, the only place with numba; each stands beside a plain NumPy reference.
+
+Those with `no_cpython_wrapper` compile faster. They are for other kernels and `parallel.for_each` to call;
+called from Python they break it.
+"""
 
 from __future__ import annotations
 

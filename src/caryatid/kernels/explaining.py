@@ -39,7 +39,7 @@ def point_costs(
         outlier: Most that a point costs [nats].
     """
     costs = np.empty(len(points))
-    hx, hy, hz = half
+    hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
         u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w

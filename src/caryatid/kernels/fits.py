@@ -1,6 +1,7 @@
-"""Compiled fits of many objects at once: search, least squares and judgement, an object and a shape a thread.
+"""Compiled steps of the fits of many objects at once: search and judgement, each piece of work a thread.
 
-The tests hold a NumPy reference of each step.
+`primitives` says in which order they come, with `fitting.refine_one` in between. The tests hold a NumPy
+reference of each step.
 """
 
 from __future__ import annotations
@@ -11,79 +12,54 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.kernels.fitting import SPHERE, levenberg_marquardt
+from caryatid.kernels.fitting import SPHERE
 from caryatid.kernels.judging import bare_share, draw_in, misfit
 from caryatid.kernels.ransac import search
 from caryatid.kernels.starts import of_one_face
 
 
-class Fitted(NamedTuple):
-    """Shapes found, one a row; what does not count for a row holds anything.
+class FitJob(NamedTuple):
+    """Shapes of several kinds are fitted to the points of each of several objects, some of each kind.
+
+    Object p and kind k have the shapes s = (p · K + k) · S … + S − 1.
 
     Attributes:
-        found: Whether there is one (J,).
-        R: Axes (J, 3, 3).
-        centre: (J, 3) [m].
-        half: Half extents (J, 3) [m].
-        seen: Sides -x, +x, -y, +y, -z, +z that points bear out (J, 6).
-        cost: What model choice compares (J,) [m].
-        residual: Mean truncated distance (J,) [m].
-        inliers: Share of the points within the threshold (J,).
-    """
-
-    found: NDArray[np.bool_]
-    R: NDArray[np.float64]
-    centre: NDArray[np.float64]
-    half: NDArray[np.float64]
-    seen: NDArray[np.bool_]
-    cost: NDArray[np.float64]
-    residual: NDArray[np.float64]
-    inliers: NDArray[np.float64]
-
-
-class Job(NamedTuple):
-    """One shape of each kind is fitted to each object; the row of object p and kind k is p · K + k.
-
-    Attributes:
-        kinds: Codes of the shapes (K,).
+        rows: Which of the shapes are judged (M,).
+        kinds: Codes of the kinds (K,).
         first: Index of each object's first point, and the number of all points (P + 1,).
         points: (N, 3) [m], object after object, each about its own origin.
         normals: Unit normals (N, 3).
-        every: The search and least squares look at every so many points of each object (P,).
+        every: The search looks at every so many points of each object (P,).
         samples: Indices (P, K, B, 2) of the pairs of those points that hypotheses are made from.
-        ridge: Added to the diagonal of least squares (9,), times the damping.
-
-    Then settings by their names in `FitConfig`, constants by their names in `refine`, and the fields of
-    `Fitted`, which are written to.
+        threshold, …, bare_spacing: Settings by their names in `FitConfig`.
+        R: Axes (P · K, S, 3, 3).
+        centre: (P · K, S, 3) [m].
+        half: Half extents (P · K, S, 3) [m].
+        seen: Sides -x, +x, -y, +y, -z, +z that points bear out (P · K, S, 6).
+        cost: What model choice compares (P · K, S) [m]; of a shape that was not found it is infinite.
+        residual: Mean truncated distance (P · K, S) [m].
+        inliers: Share of the points within the threshold (P · K, S).
     """
 
+    rows: NDArray[np.intp]
     kinds: NDArray[np.intp]
     first: NDArray[np.intp]
     points: NDArray[np.float64]
     normals: NDArray[np.float64]
     every: NDArray[np.intp]
     samples: NDArray[np.intp]
-    ridge: NDArray[np.float64]
     threshold: float
     trim: float
     max_radius: float
     max_extent: float
     min_extent: float
     confidence: float
-    polish: int
-    steps: int
-    shrink: float
     min_points: int
     side_share: float
     normal_weight: float
     size_penalty: float
     bare_weight: float
     bare_spacing: float
-    robust_width: float
-    noise_floor: float
-    rough: float
-    converged: float
-    found: NDArray[np.bool_]
     R: NDArray[np.float64]
     centre: NDArray[np.float64]
     half: NDArray[np.float64]
@@ -93,59 +69,57 @@ class Job(NamedTuple):
     inliers: NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy")
-def fit_one(row: int, job: Job) -> None:
-    """Fit the best shape of one kind to the points of one object, and write it to its row."""
-    owner, number = row // len(job.kinds), row % len(job.kinds)
-    kind, every, samples = job.kinds[number], job.every[owner], job.samples[owner, number]
-    points = job.points[job.first[owner] : job.first[owner + 1]]
-    normals = job.normals[job.first[owner] : job.first[owner + 1]]
-    some, facing = points[::every].copy(), normals[::every].copy()
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def search_one(group: int, job: FitJob) -> None:
+    """Find shapes of one kind for one object to start from; those found have a cost of 0."""
+    owner, number = group // len(job.kinds), group % len(job.kinds)
+    kind, every = job.kinds[number], job.every[owner]
+    first, end = job.first[owner], job.first[owner + 1]
+    count = (end - first + every - 1) // every
+    some, facing = np.empty((count, 3)), np.empty((count, 3))
+    for i in range(len(some)):
+        for a in range(3):
+            some[i, a], facing[i, a] = job.points[first + i * every, a], job.normals[first + i * every, a]
+    R, centre, half, cost = job.R[group], job.centre[group], job.half[group], job.cost[group]
     settings = (job.threshold, job.trim, job.max_radius, job.max_extent, job.confidence)
-    keep = job.polish
-    R, centre, half = np.empty((keep + 1, 3, 3)), np.empty((keep + 1, 3)), np.empty((keep + 1, 3))
-    count = search(kind, some, facing, samples, settings, R, centre, half, np.empty(keep + 1))
+    count = search(kind, some, facing, job.samples[owner, number], settings, R, centre, half, cost)
     if kind != SPHERE and of_one_face(
         kind, some, facing, job.trim, job.min_extent, job.max_radius, job.max_extent,
         R[count], centre[count], half[count],
     ):  # fmt: skip
         count += 1
-    job.found[row] = False
-    job.cost[row] = np.inf
-    for k in range(count):
-        _improve(row, kind, R[k], centre[k], half[k], some, points, normals, job.rough, job)
-    if job.found[row]:
-        # Kinds are compared once least squares on all the points have nothing left to gain.
-        _improve(
-            row, kind, job.R[row], job.centre[row], job.half[row], points, points, normals, job.converged, job
-        )
-        job.cost[row] += job.bare_weight * bare_share(
-            kind, job.R[row], job.centre[row], job.half[row], job.seen[row], points, job.bare_spacing
-        )
+    for k in range(len(cost)):
+        cost[k] = 0.0 if k < count else np.inf
 
 
-@njit(cache=True, error_model="numpy")
-def _improve(  # type: ignore[no-untyped-def]
-    row, kind, R, centre, half, some, points, normals, converged, job
-):
-    """Refine a shape on some points, judge it by all, and write it to the row where it costs less."""
-    R, centre, half = levenberg_marquardt(
-        kind, R.copy(), centre.copy(), half.copy(), some, job.steps, job.min_extent, job.shrink,
-        job.robust_width, job.noise_floor, job.ridge, converged,
-    )  # fmt: skip
-    seen = np.empty(6, np.bool_)
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def judge_one(index: int, job: FitJob) -> None:
+    """Draw in the sides of one of the shapes that no point bears out, and judge it by all the points."""
+    row = job.rows[index]
+    group, k = row // job.cost.shape[1], row % job.cost.shape[1]
+    owner, kind = group // len(job.kinds), job.kinds[group % len(job.kinds)]
+    points = job.points[job.first[owner] : job.first[owner + 1]]
+    normals = job.normals[job.first[owner] : job.first[owner + 1]]
+    R, centre, half = job.R[group, k], job.centre[group, k], job.half[group, k]
     least = max(job.min_points / 3.0, job.side_share * len(points))
-    draw_in(kind, R, centre, half, points, normals, job.threshold, least, job.trim, job.min_extent, seen)
+    draw_in(
+        kind, R, centre, half, points, normals, job.threshold, least, job.trim, job.min_extent,
+        job.seen[group, k],
+    )  # fmt: skip
     residual, turned, inliers = misfit(kind, R, centre, half, points, normals, job.threshold)
     size = 4.0 * (half[0] ** 2 + half[1] ** 2 + half[2] ** 2) / 3.0
-    cost = residual + job.normal_weight * turned + job.size_penalty * size
-    if not cost < job.cost[row]:
-        return
-    job.found[row] = 2.0 * max(half[0], half[1], half[2]) <= job.max_extent
-    job.cost[row], job.residual[row], job.inliers[row] = cost, residual, inliers
-    for a in range(3):
-        job.centre[row, a], job.half[row, a] = centre[a], half[a]
-        for b in range(3):
-            job.R[row, a, b] = R[a, b]
-    for side in range(6):
-        job.seen[row, side] = seen[side]
+    job.cost[group, k] = residual + job.normal_weight * turned + job.size_penalty * size
+    job.residual[group, k], job.inliers[group, k] = residual, inliers
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def bare_one(index: int, job: FitJob) -> None:
+    """Have one of the shapes pay for sides that should have been seen but are bare."""
+    row = job.rows[index]
+    group, k = row // job.cost.shape[1], row % job.cost.shape[1]
+    owner, kind = group // len(job.kinds), job.kinds[group % len(job.kinds)]
+    points = job.points[job.first[owner] : job.first[owner + 1]]
+    job.cost[group, k] += job.bare_weight * bare_share(
+        kind, job.R[group, k], job.centre[group, k], job.half[group, k], job.seen[group, k], points,
+        job.bare_spacing,
+    )  # fmt: skip

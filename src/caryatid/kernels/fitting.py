@@ -5,17 +5,67 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.frames import Array
 from caryatid.kernels.linear import solve_positive
+from caryatid.kernels.ordering import quantile
 
 SPHERE, CYLINDER, BOX = 0, 1, 2
 """Codes of the shapes."""
-Posed = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-"""Axes (3, 3), columns = x, y, z of the object; centre (3,) [m]; half extents (3,) [m] along the axes."""
+
+
+class RefineJob(NamedTuple):
+    """Shapes to be refined by least squares, each on points of its own.
+
+    Attributes:
+        rows: Which of the shapes (M,).
+        kinds: Their codes (J,).
+        first: Index (J,) of the first of each one's points.
+        end: Index (J,) after the last of them.
+        every: Of these every so many (J,).
+        points: (N, 3) [m].
+        ridge, steps, min_extent, shrink, robust_width, noise_floor, converged: See `levenberg_marquardt`.
+        R: Axes (J, 3, 3); replaced.
+        centre: (J, 3) [m]; replaced.
+        half: Half extents (J, 3) [m]; replaced.
+    """
+
+    rows: NDArray[np.intp]
+    kinds: NDArray[np.intp]
+    first: NDArray[np.intp]
+    end: NDArray[np.intp]
+    every: NDArray[np.intp]
+    points: NDArray[np.float64]
+    ridge: NDArray[np.float64]
+    steps: int
+    min_extent: float
+    shrink: float
+    robust_width: float
+    noise_floor: float
+    converged: float
+    R: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    half: NDArray[np.float64]
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def refine_one(index: int, job: RefineJob) -> None:
+    """Refine one of the shapes, and replace it."""
+    row = job.rows[index]
+    first, every = job.first[row], job.every[row]
+    points = np.empty(((job.end[row] - first + every - 1) // every, 3))
+    for i in range(len(points)):
+        for a in range(3):
+            points[i, a] = job.points[first + i * every, a]
+    levenberg_marquardt(
+        job.kinds[row], job.R[row], job.centre[row], job.half[row], points, job.steps, job.min_extent,
+        job.shrink, job.robust_width, job.noise_floor, job.ridge, job.converged,
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")
@@ -26,7 +76,22 @@ def signed_distances(
     half: NDArray[np.float64],
     points: NDArray[np.float64],
 ) -> Array:
-    """Distance (N,) [m] of points (N, 3) to a shape's surface, negative inside.
+    """Distance (N,) [m] of points (N, 3) to a shape's surface, negative inside; arguments as below."""
+    distance = np.empty(len(points))
+    write_distances(kind, R, centre, half, points, distance)
+    return distance
+
+
+@njit(cache=True, error_model="numpy")
+def write_distances(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+    distance: NDArray[np.float64],
+) -> None:
+    """Find the distance of points to a shape's surface, negative inside.
 
     Args:
         kind: Code of the shape.
@@ -34,16 +99,15 @@ def signed_distances(
         centre: (3,) [m].
         half: Half extents (3,) [m] along the axes.
         points: (N, 3) [m].
+        distance: (N,) [m]; written to.
     """
-    distance = np.empty(len(points))
-    hx, hy, hz = half
+    hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
         u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
         y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
         z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
         distance[i] = signed_distance(kind, x, y, z, hx, hy, hz)
-    return distance
 
 
 @njit(cache=True, inline="always")
@@ -75,7 +139,7 @@ def distances_and_gradients(
     """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame."""
     distance = np.empty(len(points))
     gradients = np.empty((len(points), 3))
-    hx, hy, hz = half
+    hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
         u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
@@ -99,14 +163,14 @@ def levenberg_marquardt(
     noise_floor: float,
     ridge: NDArray[np.float64],
     converged: float,
-) -> Posed:
+) -> None:
     """Minimise the Geman–McClure cost of signed distances; arguments as of `refine.refine`.
 
     Args:
         kind: Code of the shape.
-        R: Axes (3, 3) at the start.
-        centre: (3,) [m] at the start.
-        half: Half extents (3,) [m] at the start.
+        R: Axes (3, 3) at the start; replaced by those of the least cost.
+        centre: (3,) [m] at the start; replaced.
+        half: Half extents (3,) [m] at the start; replaced.
         points: (N, 3) [m].
         steps: Steps at the most.
         min_extent: Least extent [m].
@@ -116,37 +180,41 @@ def levenberg_marquardt(
         ridge: Added to the diagonal (9,), times the damping.
         converged: Share of the cost that the last step lowers it by at the most.
     """
-    columns = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8])
-    if kind == SPHERE:
-        columns = columns[:7]
-    elif kind == CYLINDER:
-        columns = np.array([0, 1, 2, 3, 4, 5, 6, 8])
-    size = len(columns)
+    columns, size = np.empty(9, np.intp), 0
+    for a in range(9):
+        if a < 7 or kind == BOX or (kind == CYLINDER and a == 8):
+            columns[size] = a
+            size += 1
     damping = 1e-3
-    H = np.empty((size, size))
-    g = np.empty(size)
-    distance = signed_distances(kind, R, centre, half, points)
+    H_all, g_all = np.empty((9, 9)), np.empty(9)
+    H, g = np.empty((size, size)), np.empty(size)
+    R_trial, centre_trial, half_trial = np.empty((3, 3)), np.empty(3), np.empty(3)
+    distance, absolute = np.empty(len(points)), np.empty(len(points))
+    write_distances(kind, R, centre, half, points, distance)
     for _ in range(steps):
-        scale = robust_width * max(1.4826 * np.median(np.abs(distance)), noise_floor)
-        H_all, g_all = normal_equations(kind, R, centre, half, points, scale)
-        for a in range(size):
-            g[a] = g_all[columns[a]] + (shrink / 2.0 if a >= 6 else 0.0)
-            for b in range(size):
-                H[a, b] = H_all[columns[a], columns[b]]
+        for i in range(len(points)):
+            absolute[i] = abs(distance[i])
+        scale = robust_width * max(1.4826 * quantile(absolute, 0.5), noise_floor)
+        normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
         cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
         improved = False
         trial_cost = cost
         for _ in range(6):
-            damped = H.copy()
             for a in range(size):
-                damped[a, a] += damping * (H[a, a] + ridge[a])
-            step = solve_positive(damped, -g)
-            R_trial, centre_trial, half_trial = _stepped(kind, R, centre, half, step, columns, min_extent)
-            trial = signed_distances(kind, R_trial, centre_trial, half_trial, points)
-            trial_cost = _robust_cost(trial, scale) + shrink * _sum_of_sizes(kind, half_trial)
+                g[a] = -(g_all[columns[a]] + (shrink / 2.0 if a >= 6 else 0.0))
+                for b in range(size):
+                    H[a, b] = H_all[columns[a], columns[b]]
+                H[a, a] += damping * (H[a, a] + ridge[a])
+            step = solve_positive(H, g)
+            _stepped(kind, R, centre, half, step, columns, min_extent, R_trial, centre_trial, half_trial)
+            write_distances(kind, R_trial, centre_trial, half_trial, points, distance)
+            trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half_trial)
             if trial_cost < cost:
                 improved = True
-                R, centre, half, distance = R_trial, centre_trial, half_trial, trial
+                for a in range(3):
+                    centre[a], half[a] = centre_trial[a], half_trial[a]
+                    for b in range(3):
+                        R[a, b] = R_trial[a, b]
                 break
             damping *= 6.0
         if not improved:
@@ -154,7 +222,6 @@ def levenberg_marquardt(
         damping = max(damping / 10.0, 1e-7)
         if cost - trial_cost < converged * cost:
             break
-    return R, centre, half
 
 
 @njit(cache=True, error_model="numpy")
@@ -165,17 +232,21 @@ def normal_equations(
     half: NDArray[np.float64],
     points: NDArray[np.float64],
     scale: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
+    H: NDArray[np.float64],
+    g: NDArray[np.float64],
+) -> None:
+    """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
 
     Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
     x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6).
     """
-    H = np.zeros((9, 9))
-    g = np.zeros(9)
-    J = np.zeros(9)
+    J = np.empty(9)
+    for a in range(9):
+        g[a] = J[a] = 0.0
+        for b in range(9):
+            H[a, b] = 0.0
     share = 1.0 / len(points)
-    hx, hy, hz = half
+    hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
         u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
@@ -200,10 +271,9 @@ def normal_equations(
     for a in range(9):
         for b in range(a):
             H[b, a] = H[a, b]
-    return H, g
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def gradient(
     kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float
 ) -> tuple[float, float, float, float]:
@@ -236,7 +306,7 @@ def gradient(
     return qz, 0.0, 0.0, np.sign(z)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _stepped(
     kind: int,
     R: NDArray[np.float64],
@@ -245,12 +315,16 @@ def _stepped(
     step: NDArray[np.float64],
     columns: NDArray[np.intp],
     min_extent: float,
-) -> Posed:
-    """The shape after a step in its own frame, shortened to 3 cm and 0.3 rad; no extent below the least."""
+    turned: NDArray[np.float64],
+    moved: NDArray[np.float64],
+    grown: NDArray[np.float64],
+) -> None:
+    """Write the shape after a step in its own frame, shortened to 3 cm and 0.3 rad, no extent too short."""
     longest = 1.0
     for a in range(len(step)):
         longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
-    grown, moved, turned = half.copy(), centre.copy(), np.empty((3, 3))
+    for a in range(3):
+        grown[a], moved[a] = half[a], centre[a]
     for a in range(6, len(step)):
         grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
     if kind == SPHERE:
@@ -263,17 +337,16 @@ def _stepped(
     sine = np.sin(angle) / angle if angle >= 1e-12 else 1.0
     rest = (1.0 - np.cos(angle)) / (angle * angle) if angle >= 1e-12 else 0.0
     for i in range(3):
-        u, v, w = R[i]
+        u, v, w = R[i, 0], R[i, 1], R[i, 2]
         moved[i] += (u * step[0] + v * step[1] + w * step[2]) / longest
         along = rest * (u * x + v * y + w * z)
         cosine = np.cos(angle) if angle >= 1e-12 else 1.0
         turned[i, 0] = cosine * u + sine * (v * z - w * y) + along * x
         turned[i, 1] = cosine * v + sine * (w * x - u * z) + along * y
         turned[i, 2] = cosine * w + sine * (u * y - v * x) + along * z
-    return turned, moved, grown
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
     total = 0.0
     for d in distance:
@@ -282,7 +355,7 @@ def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
     return total / len(distance) * scale**2
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _sum_of_sizes(kind: int, half: NDArray[np.float64]) -> float:
     if kind == SPHERE:
         return half[0]

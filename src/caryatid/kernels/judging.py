@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE, gradient
+from caryatid.kernels.ordering import quantile
 
 FACING = 0.7
 """A point bears out the side whose outward normal its own gradient follows with this cosine [1]; 45°."""
@@ -46,7 +47,7 @@ def draw_in(
         min_extent: Least extent [m].
         seen: Whether the sides -x, +x, -y, +y, -z, +z are (6,); written to.
     """
-    hx, hy, hz = half
+    hx, hy, hz = half[0], half[1], half[2]
     counts = np.zeros(6, np.intp)
     local = np.empty((3, len(points)))
     near = 0
@@ -60,7 +61,7 @@ def draw_in(
             continue
         local[0, near], local[1, near], local[2, near] = x, y, z
         near += 1
-        nx, ny, nz = normals[i]
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         wx = R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz
         wy = R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz
         wz = R[2, 0] * gx + R[2, 1] * gy + R[2, 2] * gz
@@ -86,12 +87,12 @@ def draw_in(
     for axis in range(3):
         if (kind == CYLINDER and axis < 2) or (seen[2 * axis] and seen[2 * axis + 1]):
             continue
-        ordered = np.sort(local[axis, :near])
+        reach = local[axis, :near]
         low, high = -half[axis], half[axis]
         if not seen[2 * axis]:
-            low = min(max(low, quantile(ordered, trim)), high - min_extent)
+            low = min(max(low, quantile(reach, trim)), high - min_extent)
         if not seen[2 * axis + 1]:
-            high = max(min(high, quantile(ordered, 1.0 - trim)), low + min_extent)
+            high = max(min(high, quantile(reach, 1.0 - trim)), low + min_extent)
         half[axis], shift[axis] = (high - low) / 2.0, (high + low) / 2.0
     for a in range(3):
         centre[a] += R[a, 0] * shift[0] + R[a, 1] * shift[1] + R[a, 2] * shift[2]
@@ -113,7 +114,7 @@ def misfit(
         Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, 1 at the most;
         share of the points within the threshold.
     """
-    hx, hy, hz = half
+    hx, hy, hz = half[0], half[1], half[2]
     away = turned = 0.0
     inliers = 0
     for i in range(len(points)):
@@ -122,7 +123,7 @@ def misfit(
         y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
         z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
         d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
-        nx, ny, nz = normals[i]
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         mx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
         my = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
         mz = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
@@ -169,7 +170,7 @@ def bare_share(
         places = _samples(kind, half, axis, sign, spacing)
         samples += len(places)
         for k in range(len(places)):
-            u, v, w = places[k]
+            u, v, w = places[k, 0], places[k, 1], places[k, 2]
             found = False
             for n in range(-1, len(local)):
                 i = last if n < 0 else n
@@ -214,7 +215,7 @@ def _samples(kind, half, axis, sign, spacing):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _flat_side(kind, half, axis, sign, spacing):  # type: ignore[no-untyped-def]
     u, v = (axis + 1) % 3, (axis + 2) % 3
     columns = max(2, int(np.ceil(2.0 * half[u] / spacing)))
@@ -230,12 +231,3 @@ def _flat_side(kind, half, axis, sign, spacing):  # type: ignore[no-untyped-def]
             found[count, axis], found[count, u], found[count, v] = sign * half[axis], a, b
             count += 1
     return found[:count]
-
-
-@njit(cache=True)
-def quantile(ordered: NDArray[np.float64], share: float) -> float:
-    """Quantile of ascending numbers (N,), between two of them in proportion."""
-    place = share * (len(ordered) - 1)
-    below = int(np.floor(place))
-    above = min(below + 1, len(ordered) - 1)
-    return ordered[below] + (place - below) * (ordered[above] - ordered[below])

@@ -11,15 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.kernels.fitting import (
-    BOX,
-    CYLINDER,
-    SPHERE,
-    levenberg_marquardt,
-    normal_equations,
-    signed_distances,
-)
-from caryatid.kernels.judging import quantile
+from caryatid.kernels.fitting import CYLINDER, SPHERE, normal_equations, write_distances
+from caryatid.kernels.ordering import quantile
 from caryatid.kernels.rims import likeliest_end
 
 
@@ -55,7 +48,9 @@ class PolishJob(NamedTuple):
         seen: Sides (P, 6) that points bear out.
         first: Index of each object's first point, and the number of all points (P + 1,).
         points: (N, 3) [m], object after object, in the frames of the shapes' poses.
-        ridge: Added to the diagonal of least squares (9,), times the damping.
+        R_opened: Axes (P, 3, 3) once unseen sides were moved out of the way and the others refined.
+        centre_opened: (P, 3) [m] then.
+        half_opened: Half extents (P, 3) [m] then.
 
     Then settings by their names in `FitConfig`, constants by their names in `refine`, and the fields of
     `Polished`.
@@ -65,21 +60,20 @@ class PolishJob(NamedTuple):
     seen: NDArray[np.bool_]
     first: NDArray[np.intp]
     points: NDArray[np.float64]
-    ridge: NDArray[np.float64]
+    R_opened: NDArray[np.float64]
+    centre_opened: NDArray[np.float64]
+    half_opened: NDArray[np.float64]
     threshold: float
     trim: float
     max_extent: float
     min_extent: float
     min_points: int
-    steps: int
-    opening: float
     face_width: float
     stray: float
     correlated: float
     rim: float
     robust_width: float
     noise_floor: float
-    converged: float
     R: NDArray[np.float64]
     centre: NDArray[np.float64]
     half: NDArray[np.float64]
@@ -90,79 +84,54 @@ class PolishJob(NamedTuple):
     inliers: NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def polish_one(row: int, job: PolishJob) -> None:
-    """Refine the chosen shape of one object, and write it to its row."""
+    """Close the opened shape of one object, and write it to its row with what is known of its errors."""
     kind, seen = job.kinds[row], job.seen[row]
     points = job.points[job.first[row] : job.first[row + 1]]
-    R, centre, opened = levenberg_marquardt(
-        kind, job.R[row], _opened(kind, job.R[row], job.centre[row], seen, job.opening),
-        _widened(kind, job.half[row], seen, job.opening), points, job.steps, job.min_extent, 0.0,
-        job.robust_width, job.noise_floor, job.ridge, job.converged,
-    )  # fmt: skip
-    distance = signed_distances(kind, R, centre, opened, points)
+    R, centre, opened = job.R_opened[row], job.centre_opened[row], job.half_opened[row]
+    distance = np.empty(len(points))
+    write_distances(kind, R, centre, opened, points, distance)
     near = 0
     for i in range(len(distance)):
         if abs(distance[i]) < job.threshold:
             distance[near] = abs(distance[i])
             near += 1
-    sigma = max(1.4826 * np.median(distance[:near]), job.noise_floor) if near > 0 else job.threshold
-    information, _ = normal_equations(kind, R, centre, opened, points, job.robust_width * sigma)
+    sigma = max(1.4826 * quantile(distance[:near], 0.5), job.noise_floor) if near > 0 else job.threshold
     job.sigma[row] = sigma
-    for a in range(9):
-        for b in range(9):
-            job.information[row, a, b] = information[a, b]
+    normal_equations(
+        kind, R, centre, opened, points, job.robust_width * sigma, job.information[row], np.empty(9)
+    )
     for side in range(6):
         job.hidden[row, side] = job.max_extent / np.sqrt(12.0)
-    closed, middle = opened, centre
+    closed, middle = np.empty(3), np.empty(3)
+    for a in range(3):
+        closed[a], middle[a] = opened[a], centre[a]
     if kind != SPHERE:
-        closed, middle = _closed(kind, R, centre, opened, seen, points, sigma, row, job)
+        _close(kind, R, centre, opened, seen, points, sigma, row, job, closed, middle)
     if 2.0 * max(closed[0], closed[1], closed[2]) <= job.max_extent and near > 0:
         for a in range(3):
             job.centre[row, a], job.half[row, a] = middle[a], closed[a]
             for b in range(3):
                 job.R[row, a, b] = R[a, b]
-    distance = signed_distances(kind, job.R[row], job.centre[row], job.half[row], points)
+    write_distances(kind, job.R[row], job.centre[row], job.half[row], points, distance)
     total = inliers = 0.0
-    for d in distance:
-        total += min(abs(d), job.threshold)
-        inliers += abs(d) < job.threshold
+    for i in range(len(distance)):
+        total += min(abs(distance[i]), job.threshold)
+        inliers += abs(distance[i]) < job.threshold
     job.residual[row], job.inliers[row] = total / len(distance), inliers / len(distance)
 
 
-@njit(cache=True, error_model="numpy")
-def _opened(kind, R, centre, seen, opening):  # type: ignore[no-untyped-def]
-    """Where the centre (3,) is once the unseen flat sides are moved out of the way."""
-    moved = centre.copy()
-    for axis in range(3):
-        if kind == BOX or (kind == CYLINDER and axis == 2):
-            shift = opening * (int(seen[2 * axis]) - int(seen[2 * axis + 1])) / 2.0
-            for a in range(3):
-                moved[a] += R[a, axis] * shift
-    return moved
-
-
-@njit(cache=True, error_model="numpy")
-def _widened(kind, half, seen, opening):  # type: ignore[no-untyped-def]
-    """Half extents (3,) once the unseen sides are moved out of the way; a round side is seen as a whole."""
-    grown = half.copy()
-    for axis in range(3):
-        if kind == BOX or (kind == CYLINDER and axis == 2):
-            grown[axis] += opening * (2.0 - int(seen[2 * axis]) - int(seen[2 * axis + 1])) / 2.0
-        elif kind == CYLINDER and not (seen[0] or seen[1] or seen[2] or seen[3]):
-            grown[axis] += opening
-    return grown
-
-
-@njit(cache=True, error_model="numpy")
-def _closed(kind, R, centre, opened, seen, points, sigma, row, job):  # type: ignore[no-untyped-def]
-    """Put unseen sides where the points end, or back where they were; half extents (3,) and centre (3,)."""
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _close(  # type: ignore[no-untyped-def]
+    kind, R, centre, opened, seen, points, sigma, row, job, closed, middle
+):
+    """Put unseen sides where the points end, or back where they were: half extents (3,) and centre (3,)."""
     local = np.empty((len(points), 3))
     for i in range(len(points)):
         u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         for a in range(3):
             local[i, a] = R[0, a] * u + R[1, a] * v + R[2, a] * w
-    closed, middle = opened.copy(), centre.copy()
     if kind == CYLINDER and not (seen[0] or seen[1] or seen[2] or seen[3]):
         rim, deviation = _end(kind, opened, local, 0, 1.0, sigma, job)
         closed[0] = closed[1] = job.half[row, 0] if np.isnan(rim) else rim
@@ -175,7 +144,7 @@ def _closed(kind, R, centre, opened, seen, points, sigma, row, job):  # type: ig
         before = 0.0
         for a in range(3):
             before += R[a, axis] * (job.centre[row, a] - centre[a])
-        ends = (-opened[axis], opened[axis])
+        low, high = -opened[axis], opened[axis]
         for side in range(2):
             if seen[2 * axis + side]:
                 continue
@@ -184,8 +153,10 @@ def _closed(kind, R, centre, opened, seen, points, sigma, row, job):  # type: ig
             end = before + sign * job.half[row, axis]
             if not np.isnan(rim):
                 end, job.hidden[row, 2 * axis + side] = sign * rim, deviation
-            ends = (ends[0], end) if side else (end, ends[1])
-        low, high = ends
+            if side == 0:
+                low = end
+            else:
+                high = end
         short = max(job.min_extent - (high - low), 0.0)
         if seen[2 * axis + 1]:
             low -= short
@@ -194,10 +165,9 @@ def _closed(kind, R, centre, opened, seen, points, sigma, row, job):  # type: ig
         closed[axis] = (high - low) / 2.0
         for a in range(3):
             middle[a] += R[a, axis] * (high + low) / 2.0
-    return closed, middle
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _end(kind, half, local, axis, sign, sigma, job):  # type: ignore[no-untyped-def]
     """Where points (N, 3) beside one side end along its direction, and its deviation [m]; NaN if few tell.
 
@@ -221,9 +191,9 @@ def _end(kind, half, local, axis, sign, sigma, job):  # type: ignore[no-untyped-
             count += 1
     if count < job.min_points:
         return np.nan, np.nan
-    ordered = np.sort(coordinates[:count])
-    start = quantile(ordered, 1.0 - job.trim)
-    span = start if round_ else start - quantile(ordered, job.trim)
+    found = coordinates[:count]
+    start = quantile(found, 1.0 - job.trim)
+    span = start if round_ else start - quantile(found, job.trim)
     window = max(4.0 * sigma, 0.1 * span)
-    end, deviation = likeliest_end(ordered, start, sigma, window, round_, job.stray)
+    end, deviation = likeliest_end(found, start, sigma, window, round_, job.stray)
     return end, np.sqrt(deviation * deviation * job.correlated + job.rim * job.rim)

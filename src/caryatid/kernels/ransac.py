@@ -81,7 +81,7 @@ def search(
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _swap(k: int, R: Array, centre: Array, half: Array, cost: Array) -> None:
     """Exchange a hypothesis and the one before it."""
     cost[k], cost[k - 1] = cost[k - 1], cost[k]
@@ -108,7 +108,7 @@ def msac(
     """
     total = 0.0
     inliers = 0
-    hx, hy, hz = half
+    hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
         u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
         x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
@@ -158,9 +158,9 @@ def hypothesis(
     Returns:
         Whether there is such a shape within the limits.
     """
-    i, j = sample
-    ax, ay, az = normals[i]
-    bx, by, bz = normals[j]
+    i, j = sample[0], sample[1]
+    ax, ay, az = normals[i, 0], normals[i, 1], normals[i, 2]
+    bx, by, bz = normals[j, 0], normals[j, 1], normals[j, 2]
     if kind == BOX:
         along = ax * bx + ay * by + az * bz
         ux, uy, uz = bx - along * ax, by - along * ay, bz - along * az
@@ -201,7 +201,7 @@ def hypothesis(
     return kind != CYLINDER or 2.0 * half[2] <= max_extent
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def set_axes(
     R: NDArray[np.float64], ux: float, uy: float, uz: float, x: float, y: float, z: float, column: int
 ) -> None:
@@ -214,13 +214,15 @@ def set_axes(
     R[2, 1 - column] = sign * (x * uy - y * ux)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def trimmed_range(
     points: NDArray[np.float64], dx: float, dy: float, dz: float, trim: float
 ) -> tuple[float, float]:
     """Least and greatest coordinate [m] of points (N, 3) along a direction, a share at each end left out."""
     beyond = min(int(trim * len(points)), (len(points) - 1) // 2)
-    least, greatest = np.full(beyond + 1, np.inf), np.full(beyond + 1, -np.inf)
+    least, greatest = np.empty(beyond + 1), np.empty(beyond + 1)
+    for k in range(beyond + 1):
+        least[k], greatest[k] = np.inf, -np.inf
     for i in range(len(points)):
         c = points[i, 0] * dx + points[i, 1] * dy + points[i, 2] * dz
         if c < least[beyond]:

@@ -37,13 +37,18 @@ def likeliest_end(
     Returns:
         The end and its standard deviation.
     """
-    coordinates = coordinates[coordinates > start - window - 12.0 * sigma]
+    near, close = 0, np.empty(len(coordinates))
+    for i in range(len(coordinates)):
+        if coordinates[i] > start - window - 12.0 * sigma:
+            close[near] = coordinates[i]
+            near += 1
     end = start
     density = 0.0
     for _ in range(ROUNDS):
         top = end - 2.0 * sigma
         count = 0
-        for u in coordinates:
+        for i in range(near):
+            u = close[i]
             if top - window < u <= top:
                 count += 1
         density = max(count, 1) / window
@@ -53,7 +58,8 @@ def likeliest_end(
         for _ in range(HALVINGS):
             middle = 0.5 * (low + high)
             slope = -density * sigma
-            for u in coordinates:
+            for i in range(near):
+                u = close[i]
                 z = (middle - u) / sigma
                 if -6.0 < z < 4.5:
                     within = 0.5 * math.erfc(-z * 0.7071067811865476)

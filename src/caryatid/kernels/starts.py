@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.kernels.fitting import BOX
+from caryatid.kernels.ordering import quantile
 from caryatid.kernels.ransac import LEAST_RADIUS, set_axes, trimmed_range
 
 Direction = tuple[float, float, float]
@@ -27,13 +28,13 @@ def main_normal(normals: NDArray[np.float64]) -> tuple[Direction, NDArray[np.boo
     count = len(normals)
     best, most = 0, 0
     for i in range(count):
-        x, y, z = normals[i]
+        x, y, z = normals[i, 0], normals[i, 1], normals[i, 2]
         agreeing = 0
         for j in range(count):
             agreeing += x * normals[j, 0] + y * normals[j, 1] + z * normals[j, 2] > AGREEING
         if agreeing > most:
             best, most = i, agreeing
-    x, y, z = normals[best]
+    x, y, z = normals[best, 0], normals[best, 1], normals[best, 2]
     u = v = w = 0.0
     agree = np.empty(count, np.bool_)
     for j in range(count):
@@ -110,7 +111,7 @@ def of_one_face(
         if on_face[i]:
             heights[count] = points[i, 0] * x + points[i, 1] * y + points[i, 2] * z
             count += 1
-    high[2] = np.median(heights[:count])
+    high[2] = quantile(heights[:count], 0.5)
     low[2] = min(low[2], high[2] - min_extent)
     for a in range(3):
         half[a] = (high[a] - low[a]) / 2.0
@@ -123,7 +124,7 @@ def of_one_face(
     return LEAST_RADIUS < half[0] <= max_radius and 2.0 * half[2] <= max_extent
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _across(points: NDArray[np.float64], x: float, y: float, z: float) -> Direction:
     """A direction across an axis that turns with the points: to the first one well off their middle."""
     count = len(points)
