@@ -46,6 +46,41 @@ def test_two_kinds_of_work_on_the_same_data_are_told_apart():
     np.testing.assert_array_equal(results, 7.0 * numbers + 3.0)
 
 
+RENAMED = """
+import sys
+import numpy as np
+from numba import njit
+sys.path.insert(0, sys.argv[1])
+import kinds
+from caryatid.kernels.parallel import for_each
+
+@njit
+def count(index, data):
+    data.results[index] += index
+
+data = getattr(kinds, sys.argv[2])(np.zeros(3))
+for_each(count, 3, data)
+sys.stdout.write(str(data.results.tolist()))
+"""
+
+
+def test_types_that_were_renamed_since_do_not_break_it(tmp_path):
+    """What was compiled for them is kept on disk, where it can no longer be read."""
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    for name in ("Before", "Afterwards"):
+        (tmp_path / "kinds.py").write_text(
+            f"from typing import Any, NamedTuple\nclass {name}(NamedTuple):\n    results: Any\n"
+        )
+        run = subprocess.run(
+            [sys.executable, "-c", RENAMED, str(tmp_path), name],
+            env=env,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert run.stdout == "[0.0, 1.0, 2.0]", run.stderr
+
+
 THREADED = """
 import hashlib
 import sys

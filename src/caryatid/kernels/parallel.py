@@ -11,7 +11,8 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba import njit, prange, types
+from numba import get_num_threads, njit, prange, types
+from numba.extending import intrinsic
 
 
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
@@ -31,19 +32,23 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
         kind = numba.typeof(data)
         one = types.void(types.int64, kind)
         signature = (types.FunctionType(one), types.int64, kind)
-        work.compile(one.args)
-        _loop.compile(signature)
-        entries = work.overloads[one.args].entry_point, _loop.overloads[signature].entry_point
-        _entries[layout] = entries
-    alone, loop = entries
-    if count == 1:
-        alone(0, data)
-    else:
-        loop(work, count, data)
+        _compile(work, one.args)
+        _compile(_loop, signature)
+        entry = _entries[layout] = _loop.overloads[signature].entry_point
+    entry(work, count, data)
 
 
-_entries: dict[tuple[Any, ...], tuple[Callable[..., None], Callable[..., None]]] = {}
-"""Work and loop as compiled for each layout of data; `numba.typeof` takes a quarter of a millisecond."""
+def _compile(kernel: Any, arguments: tuple[Any, ...]) -> None:
+    """Compile a kernel or take it from disk; what is kept there may name types that are no more."""
+    try:
+        kernel.compile(arguments)
+    except (AttributeError, ImportError):
+        kernel._cache.flush()
+        kernel.compile(arguments)
+
+
+_entries: dict[tuple[Any, ...], Callable[[Any, int, tuple[Any, ...]], None]] = {}
+"""The loop as compiled for each work and layout of data; `numba.typeof` takes a quarter of a millisecond."""
 
 
 def _layout(value: object) -> object:
@@ -55,5 +60,25 @@ def _layout(value: object) -> object:
 
 @njit(cache=True, parallel=True)
 def _loop(work, count, data):  # type: ignore[no-untyped-def]
-    for index in prange(count):
-        work(np.int64(index), data)
+    """Threads take the next index when they are done with one: what takes long holds up no other work."""
+    if count == 1:
+        work(0, data)
+        return
+    taken = np.zeros(1, dtype=np.int64)
+    for _ in prange(min(count, get_num_threads())):
+        index = _take(taken)
+        while index < count:
+            work(index, data)
+            index = _take(taken)
+
+
+@intrinsic
+def _take(typing_context, taken):  # type: ignore[no-untyped-def]
+    """Return the number in an array (1,) and raise it by one, as one step for all threads."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        numbers = context.make_array(signature.args[0])(context, builder, arguments[0])
+        one = context.get_constant(types.int64, 1)
+        return builder.atomic_rmw("add", numbers.data, one, "monotonic")
+
+    return types.int64(taken), generate
