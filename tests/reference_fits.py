@@ -13,6 +13,7 @@ from caryatid import frames, refine
 from caryatid.frames import Array
 from caryatid.kernels.ransac import BATCH
 from caryatid.kernels.rims import likeliest_end
+from caryatid.primitives import PROMISING
 from caryatid.refine import (
     CONVERGED,
     NOISE_FLOOR,
@@ -236,7 +237,7 @@ def candidates(points, normals, config, rng):
         shape, seen = draw_in(_refined(start, on, converged=converged, **settings), points, normals, config)
         return cost(shape, points, normals, config), shape, seen
 
-    found = {}
+    rough = {}
     for kind, drawn in zip(config.shapes, samples, strict=True):
         starts = search(kind, some, facing, drawn, config)[0].shapes(kind)
         flat = None if kind == "sphere" else of_one_face(kind, some, facing, config)
@@ -244,9 +245,13 @@ def candidates(points, normals, config, rng):
         if not tried:
             continue
         best = min(tried, key=lambda j: j[0])
-        if best[1].extents.max() > config.max_extent:
-            continue
-        price, shape, seen = min(best, judged(best[1], points, CONVERGED), key=lambda j: j[0])
+        if best[1].extents.max() <= config.max_extent:
+            rough[kind] = best
+    found = {}
+    for kind, best in rough.items():
+        if best[0] <= PROMISING * min(price for price, *_ in rough.values()):
+            best = min(best, judged(best[1], points, CONVERGED), key=lambda j: j[0])
+        price, shape, seen = best
         if shape.extents.max() <= config.max_extent:
             found[kind] = price, shape.moved(frames.rigid(np.eye(3), origin)), seen
     return found

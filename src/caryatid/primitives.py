@@ -60,6 +60,11 @@ class FitFailure:
     reason: str
 
 
+PROMISING = 2.0
+"""Kinds of shape that cost more than so many times the best one after the first refinement get no second one
+[1]: that ends where a step gains a thousandth, so no more of them can halve what is left."""
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Oriented:
     """The points of one object.
@@ -132,13 +137,14 @@ def fit_many(
     """
     results: list[Fit | FitFailure] = []
     chosen: list[Polish] = []
-    for number, found in enumerate(candidates(objects, config=config, rngs=rngs)):
+    finite = [o.finite() for o in objects]
+    for part, found in zip(finite, _candidates(finite, config, rngs), strict=True):
         if not found:
-            results.append(FitFailure(_failure_reason(len(objects[number].finite()), config)))
+            results.append(FitFailure(_failure_reason(len(part), config)))
             continue
         best = found[0] if space is None else _least_free(found, space, config)
         results.append(best)
-        chosen.append(Polish(best.shape, best.seen, objects[number].finite().points))
+        chosen.append(Polish(best.shape, best.seen, part.points))
     polished = iter(polish(chosen, config))
     for number, result in enumerate(results):
         if isinstance(result, Fit):
@@ -161,15 +167,21 @@ def candidates(
 
     Arguments as of `fit_many`.
     """
-    finite = [o.finite() for o in objects]
-    large = [k for k, o in enumerate(finite) if len(o) >= config.min_points]
+    return _candidates([o.finite() for o in objects], config, rngs)
+
+
+def _candidates(
+    objects: Sequence[Oriented], config: FitConfig, rngs: Sequence[np.random.Generator]
+) -> list[list[Fit]]:
+    """Do as `candidates` does with points that are all finite."""
+    large = [k for k, o in enumerate(objects) if len(o) >= config.min_points]
     found: list[list[Fit]] = [[] for _ in objects]
     if not large:
         return found
     kinds = np.array([CODES[kind] for kind in config.shapes])
     parts, every, samples = [], [], []
     for k in large:
-        part, rng = finite[k], rngs[k]
+        part, rng = objects[k], rngs[k]
         count = min(len(part), config.max_points)
         every.append(max(1, count // config.search_points))
         if every[-1] > 1 or count < len(part):
@@ -205,7 +217,9 @@ def _fitted(job: FitJob, config: FitConfig) -> NDArray[np.intp]:
     for_each(search_one, groups, job)
     _improve(job, np.flatnonzero(job.cost.ravel() < np.inf), job.every, ROUGHLY, config)
     best = np.argmin(job.cost, axis=1)
-    found = np.flatnonzero(_within(job, best, config))
+    costs = np.where(_within(job, best, config), job.cost.min(axis=1), np.inf).reshape(len(job.every), -1)
+    promising = (costs < np.inf) & (costs <= PROMISING * costs.min(axis=1, keepdims=True))
+    found = np.flatnonzero(promising)
     # Kinds are compared once least squares on all the points have nothing left to gain.
     last = (best + 1) % room
     for part in (job.R, job.centre, job.half):

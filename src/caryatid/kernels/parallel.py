@@ -7,11 +7,12 @@ much. Here one short loop calls the work by its address.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba import get_num_threads, njit, prange, types
+from numba import njit, prange, types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 
@@ -27,15 +28,27 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
         data: Arrays and numbers, best a `NamedTuple`; results are written to arrays among them.
     """
     layout = (work, *map(_layout, data))
-    entries = _entries.get(layout)
-    if entries is None:
-        kind = numba.typeof(data)
-        one = types.void(types.int64, kind)
-        signature = (types.FunctionType(one), types.int64, kind)
-        _compile(work, one.args)
+    compiled = _compiled_for.get(layout)
+    if compiled is None:
+        compiled = _compiled_for[layout] = _Compiled.of(work, numba.typeof(data))
+    compiled.loop(compiled.address, count, data, numba.get_num_threads())
+
+
+class _Compiled(NamedTuple):
+    """Work for one layout of data: its address, and the loop that calls it."""
+
+    address: int
+    loop: Callable[..., None]
+
+    @classmethod
+    def of(cls, work: Any, data: types.Type) -> _Compiled:
+        one = (types.int64, data)
+        _compile(work, one)
+        result = work.overloads[one]
+        signature = (types.int64, types.int64, data, types.int64)
         _compile(_loop, signature)
-        entry = _entries[layout] = _loop.overloads[signature].entry_point
-    entry(work, count, data)
+        address = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+        return cls(address, _loop.overloads[signature].entry_point)
 
 
 def _compile(kernel: Any, arguments: tuple[Any, ...]) -> None:
@@ -47,8 +60,8 @@ def _compile(kernel: Any, arguments: tuple[Any, ...]) -> None:
         kernel.compile(arguments)
 
 
-_entries: dict[tuple[Any, ...], Callable[[Any, int, tuple[Any, ...]], None]] = {}
-"""The loop as compiled for each work and layout of data; `numba.typeof` takes a quarter of a millisecond."""
+_compiled_for: dict[tuple[Any, ...], _Compiled] = {}
+"""By work and layout of data; `numba.typeof` takes a quarter of a millisecond."""
 
 
 def _layout(value: object) -> object:
@@ -59,17 +72,31 @@ def _layout(value: object) -> object:
 
 
 @njit(cache=True, parallel=True)
-def _loop(work, count, data):  # type: ignore[no-untyped-def]
+def _loop(address, count, data, threads):  # type: ignore[no-untyped-def]
     """Threads take the next index when they are done with one: what takes long holds up no other work."""
+    work = _at(address, data)
     if count == 1:
         work(0, data)
         return
     taken = np.zeros(1, dtype=np.int64)
-    for _ in prange(min(count, get_num_threads())):
+    for _ in prange(min(count, threads)):
         index = _take(taken)
         while index < count:
             work(index, data)
             index = _take(taken)
+
+
+@intrinsic
+def _at(typing_context, address, data):  # type: ignore[no-untyped-def]
+    """Return the work on such data by the address of its C entry; numba finds one by name anew each time."""
+    kind = types.FunctionType(types.void(types.int64, data))
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        work = cgutils.create_struct_proxy(kind)(context, builder)
+        work.c_addr = builder.inttoptr(arguments[0], work.c_addr.type)
+        return work._getvalue()
+
+    return kind(address, data), generate
 
 
 @intrinsic
