@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -17,6 +18,10 @@ from caryatid.kernels.compiling import compile_kernels
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth, write_truth
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # The workers share the cores: threads that wait for one that is taken hold up every parallel loop.
+    numba.set_num_threads(1)
 
 SMALL_SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 """A quarter of the usual image: what tests of the commands need, in a tenth of the time."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from caryatid import frames
 from caryatid.clouds import oriented_points
-from caryatid.config import Config, SegmentationMethod
+from caryatid.config import Config, SegmentationMethod, SurfaceConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.frames import Array
 from caryatid.segmentation import segment, segment_cloud
@@ -190,10 +190,11 @@ def _surface(
     """Find the support surface in points that belong to no given object: near the known one, or anywhere."""
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
     if known is None:
-        return _found(_spread(cloud, loose, config.surface.max_points), up, config, rng)
+        return _found(_spread(cloud, loose, config.surface.max_points), up, config.surface, rng)
     near = np.abs(known.height(cloud.points_world)) < config.surface.search
     try:
-        return _found(_spread(cloud, loose & near, config.surface.max_points_known), up, config, rng)
+        largest = replace(config.surface, planes=1)
+        return _found(_spread(cloud, loose & near, config.surface.max_points_known), up, largest, rng)
     except PerceptionError:
         return known
 
@@ -204,8 +205,8 @@ def _spread(cloud: Cloud, among: NDArray[np.bool_], count: int) -> Cloud:
     return cloud.select(index[:: max(1, len(index) // count)])
 
 
-def _found(cloud: Cloud, up: Array | None, config: Config, rng: np.random.Generator) -> SupportSurface:
+def _found(cloud: Cloud, up: Array | None, config: SurfaceConfig, rng: np.random.Generator) -> SupportSurface:
     try:
-        return find_support_surface(cloud.points_world, cloud.normals_world, up, config.surface, rng)
+        return find_support_surface(cloud.points_world, cloud.normals_world, up, config, rng)
     except PerceptionError as error:
         raise PerceptionError(f"{cloud.name}: {error}") from None

@@ -22,7 +22,7 @@ from caryatid.perception import UP, Percept, label_image, perceive
 from caryatid.plausibility import reconcile
 from caryatid.stopwatch import Stopwatch
 from caryatid.support import explain, infer
-from caryatid.surface import SupportSurface, find_support_surface
+from caryatid.surface import SupportSurface, refitted
 from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from caryatid.views import SUPPORT_LABEL, Cloud, View
@@ -162,8 +162,9 @@ class Scene:
         table = self._models.points.of(SUPPORT_LABEL)
         if self.views == 0 or len(table) < self.config.surface.min_points:
             return percept.surface
-        rng = np.random.default_rng(self.seed)
-        return find_support_surface(table.points_world, table.normals_world, UP, self.config.surface, rng)
+        known, config = self.surface or percept.surface, self.config.surface
+        fused = refitted(known, table.points_world, table.normals_world, UP, config)
+        return known if fused is None else fused
 
     def _bounds(self, percept: Percept) -> tuple[SupportSurface, VoxelMap]:
         """Enter the view into the map; return what bounds hidden extents: of this view alone with `sg`."""

@@ -129,6 +129,24 @@ def find_support_surface(
     return _surface(points, _choose_table(candidates, frames.unit(up), config), config)
 
 
+def refitted(
+    surface: SupportSurface, points: Array, normals: Array, up: Array, config: SurfaceConfig
+) -> SupportSurface | None:
+    """Fit a support surface that is known well anew, to more points; None where too few are near it.
+
+    Args:
+        surface: What is known: within the tolerance nearly everywhere.
+        points: (N, 3) [m].
+        normals: Unit normals (N, 3) towards the sensor.
+        up: Upward direction (3,).
+        config: Tolerances.
+    """
+    normal = surface.normal_world
+    offset = float(normal @ surface.point_world)
+    plane = _refine(points, normals, np.ones(len(points), dtype=bool), normal, offset, up, config)
+    return None if plane is None else _surface(points, plane, config)
+
+
 def _horizontal_planes(
     points: Array, normals: Array, up: Array, config: SurfaceConfig, rng: np.random.Generator
 ) -> list[_Plane]:
