@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -81,8 +82,9 @@ def decision_state() -> tuple[PlanningState, Callable[[], Candidates]]:
     visited = sphere.direction_of(recording.poses)
     graph = with_points(scene.graph, sphere, visited, recording.config)
     active = recording.config.active
+    asked_for_none = copy.copy(robot)
     state = PlanningState(graph, sphere, voxels, visited, robot.candidates(sphere), active)
-    return state, lambda: robot.candidates(sphere)
+    return state, lambda: copy.copy(asked_for_none).candidates(sphere)
 
 
 def with_points(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -66,7 +67,7 @@ class Episode:
 
     def __init__(self, recording: Recording, segmentation: SegmentationMethod) -> None:
         self.scene = Scene(recording.config, segmentation=segmentation)
-        self._robot, self._labels = recording.robot, segmentation == "labels"
+        self._robot, self._labels = copy.copy(recording.robot), segmentation == "labels"
         self._visited: list[Array] = []
 
     def look(self, T_world_camera: Array, view: View) -> Turn:
