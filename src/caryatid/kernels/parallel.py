@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from llvmlite import ir
 from numba import njit, prange, types
 from numba.core import cgutils
 from numba.extending import intrinsic
@@ -71,32 +72,74 @@ def _layout(value: object) -> object:
     return type(value)
 
 
-@njit(cache=True, parallel=True)
+_CALLER = ir.FunctionType(ir.VoidType(), [ir.IntType(64), cgutils.intp_t])
+"""Of an index and of where the rest is."""
+
+
+@njit(cache=True)
 def _loop(address, count, data, threads):  # type: ignore[no-untyped-def]
-    """Threads take the next index when they are done with one: what takes long holds up no other work."""
-    work = _at(address, data)
+    _share_out(_caller(data), _told(address, data), count, threads)
+
+
+@njit(cache=True, parallel=True)
+def _share_out(caller, told, count, threads):  # type: ignore[no-untyped-def]
+    """Threads take the next index when they are done with one: what takes long holds up no other work.
+
+    This knows nothing of the data and is compiled once: a parallel loop takes ten times as long as others.
+    """
     if count == 1:
-        work(0, data)
+        _call(caller, 0, told)
         return
     taken = np.zeros(1, dtype=np.int64)
     for _ in prange(min(count, threads)):
         index = _take(taken)
         while index < count:
-            work(index, data)
+            _call(caller, index, told)
             index = _take(taken)
 
 
 @intrinsic
-def _at(typing_context, address, data):  # type: ignore[no-untyped-def]
-    """Return the work on such data by the address of its C entry; numba finds one by name anew each time."""
-    kind = types.FunctionType(types.void(types.int64, data))
+def _told(typing_context, address, data):  # type: ignore[no-untyped-def]
+    """Write down the address of the work's C entry and the data; return where."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        work = cgutils.create_struct_proxy(kind)(context, builder)
-        work.c_addr = builder.inttoptr(arguments[0], work.c_addr.type)
-        return work._getvalue()
+        kept = cgutils.alloca_once_value(builder, cgutils.pack_struct(builder, arguments))
+        return builder.ptrtoint(kept, cgutils.intp_t)
 
-    return kind(address, data), generate
+    return types.intp(address, data), generate
+
+
+@intrinsic
+def _caller(typing_context, data):  # type: ignore[no-untyped-def]
+    """Return the address of a function that takes an index and what `_told` wrote, and calls the work."""
+    work = types.FunctionType(types.void(types.int64, data))
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        entry = context.get_value_type(work.ftype)
+        told = ir.LiteralStructType([cgutils.intp_t, context.get_value_type(data)])
+        name = context.mangler("caryatid_caller", (data,))
+        function = ir.Function(builder.module, _CALLER, name)
+        function.linkage = "internal"
+        inner = ir.IRBuilder(function.append_basic_block())
+        index, where = function.args
+        address, value = cgutils.unpack_tuple(inner, inner.load(inner.inttoptr(where, told.as_pointer())), 2)
+        inner.call(inner.inttoptr(address, entry), [index, value])
+        inner.ret_void()
+        return builder.ptrtoint(function, cgutils.intp_t)
+
+    return types.intp(data), generate
+
+
+@intrinsic
+def _call(typing_context, caller, index, told):  # type: ignore[no-untyped-def]
+    """Call what `_caller` made."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        function, index, told = arguments
+        builder.call(builder.inttoptr(function, _CALLER.as_pointer()), [index, told])
+        return context.get_dummy_value()
+
+    return types.void(types.intp, types.int64, types.intp), generate
 
 
 @intrinsic
