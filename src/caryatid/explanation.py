@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from caryatid.clouds import thin
 from caryatid.config import ExplanationConfig, FitConfig
 from caryatid.frames import Array
 from caryatid.interior import free_inside
 from caryatid.kernels import explaining as kernels
+from caryatid.kernels.neighbours import nearest_neighbours
 from caryatid.primitives import Oriented, candidates
 from caryatid.refine import arrays
 from caryatid.shapes import Box, Cylinder, Sphere
@@ -164,9 +164,7 @@ def joined(a: Evidence, b: Evidence) -> Evidence:
 
 def around(points: Array, neighbours: int) -> NDArray[np.intp]:
     """Indices (N, K) of each point's nearest neighbours among points (N, 3), itself among them."""
-    count = min(neighbours, len(points))
-    _, index = cKDTree(points).query(points, k=count)
-    return np.asarray(index, dtype=np.intp).reshape(len(points), count)
+    return nearest_neighbours(points, min(neighbours, len(points)))
 
 
 def border_cost(
