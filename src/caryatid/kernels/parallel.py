@@ -29,10 +29,12 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
         data: Arrays and numbers, best a `NamedTuple`; results are written to arrays among them.
     """
     layout = (work, *map(_layout, data))
+    # First of all: it starts the threads, which loops that were kept on disk take for granted.
+    threads = numba.get_num_threads()
     compiled = _compiled_for.get(layout)
     if compiled is None:
         compiled = _compiled_for[layout] = _Compiled.of(work, numba.typeof(data))
-    compiled.loop(compiled.address, count, data, numba.get_num_threads())
+    compiled.loop(compiled.address, count, data, threads)
 
 
 class _Compiled(NamedTuple):
