@@ -13,7 +13,7 @@ from caryatid import frames, refine
 from caryatid.frames import Array
 from caryatid.kernels.ransac import BATCH
 from caryatid.kernels.rims import likeliest_end
-from caryatid.primitives import PROMISING
+from caryatid.primitives import HOPEFUL, PROMISING
 from caryatid.refine import (
     CONVERGED,
     NOISE_FLOOR,
@@ -237,19 +237,27 @@ def candidates(points, normals, config, rng):
         shape, seen = draw_in(_refined(start, on, converged=converged, **settings), points, normals, config)
         return cost(shape, points, normals, config), shape, seen
 
-    rough = {}
+    starts = {}
     for kind, drawn in zip(config.shapes, samples, strict=True):
-        starts = search(kind, some, facing, drawn, config)[0].shapes(kind)
+        starts[kind] = search(kind, some, facing, drawn, config)[0].shapes(kind)
         flat = None if kind == "sphere" else of_one_face(kind, some, facing, config)
-        tried = [judged(start, some, ROUGHLY) for start in starts + [flat] * (flat is not None)]
-        if not tried:
-            continue
-        best = min(tried, key=lambda j: j[0])
-        if best[1].extents.max() <= config.max_extent:
-            rough[kind] = best
+        starts[kind] += [flat] * (flat is not None)
+
+    def hopeful(tried, factor):
+        """The best shape of each kind that is small enough, where it costs little more than any."""
+        best = {kind: min(shapes, key=lambda j: j[0]) for kind, shapes in tried.items() if shapes}
+        best = {kind: b for kind, b in best.items() if b[1].extents.max() <= config.max_extent}
+        least = min((price for price, *_ in best.values()), default=np.inf)
+        return best, [kind for kind, b in best.items() if b[0] <= factor * least]
+
+    tried = {kind: [judged(s, some, ROUGHLY) for s in shapes[:1]] for kind, shapes in starts.items()}
+    fit_in, first_hopes = hopeful(tried, HOPEFUL)
+    for kind in {*first_hopes, *(tried.keys() - fit_in.keys())}:
+        tried[kind] += [judged(s, some, ROUGHLY) for s in starts[kind][1:]]
+    rough, promising = hopeful(tried, PROMISING)
     found = {}
     for kind, best in rough.items():
-        if best[0] <= PROMISING * min(price for price, *_ in rough.values()):
+        if kind in promising:
             best = min(best, judged(best[1], points, CONVERGED), key=lambda j: j[0])
         price, shape, seen = best
         if shape.extents.max() <= config.max_extent:

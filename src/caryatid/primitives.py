@@ -64,6 +64,10 @@ PROMISING = 2.0
 """Kinds of shape that cost more than so many times the best one after the first refinement get no second one
 [1]: that ends where a step gains a thousandth, so no more of them can halve what is left."""
 
+HOPEFUL = 4.0
+"""The same where only the first start of each kind is refined yet [1]: the others may halve what it found,
+and twice the best may still win."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Oriented:
@@ -215,10 +219,16 @@ def _fitted(job: FitJob, config: FitConfig) -> NDArray[np.intp]:
     """Fit the shapes of a job, and tell which one of each object and kind is best (P · K,); -1 is none."""
     groups, room = job.cost.shape
     for_each(search_one, groups, job)
-    _improve(job, np.flatnonzero(job.cost.ravel() < np.inf), job.every, ROUGHLY, config)
+    # The first start of each kind tells which kinds' other starts are worth refining.
+    started = job.cost < np.inf
+    _improve(job, np.flatnonzero(started[:, 0]) * room, job.every, ROUGHLY, config)
+    started[:, 0] = False
+    first = np.zeros(groups, dtype=np.intp)
+    started &= (_promising(job, first, HOPEFUL, config) | ~_within(job, first, config))[:, None]
+    job.cost[:, 1:] = np.where(started[:, 1:], 0.0, np.inf)
+    _improve(job, np.flatnonzero(started), job.every, ROUGHLY, config)
     best = np.argmin(job.cost, axis=1)
-    costs = np.where(_within(job, best, config), job.cost.min(axis=1), np.inf).reshape(len(job.every), -1)
-    promising = (costs < np.inf) & (costs <= PROMISING * costs.min(axis=1, keepdims=True))
+    promising = _promising(job, best, PROMISING, config)
     found = np.flatnonzero(promising)
     # Kinds are compared once least squares on all the points have nothing left to gain.
     last = (best + 1) % room
@@ -260,6 +270,13 @@ def _improve(
     for_each(refine_one, len(rows), refined)
     for_each(judge_one, len(rows), job._replace(rows=rows))
     job.cost[np.isnan(job.cost)] = np.inf
+
+
+def _promising(job: FitJob, best: NDArray[np.intp], factor: float, config: FitConfig) -> NDArray[np.bool_]:
+    """Whether a shape of each object and kind (P · K,) is one, and costs little more than the least."""
+    cost = np.where(_within(job, best, config), job.cost[np.arange(len(best)), best], np.inf)
+    costs = cost.reshape(len(job.every), -1)
+    return np.asarray(((costs < np.inf) & (costs <= factor * costs.min(axis=1, keepdims=True))).ravel())
 
 
 def _within(job: FitJob, best: NDArray[np.intp], config: FitConfig) -> NDArray[np.bool_]:
