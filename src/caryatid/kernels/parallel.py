@@ -102,10 +102,24 @@ def _share_out(caller, told, count, threads):  # type: ignore[no-untyped-def]
 
 @intrinsic
 def _told(typing_context, address, data):  # type: ignore[no-untyped-def]
-    """Write down the address of the work's C entry and the data; return where."""
+    """Write down the address of the work's C entry and the data; return where.
+
+    Of arrays references are not counted there, which threads that take parts of the same one would wait for.
+    """
+
+    def lent(context: Any, builder: Any, kind: types.Type, value: Any) -> Any:
+        if not isinstance(kind, types.Array):
+            return value
+        array = context.make_array(kind)(context, builder, value)
+        array.meminfo = cgutils.get_null_value(array.meminfo.type)
+        array.parent = cgutils.get_null_value(array.parent.type)
+        return array._getvalue()
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        kept = cgutils.alloca_once_value(builder, cgutils.pack_struct(builder, arguments))
+        entry, held = arguments
+        parts = zip(data.types, cgutils.unpack_tuple(builder, held), strict=True)
+        held = context.make_tuple(builder, data, [lent(context, builder, *part) for part in parts])
+        kept = cgutils.alloca_once_value(builder, cgutils.pack_struct(builder, (entry, held)))
         return builder.ptrtoint(kept, cgutils.intp_t)
 
     return types.intp(address, data), generate
