@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from raycast import K, from_the_side, table_scene
 
 from caryatid import frames
-from caryatid.clouds import estimate_normals, normals_from_depth, oriented_points, thin
+from caryatid.clouds import estimate_normals, oriented_points, thin
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.kernels.local_planes import local_surface, local_surface_reference
@@ -25,10 +24,9 @@ def angles(a, b):
 def test_normals_of_a_plane_are_its_normal():
     T = from_the_side(elevation=35.0)
     view = table_scene(T, half_table=(5.0, 5.0))
-    normals = normals_from_depth(view, CONFIG)
-    found = np.linalg.norm(normals, axis=-1) > 0
-    assert found[(view.depth > 0.4) & (view.depth < 2.9)].all()
-    assert angles(frames.rotate(T, normals[found].astype(np.float64)), (0.0, 0.0, 1.0)).max() < 0.5
+    _, normals, pixels = oriented_points(view, CONFIG)
+    assert set(np.flatnonzero((view.depth > 0.4) & (view.depth < 2.9))) <= set(pixels)
+    assert angles(normals, (0.0, 0.0, 1.0)).max() < 0.5
 
 
 def test_normals_of_a_noisy_sphere_point_outwards():
@@ -44,21 +42,24 @@ def test_normals_of_a_noisy_sphere_point_outwards():
 def test_normals_do_not_smooth_over_depth_edges():
     depth = np.full((60, 80), 1.0, dtype=np.float32)
     depth[:, 40:] = 1.1
-    normals = normals_from_depth(View(depth=depth, K=K), CONFIG)
-    np.testing.assert_allclose(normals[:, 38:42], np.broadcast_to((0.0, 0.0, -1.0), (60, 4, 3)), atol=1e-3)
+    _, normals, pixels = oriented_points(View(depth=depth, K=K), CONFIG)
+    beside = np.isin(pixels % 80, range(38, 42))
+    assert beside.sum() == 4 * 60
+    np.testing.assert_allclose(normals[beside], np.broadcast_to((0.0, 0.0, -1.0), (240, 3)), atol=1e-3)
 
 
 def test_no_normal_where_there_is_no_reading():
     depth = np.zeros((40, 40), dtype=np.float32)
     depth[20, 20] = 1.0
     depth[:10] = 5.0
-    assert not normals_from_depth(View(depth=depth, K=K), CONFIG).any()
+    assert not len(oriented_points(View(depth=depth, K=K), CONFIG)[0])
 
 
 def test_given_normals_are_used():
     given = np.tile(np.float32([0.0, 0.6, -0.8]), (48, 64, 1))
     view = View(depth=np.full((48, 64), 1.0, dtype=np.float32), K=K, normals_camera=given)
-    np.testing.assert_array_equal(normals_from_depth(view, CONFIG), given)
+    _, normals, _ = oriented_points(view, CONFIG)
+    np.testing.assert_array_equal(normals, given.reshape(-1, 3))
 
 
 def test_local_surface_kernel_equals_its_reference():
@@ -208,14 +209,3 @@ def test_thin_bears_far_points_and_none():
     assert len(thin(np.array([[0.0, 0.0, 0.0], [1e6, -1e6, 1e6]]), 1e-3)) == 2
     with pytest.raises(InputError, match="not positive"):
         thin(np.zeros((1, 3)), 0.0)
-
-
-def test_normals_of_a_vga_view_are_quick():
-    view = table_scene(from_the_side(), spheres=[SPHERE])
-    normals_from_depth(view, CONFIG)
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        normals_from_depth(view, CONFIG)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 0.2

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from importlib.metadata import EntryPoint
 
@@ -229,15 +228,3 @@ class TestSupport:
         back = samples.normals_world[:, 0] > 0.9
         assert seen[front].min() == 1.0
         assert seen[back].max() == 0.0
-
-    def test_a_decision_is_quick(self):
-        rng = np.random.default_rng(0)
-        objects = [box(i, (*rng.uniform(-0.25, 0.25, 2), 0.8), (0.08, 0.08, 0.1)) for i in range(1, 16)]
-        supports = tuple(Support("o0", o.id) for o in objects) * 2
-        situation = state(objects, supports)
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            make_planner("support").plan(situation, rng)
-            times.append(time.perf_counter() - start)
-        assert min(times) < 1.0

@@ -3,7 +3,6 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from functools import cache
 
@@ -268,15 +267,3 @@ def test_nearness_is_reckoned_for_those_who_ask_for_it():
     column = FORMULATIONS.index("proximity-count")
     np.testing.assert_array_equal(np.delete(near, column, axis=1), np.delete(asked, column, axis=1))
     assert near[:, column].max() > 0.0 == asked[:, column].max()
-
-
-def test_a_decision_is_quick():
-    rng = np.random.default_rng(0)
-    objects = [box(i, (*rng.uniform(-0.25, 0.25, 2), 0.8), (0.08, 0.08, 0.1)) for i in range(1, 16)]
-    situation = state(objects, tuple(replace(ON_TABLE, supported=o.id) for o in objects))
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        make_planner("occlusion-aware").plan(situation, rng)
-        times.append(time.perf_counter() - start)
-    assert min(times) < 0.5

@@ -21,26 +21,8 @@ SPARSE = 4
 """Every fourth row and column of an image give its median depth [px]."""
 
 
-def normals_from_depth(view: View, config: CloudConfig) -> NDArray[np.float32]:
-    """Normals (H, W, 3) of a view in the camera frame, towards the camera, zero where unreliable.
-
-    Given normals (`view.normals_camera`) are passed on.
-
-    Args:
-        view: Depth [m] and intrinsics [px]; no pose needed.
-        config: Window, working range and depth edges.
-    """
-    if view.normals_camera is not None:
-        return view.normals_camera
-    surface = surface_from_depth(view, config, sharp=False)
-    normals = np.zeros((*view.depth.shape, 3), dtype=np.float32)
-    pixels = np.flatnonzero(surface.planes[2])
-    normals.reshape(-1, 3)[pixels] = surface.oriented(pixels, view.K, np.eye(4))[1]
-    return normals
-
-
 def surface_from_depth(
-    view: View, config: CloudConfig, *, among: NDArray[np.bool_] | None = None, sharp: bool = True
+    view: View, config: CloudConfig, *, among: NDArray[np.bool_] | None = None
 ) -> LocalSurface:
     """Smooth a view's depth by local planes that end at creases and depth edges, and measure its noise.
 
@@ -51,12 +33,11 @@ def surface_from_depth(
         view: Depth [m] and intrinsics [px]; no pose needed.
         config: Window, working range and depth edges.
         among: Which readings (H, W) to take, or None for all of them.
-        sharp: Whether creases stay sharp (`local_surface`).
     """
     inverse_depth, radius = _inverse_depth(view, config)
     if among is not None:
         inverse_depth[~among] = 0.0
-    return local_surface(inverse_depth, radius, config.edge_jump, config.max_slope, sharp=sharp)
+    return local_surface(inverse_depth, radius, config.edge_jump, config.max_slope)
 
 
 def oriented_points(

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.frames import Array
-from caryatid.kernels.fitting import BOX, CYLINDER, RefineJob, refine_one
+from caryatid.kernels.fits import RefineJob, refine_one
+from caryatid.kernels.fitting import BOX, CYLINDER
 from caryatid.kernels.parallel import for_each
 from caryatid.kernels.polishing import Polished, PolishJob, polish_one
 from caryatid.refine import CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH, arrays, from_arrays

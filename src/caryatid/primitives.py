@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from caryatid.config import FitConfig
 from caryatid.frames import Array
 from caryatid.interior import free_share
-from caryatid.kernels.fits import FitJob, bare_one, judge_one, search_one
-from caryatid.kernels.fitting import RefineJob, refine_one
+from caryatid.kernels.fits import FitJob, RefineJob, bare_one, judge_one, refine_one, search_one
 from caryatid.kernels.parallel import for_each
 from caryatid.polish import Polish, polish
 from caryatid.refine import CODES, CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH, ROUGHLY, from_arrays

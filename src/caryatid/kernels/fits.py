@@ -1,7 +1,6 @@
-"""Compiled steps of the fits of many objects at once: search and judgement, each piece of work a thread.
+"""Compiled steps of the fits of many objects at once, each piece a thread: search, refinement, judgement.
 
-`primitives` says in which order they come, with `fitting.refine_one` in between. The tests hold a NumPy
-reference of each step.
+`primitives` says in which order they come. The tests hold a NumPy reference of each step.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.kernels.fitting import SPHERE
+from caryatid.kernels.fitting import SPHERE, levenberg_marquardt
 from caryatid.kernels.judging import bare_share, draw_in, misfit
 from caryatid.kernels.ransac import search
 from caryatid.kernels.starts import of_one_face
@@ -69,6 +68,40 @@ class FitJob(NamedTuple):
     inliers: NDArray[np.float64]
 
 
+class RefineJob(NamedTuple):
+    """Shapes to be refined by least squares, each on points of its own.
+
+    Attributes:
+        rows: Which of the shapes (M,).
+        kinds: Their codes (J,).
+        first: Index (J,) of the first of each one's points.
+        end: Index (J,) after the last of them.
+        every: Of these every so many (J,).
+        points: (N, 3) [m].
+        ridge, steps, min_extent, shrink, robust_width, noise_floor, converged: See `levenberg_marquardt`.
+        R: Axes (J, 3, 3); replaced.
+        centre: (J, 3) [m]; replaced.
+        half: Half extents (J, 3) [m]; replaced.
+    """
+
+    rows: NDArray[np.intp]
+    kinds: NDArray[np.intp]
+    first: NDArray[np.intp]
+    end: NDArray[np.intp]
+    every: NDArray[np.intp]
+    points: NDArray[np.float64]
+    ridge: NDArray[np.float64]
+    steps: int
+    min_extent: float
+    shrink: float
+    robust_width: float
+    noise_floor: float
+    converged: float
+    R: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    half: NDArray[np.float64]
+
+
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def search_one(group: int, job: FitJob) -> None:
     """Find shapes of one kind for one object to start from; those found have a cost of 0."""
@@ -90,6 +123,21 @@ def search_one(group: int, job: FitJob) -> None:
         count += 1
     for k in range(len(cost)):
         cost[k] = 0.0 if k < count else np.inf
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def refine_one(index: int, job: RefineJob) -> None:
+    """Refine one of the shapes, and replace it."""
+    row = job.rows[index]
+    first, every = job.first[row], job.every[row]
+    points = np.empty(((job.end[row] - first + every - 1) // every, 3))
+    for i in range(len(points)):
+        for a in range(3):
+            points[i, a] = job.points[first + i * every, a]
+    levenberg_marquardt(
+        job.kinds[row], job.R[row], job.centre[row], job.half[row], points, job.steps, job.min_extent,
+        job.shrink, job.robust_width, job.noise_floor, job.ridge, job.converged,
+    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)

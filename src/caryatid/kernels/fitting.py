@@ -5,8 +5,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -17,55 +15,6 @@ from caryatid.kernels.ordering import quantile
 
 SPHERE, CYLINDER, BOX = 0, 1, 2
 """Codes of the shapes."""
-
-
-class RefineJob(NamedTuple):
-    """Shapes to be refined by least squares, each on points of its own.
-
-    Attributes:
-        rows: Which of the shapes (M,).
-        kinds: Their codes (J,).
-        first: Index (J,) of the first of each one's points.
-        end: Index (J,) after the last of them.
-        every: Of these every so many (J,).
-        points: (N, 3) [m].
-        ridge, steps, min_extent, shrink, robust_width, noise_floor, converged: See `levenberg_marquardt`.
-        R: Axes (J, 3, 3); replaced.
-        centre: (J, 3) [m]; replaced.
-        half: Half extents (J, 3) [m]; replaced.
-    """
-
-    rows: NDArray[np.intp]
-    kinds: NDArray[np.intp]
-    first: NDArray[np.intp]
-    end: NDArray[np.intp]
-    every: NDArray[np.intp]
-    points: NDArray[np.float64]
-    ridge: NDArray[np.float64]
-    steps: int
-    min_extent: float
-    shrink: float
-    robust_width: float
-    noise_floor: float
-    converged: float
-    R: NDArray[np.float64]
-    centre: NDArray[np.float64]
-    half: NDArray[np.float64]
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def refine_one(index: int, job: RefineJob) -> None:
-    """Refine one of the shapes, and replace it."""
-    row = job.rows[index]
-    first, every = job.first[row], job.every[row]
-    points = np.empty(((job.end[row] - first + every - 1) // every, 3))
-    for i in range(len(points)):
-        for a in range(3):
-            points[i, a] = job.points[first + i * every, a]
-    levenberg_marquardt(
-        job.kinds[row], job.R[row], job.centre[row], job.half[row], points, job.steps, job.min_extent,
-        job.shrink, job.robust_width, job.noise_floor, job.ridge, job.converged,
-    )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy")

@@ -51,9 +51,7 @@ class LocalSurface:
         return points, normals
 
 
-def local_surface(
-    inverse_depth: Image, radius: int, edge_jump: float, max_slope: float, *, sharp: bool = True
-) -> LocalSurface:
+def local_surface(inverse_depth: Image, radius: int, edge_jump: float, max_slope: float) -> LocalSurface:
     """Fit a plane to the surface around each pixel, up to its creases but not across them.
 
     A plane is linear in inverse depth: 1/z = a·du + b·dv + c, by least squares over the window around each
@@ -66,7 +64,6 @@ def local_surface(
         radius: The window is 2·radius + 1 pixels wide [px].
         edge_jump: Readings further than this from the pixel's own lie beyond a depth edge [1/m].
         max_slope: Added to it a pixel of distance, so that steep surfaces hold together [1/m per px].
-        sharp: Whether pixels may take another window's plane; otherwise creases come out rounded.
     """
     image = np.ascontiguousarray(inverse_depth, dtype=np.float32)
     planes = np.zeros((4, *image.shape), dtype=np.float32)
@@ -75,11 +72,10 @@ def local_surface(
     for_each(_find_planes, SHARES, _Windows(padded, radius, jump, slope, sums, planes))
     c, variance = planes[2], planes[3]
     noise = _noise(planes, radius)
-    if sharp:
-        limit = np.float32(_limit(noise, radius))
-        unsteady = np.flatnonzero((image > 0.0) & ((c == 0.0) | (variance > limit)))
-        steadier = _steadier(unsteady, image, planes, radius, limit, np.float32(TRUSTED * noise))
-        planes.reshape(4, -1)[:3, unsteady] = steadier
+    limit = np.float32(_limit(noise, radius))
+    unsteady = np.flatnonzero((image > 0.0) & ((c == 0.0) | (variance > limit)))
+    steadier = _steadier(unsteady, image, planes, radius, limit, np.float32(TRUSTED * noise))
+    planes.reshape(4, -1)[:3, unsteady] = steadier
     return LocalSurface(planes[:3], noise)
 
 

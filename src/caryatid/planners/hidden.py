@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.frames import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.interest import PointOfInterest
+from caryatid.kernels.polygons import hull
 from caryatid.kernels.sights import shown
 from caryatid.kernels.spaces import unseen_space
 from caryatid.kernels.surfaces import sample_surfaces
@@ -123,7 +123,7 @@ def space_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig)
     low, high = corners
     x, y, z = (np.arange(a, b, config.space_spacing) for a, b in zip(low, high, strict=True))
     outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
-    heap = shapely.get_coordinates(shapely.MultiPoint(np.concatenate(outlines)).convex_hull)
+    heap = hull(np.concatenate(outlines))
     voxels = solid.voxels
     points, on_table, in_heap = unseen_space(
         x, y, z, float(high[2] - low[2]), table.shape.T_world_object, table.shape.extents[:2] / 2.0, heap,
