@@ -11,14 +11,18 @@ from scipy.spatial import cKDTree
 
 from caryatid import frames, refine
 from caryatid.frames import Array
+from caryatid.kernels.fitting import levenberg_marquardt
 from caryatid.kernels.ransac import BATCH
 from caryatid.kernels.rims import likeliest_end
 from caryatid.primitives import HOPEFUL, PROMISING
 from caryatid.refine import (
+    CODES,
     CONVERGED,
     NOISE_FLOOR,
+    RIDGE,
     ROBUST_WIDTH,
     ROUGHLY,
+    arrays,
     from_arrays,
     linearise,
     refine_reference,
@@ -30,6 +34,34 @@ from caryatid.voxels import FREE
 COLUMNS = {"box": (0, 1, 2, 3, 4, 5, 6, 7, 8), "cylinder": (0, 1, 2, 3, 4, 5, 6, 8), "sphere": range(7)}
 """Where the derivatives of `linearise` stand in the normal equations."""
 LEAST_SINE = {"box": 0.5, "cylinder": 0.3, "sphere": 0.1}
+
+
+def refined(
+    shape: Box | Cylinder | Sphere,
+    points_world: Array,
+    *,
+    steps: int,
+    min_extent: float,
+    shrink: float,
+) -> Box | Cylinder | Sphere:
+    """Refine one shape by the compiled least squares; arguments as of `refine_reference`."""
+    kind, R, centre, half = arrays(shape)
+    points = np.ascontiguousarray(points_world)
+    levenberg_marquardt(
+        kind,
+        R,
+        centre,
+        half,
+        points,
+        steps,
+        min_extent,
+        shrink,
+        ROBUST_WIDTH,
+        NOISE_FLOOR,
+        RIDGE,
+        CONVERGED,
+    )
+    return from_arrays(shape.kind, R, centre, half)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -294,7 +326,8 @@ def polish(shape, seen, points, config):
     if closed.extents.max() > config.max_extent or not near.any():
         closed = shape
     information = normal_matrix(opened, points, ROBUST_WIDTH * sigma)
-    return closed, estimate(shape.kind, np.array(seen), hidden, information, sigma, config)
+    one = (np.array([value]) for value in (CODES[shape.kind], seen, hidden, information, sigma))
+    return closed, estimate(*one, config)[0]
 
 
 def normal_matrix(shape, points, scale):

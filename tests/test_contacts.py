@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import mujoco
@@ -216,13 +215,3 @@ def test_few_shapes_and_bad_margins() -> None:
     for bad in (-0.001, float("nan"), [0.1]):
         with pytest.raises(InputError, match="margin"):
             find_contacts([cube(0, 0, 0), cube(0, 0, 0.1)], bad)
-
-
-def test_fifty_shapes_take_milliseconds() -> None:
-    shapes = random_shapes(50, np.random.default_rng(0), 0.3)
-    best = np.inf
-    for _ in range(5):
-        start = time.perf_counter()
-        find_contacts(shapes, 0.01)
-        best = min(best, time.perf_counter() - start)
-    assert best < 0.05

@@ -12,7 +12,7 @@ from caryatid import frames
 from caryatid.config import FitConfig
 from caryatid.kernels.rims import likeliest_end
 from caryatid.polish import Polish, polish
-from caryatid.refine import distances, refine
+from caryatid.refine import distances
 from caryatid.shapes import Box, Cylinder
 
 INDEPENDENT = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
@@ -103,7 +103,7 @@ def test_unseen_sides_of_a_box_lie_where_its_faces_end(seed):
 def test_the_pull_of_the_search_is_gone():
     points = two_faces(0, sigma=0.0005)
     options = {"steps": 25, "min_extent": 0.008, "shrink": 2e-4}
-    pulled = refine(BOX, points, **options)
+    pulled = reference.refined(BOX, points, **options)
     assert BOX.extents.sum() - pulled.extents.sum() > 0.002
     found, _ = polished(pulled, TWO_FACES, points)
     unpulled, _ = polished(BOX, TWO_FACES, points)

@@ -11,7 +11,14 @@ import pytest
 from caryatid import frames
 from caryatid.config import VoxelConfig
 from caryatid.kernels.solids import filled_reference
-from caryatid.kernels.voxel_maps import enter_view, enter_view_reference, voxels_at, voxels_at_reference
+from caryatid.kernels.voxel_maps import (
+    enter_view,
+    enter_view_reference,
+    states_of,
+    states_of_reference,
+    voxels_at,
+    voxels_at_reference,
+)
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.views import View
 from caryatid.voxels import FREE, OCCUPIED, UNKNOWN, VoxelMap
@@ -53,6 +60,20 @@ def test_entering_a_view_agrees_with_its_reference(stride: int):
             np.testing.assert_array_equal(counted, right)
             assert 5 < (counted != old).sum() < 0.9 * old.size
         np.testing.assert_array_equal((hits, passes), before)
+
+
+def test_states_agree_with_their_reference():
+    rng = np.random.default_rng(0)
+    table = np.full((256, 256), FREE, dtype=np.int8)
+    table[0, 0] = UNKNOWN
+    table[:, 1:] = rng.choice([FREE, OCCUPIED], (256, 255))
+    for _ in range(3):
+        hits, passes = random_counts(rng)
+        states, occupied = states_of(hits, passes, table, OCCUPIED)
+        expected = states_of_reference(hits, passes, table, OCCUPIED)
+        np.testing.assert_array_equal(states, expected[0])
+        np.testing.assert_array_equal(occupied, expected[1])
+        assert len(np.unique(states)) == 3
 
 
 def test_the_voxels_of_points_agree_with_their_reference():

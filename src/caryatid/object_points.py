@@ -113,14 +113,16 @@ class ObjectPoints:
             depth: Points left in each.
         """
         seen = self._seen[label]
-        if len(seen.views) > 0 and len(np.unique(seen.views)) > 2 * depth:
+        if np.count_nonzero(np.bincount(seen.views)) > 2 * depth:
             self._seen[label] = seen.select(last_in_voxels(seen.cloud.points_world, voxel, depth))
 
     def move(self, T: Mapping[int, Array]) -> set[int]:
         """Move the points of some views, view → (4, 4); returns the labels that have such points."""
         if not T:
             return set()
-        moving = [k for k, seen in self._seen.items() if np.isin(seen.views, list(T)).any()]
+        views = np.zeros(2 + max(T), dtype=bool)
+        views[list(T)] = True
+        moving = [k for k, seen in self._seen.items() if np.take(views, seen.views, mode="clip").any()]
         for label in moving:
             self._seen[label] = self._seen[label].moved(T)
         return set(moving)

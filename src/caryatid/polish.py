@@ -109,19 +109,14 @@ def polish(found: Sequence[Polish], config: FitConfig) -> list[Refined]:
     for_each(refine_one, count, refined)
     job = PolishJob(kinds, seen, first, together, R, centre, half, **_settings(config), **rows._asdict())
     for_each(polish_one, count, job)
+    information = rows.information * np.diff(first)[:, None, None]
+    uncertainties = estimate(kinds, seen, rows.hidden, information, rows.sigma, config)
     return [
         Refined(
             from_arrays(one.shape.kind, rows.R[k], rows.centre[k] + origins[k], rows.half[k]),
             float(rows.residual[k]),
             float(rows.inliers[k]),
-            estimate(
-                one.shape.kind,
-                seen[k],
-                rows.hidden[k],
-                rows.information[k] * len(points[k]),
-                float(rows.sigma[k]),
-                config,
-            ),
+            uncertainties[k],
         )
         for k, one in enumerate(found)
     ]

@@ -11,7 +11,6 @@ from caryatid.kernels.fitting import (
     CYLINDER,
     SPHERE,
     distances_and_gradients,
-    levenberg_marquardt,
 )
 from caryatid.shapes import Box, Cylinder, Sphere
 
@@ -65,7 +64,7 @@ def stepped(shape: Box | Cylinder | Sphere, step: Array, min_extent: float) -> B
     return Box(T, np.maximum(shape.extents + 2.0 * step[6:9], min_extent))
 
 
-def refine(
+def refine_reference(
     shape: Box | Cylinder | Sphere,
     points_world: Array,
     *,
@@ -75,6 +74,8 @@ def refine(
 ) -> Box | Cylinder | Sphere:
     """Minimise robust squared signed distances by Levenberg–Marquardt with Geman–McClure weights.
 
+    Does in NumPy, step by step, what `kernels.fitting.levenberg_marquardt` does.
+
     Args:
         shape: Where to start.
         points_world: (N, 3) [m].
@@ -83,34 +84,6 @@ def refine(
         shrink: Gradient [m] that pulls every half extent inwards, so that sides nobody saw stay small. A face
             that holds a share s of the points is moved by shrink / (2·s) only.
     """
-    kind, R, centre, half = arrays(shape)
-    points = np.ascontiguousarray(points_world)
-    levenberg_marquardt(
-        kind,
-        R,
-        centre,
-        half,
-        points,
-        steps,
-        min_extent,
-        shrink,
-        ROBUST_WIDTH,
-        NOISE_FLOOR,
-        RIDGE,
-        CONVERGED,
-    )
-    return from_arrays(shape.kind, R, centre, half)
-
-
-def refine_reference(
-    shape: Box | Cylinder | Sphere,
-    points_world: Array,
-    *,
-    steps: int,
-    min_extent: float,
-    shrink: float,
-) -> Box | Cylinder | Sphere:
-    """Do the same as `refine` in NumPy, step by step."""
     damping = 1e-3
     best = shape
     distance, J = linearise(best, points_world)

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.frames import Array
+from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE
 
-_SIZE_COLUMN = {"box": (6, 7, 8), "cylinder": (6, 6, 8), "sphere": (6, 6, 6)}
-"""Column of the normal equations that holds the half extent along x, y, z."""
+_SIZE_COLUMNS = np.zeros((3, 3), dtype=np.intp)
+"""Column of the normal equations that holds the half extent along x, y, z, by the code of the kind."""
+_SIZE_COLUMNS[BOX], _SIZE_COLUMNS[CYLINDER], _SIZE_COLUMNS[SPHERE] = (6, 7, 8), (6, 6, 8), (6, 6, 6)
 _TURN = 1.0
 """Standard deviation of a rotation that nothing determines [rad]."""
 
@@ -45,47 +47,45 @@ class Uncertainty:
 
 
 def estimate(
-    kind: str,
+    kinds: NDArray[np.intp],
     seen: NDArray[np.bool_],
     unseen: Array,
-    normal_matrix: Array,
-    sigma: float,
+    normal_matrices: Array,
+    sigma: Array,
     config: FitConfig,
-) -> Uncertainty:
-    """Standard deviations from the normal equations of the last fit.
+) -> list[Uncertainty]:
+    """Standard deviations of several shapes from the normal equations of their last fits.
 
     Args:
-        kind: Of the shape.
-        seen: Which sides (6,) points bear out.
-        unseen: Standard deviation (6,) [m] of the sides that no point bears out; passed over for the others.
-        normal_matrix: Sum over the points of the products of their derivatives (9, 9), unseen sides out of
-            the way; rows and columns as of `kernels.fitting.normal_equations`.
-        sigma: Robust standard deviation of the points' distances to the shape [m].
+        kinds: Code (P,) of each shape's kind, of `kernels.fitting`.
+        seen: Which sides (P, 6) points bear out.
+        unseen: Standard deviation (P, 6) [m] of the sides that no point bears out.
+        normal_matrices: Sum over the points of the products of their derivatives (P, 9, 9), unseen sides out
+            of the way; rows and columns as of `kernels.fitting.normal_equations`.
+        sigma: Robust standard deviation (P,) [m] of the points' distances to the shape.
         config: How many points share an error, and the error of registration.
     """
-    columns = _SIZE_COLUMN[kind]
-    information = normal_matrix / (config.correlated * sigma**2)
+    information = normal_matrices / (config.correlated * sigma[:, None, None] ** 2)
     prior = np.array([config.max_extent] * 3 + [_TURN] * 3 + [config.max_extent] * 3)
     covariance = np.linalg.inv(information + np.diag(prior**-2.0))
-    borne_out = np.array(seen)
-    if kind != "box":
-        # What is round is one surface: any part of it tells where all of it is.
-        borne_out[:4] = kind == "sphere" or seen[:4].any()
-        borne_out[4:] |= kind == "sphere"
-    sides = np.empty(6)
-    position, sizes = np.empty(3), np.empty(3)
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    rows, axes, columns = np.arange(len(kinds))[:, None], np.arange(3), _SIZE_COLUMNS[kinds]
+    centre, half, both = variance[:, :3], variance[rows, columns], covariance[rows, axes, columns]
+    borne_out = _borne_out(kinds, seen)
+    low = np.where(borne_out[:, 0::2], centre + half - 2.0 * both, unseen[:, 0::2] ** 2)
+    high = np.where(borne_out[:, 1::2], centre + half + 2.0 * both, unseen[:, 1::2] ** 2)
+    determined = borne_out[:, 0::2] & borne_out[:, 1::2]
     floor = config.registration**2
-    for axis in range(3):
-        centre, half, both = (
-            covariance[axis, axis],
-            covariance[columns[axis], columns[axis]],
-            covariance[axis, columns[axis]],
-        )
-        low, high = centre + half - 2.0 * both, centre + half + 2.0 * both
-        low = low if borne_out[2 * axis] else unseen[2 * axis] ** 2
-        high = high if borne_out[2 * axis + 1] else unseen[2 * axis + 1] ** 2
-        sides[2 * axis], sides[2 * axis + 1] = np.sqrt(low + floor), np.sqrt(high + floor)
-        determined = bool(borne_out[2 * axis] and borne_out[2 * axis + 1])
-        position[axis] = np.sqrt((centre if determined else (low + high) / 4.0) + floor)
-        sizes[axis] = np.sqrt((4.0 * half if determined else low + high) + floor)
-    return Uncertainty(position, np.sqrt(np.diag(covariance)[3:6]), sizes, sides)
+    position = np.sqrt(np.where(determined, centre, (low + high) / 4.0) + floor)
+    sizes = np.sqrt(np.where(determined, 4.0 * half, low + high) + floor)
+    sides = np.sqrt(np.stack([low, high], axis=2).reshape(-1, 6) + floor)
+    rotation = np.sqrt(variance[:, 3:6])
+    return [Uncertainty(*found) for found in zip(position, rotation, sizes, sides, strict=True)]
+
+
+def _borne_out(kinds: NDArray[np.intp], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Sides (P, 6) that points tell of: any part of a round surface tells where all of it is."""
+    borne_out = seen.copy()
+    borne_out[:, :4] |= (kinds != BOX)[:, None] & seen[:, :4].any(axis=1, keepdims=True)
+    borne_out[kinds == SPHERE] = True
+    return borne_out

@@ -23,7 +23,7 @@ from caryatid.frames import Array
 from caryatid.kernels.parallel import for_each
 from caryatid.kernels.sights import shown
 from caryatid.kernels.solids import Filling, fill_layer
-from caryatid.kernels.voxel_maps import enter_view, voxels_at
+from caryatid.kernels.voxel_maps import enter_view, states_of, voxels_at
 from caryatid.shape_arrays import boxes_around, shape_arrays
 from caryatid.shapes import Shape
 from caryatid.views import View
@@ -60,21 +60,20 @@ class VoxelMap:
         empty = np.zeros(shape, dtype=np.uint8)
         return cls(np.asarray(center_world, dtype=np.float64) + corner, empty, empty, config)
 
-    @cached_property
+    @property
     def states(self) -> NDArray[np.int8]:
         """State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied."""
-        states = np.greater(self.hits | self.passes, 0, order="C").view(np.int8)
-        hit = np.flatnonzero(self.hits > 0)
-        states.reshape(-1)[hit] = _states(self.config)[
-            self.passes.reshape(-1)[hit], self.hits.reshape(-1)[hit]
-        ]
-        return states
+        return self._known[0]
+
+    @property
+    def occupied(self) -> NDArray[np.intp]:
+        """Indices x, y, z (3, N) of the occupied voxels."""
+        return self._known[1]
 
     @cached_property
-    def occupied(self) -> tuple[NDArray[np.intp], ...]:
-        """Indices x, y, z (N,) of the occupied voxels."""
-        index = np.unravel_index(np.flatnonzero(self.states == OCCUPIED), self.states.shape)
-        return tuple(np.asarray(i) for i in index)
+    def _known(self) -> tuple[NDArray[np.int8], NDArray[np.intp]]:
+        """States of the voxels, and where they are occupied."""
+        return states_of(self.hits, self.passes, _states(self.config), OCCUPIED)
 
     @property
     def occupancy(self) -> NDArray[np.float32]:
@@ -125,11 +124,11 @@ class VoxelMap:
         some = (low < high).all(axis=1)
         beyond = max(self.hits.shape)
         lowest = low[some].min(axis=0, initial=beyond)
-        lowest = np.minimum(lowest, [i.min(initial=beyond) for i in self.occupied])
+        lowest = np.minimum(lowest, self.occupied.min(axis=1, initial=beyond))
         highest = high[some].max(axis=0, initial=0)
-        highest = np.maximum(highest, [i.max(initial=-1) + 1 for i in self.occupied])
+        highest = np.maximum(highest, self.occupied.max(axis=1, initial=-1) + 1)
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
-        grid[tuple(i - first for i, first in zip(self.occupied, lowest, strict=True))] = 1
+        grid[tuple(self.occupied - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
         for_each(
             fill_layer, len(grid), Filling(grid, origin_world, size, *arrays, low - lowest, high - lowest)

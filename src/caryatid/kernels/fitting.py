@@ -113,7 +113,7 @@ def levenberg_marquardt(
     ridge: NDArray[np.float64],
     converged: float,
 ) -> None:
-    """Minimise the Geman–McClure cost of signed distances; arguments as of `refine.refine`.
+    """Minimise the Geman–McClure cost of signed distances; arguments as of `refine.refine_reference`.
 
     Args:
         kind: Code of the shape.

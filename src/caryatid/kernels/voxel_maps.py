@@ -194,6 +194,102 @@ def enter_view_reference(
     return total[0].astype(np.uint8), total[1].astype(np.uint8)
 
 
+class Known(NamedTuple):
+    """What a voxel map comes to know.
+
+    Attributes:
+        hits: Views (X, Y, Z) that had a reading in each voxel.
+        passes: Views (X, Y, Z) that looked through it.
+        table: State (256, 256) by how many views looked through and how many hit; without a hit the same
+            however many looked through.
+        states: State (X, Y, Z) of each voxel; written to.
+        sought: The state whose voxels are counted; one that takes a hit.
+        counts: Voxels of that state in each layer (X,); written to.
+    """
+
+    hits: Grid
+    passes: Grid
+    table: NDArray[np.int8]
+    states: NDArray[np.int8]
+    sought: int
+    counts: NDArray[np.intp]
+
+
+class Found(NamedTuple):
+    """Where the voxels of one state are.
+
+    Attributes:
+        states: State (X, Y, Z) of each voxel.
+        sought: The state.
+        ends: How many voxels of that state there are up to the end of each layer (X,).
+        places: Their indices (3, N), in order; written to.
+    """
+
+    states: NDArray[np.int8]
+    sought: int
+    ends: NDArray[np.intp]
+    places: NDArray[np.intp]
+
+
+def states_of(
+    hits: Grid, passes: Grid, table: NDArray[np.int8], sought: int
+) -> tuple[NDArray[np.int8], NDArray[np.intp]]:
+    """State of each voxel, and where one of the states is.
+
+    The arguments are as in `Known`.
+
+    Returns:
+        States (X, Y, Z), and the indices (3, N) of the voxels whose state is sought.
+    """
+    hits, passes = np.ascontiguousarray(hits), np.ascontiguousarray(passes)
+    counts = np.zeros(len(hits), dtype=np.intp)
+    known = Known(hits, passes, table, np.empty(hits.shape, dtype=np.int8), sought, counts)
+    for_each(look_up, len(hits), known)
+    ends = np.cumsum(counts)
+    index = np.empty((3, int(counts.sum())), dtype=np.intp)
+    for_each(find, len(hits), Found(known.states, sought, ends, index))
+    return known.states, index
+
+
+def states_of_reference(
+    hits: Grid, passes: Grid, table: NDArray[np.int8], sought: int
+) -> tuple[NDArray[np.int8], NDArray[np.intp]]:
+    """Do the same as `states_of` with arrays."""
+    states = table[passes, hits]
+    return states, np.stack(np.nonzero(states == sought))
+
+
+@njit(cache=True)
+def look_up(layer: int, known: Known) -> None:
+    """Look up the states of one layer of the map."""
+    hits, passes = known.hits[layer].reshape(-1), known.passes[layer].reshape(-1)
+    states, table = known.states[layer].reshape(-1), known.table
+    unknown, free = table[0, 0], table[1, 0]
+    for n in range(len(hits)):
+        states[n] = free if passes[n] > 0 else unknown
+    # Nearly all voxels have no hit: all others without a look into the table take a quarter of the time.
+    sought = 0
+    for n in range(len(hits)):
+        if hits[n] > 0:
+            states[n] = table[passes[n], hits[n]]
+            sought += states[n] == known.sought
+    known.counts[layer] = sought
+
+
+@njit(cache=True)
+def find(layer: int, found: Found) -> None:
+    """Write down where in one layer of the map the state is."""
+    states = found.states[layer]
+    n = found.ends[layer - 1] if layer > 0 else 0
+    if n == found.ends[layer]:
+        return
+    for j in range(states.shape[0]):
+        for k in range(states.shape[1]):
+            if states[j, k] == found.sought:
+                found.places[0, n], found.places[1, n], found.places[2, n] = layer, j, k
+                n += 1
+
+
 @njit(cache=True, error_model="numpy")
 def voxels_at(points: Array, origin: Array, size: float, shape: Voxel) -> NDArray[np.intp]:
     """Flat index (N,) of the voxel of a grid that holds each point (N, 3) [m]; −1 outside."""
