@@ -114,7 +114,7 @@ def test_another_format_is_refused(tmp_path):
     ResultStore(tmp_path / "r.sqlite", "code").close()
     with sqlite3.connect(tmp_path / "r.sqlite") as database:
         database.execute("UPDATE about SET value = '0' WHERE name = 'format'")
-    with pytest.raises(InputError, match="has format 0, this caryatid reads 1; choose another folder"):
+    with pytest.raises(InputError, match="has format 0, this caryatid reads 2; choose another folder"):
         ResultStore(tmp_path / "r.sqlite", "code")
 
 

@@ -376,7 +376,9 @@ def test_progress_names_new_objects_and_what_holds_them(tmp_path, scene_file, ca
     assert not any(ESCAPE in line for line in lines)
 
 
-@pytest.mark.parametrize("command", ["", "demo", "explore", "extract", "evaluate", "config"])
+@pytest.mark.parametrize(
+    "command", ["", "demo", "explore", "extract", "evaluate", "order", "dismantle", "config"]
+)
 def test_help_is_clean(command, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     assert run_command(*command.split(), "--help") == 0

@@ -44,11 +44,12 @@ def test_commands_run(workplace, capsys, monkeypatch):
     monkeypatch.setattr("caryatid.commands.benchmarking.run_all", lambda *arguments: None)
     lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("caryatid ")]
-    assert {command[0] for command in commands} == {"explore", "extract", "evaluate", "benchmark", "config"}
+    shown = {"explore", "extract", "evaluate", "order", "dismantle", "benchmark", "config"}
+    assert {command[0] for command in commands} == shown
     for command in commands:
         redirected = command[command.index(">") + 1] if ">" in command else None
         arguments = command[: command.index(">")] if redirected else command
-        small = [*SMALL, "--views=2"] if arguments[0] in ("explore", "demo") else []
+        small = [*SMALL, "--views=2"] if arguments[0] in ("explore", "demo", "dismantle") else []
         capsys.readouterr()
         assert run_command(*arguments, *small) == 0, command
         if redirected:

@@ -40,9 +40,11 @@ def _run(arguments: Sequence[str]) -> int:
 
     from caryatid.commands.benchmark import Benchmark
     from caryatid.commands.demo import Demo
+    from caryatid.commands.dismantle import Dismantle
     from caryatid.commands.evaluate import Evaluate
     from caryatid.commands.explore import Explore
     from caryatid.commands.extract import Extract
+    from caryatid.commands.order import Order
     from caryatid.commands.show_config import ShowConfig
 
     command = tyro.extras.subcommand_cli_from_dict(
@@ -51,6 +53,8 @@ def _run(arguments: Sequence[str]) -> int:
             "explore": Explore,
             "extract": Extract,
             "evaluate": Evaluate,
+            "order": Order,
+            "dismantle": Dismantle,
             "benchmark": Benchmark,
             "config": ShowConfig,
         },

@@ -63,6 +63,18 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
     return [o if o.doubt == doubt else replace(o, doubt=doubt) for o, doubt in zip(done, said, strict=True)]
 
 
+def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) -> SceneObject:
+    """Return an object whose shape is as likely as its own: moved, turned and sized by its uncertainty.
+
+    Args:
+        o: An object; without `uncertainty` it stays as it is.
+        rng: Source of the draw.
+        config: Least extent, and how many standard deviations uncertainty can explain.
+    """
+    change = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas) * _sigma(o)
+    return replace(o, shape=_changed(o.shape, _EFFECT[o.shape.kind] @ change, config))
+
+
 def _effect(kind: str) -> Array:
     """What each of an object's independent variables (9,) does to it.
 

@@ -17,6 +17,7 @@ from caryatid.fusion import Evidence, absorbed, fuse, fused_graph
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.joint_registration import ViewRegistration
 from caryatid.kernels.compiling import compile_kernels
+from caryatid.manipulation.effects import Effect, predict_removal
 from caryatid.object_models import ObjectModels
 from caryatid.perception import UP, Percept, label_image, perceive
 from caryatid.plausibility import reconcile
@@ -93,6 +94,17 @@ class Scene:
             supported: Id of an object.
         """
         return explain(self.graph, supporter, supported, self.config.support)
+
+    def predict_removal(self, object_id: str) -> tuple[Effect, ...]:
+        """Say which objects will move, for certain or possibly, when one is taken away; with the reason.
+
+        Args:
+            object_id: Id of an object, such as `o3`.
+
+        Raises:
+            InputError: There is no such object, or it is the support surface.
+        """
+        return predict_removal(self.graph, object_id, self.config.support)
 
     def copy(self) -> Scene:
         """Return a scene that knows the same; what one of the two learns, the other does not.

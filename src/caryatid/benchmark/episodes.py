@@ -8,6 +8,7 @@ import numpy as np
 
 from caryatid.benchmark.records import Episode, Outcome, ViewRow
 from caryatid.benchmark.scenes import opened
+from caryatid.benchmark.taking import AFTER, take_apart
 from caryatid.config import Config
 from caryatid.errors import in_one_line
 from caryatid.evaluation.oracle import planner_for
@@ -48,7 +49,7 @@ def _rows(episode: Episode) -> tuple[ViewRow, ...]:
     scene, truth = opened(episode.scene, episode.content)
     stage = set_stage(scene, config, noise=episode.noise, seed=episode.seed)
     rows: list[ViewRow] = []
-    planning = 0.0
+    planning, taken = 0.0, (0.0, 0.0)
     planner, camera = planner_for(
         episode.planner, stage.camera, truth, config, segmentation=episode.segmentation, seed=episode.seed
     )
@@ -61,7 +62,10 @@ def _rows(episode: Episode) -> tuple[ViewRow, ...]:
         seed=episode.seed,
         early_stop=False,
     ):
-        rows.append(_row(step, score(step.graph, truth, np.random.default_rng(SEED)), planning))
+        row = _row(step, score(step.graph, truth, np.random.default_rng(SEED)), planning)
+        if episode.order and row.view in AFTER:
+            taken = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
+        rows.append(replace(row, unharmed=taken[0], lifts=taken[1]))
         planning = step.timings["plan"]
     last = rows[-1]
     missing = range(last.view + 1, episode.views + 1)

@@ -5,8 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass
+from typing import Literal, get_args
 
 from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
+
+OrderName = Literal["", "one hand", "two hands", "highest first", "random", "true graph"]
+"""How objects are put in order to be taken away; nothing is taken with the empty name."""
+
+ORDERS: tuple[OrderName, ...] = tuple(name for name in get_args(OrderName) if name)
+"""All of them that take something."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +31,7 @@ class Episode:
         settings: Changes of the default settings, `stage.name=value`.
         views: Views it has, the first one too.
         seed: Seed of the noise and of every choice.
+        order: How the objects are put in order to be taken away; empty where nothing is.
     """
 
     scene: str
@@ -36,6 +44,7 @@ class Episode:
     settings: tuple[str, ...] = ()
     views: int = 5
     seed: int = 0
+    order: OrderName = ""
 
     def key(self, fingerprint: str) -> str:
         """Digest of the episode and of the code that runs it; where a scene's folder lies does not matter.
@@ -68,6 +77,9 @@ class ViewRow:
         path: Travelled so far over the floor [m].
         planning_seconds: Time the choice of this view took [s]; 0 for the first.
         perception_seconds: Time from this view to the fused graph [s].
+        unharmed: 1 where the scene, taken apart after this view, comes to no harm, else 0; between the views
+            after which it is, and where it never is, what it was before, 0 at first.
+        lifts: Share of the lifts that disturb nothing [1]; likewise.
     """
 
     view: int
@@ -85,6 +97,8 @@ class ViewRow:
     path: float
     planning_seconds: float
     perception_seconds: float
+    unharmed: float = 0.0
+    lifts: float = 0.0
 
 
 MEASURES = tuple(name for name in ViewRow.__slots__ if name != "view")

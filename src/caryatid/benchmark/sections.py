@@ -20,6 +20,11 @@ BY_VIEW = (
     ("path", "Path over the floor [m]", 2),
 )
 """Measures with a column a view: name, heading, digits."""
+TAKING = (
+    ("unharmed", "Scenes taken apart without harm", 3),
+    ("lifts", "Lifts without harm", 3),
+)
+"""The same of suites whose scenes are taken apart."""
 AT_THE_END = (
     ("precision", "precision", 3),
     ("recall", "recall", 3),
@@ -133,7 +138,8 @@ def tables(group: Group, summary: Summary, *, brief: bool = False) -> tuple[Tabl
     if not known:
         return ()
     shown = BY_VIEW[:1] if brief and group.family else BY_VIEW[:2] if brief else BY_VIEW
-    made = [_by_view(known, group, summary, *measure) for measure in shown]
+    taken = any(e.value > 0.0 for method in known for e in method.curves["lifts"])
+    made = [_by_view(known, group, summary, *measure) for measure in (*(TAKING if taken else ()), *shown)]
     rows = [difference for difference in group.differences if difference.scenes]
     if rows:
         made.append(_differences(rows, group, summary, "f1", "F1", 3))

@@ -15,7 +15,7 @@ from typing import Any, Self
 from caryatid.benchmark.records import MEASURES, Episode, Member, Outcome, Record, ViewRow
 from caryatid.errors import InputError
 
-FORMAT = "1"
+FORMAT = "2"
 """Version of the tables below."""
 
 _TABLES = f"""

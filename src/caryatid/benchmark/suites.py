@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from caryatid.benchmark.fingerprint import plugin_of
-from caryatid.benchmark.records import Episode, Member
+from caryatid.benchmark.records import ORDERS, Episode, Member, OrderName
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 from caryatid.planners import VOLUMETRIC
@@ -18,6 +18,8 @@ PILES = tuple(
     f"pile-{size}-{seed}" for seed, size in enumerate((4, 5, 6, 8, 10, 12, 14, 16, 18, 20), start=1)
 )
 """Primitives set down one by one, 4 to 20."""
+HEAPED = tuple(f"pile-{6 + i % 7}-{401 + i}" for i in range(60))
+"""Piles of 6 to 12 to be taken apart; nothing is tuned on these seeds."""
 DENSE = tuple(f"dense-{10 + i % 16}-{301 + i}" for i in range(32))
 """Heaps of 10 to 25 between screens and walls; nothing is tuned on these seeds."""
 
@@ -31,12 +33,14 @@ class Method:
         planner: Who chooses the views.
         fusion: What is fused.
         settings: Changes of the default settings.
+        order: How objects are put in order to be taken away; empty where nothing is.
     """
 
     label: str
     planner: str = "support"
     fusion: FusionMethod = "pc+sg"
     settings: tuple[str, ...] = ()
+    order: OrderName = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +106,7 @@ class Suite:
                     settings=condition.settings + method.settings,
                     views=self.views,
                     seed=seed,
+                    order=method.order,
                 ),
                 method.label,
                 condition.label,
@@ -261,6 +266,15 @@ SUITES: Mapping[str, Suite] = {
             (*DESIGNED, *PILES[2::2], *DENSE[:8]),
             (*_NOISE, _AUTO),
             seeds=1,
+        ),
+        Suite(
+            "dismantle",
+            "Whether piles come apart without harm by what is known of them after 1, 3, 5 and 10 views.",
+            tuple(Method(order, order=order) for order in ORDERS),
+            (*DESIGNED, *HEAPED),
+            seeds=1,
+            views=10,
+            reference="highest first",
         ),
         Suite(
             "full",

@@ -1,18 +1,20 @@
-"""What `caryatid explore` and `caryatid demo` do: explore, and write a run folder."""
+"""What `caryatid explore`, `demo` and `dismantle` do: explore, and write a run folder."""
 
 from __future__ import annotations
 
 import sys
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 
 from caryatid.commands.explore import Explore
+from caryatid.commands.options import Modelling
 from caryatid.commands.profile import print_profile, profile_record
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record, step_record, view_record
 from caryatid.commands.sources import Source, open_source
-from caryatid.config import Config
+from caryatid.config import Config, NoiseModel, SegmentationMethod
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, score
 from caryatid.exploration import Step, explore
@@ -20,39 +22,108 @@ from caryatid.formats.graph_json import graph_to_json
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
 from caryatid.kernels.compiling import compile_kernels
-from caryatid.report import ViewPage, draw_view, render_report
+from caryatid.report import Figure, ViewPage, draw_view, render_report
+
+
+class Exploring(Protocol):
+    """Options of a command that explores."""
+
+    @property
+    def source(self) -> str: ...  # noqa: D102
+    @property
+    def planner(self) -> str: ...  # noqa: D102
+    @property
+    def segmentation(self) -> SegmentationMethod | None: ...  # noqa: D102
+    @property
+    def noise(self) -> NoiseModel: ...  # noqa: D102
+    @property
+    def no_early_stop(self) -> bool: ...  # noqa: D102
+    @property
+    def modelling(self) -> Modelling: ...  # noqa: D102
+
+
+@dataclass(slots=True)
+class Exploration:
+    """What an exploration has come to.
+
+    Attributes:
+        source: What was explored.
+        last: The newest step, or None before the first.
+        pages: The views as the report shows them.
+        steps: What run.json says of them.
+        scores: Score after each view, where the truth is known.
+    """
+
+    source: Source
+    last: Step | None = None
+    pages: list[ViewPage] = field(default_factory=list)
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    scores: list[Score] = field(default_factory=list)
+
+    @property
+    def end(self) -> Step:
+        """The newest step."""
+        if self.last is None:
+            raise RuntimeError("an exploration that ends has taken a view")
+        return self.last
 
 
 def run_exploration(options: Explore, config: Config) -> int:
     """Explore and write the run folder; Ctrl-C ends it with the views done so far."""
     progress = Progress(options.general.quiet or options.general.json)
-    seed = options.modelling.seed
     with RunWriter(options.out) as writer:
-        with progress.working("opening"):
-            source = open_source(
-                options.source, config, noise=options.noise, segmentation=options.segmentation, seed=seed
-            )
-        with progress.working("compiling"):
-            compile_kernels(progress.say)
-        planner, camera = planner_for(
-            options.planner, source.camera, source.truth, config, segmentation=options.segmentation, seed=seed
+        done = look_around(options, config, progress, writer, report=not options.no_report)
+        finish_run("explore", options, config, done, writer, report=not options.no_report)
+    if options.general.json:
+        document = {"run": str(options.out), "graph": graph_to_json(done.end.graph)}
+        sys.stdout.write(json_text(document | (profile_record(done.steps) if options.profile else {})))
+    count = "1 view" if len(done.steps) == 1 else f"{len(done.steps)} views"
+    progress.say(f"{done.source.name}: {summary(done.end.graph)} after {count}")
+    progress.say(f"run: {options.out}" + ("" if options.no_report else ", open its report.html"))
+    if options.profile and not options.general.json:
+        print_profile(done.steps)
+    return 0
+
+
+def look_around(
+    options: Exploring, config: Config, progress: Progress, writer: RunWriter | None, *, report: bool
+) -> Exploration:
+    """Explore; every view is drawn and written as soon as it is there.
+
+    Args:
+        options: What to explore, and how.
+        config: All settings.
+        progress: Told of each view.
+        writer: Takes the views, or None where no run is wanted.
+        report: Draw the views.
+
+    Raises:
+        KeyboardInterrupt: Before the first view; later an interrupt ends the exploration.
+    """
+    seed = options.modelling.seed
+    with progress.working("opening"):
+        source = open_source(
+            options.source, config, noise=options.noise, segmentation=options.segmentation, seed=seed
         )
-        pages: list[ViewPage] = []
-        steps: list[dict[str, Any]] = []
-        scores: list[Score] = []
-        last: Step | None = None
-        try:
-            for step in explore(
-                camera,
-                source.robot,
-                planner=planner,
-                config=config,
-                segmentation=options.segmentation,
-                seed=seed,
-                early_stop=not options.no_early_stop,
-            ):
-                scored = _scored(step, source)
-                page = [] if options.no_report else [draw_view(step, config.report)]
+    with progress.working("compiling"):
+        compile_kernels(progress.say)
+    planner, camera = planner_for(
+        options.planner, source.camera, source.truth, config, segmentation=options.segmentation, seed=seed
+    )
+    done = Exploration(source)
+    try:
+        for step in explore(
+            camera,
+            source.robot,
+            planner=planner,
+            config=config,
+            segmentation=options.segmentation,
+            seed=seed,
+            early_stop=not options.no_early_stop,
+        ):
+            scored = _scored(step, source)
+            page = [draw_view(step, config.report)] if report else []
+            if writer is not None:
                 writer.add_view(
                     step.graph,
                     step.labels,
@@ -61,44 +132,60 @@ def run_exploration(options: Explore, config: Config) -> int:
                     K=step.view.K,
                     record=view_record(step),
                 )
-                before, last = last, step
-                steps.append(step_record(step))
-                pages += page
-                scores += scored
-                progress.step(step, None if before is None else before.graph, scores)
-        except KeyboardInterrupt:
-            if last is None:
-                raise
-            progress.say("interrupted: keeping the views done so far")
-        if last is None:
-            raise RuntimeError("an exploration that ends has taken a view")
-        told = {
-            "planner": options.planner,
-            "segmentation": options.segmentation,
-            "noise": options.noise,
-            "early_stop": not options.no_early_stop,
-        }
-        report = None
-        if not options.no_report:
-            report = render_report(
-                pages,
-                title=f"caryatid: {source.name}",
-                settings={"source": options.source, "seed": seed}
-                | told
-                | {"fusion": config.fusion.method, "views": config.active.max_views},
-                scores=scores or None,
-            )
-        record = run_record("explore", options.source, seed, told, config, steps, scores)
-        writer.finish(last.graph, record, report)
-    if options.general.json:
-        document = {"run": str(options.out), "graph": graph_to_json(last.graph)}
-        sys.stdout.write(json_text(document | (profile_record(steps) if options.profile else {})))
-    count = "1 view" if len(steps) == 1 else f"{len(steps)} views"
-    progress.say(f"{source.name}: {summary(last.graph)} after {count}")
-    progress.say(f"run: {options.out}" + ("" if options.no_report else ", open its report.html"))
-    if options.profile and not options.general.json:
-        print_profile(steps)
-    return 0
+            before, done.last = done.last, step
+            done.steps.append(step_record(step))
+            done.pages += page
+            done.scores += scored
+            progress.step(step, None if before is None else before.graph, done.scores)
+    except KeyboardInterrupt:
+        if done.last is None:
+            raise
+        progress.say("interrupted: keeping the views done so far")
+    return done
+
+
+def finish_run(
+    command: str,
+    options: Exploring,
+    config: Config,
+    done: Exploration,
+    writer: RunWriter,
+    *,
+    report: bool,
+    more: dict[str, Any] | None = None,
+    strip: tuple[Figure, ...] = (),
+) -> None:
+    """Write what a run folder holds beside its views, and put it in its place.
+
+    Args:
+        command: Which command made the run.
+        options: What was explored, and how.
+        config: All settings.
+        done: The exploration.
+        writer: Has taken its views.
+        report: Write report.html.
+        more: What else run.json is to hold.
+        strip: Pictures for the end of the report.
+    """
+    told = {
+        "planner": options.planner,
+        "segmentation": options.segmentation,
+        "noise": options.noise,
+        "early_stop": not options.no_early_stop,
+    }
+    seed = options.modelling.seed
+    text = None
+    if report:
+        settings = {"source": options.source, "seed": seed} | told
+        text = render_report(
+            done.pages,
+            title=f"caryatid: {done.source.name}",
+            settings=settings | {"fusion": config.fusion.method, "views": config.active.max_views},
+            scores=done.scores or None,
+            strip=strip,
+        )
+    record = run_record(command, options.source, seed, told, config, done.steps, done.scores)
+    writer.finish(done.end.graph, record | (more or {}), text)
 
 
 def _scored(step: Step, source: Source) -> list[Score]:

@@ -9,6 +9,7 @@ from caryatid.config.choices import (
     NoiseModel,
     SegmentationMethod,
 )
+from caryatid.config.manipulation import LiftConfig, RehearsalConfig
 from caryatid.config.modelling import (
     CompletionConfig,
     ExplanationConfig,
@@ -65,6 +66,8 @@ class Config:
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     oracle: OracleConfig = field(default_factory=OracleConfig)
@@ -81,6 +84,7 @@ __all__ = [
     "FusionConfig",
     "FusionMethod",
     "GenerationConfig",
+    "LiftConfig",
     "MaskConfig",
     "NoiseConfig",
     "NoiseModel",
@@ -88,6 +92,7 @@ __all__ = [
     "PhysicsConfig",
     "PlausibilityConfig",
     "RegistrationConfig",
+    "RehearsalConfig",
     "ReportConfig",
     "RobotConfig",
     "SegmentationConfig",

@@ -175,6 +175,7 @@ def render_report(
     title: str,
     settings: Mapping[str, object],
     scores: Sequence[Score] | None = None,
+    strip: Sequence[Figure] = (),
 ) -> str:
     """Write the report: one HTML file that loads nothing from anywhere.
 
@@ -183,6 +184,7 @@ def render_report(
         title: Heading of the report.
         settings: Names and values of the run's settings; mappings and dataclasses in it are flattened.
         scores: Score after each view, where the truth is known; as many as pages.
+        strip: Pictures of the objects being taken away, in order.
 
     Raises:
         ValueError: There are scores, but not one for each page, or there is no page.
@@ -206,6 +208,7 @@ def render_report(
         charts=charts(pages, scores),
         scores=scores,
         settings=settings_rows(settings),
+        strip=strip,
     )
 
 

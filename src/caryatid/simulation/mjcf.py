@@ -113,7 +113,7 @@ def build_spec(
         _add_box(spec.worldbody, f"wall{index}", centre, half, _PLASTER)
     _add_table(spec.worldbody.add_body(name=TABLE), table_size)
     for index, solid in enumerate(solids):
-        _add_solid(spec, index, solid)
+        add_solid(spec, f"object{index}", solid, palette(index))
     return spec
 
 
@@ -177,12 +177,20 @@ def _add_box(
     )
 
 
-def _add_solid(spec: Any, index: int, solid: Solid) -> None:
+def add_solid(
+    spec: Any, name: str, solid: Solid, rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+) -> None:
+    """Add a free body of one primitive to a MuJoCo spec.
+
+    Args:
+        spec: `mujoco.MjSpec`, changed in place.
+        name: Of the body.
+        solid: What it is and where.
+        rgba: Its colour.
+    """
     shape = solid.shape
     T_world_body = shape.T_world_object
-    body = spec.worldbody.add_body(
-        name=f"object{index}", pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3])
-    )
+    body = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
     body.add_freejoint()
     match shape:
         case Box():
@@ -198,5 +206,5 @@ def _add_solid(spec: Any, index: int, solid: Solid) -> None:
         condim=condim,
         friction=[solid.friction, torsional, rolling],
         density=solid.density,
-        rgba=palette(index),
+        rgba=rgba,
     )

@@ -1,0 +1,60 @@
+"""What `caryatid order` and `caryatid dismantle` print, and how they use the machine."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from caryatid.manipulation.dismantling import Taken
+from caryatid.manipulation.order import Order
+from caryatid.manipulation.telling import succeeded
+
+
+def threads() -> int:
+    """Cores this process may use: so many rehearsals run at a time."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def print_order(order: Order, title: str) -> None:
+    """Print an order as a table, and why it is not safe where it is not."""
+    table = _table(f"{title}: {'a safe order' if order.safe else 'no safe order'}", "take", "hold", "why")
+    for number, step in enumerate(order.steps, start=1):
+        mark = "" if step.safe else "! "
+        table.add_row(str(number), step.object_id, ", ".join(step.hold), Text(mark + step.why))
+    console = Console()
+    console.print(table)
+    if order.refusal:
+        console.print(Text(order.refusal))
+
+
+def print_dismantling(order: Order, taken: Sequence[Taken], left: Sequence[str], title: str) -> None:
+    """Print what came of an order as a table."""
+    well = "all taken, nothing disturbed" if succeeded(taken, left) else "not without harm"
+    if left and all(t.ok for t in taken):
+        well = f"nothing disturbed, but {', '.join(left)} left"
+    table = _table(f"{title}: {well}", "take", "body", "hold", "disturbed", "why")
+    for number, t in enumerate(taken, start=1):
+        table.add_row(
+            str(number),
+            t.step.object_id,
+            t.body or "nothing there",
+            ", ".join(t.held),
+            ", ".join(t.disturbed) or "–",
+            Text(t.step.why),
+        )
+    console = Console()
+    console.print(table)
+    if order.refusal:
+        console.print(Text(order.refusal))
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=Text(title), title_justify="left")
+    table.add_column("", justify="right")
+    for column in columns:
+        table.add_column(column)
+    return table

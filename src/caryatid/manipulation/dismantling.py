@@ -1,0 +1,107 @@
+"""An order tried out in a simulated scene: what was lifted, and what it did to the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+
+from caryatid.config import Config, EvaluationConfig
+from caryatid.evaluation.scores import TrueScene, score
+from caryatid.frames import Array
+from caryatid.graph import SupportGraph
+from caryatid.manipulation.order import TakeStep
+from caryatid.simulation.lifting import Lifting
+from caryatid.simulation.world import SimulatedScene
+
+LEAST_IOU = 0.01
+"""An extracted object stands for the body it overlaps most; overlapping less than this, for none [1]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Taken:
+    """One step of an order, done.
+
+    Attributes:
+        step: What was asked for.
+        body: Name of the body that was lifted; None where there is none at the extracted object's place.
+        held: Names of the bodies that were held meanwhile.
+        disturbed: Names of the bodies that were moved or turned beyond the limits.
+        film: States (T, N, 7) of the scene's objects on the way; empty where nothing was lifted.
+    """
+
+    step: TakeStep
+    body: str | None
+    held: tuple[str, ...]
+    disturbed: tuple[str, ...]
+    film: Array
+
+    @property
+    def ok(self) -> bool:
+        """Nothing was disturbed."""
+        return not self.disturbed
+
+
+def bodies_of(graph: SupportGraph, truth: TrueScene, seed: int = 0) -> dict[str, str]:
+    """Body each extracted object stands for, by id: what a hand that reaches for it would take hold of.
+
+    Args:
+        graph: What has been extracted.
+        truth: The true scene; its vertices are bodies.
+        seed: Seed of the points that overlaps are measured with.
+    """
+    found = score(graph, truth, np.random.default_rng(seed), replace(EvaluationConfig(), min_iou=LEAST_IOU))
+    table = graph.support_surface
+    return {i: body for i, body in found.matches.items() if table is None or i != table.id}
+
+
+def dismantle(
+    scene: SimulatedScene, steps: Sequence[TakeStep], bodies: Mapping[str, str], config: Config
+) -> Iterator[Taken]:
+    """Do the steps of an order one after the other, whatever comes of them.
+
+    Args:
+        scene: The scene in physics; it is not changed.
+        steps: What to take.
+        bodies: Body each extracted object stands for, by id.
+        config: How objects are lifted, and what counts as harm.
+
+    Yields:
+        What came of each step.
+    """
+    names = list(scene.object_bodies.values())
+    lifting = Lifting(scene.spec, names)
+    state = poses_of(scene)
+    gone: set[str] = set()
+    for step in steps:
+        body = bodies.get(step.object_id)
+        held = tuple(bodies[i] for i in step.hold if i in bodies and bodies[i] not in gone)
+        if body is None or body in gone:
+            yield Taken(step, None, held, (), np.zeros((0, len(names), 7)))
+            continue
+        lift = lifting.lift(state, names.index(body), config.lift, held=[names.index(h) for h in held])
+        disturbed = tuple(names[k] for k in np.flatnonzero(lift.disturbed))
+        state = lift.state
+        gone.add(body)
+        yield Taken(step, body, held, disturbed, lift.film)
+
+
+def poses_of(scene: SimulatedScene) -> Array:
+    """State (N, 7) of a scene's objects: positions [m] and quaternions, w first."""
+    return np.asarray(scene.data.qpos[_addresses(scene)])
+
+
+def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
+    """Return a scene with its objects elsewhere, for pictures: state (N, 7)."""
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.data.qpos
+    data.qpos[_addresses(scene)] = state
+    mujoco.mj_forward(scene.model, data)
+    return replace(scene, data=data)
+
+
+def _addresses(scene: SimulatedScene) -> Array:
+    joints = [scene.model.body_jntadr[scene.body_id(label)] for label in scene.object_bodies]
+    return np.asarray(scene.model.jnt_qposadr[joints][:, None] + np.arange(7))

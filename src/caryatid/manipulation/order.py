@@ -1,0 +1,173 @@
+"""A safe order to take objects away: each step rehearsed in physics before it is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import networkx as nx
+import numpy as np
+
+from caryatid.config import Config
+from caryatid.errors import InputError
+from caryatid.graph import SupportGraph
+from caryatid.manipulation.rehearsal import Rehearsal, Trial
+
+
+@dataclass(frozen=True, slots=True)
+class TakeStep:
+    """One object to take.
+
+    Attributes:
+        object_id: Which.
+        hold: Ids of what the other hand holds meanwhile.
+        safe: No other object was disturbed in any rehearsal.
+        risk: Share of the rehearsals in which one was [1].
+        why: What the step goes by, for a person to read.
+    """
+
+    object_id: str
+    hold: tuple[str, ...]
+    safe: bool
+    risk: float
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """An order to take objects away.
+
+    Attributes:
+        steps: What to take, one after the other.
+        refusal: Why there is no safe order, naming what stands in whose way; empty where there is one.
+    """
+
+    steps: tuple[TakeStep, ...]
+    refusal: str = ""
+
+    @property
+    def safe(self) -> bool:
+        """Every step is."""
+        return not self.refusal
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Option:
+    """A lift that could be next."""
+
+    object_id: str
+    hold: tuple[str, ...]
+    trial: Trial
+
+
+def plan_order(
+    graph: SupportGraph,
+    config: Config | None = None,
+    *,
+    goal: str | None = None,
+    hands: int = 2,
+    seed: int = 0,
+    threads: int = 1,
+) -> Order:
+    """Find a safe order to take everything away, or to get at one object.
+
+    Greedy: of what is left that object is taken whose lift disturbs no other in any rehearsal, one that
+    supports nothing before one that does, higher ones first. Where there is none, the other hand holds what
+    would be disturbed most. Where that does not help either, the least risky lift is taken, and the order is
+    not safe.
+
+    Args:
+        graph: What has been extracted.
+        config: How lifts go, and how they are rehearsed.
+        goal: Id of the object to get at; only what has to be taken before it is.
+        hands: 2 where another hand can hold one object, else 1.
+        seed: Seed of the rehearsals.
+        threads: How many of them run at a time.
+
+    Raises:
+        InputError: There is no support surface, or no object to take, or no such goal.
+    """
+    config = config or Config()
+    rehearsal = Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
+    if goal is not None and goal not in rehearsal.ids:
+        raise InputError(goal, "is no object of the graph", f"there are {', '.join(rehearsal.ids)}")
+    steps: list[TakeStep] = []
+    refusal = ""
+    while left := rehearsal.left():
+        if goal is not None and goal not in left:
+            break
+        wanted = _in_turn(graph, left) if goal is None else _on_the_way(graph, goal, left, rehearsal)
+        option, tried = _safest(rehearsal, wanted, hands)
+        if option.trial.risk > 0.0 and not refusal:
+            refusal = _refusal(option, tried)
+        steps.append(_step(graph, option, rehearsal))
+        rehearsal.take(option.object_id, option.trial)
+    return Order(tuple(steps), refusal)
+
+
+def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:
+    """What is left, what supports nothing of it first, and of these the highest."""
+    carrying = {s.supporter for s in graph.supports if s.supported in left}
+    height = {o.id: float(o.centre_world[2]) for o in graph.objects}
+    return sorted(left, key=lambda i: (i in carrying, -height[i], i))
+
+
+def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: Rehearsal) -> list[str]:
+    """The goal if it can be lifted; else what its lift disturbs, and what theirs do, the nearest first."""
+    found = [goal]
+    for object_id in found:
+        harmed = rehearsal.try_lift(object_id).harmed
+        if not harmed:
+            return [object_id]
+        found += [i for i in _in_turn(graph, left) if i in harmed and i not in found]
+    return found
+
+
+def _safest(rehearsal: Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_Option, list[_Option]]:
+    """The first lift that is safe, with one hand before two; else the least risky; and those tried before."""
+    tried: list[_Option] = []
+    for object_id in wanted:
+        option = _Option(object_id, (), rehearsal.try_lift(object_id))
+        if option.trial.risk == 0.0:
+            return option, tried
+        tried.append(option)
+    tried.sort(key=lambda o: (o.trial.risk, len(o.trial.harmed)))
+    best = tried[0]
+    for option in _with_hold(rehearsal, tried) if hands > 1 else ():
+        if option.trial.risk < best.trial.risk:
+            best = option
+        if best.trial.risk == 0.0:
+            break
+    return best, tried
+
+
+def _with_hold(rehearsal: Rehearsal, tried: Sequence[_Option]) -> Iterator[_Option]:
+    """The same lifts while the other hand holds one of those that were disturbed, the most often first."""
+    for option in tried:
+        for held in sorted(option.trial.harmed, key=lambda i: (-option.trial.harmed[i], i)):
+            yield _Option(option.object_id, (held,), rehearsal.try_lift(option.object_id, [held]))
+
+
+def _step(graph: SupportGraph, option: _Option, rehearsal: Rehearsal) -> TakeStep:
+    trial, draws = option.trial, len(option.trial.lifts)
+    carried = [s.supported for s in graph.supports if s.supporter == option.object_id]
+    left = [i for i in carried if i in rehearsal.left()]
+    what = f"supports {', '.join(left)}" if left else "supports nothing that is left"
+    with_hold = f" while {', '.join(option.hold)} is held" if option.hold else ""
+    if trial.risk == 0.0:
+        why = f"it {what}; lifting it{with_hold} disturbed nothing in {draws} rehearsals"
+    else:
+        worst = ", ".join(f"{i} in {s * draws:.0f}" for i, s in trial.harmed.items())
+        why = f"it {what}; lifting it{with_hold} disturbed {worst} of {draws} rehearsals"
+    return TakeStep(option.object_id, option.hold, trial.risk == 0.0, trial.risk, why)
+
+
+def _refusal(option: _Option, tried: Sequence[_Option]) -> str:
+    """Say which objects stand in one another's way."""
+    blocked = nx.DiGraph((o.object_id, i) for o in tried for i in o.trial.harmed)
+    try:
+        edges = nx.find_cycle(blocked, option.object_id)
+        said = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
+        return f"no safe order: {said}; whichever goes first"
+    except nx.NetworkXNoCycle:
+        return f"no safe order: lifting {option.object_id} disturbs {', '.join(option.trial.harmed)}"

@@ -1,0 +1,181 @@
+"""Lifts tried in physics before they are done: on the extracted shapes, and on others as likely.
+
+What has been extracted is not at rest in physics to the millimetre, and friction and weights are not known.
+So a lift is rehearsed in several scenes, drawn by the shapes' uncertainty, each of which is let come to rest
+first. An object that does not, though the real one was seen at rest, is wrongly shaped or rests on what was
+not seen: there it is held, and the support graph alone says what it needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import Config
+from caryatid.errors import InputError
+from caryatid.frames import Array
+from caryatid.graph import SceneObject, SupportGraph
+from caryatid.plausibility import drawn, reconcile
+from caryatid.simulation.lifting import ASIDE, Lift, Lifting
+from caryatid.simulation.mjcf import Solid, add_solid, quaternion
+from caryatid.simulation.world import TABLE
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Trial:
+    """A lift rehearsed in every drawn scene.
+
+    Attributes:
+        risk: Share of the scenes in which another object was disturbed [1].
+        harmed: In what share of them each object was [1], by id; those that never were are left out.
+        lifts: What came of it in each scene.
+    """
+
+    risk: float
+    harmed: dict[str, float]
+    lifts: tuple[Lift, ...]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Scene:
+    """One drawn scene: its physics, and which objects (N,) do not stay where they were seen."""
+
+    lifting: Lifting
+    restless: NDArray[np.bool_]
+
+
+class Rehearsal:
+    """Scenes in which to try lifts, and where their objects are once some have been taken.
+
+    Args:
+        graph: What has been extracted.
+        config: How lifts go, and what the scenes are drawn from.
+        rng: Source of the draws.
+        threads: How many scenes are simulated at a time.
+
+    Raises:
+        InputError: The graph has no support surface, or no objects.
+    """
+
+    def __init__(
+        self, graph: SupportGraph, config: Config, rng: np.random.Generator, *, threads: int = 1
+    ) -> None:
+        table = graph.support_surface
+        if table is None:
+            raise InputError("graph", "has no support surface", "extract one; lifts need a table")
+        self.ids = tuple(o.id for o in graph.objects if o.role == "object")
+        if not self.ids:
+            raise InputError("graph", "has no objects", "there is nothing to take away")
+        self._graph, self._config, self._threads = graph, config, threads
+        self._scenes: list[_Scene] = []
+        self._states: list[Array] = []
+        draws = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
+        for scene, state in self._each(lambda k: _settled(draws[k], self.ids, config)):
+            self._scenes.append(scene)
+            self._states.append(state)
+
+    @property
+    def restless(self) -> dict[str, float]:
+        """In what share of the scenes each object did not stay where it was seen [1]; the others left out."""
+        shares = np.mean([scene.restless for scene in self._scenes], axis=0)
+        return {i: float(s) for i, s in zip(self.ids, shares, strict=True) if s > 0.0}
+
+    def left(self) -> list[str]:
+        """Ids of the objects that have not been taken yet."""
+        return [i for k, i in enumerate(self.ids) if self._states[0][k, 2] < ASIDE / 2.0]
+
+    def try_lift(self, object_id: str, hold: Collection[str] = ()) -> Trial:
+        """Lift an object in every scene; nothing is changed by it.
+
+        Args:
+            object_id: Which.
+            hold: Objects that are held where they are meanwhile.
+        """
+        lifts = self._each(lambda k: self._lift(k, object_id, hold))
+        harm = np.array([lift.disturbed | self._bereft(k, object_id, hold) for k, lift in enumerate(lifts)])
+        shares = harm.mean(axis=0)
+        harmed = {i: float(s) for i, s in zip(self.ids, shares, strict=True) if s > 0.0}
+        return Trial(float(harm.any(axis=1).mean()), harmed, tuple(lifts))
+
+    def take(self, object_id: str, trial: Trial) -> None:
+        """Go on without an object that has been lifted: where others moved, they are put back."""
+        index = self.ids.index(object_id)
+        for k, (lift, scene) in enumerate(zip(trial.lifts, self._scenes, strict=True)):
+            calm = not lift.disturbed.any()
+            state = (lift.state if calm else self._states[k]).copy()
+            state[scene.restless] = self._states[k][scene.restless]
+            state[index, :3] = (0.0, 0.0, ASIDE + index)
+            self._states[k] = state
+
+    def _lift(self, k: int, object_id: str, hold: Collection[str]) -> Lift:
+        index, scene = self.ids.index(object_id), self._scenes[k]
+        held = {self.ids.index(i) for i in hold} | set(np.flatnonzero(scene.restless).tolist())
+        return scene.lifting.lift(
+            self._states[k], index, self._config.lift, held=held - {index}, to_the_end=False
+        )
+
+    def _bereft(self, k: int, object_id: str, hold: Collection[str]) -> NDArray[np.bool_]:
+        """Which objects (N,) are held in a scene but would lose a support of the graph."""
+        needs = {s.supported for s in self._graph.supports if s.supporter == object_id} - set(hold)
+        there = set(self.left())
+        losing = [i in needs and i in there for i in self.ids]
+        return self._scenes[k].restless & np.array(losing, dtype=np.bool_)
+
+    def _each(self, do: Callable[[int], Any]) -> list[Any]:
+        """Do something for every scene, in order."""
+        count = self._config.rehearsal.draws
+        if self._threads < 2:
+            return [do(k) for k in range(count)]
+        with ThreadPoolExecutor(self._threads) as pool:
+            return list(pool.map(do, range(count)))
+
+
+def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
+    """A `mujoco.MjSpec` of the extracted shapes, or of others as likely for a number above 0."""
+    objects = list(graph.objects)
+    if number > 0:
+        objects = [drawn(o, rng, config.plausibility) for o in objects]
+        objects = reconcile(objects, config.plausibility)
+    settings = config.rehearsal
+    frictions = rng.uniform(*settings.friction, len(objects))
+    densities = rng.uniform(*settings.density, len(objects))
+    if number == 0:
+        frictions[:], densities[:] = np.mean(settings.friction), np.mean(settings.density)
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 0.004
+    spec.option.impratio = 10.0
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for o, friction, density in zip(objects, frictions, densities, strict=True):
+        if o.role == "support_surface":
+            _add_table(spec, o, settings.rim)
+        else:
+            add_solid(spec, o.id, Solid(o.shape, density, friction))
+    return spec
+
+
+def _add_table(spec: Any, table: SceneObject, rim: float) -> None:
+    T, extents = table.shape.T_world_object, table.shape.extents
+    up = int(np.argmax(np.abs(T[2, :3])))
+    half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, rim)
+    body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
+    # Contacts take the larger friction of the two: the table's is not to hide how slippery objects are.
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
+
+
+def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[_Scene, Array]:
+    """Let a scene come to rest: what moves too far is put back and held, until nothing else does."""
+    lifting = Lifting(spec, ids)
+    seen, restless = lifting.start, np.zeros(len(ids), dtype=np.bool_)
+    while True:
+        state = lifting.rest(seen, np.flatnonzero(restless).tolist(), config.rehearsal.settling)
+        moved = lifting.strayed(seen, state, config.lift) & ~restless
+        if not moved.any():
+            return _Scene(lifting, restless), np.where(restless[:, None], seen, state)
+        restless |= moved

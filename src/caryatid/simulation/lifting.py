@@ -1,0 +1,229 @@
+"""Objects lifted, held and taken away in MuJoCo, and what happens to the others meanwhile.
+
+A grasp is a weld to a body that moves as it is told (a mocap body), one for each object: the object that is
+lifted follows it straight up at constant speed, those that are held stay where they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+from numpy.typing import NDArray
+
+from caryatid.config.manipulation import LiftConfig
+from caryatid.frames import Array
+from caryatid.simulation.world import mujoco_warnings_ignored
+
+ASIDE = 50.0
+"""How far up an object is put when it has been lifted [m]; nothing meets it there."""
+
+SEGMENT = 0.25
+"""Time simulated between two looks at the objects [s]; what falls is seen falling."""
+
+REST = 2e-4
+"""What moves by less than this in a `SEGMENT` stays where it is [m]: contacts creep as slowly."""
+
+HAND = "caryatid-hand-"
+"""Names of the bodies that grasp begin so."""
+
+_AT_THE_SAME_PLACE = np.zeros(12)
+"""A weld's anchor, relative position, relative quaternion and how much rotation counts [m]."""
+_AT_THE_SAME_PLACE[[6, 10]] = 1.0
+_STIFF = {"solref": [0.01, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
+"""A grasp gives way by well under a millimetre, at time steps up to 5 ms."""
+_STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+_GRASPS = int(
+    mujoco.mjtState.mjSTATE_EQ_ACTIVE | mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Lift:
+    """What came of a lift.
+
+    Attributes:
+        state: State (N, 7) afterwards.
+        distance: Farthest (N,) [m] each object was from where it had been; 0 for what was lifted or gone.
+        angle: The most (N,) [rad] each was turned.
+        disturbed: Which objects (N,) were moved or turned beyond the limits.
+        film: States (T, N, 7) on the way, one each `SEGMENT`.
+    """
+
+    state: Array
+    distance: Array
+    angle: Array
+    disturbed: NDArray[np.bool_]
+    film: Array
+
+
+class Lifting:
+    """A table in physics whose objects can be lifted one by one.
+
+    States are arrays (N, 7): position [m] and quaternion (w first) of each object, at rest. Nothing is kept
+    between calls, so that several threads may lift at once.
+
+    Args:
+        spec: `mujoco.MjSpec` with free bodies; it is copied.
+        bodies: Names of those that are objects, in their order.
+    """
+
+    def __init__(self, spec: Any, bodies: Sequence[str]) -> None:
+        self.bodies = tuple(bodies)
+        self.model = model = _with_hands(spec, self.bodies)
+        body = [model.body(name).id for name in bodies]
+        joints = model.body_jntadr[body]
+        self._qpos = model.jnt_qposadr[joints][:, None] + np.arange(7)
+        self._weld = np.array([model.equality(HAND + name).id for name in bodies], dtype=np.intp)
+        self._hand = np.array([model.body(HAND + name).mocapid[0] for name in bodies], dtype=np.intp)
+        roots = model.body_rootid[model.geom_bodyid]
+        self._geoms = [np.flatnonzero((roots == b) & (model.geom_contype != 0)) for b in body]
+
+    @property
+    def start(self) -> Array:
+        """State (N, 7) in which the spec has the objects."""
+        return np.asarray(self.model.qpos0[self._qpos])
+
+    def rest(self, state: Array, held: Collection[int], seconds: float) -> Array:
+        """State (N, 7) after some time [s] in which nothing is lifted and some objects are held."""
+        data = self._data(state, held)
+        return self._after(data, 0.0, seconds)
+
+    def lift(
+        self,
+        state: Array,
+        index: int,
+        config: LiftConfig,
+        *,
+        held: Collection[int] = (),
+        to_the_end: bool = True,
+    ) -> Lift:
+        """Lift an object straight up, take it aside and watch the others.
+
+        Args:
+            state: State (N, 7) to begin with.
+            index: Which object.
+            config: How it is lifted, and what counts as harm.
+            held: Objects that are held where they are meanwhile.
+            to_the_end: False stops as soon as one is disturbed, and watches no longer than something moves.
+        """
+        watched = state[:, 2] < ASIDE / 2.0
+        watched[index] = False
+        data = self._data(state, [*held, index])
+        lifted = self._rise(data, watched, index, config) / config.speed
+        distance, angle = np.zeros(len(state)), np.zeros(len(state))
+        film: list[Array] = []
+        for speed, seconds in ((config.speed, lifted), (0.0, config.watch)):
+            segments = max(1, int(np.ceil(seconds / SEGMENT)))
+            for _ in range(segments):
+                now = self._after(data, speed, seconds / segments, index)
+                moved, turned = _apart(state[watched], now[watched])
+                distance[watched] = np.maximum(distance[watched], moved)
+                angle[watched] = np.maximum(angle[watched], turned)
+                film.append(now)
+                if to_the_end:
+                    continue
+                if _beyond(distance, angle, config).any() or (speed == 0.0 and _at_rest(film)):
+                    return Lift(now, distance, angle, _beyond(distance, angle, config), np.array(film))
+            data = self._data_with_aside(data, index)
+        now = self._objects(data)
+        return Lift(now, distance, angle, _beyond(distance, angle, config), np.array(film))
+
+    def strayed(self, before: Array, after: Array, config: LiftConfig) -> NDArray[np.bool_]:
+        """Which objects (N,) moved or turned beyond the limits between two states (N, 7)."""
+        return _beyond(*_apart(before, after), config)
+
+    def _data(self, state: Array, grasped: Collection[int]) -> Any:
+        """MuJoCo's data for a state; what is grasped, or aside, is held where it is."""
+        data = mujoco.MjData(self.model)
+        data.qpos[self._qpos] = state
+        data.mocap_pos[self._hand], data.mocap_quat[self._hand] = state[:, :3], state[:, 3:]
+        aside = np.flatnonzero(state[:, 2] > ASIDE / 2.0)
+        data.eq_active[self._weld] = False
+        data.eq_active[self._weld[[*grasped, *aside]]] = True
+        mujoco.mj_kinematics(self.model, data)
+        return data
+
+    def _data_with_aside(self, data: Any, index: int) -> Any:
+        """Put an object out of the way, at rest, in place."""
+        place = np.array([0.0, 0.0, ASIDE + index])
+        data.qpos[self._qpos[index, :3]] = data.mocap_pos[self._hand[index]] = place
+        joint = self.model.body_jntadr[self.model.body(self.bodies[index]).id]
+        velocity = int(self.model.jnt_dofadr[joint])
+        data.qvel[velocity : velocity + 6] = 0.0
+        return data
+
+    def _after(self, data: Any, speed: float, seconds: float, index: int = 0) -> Array:
+        """Simulate for some time [s], in place, while one hand goes up [m/s]; the objects' state then."""
+        model = self.model
+        steps = max(1, round(seconds / model.opt.timestep))
+        told = np.empty(mujoco.mj_stateSize(model, _GRASPS))
+        mujoco.mj_getState(model, data, told, _GRASPS)
+        path = np.tile(told, (1, steps, 1))
+        height = model.neq + 3 * self._hand[index] + 2
+        path[0, :, height] += speed * model.opt.timestep * np.arange(1, steps + 1)
+        start = np.empty(mujoco.mj_stateSize(model, _STATE))
+        mujoco.mj_getState(model, data, start, _STATE)
+        with mujoco_warnings_ignored(), Rollout(nthread=0) as rollout:
+            states, _ = rollout.rollout(model, mujoco.MjData(model), start[None], path, control_spec=_GRASPS)
+        mujoco.mj_setState(model, data, states[0, -1], _STATE)
+        data.mocap_pos[self._hand[index], 2] = path[0, -1, height]
+        return self._objects(data)
+
+    def _objects(self, data: Any) -> Array:
+        return np.array(data.qpos[self._qpos])
+
+    def _rise(self, data: Any, watched: NDArray[np.bool_], index: int, config: LiftConfig) -> float:
+        """How far up [m] an object has to go to be above all others."""
+        low, _ = self._span(data, index)
+        tops = [self._span(data, int(k))[1] for k in np.flatnonzero(watched)]
+        return max(max(tops, default=low) - low, 0.0) + config.clearance
+
+    def _span(self, data: Any, index: int) -> tuple[float, float]:
+        """Heights [m] of an object's lowest and highest point: of the boxes around its geoms."""
+        geoms = self._geoms[index]
+        boxes = self.model.geom_aabb[geoms]
+        R = data.geom_xmat[geoms].reshape(-1, 3, 3)[:, 2]
+        middle = data.geom_xpos[geoms, 2] + np.einsum("gi,gi->g", R, boxes[:, :3])
+        reach = np.einsum("gi,gi->g", np.abs(R), boxes[:, 3:])
+        return float((middle - reach).min()), float((middle + reach).max())
+
+
+def _with_hands(spec: Any, bodies: Sequence[str]) -> Any:
+    """Compile a spec with a hand for each object, that grasps nothing yet."""
+    spec = spec.copy()
+    for name in bodies:
+        spec.worldbody.add_body(name=HAND + name, mocap=True)
+        weld = spec.add_equality(
+            name=HAND + name,
+            type=mujoco.mjtEq.mjEQ_WELD,
+            objtype=mujoco.mjtObj.mjOBJ_BODY,
+            name1=HAND + name,
+            name2=name,
+            active=False,
+            **_STIFF,
+        )
+        weld.data = _AT_THE_SAME_PLACE
+    with mujoco_warnings_ignored():
+        return spec.compile()
+
+
+def _apart(before: Array, after: Array) -> tuple[Array, Array]:
+    """Distances (N,) [m] and angles (N,) [rad] between states (N, 7)."""
+    cosine = np.abs(np.einsum("ni,ni->n", before[:, 3:], after[:, 3:]))
+    angle = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
+    return np.linalg.norm(after[:, :3] - before[:, :3], axis=1), angle
+
+
+def _at_rest(film: Sequence[Array]) -> bool:
+    """Whether the last two of some states (N, 7) are the same to a fifth of a millimetre and of a degree."""
+    distance, angle = _apart(*film[-2:])
+    return bool((distance < REST).all() and (angle < np.deg2rad(1000.0 * REST)).all())
+
+
+def _beyond(distance: Array, angle: Array, config: LiftConfig) -> NDArray[np.bool_]:
+    return (distance > config.moved) | (angle > np.deg2rad(config.turned))
