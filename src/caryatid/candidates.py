@@ -58,7 +58,7 @@ class Candidates:
     Attributes:
         T_world_camera: Camera poses (N, 4, 4).
         directions: Unit vectors (N, 3) from the view sphere's centre.
-        path_length: Way (N,) [m] over the floor from where the robot stands.
+        path_length: Way (N,) [m] from where the robot is: over the floor, or of its hand.
         rejected: Reason → how many views of the sphere were refused for it.
         indices: Which point of the view sphere each candidate is (N,), or None where they lie elsewhere.
     """
@@ -78,6 +78,16 @@ class Candidates:
         if count not in self._looks:
             self._looks[count] = looks_among(self.directions, count)
         return self._looks[count]
+
+    def without(self, index: int, reason: str) -> Candidates:
+        """Return the other views, one more being refused for a reason."""
+        T_world_camera, directions, way = (
+            np.delete(of_each, index, axis=0)
+            for of_each in (self.T_world_camera, self.directions, self.path_length)
+        )
+        indices = None if self.indices is None else np.delete(self.indices, index)
+        rejected = self.rejected | {reason: self.rejected.get(reason, 0) + 1}
+        return Candidates(T_world_camera, directions, way, rejected, indices)
 
     def from_elsewhere(self, path_length: Array) -> Candidates:
         """Return the same views as they are to a robot with another way (N,) [m] to each."""

@@ -16,7 +16,7 @@ from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.planners import Decision, Planner, PlanningState, make_planner
-from caryatid.robot import Robot
+from caryatid.robot import Robot, refusal_of, view_sphere_of
 from caryatid.scene import Scene
 from caryatid.stopwatch import Stopwatch
 from caryatid.threads import one_blas_thread
@@ -34,13 +34,13 @@ class Step:
         labels: Label image (H, W) of the view.
         graph: The fused graph after this view.
         cloud: All points so far, thinned, with labels.
-        sphere: The view sphere.
+        sphere: The view sphere, as the robot has it.
         visited: Unit directions (V, 3) of the views so far from the sphere's centre.
         candidates: The views that could be reached next, or None where the loop stops.
         decision: The next view, or None where the loop stops.
         timings: Seconds each stage took.
         angle_travelled: Sum of the angles between consecutive views at the sphere's centre [rad].
-        path_travelled: Way of the robot over the floor [m].
+        path_travelled: Way of the robot [m], as it measures it: a platform over the floor, an arm its hand.
         stop: Why this is the last step, or None.
     """
 
@@ -97,9 +97,10 @@ def explore(
         watch.lap("capture")
         before = scene.graph
         graph = scene.update(view)
-        sphere, labels = scene.sphere, scene.labels
-        if sphere is None or labels is None:
+        labels = scene.labels
+        if scene.sphere is None or labels is None:
             raise RuntimeError("an updated scene has a sphere and labels")
+        sphere = view_sphere_of(robot, scene.sphere)
         if view.T_world_camera is None and scene.T_world_camera is not None:
             view = view.with_pose(scene.T_world_camera)
         visited.append(sphere.direction_of(robot.T_world_camera))
@@ -111,7 +112,9 @@ def explore(
         if stop is None:
             try:
                 candidates = robot.candidates(sphere)
-                decision = _decided(scene, candidates, np.array(visited), chooser, seed)
+                decision, candidates = _decided(
+                    scene, robot, sphere, candidates, np.array(visited), chooser, seed
+                )
             except PlanningError as error:
                 stop = str(error)
         watch.lap("plan")
@@ -138,8 +141,8 @@ def next_best_view(
     Args:
         scene: What is known, of at least one view.
         robot: Says which views it can reach.
-        visited: Unit directions (V, 3) of earlier views from the sphere's centre, the current one last;
-            None = where the robot is.
+        visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
+            current one last; None = where the robot is.
         planner: Chooses among them, or the name of one that does.
         seed: Seed of random planners.
 
@@ -152,17 +155,42 @@ def next_best_view(
     if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
     chooser = make_planner(planner) if isinstance(planner, str) else planner
+    sphere = view_sphere_of(robot, scene.sphere)
     if visited is None:
-        visited = scene.sphere.direction_of(robot.T_world_camera)[None]
-    return _decided(scene, robot.candidates(scene.sphere), visited, chooser, seed)
+        visited = sphere.direction_of(robot.T_world_camera)[None]
+    return _decided(scene, robot, sphere, robot.candidates(sphere), visited, chooser, seed)[0]
 
 
 @one_blas_thread
-def _decided(scene: Scene, candidates: Candidates, visited: Array, planner: Planner, seed: int) -> Decision:
-    if scene.sphere is None or scene.voxels is None:
+def _decided(
+    scene: Scene,
+    robot: Robot,
+    sphere: ViewSphere,
+    candidates: Candidates,
+    visited: Array,
+    planner: Planner,
+    seed: int,
+) -> tuple[Decision, Candidates]:
+    """Plan; where the robot, looking closer, cannot take the view, plan anew among the others.
+
+    Returns:
+        The decision, and the candidates it was taken among.
+
+    Raises:
+        PlanningError: No view is left, or the robot could take none of as many as it may try.
+    """
+    if scene.voxels is None:
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
-    state = PlanningState(scene.graph, scene.sphere, scene.voxels, visited, candidates, scene.config.active)
-    return planner.plan(state, np.random.default_rng([seed, len(visited)]))
+    rng = np.random.default_rng([seed, len(visited)])
+    for _ in range(scene.config.active.attempts):
+        state = PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active)
+        decision = planner.plan(state, rng)
+        refused = refusal_of(robot, decision.T_world_camera)
+        if refused is None:
+            return decision, candidates
+        why = refused.reason
+        candidates = candidates.without(decision.index, why)
+    raise PlanningError(f"the robot could take none of {scene.config.active.attempts} views: {why}")
 
 
 def _reason_to_stop(

@@ -58,7 +58,7 @@ class Unreachable:
 
 
 class Robot(Protocol):
-    """What carries the camera."""
+    """What carries the camera; one with views of its own is an `OwnViews` too."""
 
     @property
     def T_world_camera(self) -> Array:
@@ -74,8 +74,37 @@ class Robot(Protocol):
         ...
 
     def move_to(self, T_world_camera: Array) -> float:
-        """Go there and return the length of the way [m]."""
+        """Go there and return the length of the way [m].
+
+        Raises:
+            PlanningError: The pose cannot be reached.
+        """
         ...
+
+
+class OwnViews:
+    """What a robot may say beyond `Robot`: one that inherits this is asked, another is not."""
+
+    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
+        """Say on which sphere this robot's views lie: radius, centre and points.
+
+        What is asked twice, also about its own answer, is answered with the same sphere.
+
+        Args:
+            proposed: The sphere of the settings around the middle of the table top.
+
+        Returns:
+            The proposed one, unless a robot says otherwise.
+        """
+        return proposed
+
+    def confirm(self, T_world_camera: Array) -> Unreachable | None:
+        """Say why a candidate (4, 4) that was chosen cannot be taken after all; then another one is chosen.
+
+        Returns:
+            None, go ahead, unless a robot says otherwise.
+        """
+        return None
 
 
 class HumanoidRobot:
@@ -265,18 +294,39 @@ class _Offer:
     cells: NDArray[np.intp]
 
 
+def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
+    """Return the sphere a robot's views lie on: its own where it has one, else the proposed."""
+    return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
+
+
+def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
+    """Why a robot, looking closer where it can, does not take a candidate (4, 4), or None."""
+    return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
+
+
 def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
-    """Pick the first view: the reachable candidate (4, 4) nearest to `config.home` on the view sphere.
+    """Pick the first view: the reachable candidate (4, 4) nearest to `config.home` on its view sphere.
+
+    Args:
+        robot: Says what it can reach.
+        sphere: What it is proposed.
+        config: Where the first view is to be.
 
     Raises:
         PlanningError: No view of the sphere can be reached.
     """
-    candidates = robot.candidates(sphere)
+    candidates = robot.candidates(view_sphere_of(robot, sphere))
     if len(candidates) == 0:
         why = ", ".join(f"{reason} ({count})" for reason, count in candidates.rejected.items())
         raise PlanningError(f"no view of the sphere can be reached: {why}")
-    home = direction(*np.deg2rad(config.home))
-    return candidates.T_world_camera[int(np.argmax(candidates.directions @ home))]
+    nearness = candidates.directions @ direction(*np.deg2rad(config.home))
+    reasons: set[str] = set()
+    for index in np.argsort(-nearness, kind="stable"):
+        refused = refusal_of(robot, candidates.T_world_camera[index])
+        if refused is None:
+            return candidates.T_world_camera[index]
+        reasons.add(refused.reason)
+    raise PlanningError(f"no view of the sphere can be reached: {', '.join(sorted(reasons))}")
 
 
 def _wrap(angle: Array) -> Array:

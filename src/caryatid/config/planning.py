@@ -1,4 +1,4 @@
-"""Settings of active vision: voxels, view sphere, points of interest, robot."""
+"""Settings of active vision: voxels, view sphere, points of interest, robots."""
 
 from __future__ import annotations
 
@@ -71,6 +71,9 @@ class ActiveVisionConfig(Stage):
     """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path halves it."""
     max_views: Count = 10
     """Views at the most, the first one too; the paper's."""
+    attempts: Count = 20
+    """Views chosen for one step that the robot, looking closer, cannot take, before it stops [1]; a coarse
+    map of an arm's reach is wrong about every tenth."""
     clearance: NotNegative = 0.05
     """Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
     ring_views: Count = 5
@@ -133,3 +136,35 @@ class RobotConfig(Stage):
     """Obstacles met this near to the sphere's centre are the table, not a wall in the line of sight [m]."""
     home: tuple[Azimuth, Elevation] = (180.0, 35.0)
     """Azimuth and elevation on the view sphere of the first view [deg]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArmConfig(Stage):
+    """An arm with a camera in its hand."""
+
+    base: tuple[float, float, float] = (-0.5, 0.0, 0.0)
+    """Where a simulated arm stands, from the middle of the table top [m]; 0.2 m beside a built-in table."""
+    base_yaw: Azimuth = 0.0
+    """Where the x axis of its base points, from the world's x towards y [deg]; 0 is over the table."""
+    radius: Lengths = (0.4, 1.0)
+    """Smallest and largest view sphere tried [m]: nearer, the camera meets what is on the table, and the hand
+    of a common arm gets no farther. Equal ends fix the radius."""
+    radii: Count = 13
+    """View spheres tried from the smallest to the largest [1]; 5 cm apart."""
+    radius_share: Share = 0.65
+    """Share of the views within reach on the best of these spheres that makes a larger one do [1]; from
+    farther away a view shows more of the table, and the nearest spheres show too little of it."""
+    radius_views: Count = 400
+    """Views of each sphere tried to choose among them [1]; about 10° apart."""
+    sphere_points: Count = 4000
+    """Points of the view sphere [1]; about 3° apart, and a tenth of the humanoid's to ask a slow function."""
+    rolls: Count = 8
+    """Rolls of the camera about its optical axis that are tried, level first [1]; 45° apart, 1 = level."""
+    clearance: NotNegative = 0.15
+    """Height of the camera over the sphere's centre at least [m]; lower, the hand meets the table."""
+    table_margin: NotNegative = 0.1
+    """Furniture met this near to the sphere's centre is the table, not a wall in the line of sight [m]."""
+    cell: Positive = 0.08
+    """Edge of a cell of a sampled map [m]; finer ones need more samples, by the third power."""
+    view_directions: Count = 150
+    """Viewing directions a sampled map tells apart [1]; about 16° apart."""
