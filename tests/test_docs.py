@@ -9,10 +9,14 @@ import shutil
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+from arms import SLIDES, gantry
 from conftest import SMALL, run_command
 
 import caryatid as ct
+from caryatid.formats.reachability_npz import write_reachability
+from caryatid.reachability import sample_reachability
 from caryatid.settings import write_settings
 
 ROOT = Path(__file__).parents[1]
@@ -30,6 +34,9 @@ def workplace(tmp_path, monkeypatch, kept_recording, scene_file, points, write_p
     write_pcd(*points, name="table.pcd")
     shutil.copytree(kept_recording, tmp_path / "recording")
     shutil.copytree(scene_file.parent, tmp_path / "my-scene")
+    write_reachability(
+        tmp_path / "arm.npz", sample_reachability(gantry, SLIDES, 100_000, np.random.default_rng(0))
+    )
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -19,8 +19,10 @@ def run_example(path, monkeypatch, *arguments):
     runpy.run_path(str(path), run_name="__main__")
 
 
-def test_there_are_five():
-    assert [path.name[:2] for path in EXAMPLES] == ["01", "02", "03", "04", "05"]
+def test_each_has_a_number_of_its_own():
+    numbers = [path.name[:2] for path in EXAMPLES]
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) >= 6
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

@@ -155,8 +155,8 @@ def test_settings_made_in_python_are_looked_after_too():
         FusionConfig(keep_share=float("nan"))
 
 
-ANY = {"mask.min_score", "sensor.light"}
-"""Settings that may be any number: of the segmenter's unit, and a direction."""
+ANY = {"mask.min_score", "sensor.light", "arm.base"}
+"""Settings that may be any number: of the segmenter's unit, a direction, and a place."""
 
 
 def test_every_number_says_its_range():

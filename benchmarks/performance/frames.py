@@ -10,7 +10,7 @@ import numpy as np
 from caryatid import frames
 from caryatid.config import Config, SensorConfig
 from caryatid.frames import Array
-from caryatid.robot import HumanoidRobot
+from caryatid.robot import Robot
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.simulation.mjcf import TABLE_HEIGHT, Solid, build_spec
 from caryatid.simulation.scenes import load_scene
@@ -50,7 +50,7 @@ class Recording:
     config: Config
     poses: Array
     views: tuple[View, ...]
-    robot: HumanoidRobot
+    robot: Robot
 
 
 def record(
@@ -70,7 +70,7 @@ def capture(scene: SimulatedScene, count: int, seed: int = 0) -> Iterator[tuple[
         yield T_world_camera, stage.camera.capture(T_world_camera)
 
 
-def ring(scene: SimulatedScene, robot: HumanoidRobot, config: Config, count: int) -> Array:
+def ring(scene: SimulatedScene, robot: Robot, config: Config, count: int) -> Array:
     """Poses (V, 4, 4) around the table that the robot reaches, the first where it stands."""
     top = table_top(scene)
     centre = np.append(top.corners_world[:, :2].mean(axis=0), top.height)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from caryatid.commands.names import PlannerName
+from caryatid.commands.names import PlannerName, RobotName
 from caryatid.commands.options import SAID, ModellingCommand, Views, defaults_to, with_views
 from caryatid.config import NoiseModel, SegmentationMethod
 
@@ -35,6 +35,8 @@ class Dismantle(ModellingCommand):
     """Views at the most, the first one too."""
     planner: PlannerName = "support"
     """Who chooses the next view."""
+    robot: RobotName = "humanoid"
+    """Who carries the simulated camera, as of explore."""
     segmentation: SegmentationMethod = "labels"
     """Where parts come from: the simulator's masks, or automatic."""
     noise: NoiseModel = "none"

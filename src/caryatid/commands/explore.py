@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from caryatid.commands.names import PlannerName
+from caryatid.commands.names import PlannerName, RobotName
 from caryatid.commands.options import SAID, ModellingCommand, OutPath, Profile, Views, defaults_to, with_views
 from caryatid.config import NoiseModel, SegmentationMethod
 
@@ -24,6 +24,7 @@ class Explore(ModellingCommand):
     To try:
       caryatid explore tower --noise carmine --out run
       caryatid explore scene.xml --views 5 --out run
+      caryatid explore tower --robot arm:arm.npz --out run
       caryatid explore recording/ --segmentation auto --out run
     """
 
@@ -35,6 +36,9 @@ class Explore(ModellingCommand):
     """Views at the most, the first one too."""
     planner: PlannerName = "support"
     """Who chooses the next view; oracle, which knows the truth, in simulation only."""
+    robot: RobotName = "humanoid"
+    """Who carries the simulated camera: arm:FILE.npz is an arm with a map of what it reaches, module:callable
+    one of your own."""
     segmentation: Annotated[
         SegmentationMethod | None, tyro.conf.DisallowNone, defaults_to("labels where the source has them")
     ] = None

@@ -33,6 +33,8 @@ class Exploring(Protocol):
     @property
     def planner(self) -> str: ...  # noqa: D102
     @property
+    def robot(self) -> str: ...  # noqa: D102
+    @property
     def segmentation(self) -> SegmentationMethod | None: ...  # noqa: D102
     @property
     def noise(self) -> NoiseModel: ...  # noqa: D102
@@ -103,7 +105,12 @@ def look_around(
     seed = options.modelling.seed
     with progress.working("opening"):
         source = open_source(
-            options.source, config, noise=options.noise, segmentation=options.segmentation, seed=seed
+            options.source,
+            config,
+            noise=options.noise,
+            segmentation=options.segmentation,
+            seed=seed,
+            robot=options.robot,
         )
     with progress.working("compiling"):
         compile_kernels(progress.say)
@@ -169,6 +176,7 @@ def finish_run(
     """
     told = {
         "planner": options.planner,
+        "robot": options.robot,
         "segmentation": options.segmentation,
         "noise": options.noise,
         "early_stop": not options.no_early_stop,

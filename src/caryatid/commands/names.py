@@ -10,6 +10,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from caryatid.benchmark.suites import SUITES, find_suite
 from caryatid.errors import InputError
 from caryatid.planners import BUILT_IN, ORACLE, make_planner
+from caryatid.robots import ARM, HUMANOID, find_robot
 
 
 def name_of(find: Callable[[str], object], metavar: Iterable[str]) -> PrimitiveConstructorSpec[str]:
@@ -43,6 +44,15 @@ def _known_planner(name: str) -> None:
 
 PlannerName = Annotated[str, name_of(_known_planner, [*BUILT_IN, ORACLE, "…"])]
 """`oracle`, or a name `make_planner` knows, of another package's planner too."""
+
+
+def _known_robot(name: str) -> None:
+    if ":" not in name:
+        find_robot(name)
+
+
+RobotName = Annotated[str, name_of(_known_robot, [HUMANOID, f"{ARM}FILE.npz", "module:callable", "…"])]
+"""A name `find_robot` knows; what a file or a module is, is seen when it is opened."""
 
 SuiteName = Annotated[str | None, name_of(find_suite, SUITES)]
 """A name `find_suite` knows."""

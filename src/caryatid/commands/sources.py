@@ -17,6 +17,7 @@ from caryatid.formats.bop import Recording, read_recording
 from caryatid.recording_camera import RecordingCamera
 from caryatid.recording_robot import RecordingRobot
 from caryatid.robot import Robot
+from caryatid.robots import HUMANOID, find_robot
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.stage import set_stage
 from caryatid.simulation.truth import ground_truth, read_truth
@@ -50,7 +51,13 @@ def is_recording(source: str) -> bool:
 
 
 def open_source(
-    source: str, config: Config, *, noise: NoiseModel, segmentation: SegmentationMethod | None, seed: int
+    source: str,
+    config: Config,
+    *,
+    noise: NoiseModel,
+    segmentation: SegmentationMethod | None,
+    seed: int,
+    robot: str = HUMANOID,
 ) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
@@ -60,19 +67,26 @@ def open_source(
         noise: Noise of the simulated camera.
         segmentation: Where parts are to come from.
         seed: Seed of the noise.
+        robot: Name of the simulated robot.
 
     Raises:
-        InputError: It is none of them, or broken, or lacks the labels that are demanded.
+        InputError: It is none of them, or broken, or lacks the labels that are demanded; or there is no such
+            robot, or a robot is given for a recording.
+        PlanningError: The robot reaches no view of the table.
     """
     if Path(source).suffix.lower() in CLOUD_SUFFIXES:
         raise InputError(source, "is a single cloud, and there is nowhere to go", "use `caryatid extract`")
     if is_recording(source):
+        if robot != HUMANOID:
+            reason = "is a recording, its camera can only be where a recorded view is"
+            raise InputError(source, reason, "leave --robot out")
         return _open_recording(open_recording(source, config, segmentation))
+    make = find_robot(robot)
     scene = load_scene(source)
     truth_file = Path(scene.source).parent / "gt.json"
     known = read_truth(truth_file) if truth_file.is_file() else None
     truth = ground_truth(scene) if known is None else known
-    stage = set_stage(scene, config, noise=noise, seed=seed)
+    stage = set_stage(scene, config, noise=noise, seed=seed, robot=make)
     return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
 
 

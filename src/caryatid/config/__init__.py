@@ -28,6 +28,7 @@ from caryatid.config.perception import (
 )
 from caryatid.config.planning import (
     ActiveVisionConfig,
+    ArmConfig,
     RobotConfig,
     VoxelConfig,
 )
@@ -63,6 +64,7 @@ class Config:
     voxels: VoxelConfig = field(default_factory=VoxelConfig)
     active: ActiveVisionConfig = field(default_factory=ActiveVisionConfig)
     robot: RobotConfig = field(default_factory=RobotConfig)
+    arm: ArmConfig = field(default_factory=ArmConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     sensor: SensorConfig = field(default_factory=SensorConfig)
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
@@ -75,6 +77,7 @@ class Config:
 
 __all__ = [
     "ActiveVisionConfig",
+    "ArmConfig",
     "CloudConfig",
     "CompletionConfig",
     "Config",

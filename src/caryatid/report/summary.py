@@ -70,9 +70,7 @@ def cards(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[tup
     ]
     if last.angle_travelled > 0.0 or last.path_travelled > 0.0:
         travelled = f"{np.rad2deg(last.angle_travelled):.0f}°"
-        figures.append(
-            ("travelled", travelled, f"around the scene; {last.path_travelled:.1f} m over the floor")
-        )
+        figures.append(("travelled", travelled, f"around the scene; {last.path_travelled:.1f} m of way"))
     if scores is not None:
         final = scores[-1]
         figures.insert(
@@ -92,7 +90,7 @@ def charts(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[st
         drawn.append(
             line_chart(number, lines, title="F1 over views", x_name="view", y_name=names, y_range=(0.0, 1.0))
         )
-        path, unit = [page.path_travelled for page in pages], "path over the floor [m]"
+        path, unit = [page.path_travelled for page in pages], "path [m]"
         if path[-1] == 0.0:
             path = [float(np.rad2deg(page.angle_travelled)) for page in pages]
             unit = "angle around the scene [°]"

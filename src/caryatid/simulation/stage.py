@@ -8,7 +8,8 @@ import numpy as np
 
 from caryatid.config import Config, NoiseModel
 from caryatid.floor import FloorGrid
-from caryatid.robot import HumanoidRobot, home_view
+from caryatid.robot import Robot, home_view
+from caryatid.robots import HUMANOID, RobotMaker, Surroundings, find_robot
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.solids import static_boxes, table_top
 from caryatid.simulation.world import SimulatedScene
@@ -27,19 +28,28 @@ class Stage:
 
     scene: SimulatedScene
     camera: SimulatedCamera
-    robot: HumanoidRobot
+    robot: Robot
 
 
-def set_stage(scene: SimulatedScene, config: Config, *, noise: NoiseModel, seed: int) -> Stage:
-    """Put the robot before the table, at its home view, with the furniture on its floor map.
+def set_stage(
+    scene: SimulatedScene,
+    config: Config,
+    *,
+    noise: NoiseModel,
+    seed: int,
+    robot: RobotMaker | str = HUMANOID,
+) -> Stage:
+    """Put a robot before the table, at its home view, with the furniture on its floor map.
 
     Args:
         scene: The scene in physics.
         config: Robot, sensor, noise and view sphere.
         noise: Noise of the camera.
         seed: Seed of the noise.
+        robot: Makes the robot, or the name of one as `find_robot` knows it.
 
     Raises:
+        InputError: There is no robot of this name.
         PlanningError: No view of the table can be reached.
     """
     boxes = static_boxes(scene)
@@ -52,7 +62,8 @@ def set_stage(scene: SimulatedScene, config: Config, *, noise: NoiseModel, seed:
         config.robot,
         centre[:2],
     )
-    robot = HumanoidRobot(floor, config.robot)
-    robot.move_to(home_view(robot, ViewSphere.around(centre, config.active), config.robot))
+    make = find_robot(robot) if isinstance(robot, str) else robot
+    made = make(Surroundings(centre, floor, config))
+    made.move_to(home_view(made, ViewSphere.around(centre, config.active), config.robot))
     camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor)
-    return Stage(scene, camera, robot)
+    return Stage(scene, camera, made)

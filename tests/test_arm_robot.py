@@ -1,0 +1,393 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from arms import LIMITS, base_at, gantry, sideways_only, within_arms_length
+from synthetic import SENSOR
+from test_docs import ROOT, blocks
+
+from caryatid import frames
+from caryatid.arm_robot import REASONS, UNCONFIRMED, ArmRobot
+from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
+from caryatid.errors import InputError, PlanningError
+from caryatid.exploration import explore, next_best_view
+from caryatid.floor import FloorGrid
+from caryatid.reachability import sample_reachability
+from caryatid.robot import HumanoidRobot, Posture, Unreachable, home_view, view_sphere_of
+from caryatid.scene import Scene
+from caryatid.simulation import load_scene
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.stage import set_stage
+from caryatid.view_sphere import ViewSphere
+
+PAGE = ROOT / "docs/how-to-own-robot.md"
+
+TOP = (0.0, 0.0, 0.75)
+PROPOSED = ViewSphere.around(TOP, ActiveVisionConfig(sphere_points=1000))
+BASE = base_at(-0.5, 0.0, 0.75)
+CONFIG = ArmConfig(sphere_points=600, radius_views=200)
+
+
+def arm(reachable=within_arms_length, T_world_base=BASE, config=CONFIG, **given) -> ArmRobot:
+    return ArmRobot(reachable, T_world_base, config, **given)
+
+
+def never(T_base_camera):
+    return np.zeros(len(T_base_camera), dtype=bool)
+
+
+def roll_of(T_world_camera):
+    """Angle of the image's rows against the horizontal [deg]."""
+    return np.rad2deg(np.arcsin(np.abs(T_world_camera[..., 2, 0])))
+
+
+class TestViewSphere:
+    def test_it_is_around_the_table_at_a_radius_the_arm_reaches(self):
+        sphere = arm().view_sphere(PROPOSED)
+        np.testing.assert_array_equal(sphere.centre_world, TOP)
+        assert 0.4 <= sphere.radius < 0.9
+        assert len(sphere.directions) == CONFIG.sphere_points
+        assert len(arm().candidates(sphere)) > 10 * len(arm().candidates(PROPOSED))
+
+    def test_the_largest_with_nearly_as_many_views_is_taken(self):
+        def count(radius: float) -> int:
+            robot = arm(config=replace(CONFIG, radius=(radius, radius)))
+            return len(robot.candidates(robot.view_sphere(PROPOSED)))
+
+        chosen = arm().view_sphere(PROPOSED).radius
+        most = max(count(float(r)) for r in np.linspace(*CONFIG.radius, CONFIG.radii))
+        share = CONFIG.radius_share
+        assert count(chosen) > (share - 0.05) * most
+        assert count(chosen + 0.1) < share * most
+
+    def test_equal_ends_fix_the_radius_without_asking(self):
+        def refuse(T_base_camera):
+            raise AssertionError("asked")
+
+        fixed = replace(CONFIG, radius=(0.62, 0.62))
+        assert arm(refuse, config=fixed).view_sphere(PROPOSED).radius == 0.62
+
+    def test_the_centre_can_be_the_robots(self):
+        sphere = arm(centre_world=(0.1, 0.0, 0.8)).view_sphere(PROPOSED)
+        np.testing.assert_array_equal(sphere.centre_world, (0.1, 0.0, 0.8))
+
+    def test_its_own_answer_is_answered_with_itself(self):
+        robot = arm(centre_world=(0.1, 0.0, 0.8))
+        sphere = robot.view_sphere(PROPOSED)
+        assert robot.view_sphere(sphere) is sphere is robot.view_sphere(PROPOSED)
+
+    def test_another_table_has_another_sphere(self):
+        robot = arm()
+        robot.view_sphere(PROPOSED)
+        moved = replace(PROPOSED, centre_world=np.array([0.2, 0.1, 0.7]))
+        np.testing.assert_array_equal(robot.view_sphere(moved).centre_world, moved.centre_world)
+
+    def test_a_humanoid_takes_what_it_is_proposed(self):
+        floor = FloorGrid.from_boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), RobotConfig())
+        assert view_sphere_of(HumanoidRobot(floor, RobotConfig()), PROPOSED) is PROPOSED
+
+
+class TestCandidates:
+    def test_they_are_what_the_function_allows_clear_of_the_table(self):
+        robot = arm()
+        sphere = robot.view_sphere(PROPOSED)
+        found = robot.candidates(sphere)
+        assert len(found) > 50
+        assert within_arms_length(frames.invert(BASE) @ found.T_world_camera).all()
+        np.testing.assert_allclose(roll_of(found.T_world_camera), 0.0, atol=1e-9)
+        assert found.T_world_camera[:, 2, 3].min() >= TOP[2] + CONFIG.clearance
+        np.testing.assert_array_equal(found.directions, sphere.directions[found.indices])
+        others = np.setdiff1d(np.arange(len(sphere.directions)), found.indices)
+        poses = sphere.poses(sphere.directions[others])
+        high = poses[:, 2, 3] >= TOP[2] + CONFIG.clearance
+        assert not within_arms_length((frames.invert(BASE) @ poses)[high]).any()
+
+    def test_every_view_is_a_candidate_or_counted_with_its_reason(self):
+        wall = FloorGrid.from_boxes([[0.0, 0.4, 1.0]], [[0.6, 0.02, 1.0]], [np.eye(3)], RobotConfig())
+        robot = arm(furniture=wall)
+        sphere = robot.view_sphere(PROPOSED)
+        found = robot.candidates(sphere)
+        assert set(found.rejected) == set(REASONS)
+        assert len(found) + sum(found.rejected.values()) == len(sphere.directions)
+        assert found.T_world_camera[:, 1, 3].max() < 0.4
+        free = arm().candidates(sphere)
+        assert free.T_world_camera[:, 1, 3].max() > 0.4
+        assert free.rejected.keys() == {REASONS[0], REASONS[2]}
+
+    def test_a_camera_mounted_on_its_side_is_rolled(self):
+        robot = arm(sideways_only)
+        sphere = robot.view_sphere(PROPOSED)
+        found = robot.candidates(sphere)
+        assert len(found) > 50
+        assert sideways_only(frames.invert(BASE) @ found.T_world_camera).all()
+        level = sphere.poses(found.directions)
+        np.testing.assert_allclose(found.T_world_camera[:, :3, 2:], level[:, :3, 2:], atol=1e-12)
+        assert roll_of(found.T_world_camera).min() > 30.0
+        assert len(arm(sideways_only, config=replace(CONFIG, rolls=1)).candidates(sphere)) == 0
+
+    def test_the_way_is_the_straight_line_of_the_hand(self):
+        robot = arm()
+        sphere = robot.view_sphere(PROPOSED)
+        start = robot.candidates(sphere)
+        assert not start.path_length.any()
+        assert robot.move_to(start.T_world_camera[0]) == 0.0
+        found = robot.candidates(sphere)
+        angle = frames.angle_between(found.directions[0], found.directions)
+        np.testing.assert_allclose(found.path_length, 2.0 * sphere.radius * np.sin(angle / 2.0), atol=1e-9)
+        assert robot.move_to(found.T_world_camera[7]) == pytest.approx(found.path_length[7])
+        np.testing.assert_array_equal(robot.T_world_camera, found.T_world_camera[7])
+
+    @pytest.mark.parametrize("seed", range(5))
+    def test_base_and_table_moved_together_change_nothing(self, seed):
+        rng = np.random.default_rng(seed)
+        T = base_at(*rng.uniform(-3.0, 3.0, 3), float(rng.uniform(-180.0, 180.0)))
+        there = replace(PROPOSED, centre_world=frames.transform(T, PROPOSED.centre_world))
+        reach = sample_reachability(gantry, LIMITS, 20_000, rng, CONFIG)
+        for reachable in (within_arms_length, sideways_only, reach):
+            robot, moved = arm(reachable), arm(reachable, T @ BASE)
+            here = robot.candidates(robot.view_sphere(PROPOSED))
+            elsewhere = moved.candidates(moved.view_sphere(there))
+            assert moved.view_sphere(there).radius == robot.view_sphere(PROPOSED).radius
+            assert elsewhere.rejected == here.rejected
+            np.testing.assert_array_equal(elsewhere.indices, here.indices)
+            np.testing.assert_allclose(elsewhere.T_world_camera, T @ here.T_world_camera, atol=1e-9)
+
+    def test_a_map_offers_only_poses_it_holds(self):
+        reach = sample_reachability(gantry, LIMITS, 100_000, np.random.default_rng(0), CONFIG)
+        robot = arm(reach, base_at(-0.4, 0.0, 0.9))
+        found = robot.candidates(robot.view_sphere(PROPOSED))
+        assert len(found) > 20
+        assert reach(frames.invert(robot.T_world_base) @ found.T_world_camera).all()
+
+
+class TestSolve:
+    def test_every_candidate_has_a_posture(self):
+        robot = arm(T_world_base=base_at(-0.5, 0.1, 0.75, 30.0))
+        found = robot.candidates(robot.view_sphere(PROPOSED))
+        for T in found.T_world_camera[::20]:
+            posture = robot.solve(T, np.array(TOP))
+            assert isinstance(posture, Posture)
+            np.testing.assert_allclose(posture.platform_world, [-0.5, 0.1, np.deg2rad(30.0)])
+            gaze, level = np.deg2rad(30.0) + posture.head_yaw, np.cos(posture.head_pitch)
+            axis = [level * np.cos(gaze), level * np.sin(gaze), np.sin(posture.head_pitch)]
+            np.testing.assert_allclose(axis, T[:3, 2], atol=1e-9)
+            assert posture.camera_height == T[2, 3]
+
+    @pytest.mark.parametrize(
+        ("reachable", "eye", "target", "reason"),
+        [
+            (
+                within_arms_length,
+                (2.0, 0.0, 1.5),
+                None,
+                "the hand does not reach there, 2.61 m from the base",
+            ),
+            (sideways_only, (-0.3, 0.0, 1.2), None, "from the base; rolled otherwise it does"),
+            (within_arms_length, (0.3, 0.0, 0.8), TOP, "too low over the table"),
+        ],
+    )
+    def test_it_says_why_not(self, reachable, eye, target, reason):
+        answer = arm(reachable).solve(frames.look_at(eye, TOP), target)
+        assert isinstance(answer, Unreachable)
+        assert reason in answer.reason
+        with pytest.raises(PlanningError, match="cannot go to this view"):
+            arm(never).move_to(frames.look_at(eye, TOP))
+
+    def test_a_refused_move_leaves_it_where_it_is(self):
+        here = frames.look_at((-0.3, 0.0, 1.2), TOP)
+        robot = arm(T_world_camera=here)
+        with pytest.raises(PlanningError):
+            robot.move_to(frames.look_at((5.0, 0.0, 1.2), TOP))
+        np.testing.assert_array_equal(robot.T_world_camera, here)
+
+    def test_where_it_is_is_taken_as_it_is(self):
+        class Real(ArmRobot):
+            def move_to(self, T_world_camera):
+                raise AssertionError("moved")
+
+        here = frames.look_at((5.0, 0.0, 1.2), TOP)
+        np.testing.assert_array_equal(Real(never, BASE, T_world_camera=here).T_world_camera, here)
+        with pytest.raises(InputError, match="T_world_camera"):
+            Real(never, BASE, T_world_camera=np.ones((4, 4)))
+
+    def test_it_is_nowhere_before_it_is_put_somewhere(self):
+        with pytest.raises(PlanningError, match="nowhere yet"):
+            _ = arm().T_world_camera
+
+    def test_a_base_that_is_no_pose_is_refused(self):
+        with pytest.raises(InputError, match="T_world_base"):
+            arm(T_world_base=2.0 * BASE)
+
+    @pytest.mark.parametrize(
+        "answer", [lambda T: True, lambda T: np.ones((len(T), 1), dtype=bool), lambda T: np.ones(len(T))]
+    )
+    def test_an_answer_that_is_not_one_bool_a_pose_is_refused(self, answer):
+        robot = arm(answer)
+        with pytest.raises(InputError, match=r"reachable: returned .* return bool of shape"):
+            robot.view_sphere(PROPOSED)
+
+
+class TestExploring:
+    SETTINGS = Config(
+        sensor=SENSOR,
+        arm=CONFIG,
+        active=ActiveVisionConfig(sphere_points=2000, look_directions=200, max_views=3),
+    )
+
+    def stage(self, reachable=within_arms_length):
+        def make(around):
+            return ArmRobot(reachable, around.T_world_base, around.config.arm, furniture=around.floor)
+
+        return set_stage(load_scene("tower"), self.SETTINGS, noise="none", seed=0, robot=make)
+
+    def test_an_arm_goes_around_on_its_own_sphere(self):
+        stage = self.stage()
+        steps = list(explore(stage.camera, stage.robot, config=self.SETTINGS, early_stop=False))
+        assert len(steps) == 3
+        for step in steps[1:]:
+            assert step.sphere is stage.robot.view_sphere(step.sphere)
+            distance = np.linalg.norm(step.view.T_world_camera[:3, 3] - step.sphere.centre_world)
+            assert distance == pytest.approx(step.sphere.radius)
+            assert distance < 1.0
+        assert steps[-1].path_travelled > 0.3
+        assert len(steps[-1].graph.objects) > 3
+
+    def test_a_robot_of_four_members_is_on_the_sphere_of_the_settings(self):
+        class Plain:
+            """A robot that inherits nothing, and knows no posture."""
+
+            def __init__(self, other):
+                self.T_world_camera, self._other = other.T_world_camera, other
+
+            def solve(self, T_world_camera):
+                return Unreachable("the arm itself knows")
+
+            def candidates(self, sphere):
+                return self._other.candidates(sphere)
+
+            def move_to(self, T_world_camera):
+                self.T_world_camera = T_world_camera
+                return self._other.move_to(T_world_camera)
+
+        def run(wrap):
+            stage = set_stage(load_scene("tower"), self.SETTINGS, noise="none", seed=0)
+            return list(explore(stage.camera, wrap(stage.robot), config=self.SETTINGS, early_stop=False))
+
+        plain, humanoid = run(Plain), run(lambda robot: robot)
+        for one, other in zip(plain, humanoid, strict=True):
+            assert one.sphere.radius == self.SETTINGS.active.sphere_radius
+            np.testing.assert_array_equal(one.view.T_world_camera, other.view.T_world_camera)
+
+    def test_the_next_view_is_the_one_the_loop_takes(self):
+        stage = self.stage()
+        step = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
+        again = self.stage()
+        scene = Scene(self.SETTINGS)
+        scene.update(again.camera.capture(again.robot.T_world_camera))
+        decision = next_best_view(scene, again.robot)
+        np.testing.assert_array_equal(decision.T_world_camera, step.decision.T_world_camera)
+        assert decision.why == step.decision.why
+
+    def test_where_nothing_is_in_reach_it_stops_with_reasons_and_counts(self):
+        stage = self.stage()
+        stage.robot._reachable = never
+        step = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
+        low, out = (step.candidates.rejected[reason] for reason in (REASONS[0], REASONS[2]))
+        assert low + out == CONFIG.sphere_points
+        assert step.stop == f"no view is left to go to: {REASONS[0]} ({low}), {REASONS[2]} ({out})"
+        with pytest.raises(
+            PlanningError, match=rf"no view of the sphere can be reached: .*{REASONS[2]} \(\d"
+        ):
+            self.stage(never)
+
+    def test_a_view_the_arm_does_not_confirm_is_given_up_for_another(self):
+        asked = []
+
+        def confirm(T_base_camera):
+            asked.append(T_base_camera)
+            return len(asked) > 3
+
+        stage = self.stage()
+        step = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
+        stage.robot._confirm = confirm
+        scene = Scene(self.SETTINGS)
+        scene.update(stage.camera.fork().capture(stage.robot.T_world_camera))
+        decision = next_best_view(scene, stage.robot)
+        base = stage.robot.T_world_base
+        np.testing.assert_allclose(base @ asked[0], step.decision.T_world_camera)
+        np.testing.assert_allclose(base @ asked[3], decision.T_world_camera)
+        eyes = np.array(asked)[:, :3, 3]
+        assert len(np.unique(eyes.round(6), axis=0)) == 4
+
+        stage.robot._confirm = lambda T: len(asked) > 4 or asked.append(T)
+        refused = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
+        assert refused.candidates.rejected[UNCONFIRMED] == 1
+        assert len(refused.candidates) == len(step.candidates) - 1
+
+    def test_an_arm_that_confirms_nothing_stops(self):
+        stage = self.stage()
+        asked = []
+        stage.robot._confirm = lambda T: asked.append(T)
+        (step,) = explore(stage.camera, stage.robot, config=self.SETTINGS)
+        assert step.stop == f"the robot could take none of 20 views: {UNCONFIRMED}"
+        assert len(asked) == self.SETTINGS.active.attempts == 20
+
+    def test_no_first_view_that_is_confirmed_is_an_error(self):
+        with pytest.raises(PlanningError, match=f"can be reached: {UNCONFIRMED}"):
+            home_view(arm(confirm=lambda T: False), PROPOSED, RobotConfig())
+
+    def test_the_first_view_is_the_reachable_one_nearest_to_home(self):
+        robot = arm()
+        home = home_view(robot, PROPOSED, RobotConfig(home=(90.0, 40.0)))
+        sphere = robot.view_sphere(PROPOSED)
+        wanted = np.array([0.0, np.cos(np.deg2rad(40.0)), np.sin(np.deg2rad(40.0))])
+        nearest = np.argmax(robot.candidates(sphere).directions @ wanted)
+        np.testing.assert_array_equal(home, robot.candidates(sphere).T_world_camera[nearest])
+
+
+class Rig:
+    """A real arm and its camera, played by the simulation: the page's driver and sensor."""
+
+    def __init__(self, camera, T_hand_camera):
+        self.camera, self.K, self.T_hand_camera = camera, camera.K, T_hand_camera
+        self.T_hand = (
+            frames.invert(BASE) @ frames.look_at((-0.4, 0.1, 1.3), TOP) @ frames.invert(T_hand_camera)
+        )
+        self.planned, self.gone = 0, 0
+
+    def T_base_hand(self):
+        return self.T_hand
+
+    def plan(self, T_base_hand):
+        self.planned += 1
+        return None if self.planned == 1 else [T_base_hand]
+
+    def go_to(self, T_base_hand):
+        self.gone += 1
+        self.T_hand = T_base_hand
+
+    def read(self):
+        view = self.camera.capture(BASE @ self.T_hand @ self.T_hand_camera)
+        return view.depth, view.rgb
+
+
+def test_the_hardware_of_the_page_on_robots_goes_around_the_table():
+    (code,) = (block for block in blocks(PAGE, "python") if "class RealArm" in block)
+    page = {}
+    exec(code, page)
+    assert len(code.splitlines()) < 40
+    settings = TestExploring.SETTINGS
+    T_hand_camera = base_at(0.02, -0.06, 0.03, 90.0)
+    rig = Rig(SimulatedCamera(load_scene("tower"), sensor=SENSOR), T_hand_camera)
+    robot = page["RealArm"](rig, within_arms_length, BASE, T_hand_camera)
+    camera = page["HandCamera"](rig, rig, BASE, T_hand_camera)
+    steps = list(explore(camera, robot, config=settings, early_stop=False))
+    assert (len(steps), rig.gone) == (3, 2)
+    assert steps[0].candidates.rejected[UNCONFIRMED] == 1
+    for before, after in pairwise(steps):
+        taken = after.view.T_world_camera
+        np.testing.assert_allclose(taken, before.decision.T_world_camera, atol=1e-9)
+    assert len(steps[-1].graph.objects) > 3

@@ -1,0 +1,201 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from arms import HIGH, LIMITS, LOW, PITCH, gantry
+
+from caryatid.config import ArmConfig
+from caryatid.errors import InputError
+from caryatid.formats import reachability_npz
+from caryatid.formats.reachability_npz import read_reachability, write_reachability
+from caryatid.reachability import ReachabilityMap, sample_reachability
+
+CONFIG = ArmConfig(cell=0.1, view_directions=60)
+BIN = np.deg2rad(35.0)
+"""Angle between directions that share a bin at the most."""
+
+
+def sample(count: int = 400_000, seed: int = 0) -> ReachabilityMap:
+    return sample_reachability(gantry, LIMITS, count, np.random.default_rng(seed), CONFIG)
+
+
+@pytest.fixture(scope="module")
+def reachability() -> ReachabilityMap:
+    return sample()
+
+
+def poses(low, high, count: int = 3000) -> np.ndarray:
+    """Poses of the gantry with joints between two ends."""
+    return gantry(np.random.default_rng(1).uniform(low, high, (count, 6)))
+
+
+class TestReachabilityMap:
+    def test_it_holds_what_lies_well_within_the_limits(self, reachability):
+        inside = poses([*(LOW + 0.05), -np.pi, -0.6, -0.5], [*(HIGH - 0.05), np.pi, -0.4, 0.5])
+        assert reachability(inside).all()
+        assert reachability.fresh < 0.01
+
+    @pytest.mark.parametrize(
+        ("joint", "low", "high"),
+        [
+            (0, HIGH[0] + 0.1, HIGH[0] + 5.0),
+            (1, -5.0, LOW[1] - 0.1),
+            (2, HIGH[2] + 0.1, 1e6),
+            (4, PITCH[1] + BIN, np.pi / 2.0),
+            (5, np.deg2rad(150.0), np.deg2rad(210.0)),
+        ],
+    )
+    def test_it_holds_nothing_well_beyond_them(self, reachability, joint, low, high):
+        beyond = LIMITS.copy()
+        beyond[joint] = low, high
+        assert not reachability(poses(*beyond.T)).any()
+
+    def test_every_sampled_pose_is_in_it(self):
+        seen = []
+
+        def forward(joints):
+            seen.append(gantry(joints))
+            return seen[-1]
+
+        few = sample_reachability(forward, LIMITS, 1234, np.random.default_rng(3), CONFIG)
+        assert sum(map(len, seen)) == 1234
+        assert few(np.concatenate(seen)).all()
+        assert 0.2 < few.fresh < 0.6
+
+    def test_no_poses_have_no_answer(self, reachability):
+        assert reachability(np.zeros((0, 4, 4))).shape == (0,)
+
+    def test_the_same_seed_gives_the_same_map(self):
+        one, other, third = sample(5000), sample(5000), sample(5000, seed=1)
+        np.testing.assert_array_equal(one.reached, other.reached)
+        assert one.reached.shape != third.reached.shape or (one.reached != third.reached).any()
+
+    def test_impossible_postures_are_left_out(self):
+        def forward(joints):
+            T = gantry(joints)
+            T[joints[:, 0] > 0.35] = np.nan
+            return T
+
+        found = sample_reachability(forward, LIMITS, 50_000, np.random.default_rng(0), CONFIG)
+        assert found(poses(LIMITS[:, 0], [0.3, *LIMITS[1:, 1]])).mean() > 0.9
+        assert not found(poses([0.41, *LIMITS[1:, 0]], LIMITS[:, 1])).any()
+
+
+class TestWhatCannotBeSampled:
+    @pytest.mark.parametrize(
+        ("limits", "message"),
+        [
+            (np.zeros((6, 3)), r"\(6, 3\) is not \(J, 2\)"),
+            ([[0.0, np.nan]], "finite"),
+            ([[0.0, 1.0], [1.0, 0.5]], "joint 1 begins above its end"),
+        ],
+    )
+    def test_limits(self, limits, message):
+        with pytest.raises(InputError, match=message):
+            sample_reachability(gantry, limits, 10, np.random.default_rng(0))
+
+    @pytest.mark.parametrize(
+        ("forward", "message"),
+        [
+            (lambda joints: gantry(joints)[:, :3], r"returned shape \(1, 3, 4\) for 1 postures"),
+            (lambda joints: gantry(joints)[:-1], r"returned shape \(0, 4, 4\)"),
+            (lambda joints: 2.0 * gantry(joints), "last row"),
+            (lambda joints: gantry(joints) * np.array([-1.0, 1.0, 1.0, 1.0]), "no rotation"),
+            (lambda joints: np.full((len(joints), 4, 4), np.nan), "no posture possible"),
+        ],
+    )
+    def test_forward_kinematics(self, forward, message):
+        with pytest.raises(InputError, match=message):
+            sample_reachability(forward, LIMITS, 10, np.random.default_rng(0))
+
+    def test_no_postures(self):
+        with pytest.raises(InputError, match="0 postures"):
+            sample_reachability(gantry, LIMITS, 0, np.random.default_rng(0))
+
+
+class TestFiles:
+    def test_a_map_comes_back_as_it_was_and_the_same_bytes_go_out(self, reachability, tmp_path):
+        one, other = tmp_path / "one.npz", tmp_path / "other"
+        write_reachability(one, reachability)
+        back = read_reachability(one)
+        np.testing.assert_array_equal(back.reached, reachability.reached)
+        np.testing.assert_array_equal(back.origin_base, reachability.origin_base)
+        assert (back.cell, back.fresh) == (reachability.cell, reachability.fresh)
+        write_reachability(other, back)
+        assert one.read_bytes() == other.read_bytes()
+        assert sorted(p.name for p in tmp_path.iterdir()) == ["one.npz", "other"]
+
+    @pytest.mark.parametrize("keep", [0, 10, 300, 0.5, 0.99])
+    def test_a_cut_file_is_refused(self, reachability, tmp_path, keep):
+        file = tmp_path / "map.npz"
+        write_reachability(file, reachability)
+        whole = file.read_bytes()
+        file.write_bytes(whole[: keep if isinstance(keep, int) else int(keep * len(whole))])
+        with pytest.raises(InputError, match=r"map\.npz: .*sample it again"):
+            read_reachability(file)
+
+    def test_a_flipped_byte_is_found_or_changes_nothing(self, reachability, tmp_path):
+        file = tmp_path / "map.npz"
+        write_reachability(file, reachability)
+        whole, refused = file.read_bytes(), 0
+        for place in range(0, len(whole), 5):
+            damaged = bytearray(whole)
+            damaged[place] ^= 0xFF
+            file.write_bytes(damaged)
+            try:
+                np.testing.assert_array_equal(read_reachability(file).reached, reachability.reached)
+            except InputError:
+                refused += 1
+        assert refused > len(whole) / 10
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"format": None}, "no map of what an arm reaches"),
+            ({"format": np.array("caryatid/graph")}, "no map of what an arm reaches"),
+            ({"version": np.array(2)}, "version 2, not 1"),
+            ({"version": np.array([1, 1])}, "version"),
+            ({"cell": None}, "holds no cell"),
+            ({"cell": np.array(0.0)}, "0 m wide"),
+            ({"cell": np.array(np.nan)}, "cell is not a finite number"),
+            ({"origin_base": np.zeros(2)}, "origin_base is not a finite number"),
+            ({"reached": np.zeros((2, 2, 2, 2))}, "float64 of shape"),
+            ({"reached": np.zeros((2, 2, 2), dtype=np.uint8)}, "not uint8"),
+            ({"reached": np.zeros((0, 2, 2, 2), dtype=np.uint8)}, "not uint8"),
+            ({"reached": np.array([None])}, "pickle"),
+        ],
+    )
+    def test_another_content_is_refused(self, tmp_path, change, message):
+        content = {
+            "format": np.array("caryatid/reachability"),
+            "version": np.array(1),
+            "reached": np.ones((2, 2, 2, 3), dtype=np.uint8),
+            "origin_base": np.zeros(3),
+            "cell": np.array(0.1),
+            "fresh": np.array(0.0),
+        }
+        file = tmp_path / "map.npz"
+        np.savez(file, **content)
+        assert read_reachability(file).reached.shape == (2, 2, 2, 3)
+        np.savez(file, **{k: v for k, v in (content | change).items() if v is not None})
+        with pytest.raises(InputError, match=message):
+            read_reachability(file)
+
+    def test_what_would_fill_the_memory_is_not_unpacked(self, reachability, tmp_path, monkeypatch):
+        write_reachability(tmp_path / "map.npz", reachability)
+        monkeypatch.setattr(reachability_npz, "MAX_BYTES", reachability.reached.nbytes - 1)
+        monkeypatch.setattr(np, "load", lambda *args, **kwargs: pytest.fail("unpacked"))
+        with pytest.raises(InputError, match="would unpack to"):
+            read_reachability(tmp_path / "map.npz")
+
+    def test_a_missing_file_and_a_folder_are_said_clearly(self, tmp_path):
+        with pytest.raises(InputError, match="is missing"):
+            read_reachability(tmp_path / "none.npz")
+        with pytest.raises(InputError, match="cannot be read"):
+            read_reachability(tmp_path)
+
+    def test_nothing_is_left_where_writing_fails(self, reachability, tmp_path):
+        (tmp_path / "map.npz").mkdir()
+        with pytest.raises(InputError, match="cannot be written"):
+            write_reachability(tmp_path / "map.npz", reachability)
+        assert [p.name for p in tmp_path.iterdir()] == ["map.npz"]
