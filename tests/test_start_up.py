@@ -13,6 +13,7 @@ import pytest
 
 import caryatid
 import caryatid.planners
+import caryatid.recordings
 from caryatid.kernels.information import FORMULATIONS
 
 HEAVY = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx", "matplotlib", "trimesh", "PIL", "jinja2")
@@ -50,6 +51,7 @@ def python(code, *arguments, **environment):
         "explore --help",
         "extract --help",
         "evaluate --help",
+        "import --help",
         "benchmark --help",
         "benchmark --suite nothing",
         "explore --planner support",
@@ -81,7 +83,7 @@ def declared(package):
     return {alias.name: node.module for node in imports for alias in node.names}
 
 
-@pytest.mark.parametrize("package", [caryatid, caryatid.planners])
+@pytest.mark.parametrize("package", [caryatid, caryatid.planners, caryatid.recordings])
 def test_names_come_from_where_type_checkers_are_told(package):
     names = declared(package)
     assert names

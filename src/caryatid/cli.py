@@ -44,6 +44,7 @@ def _run(arguments: Sequence[str]) -> int:
     from caryatid.commands.evaluate import Evaluate
     from caryatid.commands.explore import Explore
     from caryatid.commands.extract import Extract
+    from caryatid.commands.import_recording import Import
     from caryatid.commands.order import Order
     from caryatid.commands.show_config import ShowConfig
 
@@ -55,6 +56,7 @@ def _run(arguments: Sequence[str]) -> int:
             "evaluate": Evaluate,
             "order": Order,
             "dismantle": Dismantle,
+            "import": Import,
             "benchmark": Benchmark,
             "config": ShowConfig,
         },

@@ -60,17 +60,34 @@ class General:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Modelling:
+class Settings:
+    """Where settings come from."""
+
+    config: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.toml"), SAID] = None
+    """Settings to use in place of the defaults; `caryatid config` writes a file with all of them."""
+    set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="STAGE.NAME=VALUE")] = ()
+    """One setting, say `--set fit.hypotheses=200`; goes before the file's."""
+
+    def settings(self, base: Config = DEFAULTS) -> Config:
+        """The configuration: flag > file > default.
+
+        Args:
+            base: The defaults.
+
+        Raises:
+            InputError: A file, name or value is not valid.
+        """
+        return read_settings(self.config, self.set, base)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Modelling(Settings):
     """How views become a scene model."""
 
     fusion: Annotated[FusionMethod | None, tyro.conf.DisallowNone, defaults_to(DEFAULTS.fusion.method)] = None
     """What is fused over views: points, graphs, or both."""
     seed: Seed = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""
-    config: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.toml"), SAID] = None
-    """Settings to use in place of the defaults; `caryatid config` writes a file with all of them."""
-    set: Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="STAGE.NAME=VALUE")] = ()
-    """One setting, say `--set fit.hypotheses=200`; goes before the file's."""
 
     def settings(self, base: Config = DEFAULTS) -> Config:
         """The configuration: flag > file > default.

@@ -32,6 +32,9 @@ from caryatid.config.planning import (
     RobotConfig,
     VoxelConfig,
 )
+from caryatid.config.recording import (
+    RecordingConfig,
+)
 from caryatid.config.reporting import (
     EvaluationConfig,
     OracleConfig,
@@ -70,6 +73,7 @@ class Config:
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
     rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     oracle: OracleConfig = field(default_factory=OracleConfig)
@@ -94,6 +98,7 @@ __all__ = [
     "OracleConfig",
     "PhysicsConfig",
     "PlausibilityConfig",
+    "RecordingConfig",
     "RegistrationConfig",
     "RehearsalConfig",
     "ReportConfig",

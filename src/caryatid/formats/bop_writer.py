@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,63 @@ from caryatid.formats import images
 from caryatid.formats.json_files import json_text
 from caryatid.formats.staging import StagedFolder
 from caryatid.views import View
+
+
+class RecordingWriter:
+    """Writes a BOP scene folder view by view; it appears whole, at `finish`, or not at all.
+
+    Args:
+        folder: Where; must not exist, or be empty.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self._staged = StagedFolder(Path(folder), lambda _: False, "give a new folder")
+        self._cameras: dict[str, Any] = {}
+        self._objects: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._staged.discard()
+
+    def add_view(self, view: View, depth_scale: float = 0.1) -> None:
+        """Write the next view.
+
+        Args:
+            view: Labels become one mask each and `obj_id` = label.
+            depth_scale: Millimetres of one unit of depth; 0.1 reaches to 6.5 m.
+
+        Raises:
+            InputError: Depth beyond what 16 bits hold, or the disk is full or refuses.
+        """
+        index = len(self._cameras)
+        self._cameras[str(index)] = _camera_to_json(view, depth_scale)
+        self._staged.write(f"depth/{index:06d}.png", images.png(_depth_units(view, depth_scale)))
+        if view.rgb is not None:
+            self._staged.write(f"rgb/{index:06d}.png", images.png(view.rgb))
+        if view.labels is not None:
+            present = [int(k) for k in np.unique(view.labels) if k > 0]
+            self._objects[str(index)] = [{"obj_id": k} for k in present]
+            for order, label in enumerate(present):
+                mask = np.where(view.labels == label, np.uint8(255), np.uint8(0))
+                self._staged.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
+
+    def finish(self) -> None:
+        """Put the folder in its place.
+
+        Raises:
+            InputError: The place has been taken meanwhile, or the disk is full or refuses.
+        """
+        self._staged.write("scene_camera.json", json_text(self._cameras).encode())
+        if self._objects:
+            self._staged.write("scene_gt.json", json_text(self._objects).encode())
+        self._staged.publish()
 
 
 def write_recording(folder: str | Path, views: Sequence[View], depth_scale: float = 0.1) -> None:
@@ -30,28 +88,10 @@ def write_recording(folder: str | Path, views: Sequence[View], depth_scale: floa
     """
     if not views:
         raise InputError(folder, "there are no views to write", "give at least one")
-    staged = StagedFolder(Path(folder), lambda _: False, "give a new folder")
-    try:
-        cameras: dict[str, Any] = {}
-        objects: dict[str, Any] = {}
-        for index, view in enumerate(views):
-            cameras[str(index)] = _camera_to_json(view, depth_scale)
-            staged.write(f"depth/{index:06d}.png", images.png(_depth_units(view, depth_scale)))
-            if view.rgb is not None:
-                staged.write(f"rgb/{index:06d}.png", images.png(view.rgb))
-            if view.labels is not None:
-                present = [int(k) for k in np.unique(view.labels) if k > 0]
-                objects[str(index)] = [{"obj_id": k} for k in present]
-                for order, label in enumerate(present):
-                    mask = np.where(view.labels == label, np.uint8(255), np.uint8(0))
-                    staged.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
-        staged.write("scene_camera.json", json_text(cameras).encode())
-        if objects:
-            staged.write("scene_gt.json", json_text(objects).encode())
-        staged.publish()
-    except BaseException:
-        staged.discard()
-        raise
+    with RecordingWriter(folder) as writer:
+        for view in views:
+            writer.add_view(view, depth_scale)
+        writer.finish()
 
 
 def _camera_to_json(view: View, depth_scale: float) -> dict[str, Any]:

@@ -57,9 +57,7 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     Raises:
         InputError: Missing, truncated, not 16 bit, or without a single reading.
     """
-    check_image(path, DEPTH_MODES, "a 16-bit grey PNG")
-    with _clearly(path), Image.open(path) as image:
-        raw = np.asarray(image)
+    raw = read_units(path)
     if not raw.any():
         raise InputError(path, "the frame is empty: no pixel has a depth reading", "leave this frame out")
     return (raw.astype(np.float64) * (depth_scale / 1000.0)).astype(np.float32)
@@ -93,8 +91,8 @@ def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     return buffer.getvalue()
 
 
-def read_labels_png(path: Path) -> NDArray[np.int32]:
-    """Read a 16-bit label image (H, W).
+def read_units(path: Path) -> NDArray[np.int32]:
+    """Read a 16-bit grey PNG (H, W) as it is: depth in units of its own, or labels.
 
     Raises:
         InputError: Missing, truncated or not 16 bit.

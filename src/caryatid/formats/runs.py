@@ -145,7 +145,7 @@ class RunView:
             InputError: The file is missing, broken or of another kind.
         """
         if self.labels_path.suffix == ".png":
-            return images.read_labels_png(self.labels_path)
+            return images.read_units(self.labels_path)
         remedy = "run caryatid again"
         try:
             labels = np.load(self.labels_path, allow_pickle=False)

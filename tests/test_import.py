@@ -1,0 +1,601 @@
+"""What robots record becomes a recording: bags of both ROS and TUM folders, good ones and bad ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bag_files import (
+    DEPTH,
+    INFO,
+    LENS,
+    RGB,
+    SECOND,
+    START,
+    WORLD,
+    BagFile,
+    compressed_depth,
+    jpeg,
+    png,
+    write_bag,
+    write_tum,
+)
+from conftest import run_command, without_labels
+from PIL import Image
+from rosbags.typesys import get_types_from_msg
+
+from caryatid import frames
+from caryatid.formats import read_recording, write_recording
+from caryatid.scene import Scene
+
+TOPICS = ("--depth", DEPTH, "--info", INFO)
+ALL = (*TOPICS, "--rgb", RGB, "--tf", WORLD)
+KINDS = [("one.bag", ""), ("two", "sqlite3"), ("three", "mcap")]
+
+
+def bag_of(tmp_path, views, kind=KINDS[0], **options):
+    name, storage = kind
+    write_bag(tmp_path / name, views, storage or "sqlite3", **options)
+    return tmp_path / name
+
+
+def imported(tmp_path, source, *options, name="out"):
+    assert run_command("import", source, *options, "--out", tmp_path / name) == 0
+    return read_recording(tmp_path / name)
+
+
+def refused(capsys, *arguments):
+    """The one line a command ends with."""
+    capsys.readouterr()
+    assert run_command("import", *arguments) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("error: ")
+    assert told.count("\n") == 1
+    return told
+
+
+def same_views(recording, views, atol=0.00051, colour=True):
+    assert len(recording) == len(views)
+    for view, original in zip(recording, views, strict=True):
+        assert np.allclose(view.depth, original.depth, atol=atol)
+        assert np.allclose(view.T_world_camera, original.T_world_camera, atol=1e-6)
+        assert np.array_equal(view.K, original.K)
+        assert not colour or np.array_equal(view.rgb, original.rgb)
+
+
+# What is in a bag comes out
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
+def test_a_bag_becomes_the_views_it_holds(tmp_path, views, kind):
+    recording = imported(tmp_path, bag_of(tmp_path, views, kind), *ALL)
+    same_views(recording, views)
+
+
+@pytest.mark.parametrize("suffix", ["db3", "mcap"])
+def test_the_file_of_a_bag_will_do(tmp_path, views, suffix):
+    folder = bag_of(tmp_path, views, ("two", "mcap" if suffix == "mcap" else "sqlite3"))
+    (file,) = folder.glob(f"*.{suffix}")
+    file.rename(tmp_path / file.name)
+    same_views(imported(tmp_path, tmp_path / file.name, *ALL), views)
+
+
+def test_a_bag_that_does_not_say_how_messages_are_laid_out(tmp_path, views):
+    """As ROS 2 wrote them before Iron."""
+    folder = bag_of(tmp_path, views, ("two", "sqlite3"))
+    (file,) = folder.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        database.execute("DELETE FROM message_definitions")
+    same_views(imported(tmp_path, folder, *ALL), views)
+
+
+def test_names_of_frames_may_begin_with_a_slash(tmp_path, views):
+    same_views(imported(tmp_path, bag_of(tmp_path, views, slash="/"), *ALL), views)
+
+
+def test_transforms_of_the_first_kind(tmp_path, views):
+    """As ROS 1 sent them before tf2."""
+    with BagFile(tmp_path / "one.bag") as bag:
+        layout = "geometry_msgs/TransformStamped[] transforms"
+        bag.store.register(get_types_from_msg(layout, "tf/msg/tfMessage"))
+        for index, view in enumerate(views):
+            time = START + index * SECOND
+            bag.write(INFO, bag.camera(time, view.K, (160, 120)), time)
+            depth = np.rint(view.depth * 1000.0).astype(np.uint16)
+            bag.write(DEPTH, bag.image(time, depth, "16UC1"), time)
+            pose = bag.transform(time, "/" + WORLD, "/" + LENS, view.T_world_camera)
+            bag.write("/tf", bag.type("tf/msg/tfMessage")(transforms=pose.transforms), time)
+    same_views(imported(tmp_path, tmp_path / "one.bag", *TOPICS, "--tf", WORLD), views, colour=False)
+
+
+@pytest.mark.parametrize("source", ["bag", "tum"])
+def test_the_graph_is_that_of_the_direct_recording(tmp_path, views, source, settings):
+    """Masks are no part of what robots record; they are put beside both."""
+    if source == "bag":
+        recording = imported(tmp_path, bag_of(tmp_path, views, KINDS[2]), *ALL)
+        write_recording(tmp_path / "direct", views, depth_scale=1.0)
+    else:
+        camera = camera_file(tmp_path, views[0].K)
+        recording = imported(tmp_path, tum_folder(tmp_path, views), "--camera", camera)
+        write_recording(tmp_path / "direct", views, depth_scale=0.2)
+    ours, direct = Scene(settings, seed=3), Scene(settings, seed=3)
+    for view, original in zip(recording, read_recording(tmp_path / "direct"), strict=True):
+        ours.update(replace(view, labels=original.labels))
+        direct.update(original)
+    assert {s.pair for s in ours.graph.supports} == {("o0", "o1"), ("o1", "o2")}
+    assert [s.pair for s in ours.graph.supports] == [s.pair for s in direct.graph.supports]
+    for item, other in zip(ours.graph.objects, direct.graph.objects, strict=True):
+        assert (item.id, item.shape.kind) == (other.id, other.shape.kind)
+        points_world, _ = item.shape.surface(0.01)
+        assert np.abs(other.shape.signed_distance(points_world)).max() < 0.001
+
+
+def test_without_colour_the_fullest_depth_is_the_sharpest(tmp_path, views):
+    recording = imported(tmp_path, bag_of(tmp_path, views), *TOPICS, "--tf", WORLD)
+    same_views(recording, views, colour=False)
+    assert all(view.rgb is None for view in recording)
+
+
+def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views, capsys):
+    recording = imported(tmp_path, bag_of(tmp_path, views), *TOPICS)
+    assert len(recording) == 1
+    assert not recording.has_poses
+    told = capsys.readouterr().err
+    assert "no --tf FRAME: poses are not known, a single frame is taken" in told
+    options = ("--out", tmp_path / "run", "--quiet", "--no-report")
+    assert run_command("extract", tmp_path / "out", *options) == 0
+
+
+# Encodings
+
+
+def one_frame(tmp_path, views, depth=None, colour=None, **camera):
+    """A bag of one frame; messages are made by functions of the bag and the time."""
+    view = views[0]
+    millimetres = np.rint(view.depth * 1000.0).astype(np.uint16)
+    with BagFile(tmp_path / "one.bag") as bag:
+        size = view.depth.shape[::-1]
+        bag.write(INFO, bag.camera(START, view.K, size, **camera), START)
+        made = depth(bag, START) if depth else bag.image(START, millimetres, "16UC1")
+        bag.write(DEPTH, made, START)
+        if colour:
+            bag.write(RGB, colour(bag, START), START)
+    return tmp_path / "one.bag"
+
+
+@pytest.mark.parametrize("encoding", ["16UC1", "mono16"])
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("padding", [0, 6])
+def test_depth_in_millimetres(tmp_path, views, encoding, big, padding):
+    millimetres = np.rint(views[0].depth * 1000.0).astype(np.uint16)
+    bag = one_frame(tmp_path, views, lambda b, t: b.image(t, millimetres, encoding, padding=padding, big=big))
+    (view,) = imported(tmp_path, bag, *TOPICS)
+    assert np.array_equal(np.rint(view.depth * 1000.0), millimetres)
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_depth_in_metres_without_what_is_no_reading(tmp_path, views, big):
+    metres = views[0].depth.astype(np.float32)
+    metres[:2], metres[2:4], metres[4:6], metres[6:8] = np.nan, np.inf, -1.0, 30.0
+    bag = one_frame(tmp_path, views, lambda b, t: b.image(t, metres, "32FC1", padding=8, big=big))
+    (view,) = imported(tmp_path, bag, *TOPICS)
+    assert not view.depth[:8].any()
+    assert np.allclose(view.depth[8:], views[0].depth[8:], atol=0.00011)
+
+
+@pytest.mark.parametrize(
+    ("form", "atol"),
+    [("16UC1; compressedDepth png", 0.00051), ("16UC1; compressedDepth", 0.00051),
+     ("32FC1; compressedDepth png", 0.0015), ("16UC1; png compressed 16UC1", 0.00051), ("png", 0.00051)],
+)  # fmt: skip
+def test_compressed_depth(tmp_path, views, form, atol):
+    depth = views[0].depth
+    if "compressedDepth" in form:
+        data = compressed_depth(depth, form[:5])
+    else:
+        data = png(np.rint(depth * 1000.0).astype(np.uint16))
+    bag = one_frame(tmp_path, views, lambda b, t: b.compressed(t, data, form))
+    (view,) = imported(tmp_path, bag, *TOPICS)
+    assert ((view.depth > 0.0) == (depth > 0.0)).all()
+    assert np.allclose(view.depth, depth, atol=atol)
+
+
+def rgba(rgb):
+    return np.dstack([rgb, np.full(rgb.shape[:2], 9, dtype=np.uint8)])
+
+
+COLOURS = {
+    "rgb8": lambda rgb: rgb,
+    "bgr8": lambda rgb: rgb[:, :, ::-1],
+    "rgba8": rgba,
+    "bgra8": lambda rgb: rgba(rgb[:, :, ::-1]),
+}
+
+
+@pytest.mark.parametrize("encoding", COLOURS)
+def test_colour(tmp_path, views, encoding):
+    rgb = views[0].rgb
+    pixels = np.ascontiguousarray(COLOURS[encoding](rgb))
+    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, pixels, encoding, padding=5))
+    (view,) = imported(tmp_path, bag, *TOPICS, "--rgb", RGB)
+    assert np.array_equal(view.rgb, rgb)
+
+
+def test_grey_images_have_three_equal_channels(tmp_path, views):
+    grey = views[0].rgb[:, :, 1]
+    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, grey, "mono8", padding=3))
+    (view,) = imported(tmp_path, bag, *TOPICS, "--rgb", RGB)
+    assert np.array_equal(view.rgb, np.dstack([grey] * 3))
+
+
+@pytest.mark.parametrize(("pack", "form"), [(png, "rgb8; png compressed bgr8"), (jpeg, "jpeg")])
+def test_compressed_colour(tmp_path, views, pack, form):
+    rgb = views[0].rgb
+    bag = one_frame(tmp_path, views, colour=lambda b, t: b.compressed(t, pack(rgb), form))
+    (view,) = imported(tmp_path, bag, *TOPICS, "--rgb", RGB)
+    assert np.abs(view.rgb.astype(int) - rgb).mean() < (3.0 if form == "jpeg" else 1e-9)
+
+
+def test_a_lens_that_distorts_is_told_of(tmp_path, views, capsys):
+    imported(tmp_path, one_frame(tmp_path, views, D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
+    assert "the lens distorts" in capsys.readouterr().err
+
+
+# What is left out is counted
+
+
+def summary(tmp_path, capsys, source, *options):
+    capsys.readouterr()
+    assert run_command("import", source, *options, "--out", tmp_path / "out", "--json") == 0
+    told = capsys.readouterr()
+    assert told.err == ""
+    document = json.loads(told.out)
+    assert document["frames"] == len(document["views"]) + sum(document["skipped"].values())
+    assert len(read_recording(tmp_path / "out")) == len(document["views"])
+    return document
+
+
+def test_frames_without_a_pose_or_colour_are_counted(tmp_path, views, capsys):
+    bag = bag_of(tmp_path, [*views, views[0]], without_pose=(1,), without_colour=(3,))
+    document = summary(tmp_path, capsys, bag, *ALL)
+    assert document["skipped"] == {"no colour image of that time": 1, "no pose": 1}
+    assert [view["frame"] for view in document["views"]] == [0, 2]
+    assert document["views"][1]["time"] == START + 2 * SECOND
+
+
+def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
+    dark = replace(views[1], depth=np.where(np.arange(160) < 8, views[1].depth, np.float32(0.0)))
+    grey = replace(views[2], rgb=np.full_like(views[2].rgb, 90))
+    bag = bag_of(tmp_path, [views[0], dark, views[0], grey, views[2]])
+    options = ("--set", "recording.sharp_window=1.5")
+    document = summary(tmp_path, capsys, bag, *ALL, *options)
+    assert document["skipped"] == {"hardly any depth": 1, "seen from where another view is": 1, "blurred": 1}
+    assert [view["frame"] for view in document["views"]] == [0, 4]
+
+
+@pytest.mark.parametrize("kind", ["bag", "tum"])
+def test_a_frame_with_nothing_near_is_one_without_depth(tmp_path, views, capsys, kind):
+    nothing = replace(views[1], depth=np.where(views[1].depth > 0.0, np.float32(12.0), np.float32(0.0)))
+    if kind == "bag":
+        source, options = bag_of(tmp_path, [views[0], nothing]), ALL
+    else:
+        source, options = (
+            tum_folder(tmp_path, [views[0], nothing]),
+            ("--camera", camera_file(tmp_path, views[0].K)),
+        )
+    assert summary(tmp_path, capsys, source, *options)["skipped"] == {"hardly any depth": 1}
+
+
+def test_as_many_views_as_wanted(tmp_path, views, capsys):
+    document = summary(tmp_path, capsys, bag_of(tmp_path, views), *ALL, "--views", 2)
+    assert document["skipped"] == {"more than are wanted": 1}
+
+
+def test_a_broken_image_is_left_out(tmp_path, views, capsys):
+    with BagFile(tmp_path / "one.bag") as bag:
+        for index, view in enumerate(views):
+            time = START + index * SECOND
+            bag.write(INFO, bag.camera(time, view.K, (160, 120)), time)
+            data = compressed_depth(view.depth, "16UC1")
+            data = data[: len(data) // 2] if index == 1 else data
+            bag.write(DEPTH, bag.compressed(time, data, "16UC1; compressedDepth png"), time)
+            pose = bag.transform(time, WORLD, LENS, view.T_world_camera)
+            bag.write("/tf", pose, time)
+    document = summary(tmp_path, capsys, tmp_path / "one.bag", *TOPICS, "--tf", WORLD)
+    assert document["skipped"] == {"broken": 1}
+
+
+def test_what_is_said_ends_with_what_to_do_next(tmp_path, views, capsys):
+    imported(tmp_path, bag_of(tmp_path, views, without_pose=(0,)), *ALL)
+    told = capsys.readouterr().err.splitlines()
+    assert told[0] == "one.bag: 2 views of 3 frames; skipped: 1 no pose"
+    assert f"caryatid extract {tmp_path / 'out'}" in told[1]
+
+
+# Bags that will not do
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ((), "--depth TOPIC is needed; topics with images: /camera/depth/image, /camera/rgb/image; other"),
+        (("--depth", "/nothing", "--info", INFO), "there is no topic '/nothing'; topics with images:"),
+        (("--depth", DEPTH, "--info", "/cam"), "'/cam'; topics with cameras: /camera/depth/camera_info"),
+        (("--depth", DEPTH), "--info TOPIC is needed; topics with cameras: /camera/depth/camera_info; other"),
+        (("--depth", "/chatter", "--info", INFO), "'/chatter' holds std_msgs/msg/String, not images"),
+        ((*TOPICS, "--rgb", "/tf"), "--rgb: '/tf' holds tf2_msgs/msg/TFMessage, not images"),
+        ((*TOPICS, "--tf", "earth"), "no frame 'earth' in its transforms; there are base, map, optical"),
+        ((*TOPICS, "--camera", "x.json"), "--camera: is for TUM RGB-D folders"),
+        ((*TOPICS, "--set", "recording.min_readings=0.999"), "of its 3 depth images is usable: 3 hardly any"),
+        ((*TOPICS, "--rgb", RGB, "--set", "recording.colour_gap=0.001"), "3 no colour image of that time"),
+        ((*TOPICS, "--tf", WORLD, "--set", "recording.pose_gap=0.01"), "3 no pose; record its poses"),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_the_bag_is_said(tmp_path, views, capsys, leftovers, options, said):
+    bag = bag_of(tmp_path, views)
+    assert said in refused(capsys, bag, *options, "--out", tmp_path / "out")
+    assert leftovers() == {"one.bag"}
+
+
+def test_a_bag_of_a_later_version_is_not_called_damaged(tmp_path, views, capsys):
+    bag = bag_of(tmp_path, views, KINDS[2])
+    path = bag / "metadata.yaml"
+    path.write_text(path.read_text().replace("version: 9", "version: 99"))
+    told = refused(capsys, bag, *ALL, "--out", tmp_path / "out")
+    assert "is of a kind rosbags does not read (Rosbag2 version 99 not supported" in told
+
+
+def test_a_bag_without_transforms(tmp_path, views, capsys):
+    told = refused(capsys, one_frame(tmp_path, views), *TOPICS, "--tf", "map", "--out", tmp_path / "out")
+    assert "holds no transforms; record /tf and /tf_static, or leave --tf out" in told
+
+
+def test_depth_that_is_not_registered(tmp_path, views, capsys):
+    rgb = views[0].rgb
+    large = np.repeat(rgb, 2, axis=1)
+    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, large, "rgb8"))
+    told = refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
+    assert "depth (160×120, frame 'optical') is not registered to colour (320×120, frame 'optical')" in told
+    bag.unlink()
+    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, rgb, "rgb8", frame="other"))
+    told = refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
+    assert "frame 'other') ; give" in told.replace(");", ") ;")
+
+
+@pytest.mark.parametrize(
+    ("camera", "said"),
+    [
+        ({"K": np.zeros((3, 3))}, "the camera is not calibrated"),
+        ({"binning": 2}, "cropped or binned"),
+        ({"size": (320, 240)}, "is the camera of 320×240 pixel images, the depth has 160×120"),
+        ({"frame": "infra"}, "is the camera 'infra', the depth is of 'optical'"),
+    ],
+)
+def test_a_camera_that_is_not_the_depth_images(tmp_path, views, capsys, camera, said):
+    with BagFile(tmp_path / "one.bag") as bag:
+        given = {"K": views[0].K, "size": (160, 120)} | camera
+        bag.write(INFO, bag.camera(START, **given), START)
+        depth = np.rint(views[0].depth * 1000.0).astype(np.uint16)
+        bag.write(DEPTH, bag.image(START, depth, "16UC1"), START)
+    assert said in refused(capsys, tmp_path / "one.bag", *TOPICS, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda b, t, d: b.image(t, d.astype(np.uint8), "mono8"), "encoding 'mono8' is none of depth"),
+        (
+            lambda b, t, d: b.compressed(t, jpeg(d.astype(np.uint8)), "jpeg"),
+            "its depth is compressed as 'jpeg'",
+        ),
+        (lambda b, t, d: b.compressed(t, b"\0" * 99, "16UC1; compressedDepth rvl"), "compressedDepth rvl"),
+        (
+            lambda b, t, d: b.compressed(t, b"\0" * 5, "16UC1; compressedDepth png"),
+            "images is usable: 1 broken",
+        ),
+        (lambda b, t, d: b.compressed(t, jpeg(d.astype(np.uint8)), "16UC1"), "images is usable: 1 broken"),
+    ],
+)
+def test_depth_that_cannot_be_decoded(tmp_path, views, capsys, leftovers, make, said):
+    bag = one_frame(tmp_path, views, lambda b, t: make(b, t, np.rint(views[0].depth * 1000.0)))
+    assert said in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
+    assert leftovers() == {"one.bag"}
+
+
+def test_colour_of_an_unknown_encoding(tmp_path, views, capsys):
+    rgb = views[0].rgb
+    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, rgb[:, :, 0], "bayer_rggb8"))
+    told = refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
+    assert "its encoding 'bayer_rggb8' is none of colour; record a topic with rgb8, bgr8" in told
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
+def test_a_bag_that_was_cut_off(tmp_path, views, kind, capsys):
+    bag = bag_of(tmp_path, views, kind)
+    (file,) = [bag] if bag.is_file() else [p for p in bag.iterdir() if p.suffix in (".db3", ".mcap")]
+    whole = file.read_bytes()
+    before = set(tmp_path.iterdir())
+    for share in (0.001, 0.05, 0.3, 0.6, 0.9, 0.99):
+        file.write_bytes(whole[: int(share * len(whole))])
+        assert "is damaged or was cut off" in refused(capsys, bag, *ALL, "--out", tmp_path / "out")
+        assert set(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
+def test_a_bag_with_wrong_bytes_is_read_or_refused_in_one_line(tmp_path, views, kind, capsys):
+    bag = bag_of(tmp_path, views, kind)
+    (file,) = [bag] if bag.is_file() else [p for p in bag.iterdir() if p.suffix in (".db3", ".mcap")]
+    whole = file.read_bytes()
+    rng = np.random.default_rng(0)
+    ends = set()
+    for _ in range(25):
+        damaged = bytearray(whole)
+        for place in rng.integers(0, len(whole), 40):
+            damaged[place] = rng.integers(0, 256)
+        # Names, sizes and indices stand at both ends, pixels in between.
+        damaged[rng.integers(100, 6000)] ^= 255
+        damaged[-rng.integers(1, 3000)] ^= 255
+        file.write_bytes(bytes(damaged))
+        capsys.readouterr()
+        ends.add(status := run_command("import", bag, *ALL, "--out", tmp_path / "out"))
+        told = capsys.readouterr().err
+        assert "a fault in caryatid" not in told
+        assert (tmp_path / "out").exists() == (status == 0)
+        assert status == 0 or told.count("\n") == 1
+        shutil.rmtree(tmp_path / "out", ignore_errors=True)
+    assert 1 in ends
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
+def test_an_empty_bag(tmp_path, kind, capsys):
+    name, storage = kind
+    with BagFile(tmp_path / name, storage or "sqlite3"):
+        pass
+    assert "the bag is empty" in refused(capsys, tmp_path / name, *TOPICS, "--out", tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["x.bag", "x.mcap", "x.db3"])
+def test_an_empty_file(tmp_path, name, capsys):
+    (tmp_path / name).touch()
+    assert "the bag is empty" in refused(capsys, tmp_path / name, *TOPICS, "--out", tmp_path / "out")
+
+
+def test_what_is_neither_a_bag_nor_a_folder_of_the_benchmark(tmp_path, capsys, recording):
+    (tmp_path / "x.zip").write_bytes(b"PK")
+    for source in (tmp_path / "x.zip", recording):
+        told = refused(capsys, source, *TOPICS, "--out", tmp_path / "out")
+        assert "is neither a bag nor a TUM RGB-D folder" in told
+    assert "there is no such file" in refused(capsys, tmp_path / "no.bag", "--out", tmp_path / "out")
+
+
+def test_a_folder_with_other_files_is_never_touched(tmp_path, views, capsys):
+    bag = bag_of(tmp_path, views)
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/mine.txt").write_text("mine")
+    assert "holds other files" in refused(capsys, bag, *ALL, "--out", tmp_path / "out")
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
+
+
+def test_without_the_library_the_extra_is_named(tmp_path, views, capsys, monkeypatch):
+    bag = bag_of(tmp_path, views)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    told = refused(capsys, bag, *ALL, "--out", tmp_path / "out")
+    assert 'reading bags needs rosbags; pip install "caryatid[ros]"' in told
+
+
+# Folders of the TUM RGB-D benchmark
+
+
+def tum_folder(tmp_path, views, name="mine"):
+    write_tum(tmp_path / name, views)
+    return tmp_path / name
+
+
+def camera_file(tmp_path, K):
+    path = tmp_path / "camera.json"
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "depth_scale": 0.2}
+    path.write_text(json.dumps(values))
+    return path
+
+
+def test_a_folder_of_the_benchmark_becomes_the_views_it_holds(tmp_path, views):
+    folder = tum_folder(tmp_path, views)
+    recording = imported(tmp_path, folder, "--camera", camera_file(tmp_path, views[0].K))
+    same_views(recording, views, atol=0.00011)
+
+
+@pytest.mark.parametrize(
+    ("name", "fx"),
+    [("rgbd_dataset_freiburg1_xyz", 517.3), ("x-freiburg2-y", 520.9), ("rgbd_dataset_freiburg3_z", 535.4)],
+)
+def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, name, fx):
+    large = [
+        replace(v, depth=np.kron(v.depth, np.ones((4, 4))), rgb=np.kron(v.rgb, np.ones((4, 4, 1), np.uint8)))
+        for v in without_labels(views[:1])
+    ]
+    (view,) = imported(tmp_path, tum_folder(tmp_path, large, name), "--quiet")
+    assert view.K[0, 0] == fx
+    shutil.rmtree(tmp_path / "out")
+    imported(tmp_path, tmp_path / name)
+    assert f"camera: as published for freiburg{name.partition('freiburg')[2][0]}, fx {fx:g}" in (
+        capsys.readouterr().err
+    )
+
+
+def test_a_folder_without_poses_gives_a_single_frame(tmp_path, views, capsys):
+    folder = tum_folder(tmp_path, views)
+    (folder / "groundtruth.txt").unlink()
+    recording = imported(tmp_path, folder, "--camera", camera_file(tmp_path, views[0].K))
+    assert len(recording) == 1
+    assert "no groundtruth.txt: poses are not known" in capsys.readouterr().err
+
+
+def test_poses_of_a_folder_are_interpolated(tmp_path, views):
+    folder = tum_folder(tmp_path, views[:1])
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    time, *numbers = lines[-1].split()
+    later = [float(n) + (0.01 if k == 0 else 0.0) for k, n in enumerate(numbers)]
+    rows = [
+        f"{float(time) - 0.05:.6f} {' '.join(numbers)}",
+        f"{float(time) + 0.05:.6f} {' '.join(map(str, later))}",
+    ]
+    (folder / "groundtruth.txt").write_text("\n".join(rows))
+    (view,) = imported(tmp_path, folder, "--camera", camera_file(tmp_path, views[0].K))
+    moved = frames.invert(views[0].T_world_camera) @ view.T_world_camera
+    assert np.allclose(
+        views[0].T_world_camera[:3, 3] + (0.005, 0.0, 0.0), view.T_world_camera[:3, 3], atol=1e-6
+    )
+    assert np.allclose(moved[:3, :3], np.eye(3), atol=1e-6)
+
+
+def spoil(name, text):
+    return lambda folder: (folder / name).write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (spoil("depth.txt", ""), "holds no depth image"),
+        (spoil("depth.txt", "noon depth/x.png\n"), "a row does not begin with a time in seconds"),
+        (spoil("depth.txt", "1.0\n"), "'1.0' has 1 columns, not 2"),
+        (spoil("depth.txt", "nan depth/x.png\n"), "a row does not begin with a time in seconds"),
+        (spoil("groundtruth.txt", "1.0 0 0 0\n"), "has 4 columns, not 8"),
+        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 0\n"), "is no pose"),
+        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 one\n"), "is no pose"),
+        (spoil("groundtruth.txt", "# none\n"), "none of its 3 depth images is usable: 3 no pose"),
+        (spoil("rgb.txt", "# none\n"), "3 no colour image of that time"),
+        (lambda folder: shutil.rmtree(folder / "depth"), "3 broken"),
+        (lambda folder: (folder / "depth.txt").write_bytes(b"\xff\xfe"), "depth.txt: cannot be read"),
+    ],
+)
+def test_a_folder_that_is_broken(tmp_path, views, capsys, change, said):
+    folder = tum_folder(tmp_path, views)
+    camera = camera_file(tmp_path, views[0].K)
+    change(folder)
+    assert said in refused(capsys, folder, "--camera", camera, "--out", tmp_path / "out")
+    assert {p.name for p in tmp_path.iterdir()} == {"mine", "camera.json"}
+
+
+def test_a_camera_that_is_not_known_or_does_not_fit(tmp_path, views, capsys):
+    folder = tum_folder(tmp_path, views)
+    out = ("--out", tmp_path / "out")
+    assert "its name holds none of freiburg1, freiburg2, freiburg3" in refused(capsys, folder, *out)
+    (tmp_path / "camera.json").write_text('{"fx": 500, "fy": 500, "cx": 320}')
+    told = refused(capsys, folder, "--camera", tmp_path / "camera.json", *out)
+    assert "the key 'cy' is missing" in told
+    other = tum_folder(tmp_path, views, "freiburg1")
+    assert "is 160×120 pixels, the published camera has 640×480" in refused(capsys, other, *out)
+    assert "are for bags" in refused(capsys, folder, *TOPICS, *out)
+
+
+def test_colour_of_another_size(tmp_path, views, capsys):
+    folder = tum_folder(tmp_path, views)
+    for path in (folder / "rgb").iterdir():
+        Image.fromarray(views[0].rgb[:60]).save(path)
+    told = refused(capsys, folder, "--camera", camera_file(tmp_path, views[0].K), "--out", tmp_path / "out")
+    assert "its colour image is of another size" in told

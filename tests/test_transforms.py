@@ -1,0 +1,119 @@
+"""Frames over time: what is asked between any two of them is what was said, interpolated or refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from caryatid import frames
+from caryatid.recordings import TransformTree
+from caryatid.recordings.transforms import SECOND, MissingTransform, is_pose
+
+NOW = 1_700_000_000 * SECOND
+"""Large enough that a float would lose the nanoseconds."""
+
+
+def random_pose(rng):
+    return frames.rigid(frames.random_rotation(rng), rng.normal(size=3))
+
+
+def tree_with(*links, gap=1.0):
+    tree = TransformTree(gap)
+    for parent, child, time, pose, *fixed in links:
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        tree.add(parent, child, time, numbers, fixed=bool(fixed))
+    return tree
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_chains_up_and_down_the_tree_multiply(seed):
+    rng = np.random.default_rng(seed)
+    A, B, C, D = (random_pose(rng) for _ in range(4))
+    tree = tree_with(
+        ("map", "odom", NOW, A),
+        ("odom", "base", NOW, B),
+        ("base", "eye", 0, C, True),
+        ("odom", "hand", NOW, D),
+    )
+    assert np.allclose(tree.between("map", "eye", NOW), A @ B @ C)
+    assert np.allclose(tree.between("eye", "map", NOW), np.linalg.inv(A @ B @ C))
+    assert np.allclose(tree.between("hand", "eye", NOW), np.linalg.inv(D) @ B @ C)
+    assert np.allclose(tree.between("odom", "odom", NOW), np.eye(4))
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
+@settings(max_examples=30, deadline=None)
+def test_between_two_poses_the_path_is_straight_and_the_turn_even(seed, share):
+    rng = np.random.default_rng(seed)
+    start = random_pose(rng)
+    axis, angle, way = frames.unit(rng.normal(size=3)), rng.uniform(0.0, 3.0), rng.normal(size=3)
+
+    def after(part):
+        R = start[:3, :3] @ frames.rotation_from_vector(part * angle * axis)
+        return frames.rigid(R, start[:3, 3] + part * way)
+
+    tree = tree_with(("map", "eye", NOW, start), ("map", "eye", NOW + SECOND // 2, after(1.0)))
+    nanoseconds = round(share * (SECOND // 2))
+    exact = after(nanoseconds / (SECOND // 2))
+    assert np.allclose(tree.between("map", "eye", NOW + nanoseconds), exact, atol=1e-7)
+
+
+def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
+    rng = np.random.default_rng(0)
+    first, last, other = (random_pose(rng) for _ in range(3))
+    tree = tree_with(
+        ("map", "eye", NOW + SECOND, last), ("map", "eye", NOW, other), ("map", "eye", NOW, first)
+    )
+    assert np.allclose(tree.between("map", "eye", NOW), first)
+    assert np.allclose(tree.between("map", "eye", NOW + SECOND), last)
+
+
+@pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])
+def test_outside_what_was_said_nothing_is_made_up(late):
+    rng = np.random.default_rng(1)
+    links = [("map", "eye", NOW + k * SECOND, random_pose(rng)) for k in (0, 1)]
+    with pytest.raises(MissingTransform, match="'eye' has no pose in 'map'"):
+        tree_with(*links).between("map", "eye", NOW + late)
+
+
+def test_a_gap_is_not_interpolated_across():
+    rng = np.random.default_rng(2)
+    links = [("map", "eye", NOW + k * SECOND, random_pose(rng)) for k in (0, 1)]
+    assert tree_with(*links, gap=1.0).between("map", "eye", NOW + SECOND // 2).shape == (4, 4)
+    with pytest.raises(MissingTransform):
+        tree_with(*links, gap=0.9).between("map", "eye", NOW + SECOND // 2)
+
+
+def test_a_frame_that_changes_its_parent_has_no_pose_in_between():
+    rng = np.random.default_rng(3)
+    tree = tree_with(("map", "cup", NOW, random_pose(rng)), ("hand", "cup", NOW + SECOND, random_pose(rng)))
+    assert tree.between("map", "cup", NOW).shape == (4, 4)
+    for target in ("map", "hand"):
+        with pytest.raises(MissingTransform):
+            tree.between(target, "cup", NOW + 1)
+
+
+def test_frames_in_a_circle_and_frames_apart_are_refused():
+    tree = tree_with(("a", "b", NOW, np.eye(4)), ("b", "a", NOW, np.eye(4)), ("c", "d", NOW, np.eye(4)))
+    for target in ("c", "nowhere"):
+        with pytest.raises(MissingTransform):
+            tree.between(target, "a", NOW)
+    assert tree.frames == ["a", "b", "c", "d"]
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)])
+def test_numbers_that_are_no_rotation_make_no_pose(q):
+    assert not is_pose((0.0, 0.0, 0.0, *q))
+    assert not is_pose((np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    assert not is_pose((0.0, 0.0, 0.0, 1.0))
+
+
+def test_a_quaternion_need_not_have_length_one():
+    tree = TransformTree(1.0)
+    tree.add("map", "eye", NOW, (1.0, 1.0, 1.0, 0.0, 0.0, 2.0, 2.0))
+    T = tree.between("map", "eye", NOW)
+    assert np.allclose(T, frames.rigid(frames.rotation_from_vector((0.0, 0.0, np.pi / 2)), np.ones(3)))
