@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import caryatid
+import caryatid.exports
 import caryatid.planners
 import caryatid.recordings
 from caryatid.kernels.information import FORMULATIONS
@@ -52,6 +53,7 @@ def python(code, *arguments, **environment):
         "extract --help",
         "evaluate --help",
         "import --help",
+        "export --help",
         "benchmark --help",
         "benchmark --suite nothing",
         "explore --planner support",
@@ -83,7 +85,7 @@ def declared(package):
     return {alias.name: node.module for node in imports for alias in node.names}
 
 
-@pytest.mark.parametrize("package", [caryatid, caryatid.planners, caryatid.recordings])
+@pytest.mark.parametrize("package", [caryatid, caryatid.planners, caryatid.recordings, caryatid.exports])
 def test_names_come_from_where_type_checkers_are_told(package):
     names = declared(package)
     assert names

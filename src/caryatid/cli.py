@@ -43,6 +43,7 @@ def _run(arguments: Sequence[str]) -> int:
     from caryatid.commands.dismantle import Dismantle
     from caryatid.commands.evaluate import Evaluate
     from caryatid.commands.explore import Explore
+    from caryatid.commands.export import Export
     from caryatid.commands.extract import Extract
     from caryatid.commands.import_recording import Import
     from caryatid.commands.order import Order
@@ -57,6 +58,7 @@ def _run(arguments: Sequence[str]) -> int:
             "order": Order,
             "dismantle": Dismantle,
             "import": Import,
+            "export": Export,
             "benchmark": Benchmark,
             "config": ShowConfig,
         },

@@ -33,6 +33,7 @@ from caryatid.config.planning import (
     VoxelConfig,
 )
 from caryatid.config.recording import (
+    ExportConfig,
     RecordingConfig,
 )
 from caryatid.config.reporting import (
@@ -74,6 +75,7 @@ class Config:
     lift: LiftConfig = field(default_factory=LiftConfig)
     rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
     recording: RecordingConfig = field(default_factory=RecordingConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
     report: ReportConfig = field(default_factory=ReportConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     oracle: OracleConfig = field(default_factory=OracleConfig)
@@ -87,6 +89,7 @@ __all__ = [
     "Config",
     "EvaluationConfig",
     "ExplanationConfig",
+    "ExportConfig",
     "FitConfig",
     "FusionConfig",
     "FusionMethod",

@@ -1,4 +1,4 @@
-"""Settings of importing recordings."""
+"""Settings of importing recordings, and of exporting scene models."""
 
 from __future__ import annotations
 
@@ -30,3 +30,15 @@ class RecordingConfig(Stage):
     """Least share of pixels with a depth reading [1]; a camera held too near, or at the sky, has fewer."""
     far: Annotated[float, Range(0.0, 65.0, above=True)] = 10.0
     """Readings farther away than this are left out [m]; beyond what RGB-D cameras measure."""
+
+
+@dataclass(frozen=True, slots=True)
+class ExportConfig(Stage):
+    """What other programs want to know that a scene model does not say."""
+
+    density: Positive = 600.0
+    """Density of objects [kg/m³]; that of the simulated scenes, wood or a filled carton."""
+    friction: NotNegative = 0.8
+    """Sliding friction of objects [1]; that of the simulated scenes."""
+    corners: Annotated[int, Range(8)] = 48
+    """Corners of a cylinder's ends in meshes [1]; its radius is then right to 0.2 %."""

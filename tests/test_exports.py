@@ -1,0 +1,269 @@
+"""Scene models for other programs: each file is read by a program that knows it, and compared."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import mujoco
+import networkx as nx
+import numpy as np
+import pydot
+import pytest
+import trimesh
+import yourdfpy
+from conftest import run_command
+
+from caryatid import frames
+from caryatid.errors import InputError
+from caryatid.exports import export_graph
+from caryatid.formats import graph_text, read_run
+from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.report.colours import object_colour
+from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.simulation.scenes import load_scene
+
+
+def at(x, y, z, turn=(0.0, 0.0, 0.0)):
+    return frames.rigid(frames.rotation_from_vector(turn), (x, y, z))
+
+
+def make_graph():
+    """A table, one shape of each kind, and a box whose axis points straight down."""
+    down = (0.0, np.pi / 2.0, 0.0)
+    return SupportGraph(
+        objects=(
+            SceneObject("o0", 0, Box(at(0.0, 0.0, 0.73), np.array([0.6, 0.9, 0.04])), "support_surface"),
+            SceneObject("o1", 1, Box(at(0.1, 0.0, 0.80, (0.1, 0.2, 2.0)), np.array([0.08, 0.1, 0.09]))),
+            SceneObject("o2", 2, Cylinder(at(-0.1, 0.2, 0.81, (1.0, -0.4, 0.3)), 0.04, 0.12)),
+            SceneObject("o3", 3, Sphere(at(0.0, -0.2, 0.78), 0.03), occurrences=2, opportunities=3),
+            SceneObject("o15", 15, Box(at(0.2, 0.3, 0.85, down), np.array([0.2, 0.06, 0.05]))),
+        ),
+        supports=(
+            Support("o0", "o1"),
+            Support("o1", "o2", "lean", certain=False, occurrences=1, opportunities=3),
+            Support("o3", "o1", "top-down"),
+        ),
+    )
+
+
+@pytest.fixture
+def graph():
+    return make_graph()
+
+
+@pytest.fixture(scope="session")
+def extracted(tmp_path_factory, kept_recording):
+    """A run: two objects on a table."""
+    run = tmp_path_factory.mktemp("exports") / "run"
+    assert run_command("extract", kept_recording, "--out", run, "--quiet", "--no-report") == 0
+    return run
+
+
+# Simulators
+
+
+def test_mjcf_has_the_poses_and_sizes_of_the_model(tmp_path, graph):
+    export_graph(graph, tmp_path / "scene.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert model.nbody == 1 + len(graph.objects)
+    for item in graph.objects:
+        body = data.body("table" if item.role == "support_surface" else item.id)
+        assert np.allclose(body.xpos, item.centre_world, atol=1e-6)
+        assert np.allclose(body.xmat.reshape(3, 3), item.shape.T_world_object[:3, :3], atol=1e-5)
+        geom = model.body(body.name).geomadr[0]
+        assert model.body(body.name).jntnum == (item.role == "object")
+        sizes = {
+            "box": item.shape.extents / 2.0,
+            "cylinder": [getattr(item.shape, "radius", 0), item.shape.extents[2] / 2.0, 0.0],
+            "sphere": [getattr(item.shape, "radius", 0), 0.0, 0.0],
+        }
+        assert np.allclose(model.geom_size[geom], sizes[item.shape.kind], atol=1e-6)
+        if item.role == "object":
+            assert model.body(body.name).mass[0] == pytest.approx(600.0 * item.shape.volume, rel=1e-4)
+
+
+def test_an_extracted_model_stays_where_it_is_in_mujoco(tmp_path, extracted):
+    assert run_command("export", extracted, "--format", "mjcf", "--out", tmp_path / "scene.xml") == 0
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    before, turned = data.xpos.copy(), data.xmat.copy().reshape(-1, 3, 3)
+    while data.time < 1.0:
+        mujoco.mj_step(model, data)
+    assert np.linalg.norm(data.xpos - before, axis=1).max() < 0.005
+    cosine = (np.einsum("nij,nij->n", data.xmat.reshape(-1, 3, 3), turned) - 1.0) / 2.0
+    assert np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max() < 3.0
+
+
+def test_caryatid_takes_its_own_mjcf_for_a_scene(tmp_path, extracted):
+    export_graph(read_run(extracted).graph, tmp_path / "scene.xml")
+    assert sorted(load_scene(tmp_path / "scene.xml").object_bodies.values()) == ["o1", "o2"]
+
+
+def test_urdf_has_the_poses_sizes_and_masses_of_the_model(tmp_path, graph):
+    export_graph(graph, tmp_path / "scene.urdf")
+    robot = yourdfpy.URDF.load(str(tmp_path / "scene.urdf"))
+    assert robot.validate()
+    assert robot.base_link == "world"
+    for item in graph.objects:
+        T = robot.get_transform(item.id, "world")
+        if item.shape.kind != "sphere":
+            assert np.allclose(T, item.shape.T_world_object, atol=1e-6)
+        assert np.allclose(T[:3, 3], item.centre_world, atol=1e-6)
+        link = robot.link_map[item.id]
+        geometry = link.collisions[0].geometry
+        match item.shape:
+            case Box():
+                assert np.allclose(geometry.box.size, item.shape.extents)
+                exact = trimesh.primitives.Box(extents=item.shape.extents)
+            case Cylinder():
+                assert (geometry.cylinder.radius, geometry.cylinder.length) == pytest.approx((0.04, 0.12))
+                exact = trimesh.primitives.Cylinder(0.04, 0.12, sections=720)
+            case Sphere():
+                assert geometry.sphere.radius == pytest.approx(0.03)
+                exact = trimesh.primitives.Sphere(0.03, subdivisions=5)
+        assert link.inertial.mass == pytest.approx(600.0 * item.shape.volume)
+        moments = 600.0 * exact.to_mesh().moment_inertia
+        assert np.allclose(link.inertial.inertia, moments, rtol=0.01, atol=1e-9)
+
+
+def test_urdf_joins_every_link_to_the_world(tmp_path, graph):
+    export_graph(graph, tmp_path / "scene.urdf")
+    robot = yourdfpy.URDF.load(str(tmp_path / "scene.urdf"))
+    assert {j.parent for j in robot.joint_map.values()} == {"world"}
+    assert {j.child for j in robot.joint_map.values()} == {o.id for o in graph.objects}
+    assert robot.num_actuated_joints == 0
+
+
+# Viewers
+
+
+@pytest.mark.parametrize("name", ["scene.glb", "scene.gltf"])
+def test_gltf_has_a_coloured_node_for_each_object(tmp_path, graph, name):
+    export_graph(graph, tmp_path / name)
+    scene = trimesh.load(tmp_path / name)
+    assert set(scene.geometry) == {o.id for o in graph.objects}
+    for item in graph.objects:
+        T_z_up_object, geometry = scene.graph.get(item.id, frame_from="z_up")
+        mesh = scene.geometry[geometry]
+        assert np.allclose(T_z_up_object, item.shape.T_world_object, atol=1e-6)
+        assert np.allclose(mesh.extents, item.shape.extents, rtol=0.011)
+        red, green, blue = mesh.visual.material.baseColorFactor[:3]
+        assert f"#{red:02x}{green:02x}{blue:02x}" == object_colour(item.label)
+        assert mesh.metadata["shape"] == item.shape.kind
+        assert mesh.is_watertight
+
+
+def test_gltf_has_y_up_as_its_viewers_expect(tmp_path, graph):
+    export_graph(graph, tmp_path / "scene.glb")
+    scene = trimesh.load(tmp_path / "scene.glb")
+    x, y, z = graph["o15"].centre_world
+    assert np.allclose(scene.graph.get("o15")[0][:3, 3], (x, z, -y), atol=1e-6)
+
+
+# Graphs
+
+
+def test_graphml_is_the_graph(tmp_path, graph):
+    export_graph(graph, tmp_path / "graph.graphml")
+    read = nx.read_graphml(tmp_path / "graph.graphml")
+    assert read.is_directed()
+    assert set(read.nodes) == {o.id for o in graph.objects}
+    assert set(read.edges) == {s.pair for s in graph.supports}
+    for item in graph.objects:
+        node = read.nodes[item.id]
+        assert (node["role"], node["shape"], node["label"]) == (item.role, item.shape.kind, item.label)
+        assert np.allclose([node["x"], node["y"], node["z"]], item.centre_world)
+    assert read.nodes["o2"]["size"] == "0.04 0.12"
+    assert read.edges["o1", "o2"] == {"kind": "lean", "certain": False, "occurrences": 1, "opportunities": 3}
+
+
+def test_dot_is_the_graph(tmp_path, graph):
+    export_graph(graph, tmp_path / "graph.dot")
+    (read,) = pydot.graph_from_dot_file(str(tmp_path / "graph.dot"))
+    edges = {(e.get_source().strip('"'), e.get_destination().strip('"')): e for e in read.get_edges()}
+    assert set(edges) == {s.pair for s in graph.supports}
+    assert edges["o1", "o2"].get("style") == '"dashed"'
+    assert edges["o1", "o2"].get("label") == '"lean"'
+    assert edges["o0", "o1"].get("style") == '"solid"'
+    assert read.get_node('"o3"')[0].get("shape") == '"circle"'
+    assert read.get_node('"o3"')[0].get("fillcolor") == f'"{object_colour(3)}"'
+
+
+@pytest.mark.parametrize("name", ['say "hi"', "back\\slash", "a -> b; c", "<b>&amp;</b>", "two\nlines", "Öl"])
+def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
+    objects = tuple(replace(o, id=name) if o.id == "o15" else o for o in graph.objects)
+    named = replace(graph, objects=objects)
+    export_graph(named, tmp_path / "graph.dot")
+    (read,) = pydot.graph_from_dot_file(str(tmp_path / "graph.dot"))
+    assert len([n for n in read.get_nodes() if n.get_name() != "node"]) == 5
+    assert len(read.get_edges()) == 3
+    export_graph(named, tmp_path / "graph.graphml")
+    assert name in nx.read_graphml(tmp_path / "graph.graphml").nodes
+    export_graph(named, tmp_path / "scene.urdf")
+    assert len(yourdfpy.URDF.load(str(tmp_path / "scene.urdf")).link_map) == 6
+    export_graph(named, tmp_path / "scene.glb")
+    assert len(trimesh.load(tmp_path / "scene.glb").geometry) == 5
+    export_graph(named, tmp_path / "scene.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
+    assert name in [model.body(k).name for k in range(model.nbody)]
+
+
+# The command
+
+
+@pytest.mark.parametrize("name", ["s.xml", "s.urdf", "s.glb", "s.gltf", "s.graphml", "s.dot", "s.gv"])
+def test_the_name_says_the_format_and_the_same_model_gives_the_same_bytes(tmp_path, extracted, name, capsys):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        assert run_command("export", extracted, "--out", tmp_path / folder / name, "--json") == 0
+        told = json.loads(capsys.readouterr().out)
+        assert told["file"] == str(tmp_path / folder / name)
+    assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert [p.name for p in (tmp_path / "a").iterdir()] == [name]
+
+
+def test_a_graph_file_alone_can_be_exported_and_settings_count(tmp_path, graph):
+    (tmp_path / "graph.json").write_text(graph_text(graph))
+    heavy = ("--set", "export.density=1200")
+    assert run_command("export", tmp_path / "graph.json", "--out", tmp_path / "s.urdf", *heavy) == 0
+    robot = yourdfpy.URDF.load(str(tmp_path / "s.urdf"))
+    assert robot.link_map["o3"].inertial.mass == pytest.approx(1200.0 * graph["o3"].shape.volume)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--out", "model.step"], "does not say which format"),
+        (["--format", "mjcf", "--out", "graph.json"], "does not end as mjcf does"),
+        (["--out", "folder.urdf"], "is a folder"),
+    ],
+)
+def test_a_file_that_is_no_export_is_never_touched(tmp_path, extracted, monkeypatch, capsys, arguments, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "graph.json").write_text("mine")
+    (tmp_path / "folder.urdf").mkdir()
+    assert run_command("export", extracted, *arguments) == 1
+    told = capsys.readouterr().err
+    assert said in told
+    assert told.count("\n") == 1
+    assert (tmp_path / "graph.json").read_text() == "mine"
+    assert {p.name for p in tmp_path.iterdir()} == {"graph.json", "folder.urdf"}
+
+
+def test_what_cannot_be_exported_is_said(tmp_path, graph, capsys):
+    assert run_command("export", tmp_path / "no-run", "--out", tmp_path / "s.xml") == 1
+    assert "is no folder" in capsys.readouterr().err
+    assert run_command("export", tmp_path, "--format", "step", "--out", tmp_path / "s.step") == 2
+    with pytest.raises(InputError, match="holds no objects"):
+        export_graph(SupportGraph(), tmp_path / "s.glb")
+    named = replace(graph, objects=(replace(graph.objects[1], id="world"),), supports=())
+    with pytest.raises(InputError, match="called 'world'"):
+        export_graph(named, tmp_path / "s.urdf")
+    twice = replace(graph, objects=(graph.objects[0], replace(graph.objects[1], id="table")), supports=())
+    with pytest.raises(InputError, match="MuJoCo does not take it"):
+        export_graph(twice, tmp_path / "s.xml")
+    assert list(tmp_path.iterdir()) == []
