@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
 import shlex
 import shutil
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from arms import SLIDES, gantry
-from conftest import SMALL, run_command
+from bag_files import write_bag, write_tum
+from conftest import SMALL, run_command, without_labels
 
 import caryatid as ct
 from caryatid.formats.reachability_npz import write_reachability
@@ -29,9 +32,10 @@ def blocks(path, language):
 
 
 @pytest.fixture
-def workplace(tmp_path, monkeypatch, kept_recording, scene_file, points, write_pcd):
+def workplace(tmp_path, monkeypatch, kept_recording, scene_file, points, views, write_pcd):
     """The files the pages speak of, in the current folder."""
     write_pcd(*points, name="table.pcd")
+    write_bag(tmp_path / "pour.bag", views)
     shutil.copytree(kept_recording, tmp_path / "recording")
     shutil.copytree(scene_file.parent, tmp_path / "my-scene")
     write_reachability(
@@ -47,12 +51,32 @@ def test_python_blocks_run(page, workplace, capsys):
         exec(compile(block, str(page), "exec"), {"__name__": "__main__"})
 
 
-def test_commands_run(workplace, capsys, monkeypatch):
+@pytest.fixture
+def benchmark_folder(workplace, views):
+    """A folder of the TUM RGB-D benchmark in the current folder, of 640×480 images."""
+    large = [
+        replace(v, depth=np.kron(v.depth, np.ones((4, 4))), rgb=np.kron(v.rgb, np.ones((4, 4, 1), np.uint8)))
+        for v in without_labels(views)
+    ]
+    write_tum(workplace / "rgbd_dataset_freiburg1_desk", large)
+
+
+def test_commands_run(workplace, benchmark_folder, capsys, monkeypatch):
     monkeypatch.setattr("caryatid.commands.benchmarking.run_all", lambda *arguments: None)
     lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("caryatid ")]
-    shown = {"explore", "extract", "evaluate", "order", "dismantle", "benchmark", "config"}
-    assert {command[0] for command in commands} == shown
+    named = {
+        "explore",
+        "extract",
+        "evaluate",
+        "order",
+        "dismantle",
+        "import",
+        "export",
+        "benchmark",
+        "config",
+    }
+    assert {command[0] for command in commands} == named
     for command in commands:
         redirected = command[command.index(">") + 1] if ">" in command else None
         arguments = command[: command.index(">")] if redirected else command
@@ -77,7 +101,8 @@ def test_the_settings_the_method_page_names_exist():
     known = {(stage, name) for stage in settings for name in settings[stage]}
     assert len(named & known) > 5
     for module, name in named - known:
-        assert hasattr(importlib.import_module(f"caryatid.{module}"), name), f"{module}.{name}"
+        home = importlib.import_module(f"caryatid.{module}")
+        assert hasattr(home, name) or importlib.util.find_spec(f"{home.__name__}.{name}"), f"{module}.{name}"
 
 
 def test_the_modules_the_method_page_names_exist():
