@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import runpy
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -28,9 +27,7 @@ def test_each_has_a_number_of_its_own():
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs_and_says_what_it_found(path, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
-    begun = time.monotonic()
     run_example(path, monkeypatch)
-    assert time.monotonic() - begun < 15.0
     assert len(capsys.readouterr().out.splitlines()) >= 5
     assert not list(tmp_path.iterdir())
 
