@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -21,7 +22,15 @@ def run_example(path, monkeypatch, *arguments):
 def test_each_has_a_number_of_its_own():
     numbers = [path.name[:2] for path in EXAMPLES]
     assert numbers == sorted(set(numbers))
-    assert len(numbers) >= 6
+    assert len(numbers) >= 7
+
+
+def test_the_client_is_one_small_file_that_needs_nothing_but_python():
+    text = (ROOT / "examples/robot_client.py").read_text()
+    imported = re.findall(r"^ *(?:import|from) (\w+)", text, re.M)
+    assert len(imported) > 5
+    assert set(imported) <= sys.stdlib_module_names
+    assert len(text.splitlines()) < 120
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from caryatid.primitives import fit
     from caryatid.robot import Robot
     from caryatid.scene import Scene
+    from caryatid.sessions.session import Session
     from caryatid.shapes import Box, Cylinder, Sphere
     from caryatid.views import Camera, Cloud, View
 
@@ -32,6 +33,7 @@ __all__ = [
     "Robot",
     "Scene",
     "SceneObject",
+    "Session",
     "Sphere",
     "Step",
     "Support",
@@ -54,6 +56,7 @@ if not TYPE_CHECKING:
             "primitives": ["fit"],
             "robot": ["Robot"],
             "scene": ["Scene"],
+            "sessions.session": ["Session"],
             "shapes": ["Box", "Cylinder", "Sphere"],
             "views": ["Camera", "Cloud", "View"],
         },

@@ -47,6 +47,8 @@ def _run(arguments: Sequence[str]) -> int:
     from caryatid.commands.extract import Extract
     from caryatid.commands.import_recording import Import
     from caryatid.commands.order import Order
+    from caryatid.commands.serve import Serve
+    from caryatid.commands.session import SessionCommand
     from caryatid.commands.show_config import ShowConfig
 
     command = tyro.extras.subcommand_cli_from_dict(
@@ -60,6 +62,8 @@ def _run(arguments: Sequence[str]) -> int:
             "import": Import,
             "export": Export,
             "benchmark": Benchmark,
+            "session": SessionCommand,
+            "serve": Serve,
             "config": ShowConfig,
         },
         prog="caryatid",

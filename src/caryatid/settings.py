@@ -41,6 +41,20 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
     return config
 
 
+def changed_settings(base: Config, document: Mapping[str, Any], source: str) -> Config:
+    """Return a configuration with some settings changed: stage → name → value.
+
+    Args:
+        base: What to start from.
+        document: As `tomllib` or `json` read it.
+        source: What to call it in errors.
+
+    Raises:
+        InputError: A name or value is not valid.
+    """
+    return _changed(base, document, source, "")
+
+
 def write_settings(config: Config) -> str:
     """Write a configuration as TOML that `read_settings` reads."""
     lines: list[str] = []

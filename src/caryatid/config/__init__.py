@@ -42,6 +42,7 @@ from caryatid.config.reporting import (
     ReportConfig,
     StatisticsConfig,
 )
+from caryatid.config.sessions import SessionConfig
 from caryatid.config.simulation import (
     GenerationConfig,
     NoiseConfig,
@@ -79,6 +80,7 @@ class Config:
     report: ReportConfig = field(default_factory=ReportConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     oracle: OracleConfig = field(default_factory=OracleConfig)
+    session: SessionConfig = field(default_factory=SessionConfig)
 
 
 __all__ = [
@@ -109,6 +111,7 @@ __all__ = [
     "SegmentationConfig",
     "SegmentationMethod",
     "SensorConfig",
+    "SessionConfig",
     "SplitConfig",
     "StatisticsConfig",
     "SupportConfig",

@@ -7,7 +7,7 @@ import struct
 import warnings
 import zlib
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +100,29 @@ def read_units(path: Path) -> NDArray[np.int32]:
     check_image(path, DEPTH_MODES, "a 16-bit grey PNG")
     with _clearly(path), Image.open(path) as image:
         return np.asarray(image).astype(np.int32)
+
+
+def decode_image(content: bytes, name: str, modes: tuple[str, ...], what: str, most: int) -> NDArray[Any]:
+    """Decode a PNG or JPEG that came from elsewhere: (H, W), or (H, W, 3) where it is in colour.
+
+    Args:
+        content: The file.
+        name: What to call it in errors.
+        modes: Pillow modes allowed.
+        what: What the image ought to be, for the error where the mode is another.
+        most: Pixels it may have; of one that has more nothing is decoded.
+
+    Raises:
+        InputError: It is broken, larger, or no such image.
+    """
+    with _clearly(Path(name)), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+        width, height = image.size
+        if width * height <= most and image.mode in modes:
+            return np.array(image)
+        mode = image.mode
+    if mode not in modes:
+        raise InputError(name, f"has pixels of mode {mode}, not {what}", f"save it as {what}")
+    raise InputError(name, f"has {width}×{height} pixels, {most} are allowed", "give a smaller image")
 
 
 class _clearly:  # noqa: N801

@@ -1,0 +1,59 @@
+"""A robot with software of its own asks a service where to look; here the simulator plays the robot."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import caryatid as ct
+from caryatid.simulation import load_scene
+from caryatid.simulation.stage import Stage, set_stage
+
+sys.path.append(str(Path(__file__).parent))
+from robot_client import RobotClient, png16
+
+
+def image(values: NDArray[Any]) -> bytes:
+    """What the client sends of an image: a 16-bit PNG."""
+    return png16(values.shape[1], values.shape[0], values.astype(">u2").tobytes())
+
+
+def main() -> None:
+    """Start a service, and drive the robot where it says."""
+    stage = set_stage(load_scene("tower"), ct.Config(), noise="carmine", seed=0)
+    with TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "caryatid", "serve", folder, "--port", "0", "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
+            assert service.stdout is not None
+            try:
+                told = "".join(iter(service.stdout.readline, "}\n")) + "}"
+                graph = drive(RobotClient(json.loads(told)["address"]), stage)
+            finally:
+                service.terminate()
+    for support in graph["supports"]:
+        print(f"{support['supporter']} holds {support['supported']} ({support['kind']})")
+    assert len(graph["supports"]) >= 3
+    assert service.returncode == 0
+
+
+def drive(robot: RobotClient, stage: Stage) -> dict[str, Any]:
+    """Look, say what was seen, ask, go there."""
+    robot.begin("table", segmentation="labels")
+    while True:
+        view = stage.camera.capture(stage.robot.T_world_camera)
+        depth, labels = image(1e3 * view.depth), image(np.asarray(view.labels))
+        added = robot.add("table", depth, view.K.tolist(), view.pose.tolist(), labels=labels)
+        told = robot.next("table")
+        print(f"{len(added['graph']['objects']) - 1} objects; {told['stop'] or told['why']}")
+        if told["stop"]:
+            return dict(added["graph"])
+        stage.robot.move_to(np.array(told["T_world_camera"]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,113 @@
+"""Drive a caryatid service from a robot's own software; needs nothing but Python. Copy this file.
+
+robot = RobotClient("http://127.0.0.1:8765")
+robot.begin("table", segmentation="auto")
+robot.add("table", png16(640, 480, depth_mm_big_endian), K, T_world_camera)
+robot.next("table")["T_world_camera"]
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import time
+import urllib.error
+import urllib.request
+import zlib
+from typing import Any
+
+Matrix = list[list[float]]
+
+
+class RobotClient:
+    """Sessions of a service.
+
+    Args:
+        address: Where the service is.
+        token: What it demands, if it does.
+        patience: How long an answer may take, and how long a service that is busy or away is asked again [s].
+    """
+
+    def __init__(self, address: str, token: str | None = None, patience: float = 60.0) -> None:
+        self.address = address.rstrip("/")
+        self.patience = patience
+        self.headers = {"Content-Type": "application/json"}
+        if token:
+            self.headers["Authorization"] = f"Bearer {token}"
+
+    def begin(self, name: str, **options: Any) -> dict[str, Any]:
+        """Begin a session; options: segmentation, seed, planner, settings."""
+        return self._ask("POST", "/sessions", {"name": name, **options})
+
+    def add(
+        self,
+        name: str,
+        depth: bytes,
+        K: Matrix,
+        T_world_camera: Matrix,
+        *,
+        depth_scale: float = 1.0,
+        rgb: bytes | None = None,
+        labels: bytes | None = None,
+        number: int | None = None,
+    ) -> dict[str, Any]:
+        """Add a view, images as files of PNG or .npy; returns the graph with it, and whether it changed.
+
+        The view is added once, even where the answer to a first try was lost: its number says which it is.
+        """
+        images = {"depth": depth, "rgb": rgb, "labels": labels}
+        view: dict[str, Any] = {k: base64.b64encode(v).decode() for k, v in images.items() if v is not None}
+        view["camera"] = {"K": K, "T_world_camera": T_world_camera, "depth_scale": depth_scale}
+        view["number"] = self.views(name) if number is None else number
+        return self._ask("POST", f"/sessions/{name}/views", view)
+
+    def next(self, name: str, candidates: list[Matrix] | None = None) -> dict[str, Any]:
+        """Where to look next, of what the humanoid of the settings reaches, or of these camera poses."""
+        if candidates is None:
+            return self._ask("GET", f"/sessions/{name}/next")
+        return self._ask("POST", f"/sessions/{name}/next", {"T_world_camera": candidates})
+
+    def graph(self, name: str) -> dict[str, Any]:
+        """The support graph, as graph.json."""
+        return self._ask("GET", f"/sessions/{name}/graph")
+
+    def undo(self, name: str) -> dict[str, Any]:
+        """Take the last view back."""
+        return self._ask("DELETE", f"/sessions/{name}/views/last")
+
+    def views(self, name: str) -> int:
+        """How many views a session has."""
+        return int(self._ask("GET", f"/sessions/{name}")["views"])
+
+    def _ask(self, method: str, path: str, body: dict[str, Any] | None = None) -> dict[str, Any]:
+        data = None if body is None else json.dumps(body).encode()
+        request = urllib.request.Request(self.address + path, data, self.headers, method=method)
+        begun = time.monotonic()
+        while True:
+            try:
+                with urllib.request.urlopen(request, timeout=self.patience) as answer:
+                    document: dict[str, Any] = json.load(answer)
+                    return document
+            except urllib.error.HTTPError as error:
+                if error.code != 503 or time.monotonic() - begun > self.patience:
+                    raise RuntimeError(f"{method} {path}: {error.code} {error.read().decode()}") from None
+            except OSError:
+                # What takes a view back would take another one back.
+                if method == "DELETE" or path == "/sessions" or time.monotonic() - begun > self.patience:
+                    raise
+            time.sleep(0.2)
+
+
+def png16(width: int, height: int, samples: bytes) -> bytes:
+    """Encode depth [mm] or labels as a 16-bit grey PNG: two bytes a pixel, the high one first, row by row."""
+    rows = b"".join(b"\0" + samples[2 * width * y : 2 * width * (y + 1)] for y in range(height))
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return (
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+        )
+
+    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    parts = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows, 1)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + parts

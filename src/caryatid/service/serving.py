@@ -1,0 +1,118 @@
+"""Running the service until it is told to stop."""
+
+from __future__ import annotations
+
+import ipaddress
+import signal
+import socket
+import sys
+from pathlib import Path
+
+import uvicorn
+
+from caryatid.config import Config
+from caryatid.errors import InputError
+from caryatid.formats.json_files import json_text
+from caryatid.formats.staging import said_clearly
+from caryatid.kernels.compiling import compile_kernels
+from caryatid.service.app import make_app
+from caryatid.service.desk import Desk
+
+CONNECTIONS = 64
+"""Connections at the most [1]; with the size of a request they bound what is held in memory."""
+
+
+def is_local(host: str) -> bool:
+    """Whether an address is this machine's own, which no other can reach."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def check_token(host: str, token: str | None) -> None:
+    """Refuse to serve others than this machine without a token.
+
+    Raises:
+        InputError: There is none, or it is too short to keep anybody out.
+    """
+    if token is not None and len(token) < 16:
+        raise InputError("--token", "has fewer than 16 characters", "give a longer one that nobody can guess")
+    if token is None and not is_local(host):
+        raise InputError(
+            "--host",
+            f"{host} can be reached from elsewhere, and there is no token",
+            "set CARYATID_TOKEN, or serve at 127.0.0.1",
+        )
+
+
+def run_service(
+    folder: Path,
+    config: Config,
+    *,
+    host: str,
+    port: int,
+    token: str | None,
+    open_sessions: int,
+    waiting: int,
+    max_request: int,
+    quiet: bool,
+    json: bool,
+) -> int:
+    """Serve the sessions of a folder until Ctrl-C or SIGTERM; what has been asked by then is answered.
+
+    Raises:
+        InputError: A token is missing, the address is taken, or the folder cannot be written.
+    """
+    check_token(host, token)
+    with said_clearly(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    listener = _listen(host, port)
+    compile_kernels(lambda line: None if quiet or json else _say(line))
+    app = make_app(Desk(folder, config, open_sessions, waiting), token=token, max_request=max_request)
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            log_level="warning",
+            access_log=False,
+            limit_concurrency=CONNECTIONS,
+            ws="none",
+            lifespan="on",
+            server_header=False,
+        )
+    )
+    shown = f"[{host}]" if ":" in host else host
+    address = f"http://{shown}:{listener.getsockname()[1]}"
+    if json:
+        sys.stdout.write(json_text({"address": address, "folder": str(folder)}))
+        sys.stdout.flush()
+    elif not quiet:
+        _say(f"serving {folder} at {address}, its pages at {address}/docs; Ctrl-C stops")
+    # The server hands a signal on once it has stopped; stopping when told to is no failure.
+    before = {number: signal.signal(number, _ignore) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        server.run(sockets=[listener])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 0
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=CONNECTIONS)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise InputError(
+            f"{host}:{port}", f"cannot be listened at ({reason.lower()})", "choose another --port or --host"
+        ) from None
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(f"{line}\n")
+    sys.stdout.flush()
+
+
+def _ignore(number: int, frame: object) -> None:
+    """Do nothing."""

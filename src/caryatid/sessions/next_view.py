@@ -1,0 +1,183 @@
+"""Where to look next, and how the robot would stand there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from caryatid import frames
+from caryatid.candidates import Candidates
+from caryatid.config import Config
+from caryatid.errors import InputError, PlanningError
+from caryatid.exploration import next_best_view
+from caryatid.floor import FloorGrid
+from caryatid.formats.json_files import field, numbers
+from caryatid.frames import Array
+from caryatid.planners import Decision
+from caryatid.robot import HumanoidRobot, Posture, Unreachable
+from caryatid.scene import Scene
+from caryatid.view_sphere import ViewSphere
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class NextView:
+    """Where to look next.
+
+    Attributes:
+        number: Which view it would be, 0 the first.
+        decision: Pose, expected gain, cost, and why.
+        posture: How the humanoid would stand there; None where the robot said itself what it reaches.
+        stop: Why the next view may as well be left out, or None.
+    """
+
+    number: int
+    decision: Decision
+    posture: Posture | None
+    stop: str | None
+
+    def to_json(self) -> dict[str, Any]:
+        """What `caryatid session next` and the service answer."""
+        d, p = self.decision, self.posture
+        return {
+            "view": self.number,
+            "T_world_camera": d.T_world_camera.tolist(),
+            "candidate": d.index,
+            "platform": None if p is None else [float(x) for x in p.platform_world],
+            "camera_height": None if p is None else p.camera_height,
+            "gaze": None if p is None else {"yaw": p.head_yaw, "pitch": p.head_pitch},
+            "expected_gain": d.saliency,
+            "cost": d.cost,
+            "score": d.score,
+            "why": d.why,
+            "stop": self.stop,
+        }
+
+
+def plan_next(
+    scene: Scene,
+    T_world_cameras: Sequence[Array],
+    planner: str,
+    candidates: tuple[Array, Array | None] | None,
+    stop: str | None,
+) -> NextView:
+    """Choose the next view.
+
+    Args:
+        scene: What is known, of at least one view.
+        T_world_cameras: Where the views so far were taken (4, 4), the last one last.
+        planner: Name of who chooses.
+        candidates: Poses (N, 4, 4) the robot reaches and the way (N,) [m] to each, or None for straight
+            lines; None for the humanoid's, which knows the table.
+        stop: Why looking on may not pay, or None.
+
+    Raises:
+        PlanningError: Nothing has been seen yet, or no view can be reached.
+        InputError: A candidate is no pose, or ways are not as many, or negative.
+    """
+    if scene.sphere is None:
+        raise PlanningError("nothing has been seen yet; add a first view")
+    visited = np.stack([scene.sphere.direction_of(T) for T in T_world_cameras])
+    robot: _Reaching | _Standing
+    if candidates is None:
+        robot = _Standing(scene, T_world_cameras[-1])
+    else:
+        robot = _Reaching(T_world_cameras[-1], *candidates)
+    decision = next_best_view(scene, robot, visited, planner=planner, seed=scene.seed)
+    posture = robot.solve(decision.T_world_camera)
+    return NextView(len(T_world_cameras), decision, posture if isinstance(posture, Posture) else None, stop)
+
+
+def candidates_from(document: Mapping[str, Any], source: str) -> tuple[Array, Array | None]:
+    """Read poses (N, 4, 4) a robot reaches and the way (N,) [m] to each, None where it is left out.
+
+    Args:
+        document: The JSON object.
+        source: What to call it in errors.
+
+    Raises:
+        InputError: A key is missing, or not a list of poses, or of lengths.
+    """
+    listed = field(document, "T_world_camera", list, source)
+    poses = (
+        numbers(listed, (len(listed), 4, 4), f"{source}: T_world_camera") if listed else np.zeros((0, 4, 4))
+    )
+    ways = field(document, "path_length", (list, type(None)), source, default=None)
+    poses = poses[: len(listed)]
+    return poses, None if ways is None else numbers(ways, (len(ways),), f"{source}: path_length")
+
+
+def table_floor(scene: Scene, config: Config) -> FloorGrid:
+    """The floor around the table: under its top, and everything on it, nobody can stand."""
+    if scene.surface is None or scene.sphere is None:
+        raise PlanningError("nothing has been seen yet; add a first view")
+    shape = scene.surface.shape
+    top = float(scene.surface.point_world[2])
+    half = shape.extents / 2.0
+    centre = np.array([*shape.T_world_object[:2, 3], top / 2.0])
+    sides = np.array([half[0], half[1], max(abs(top) / 2.0, config.robot.step)])
+    R = shape.T_world_object[:3, :3]
+    return FloorGrid.from_boxes([centre], [sides], [R], config.robot, scene.sphere.centre_world[:2])
+
+
+class _Standing:
+    """The humanoid, which stands where the last view was taken."""
+
+    def __init__(self, scene: Scene, T_world_camera: Array) -> None:
+        self.T_world_camera = T_world_camera
+        self._robot = HumanoidRobot(table_floor(scene, scene.config), scene.config.robot)
+        self._placed = scene.sphere is not None and self._place(scene.sphere.centre_world)
+
+    def _place(self, centre_world: Array) -> bool:
+        """Put it where the camera is, looking at the scene without roll; whether it can stand so."""
+        eye = self.T_world_camera[:3, 3]
+        if np.linalg.norm(eye - centre_world) < 1e-6:
+            return False
+        level = frames.look_at(eye, centre_world)
+        if isinstance(self._robot.solve(level), Unreachable):
+            return False
+        self._robot.move_to(level)
+        return True
+
+    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
+        return self._robot.solve(T_world_camera)
+
+    def candidates(self, sphere: ViewSphere) -> Candidates:
+        """What it reaches; where it does not know its own place the ways are straight lines."""
+        found = self._robot.candidates(sphere)
+        if self._placed:
+            return found
+        return found.from_elsewhere(_straight(self.T_world_camera, found.T_world_camera))
+
+    def move_to(self, T_world_camera: Array) -> float:
+        return self._robot.move_to(T_world_camera)
+
+
+class _Reaching:
+    """A robot that has said itself which views it reaches."""
+
+    def __init__(self, T_world_camera: Array, poses: Array, ways: Array | None) -> None:
+        self.T_world_camera = T_world_camera
+        self._poses = np.array([frames.as_rigid(T, f"candidates[{n}]") for n, T in enumerate(poses)])
+        self._poses = self._poses.reshape(-1, 4, 4)
+        self._ways = _straight(T_world_camera, self._poses) if ways is None else np.asarray(ways, np.float64)
+        if self._ways.shape != (len(self._poses),) or not (self._ways >= 0.0).all():
+            raise InputError(
+                "path_length", "is not one length a candidate", "give as many as candidates, 0 or more"
+            )
+
+    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
+        return Unreachable("the robot itself knows how it stands")
+
+    def candidates(self, sphere: ViewSphere) -> Candidates:
+        return Candidates(self._poses, sphere.direction_of(self._poses), self._ways, {})
+
+    def move_to(self, T_world_camera: Array) -> float:
+        raise PlanningError("the robot moves itself")
+
+
+def _straight(T_world_camera: Array, poses: Array) -> Array:
+    """Straight way (N,) [m] from one camera pose to others (N, 4, 4)."""
+    return np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=-1)

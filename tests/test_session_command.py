@@ -1,0 +1,157 @@
+"""`caryatid session`: what a robot's software says and hears on the command line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import run_command
+
+from caryatid.config import Config
+from caryatid.formats.graph_json import graph_text
+from caryatid.formats.images import png
+from caryatid.scene import Scene
+from caryatid.sessions import Capture, Session
+
+
+@pytest.fixture
+def files(tmp_path, views):
+    """Files of each view: depth, camera, labels, as options of `session add`."""
+
+    def write(number, **camera):
+        view = views[number]
+        depth = np.round(1e4 * view.depth).astype(np.uint16)
+        (tmp_path / "depth.png").write_bytes(png(depth))
+        (tmp_path / "labels.png").write_bytes(png(view.labels.astype(np.uint8)))
+        document = {"K": view.K.tolist(), "T_world_camera": view.pose.tolist(), "depth_scale": 0.1} | camera
+        (tmp_path / "camera.json").write_text(json.dumps(document))
+        return [f"--{name}={tmp_path / name}.png" for name in ("depth", "labels")] + [
+            f"--camera={tmp_path / 'camera.json'}"
+        ]
+
+    return write
+
+
+@pytest.fixture
+def folder(tmp_path):
+    assert (
+        run_command("session", "new", tmp_path / "s", "--segmentation", "labels", "--seed", 3, "--quiet") == 0
+    )
+    return tmp_path / "s"
+
+
+def test_a_session_from_the_first_view_to_the_last(folder, files, capsys, views):
+    capsys.readouterr()
+    scene = Scene(segmentation="labels", seed=3)
+    for number in range(2):
+        options = files(number)
+        assert run_command("session", "add", folder, *options, "--json") == 0
+        told = json.loads(capsys.readouterr().out)
+        depth, camera, labels = (folder.parent / f for f in ("depth.png", "camera.json", "labels.png"))
+        capture = Capture.from_files(depth, camera, None, labels, Config().session)
+        scene.update(capture.decode(Config().session))
+        assert told["view"] == number
+        assert json.dumps(told["graph"], indent=1, ensure_ascii=False) + "\n" == graph_text(scene.graph)
+
+    assert run_command("session", "graph", folder) == 0
+    assert capsys.readouterr().out == graph_text(scene.graph)
+
+    assert run_command("session", "next", folder) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["view"] == 2
+    assert set(told["gaze"]) == {"yaw", "pitch"}
+    assert told["expected_gain"] > 0.0
+    assert told["why"]
+
+    assert run_command("session", "undo", folder) == 0
+    assert capsys.readouterr().out.startswith("1 view left: ")
+    with Session.open(folder) as session:
+        assert session.views == 1
+        assert np.allclose(session.scene.T_world_camera, views[0].pose, atol=0.02)
+
+
+def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
+    assert run_command("session", "add", folder, *files(0)) == 0
+    path = folder.parent / "candidates.json"
+    path.write_text(
+        json.dumps({"T_world_camera": [v.pose.tolist() for v in views[1:]], "path_length": [9, 0]})
+    )
+    capsys.readouterr()
+    assert run_command("session", "next", folder, "--candidates", path) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert np.allclose(told["T_world_camera"], views[1 + told["candidate"]].pose)
+    for document, said in (
+        ({}, "'T_world_camera' is missing"),
+        ({"T_world_camera": [[1]]}, "4×4 finite numbers"),
+    ):
+        path.write_text(json.dumps(document))
+        assert run_command("session", "next", folder, "--candidates", path) == 1
+        assert said in capsys.readouterr().err
+
+
+def test_a_view_is_told_in_a_line(folder, files, capsys):
+    capsys.readouterr()
+    assert run_command("session", "add", folder, *files(0)) == 0
+    assert capsys.readouterr().out == "view 1: 2 objects, 2 supports\n"
+    assert run_command("session", "add", folder, *files(0), "--number", 0) == 0
+    assert run_command("session", "add", folder, *files(1), "--number", 0) == 1
+    assert "the next one is view 1" in capsys.readouterr().err
+
+
+BAD = {
+    "no pose": ({"T_world_camera": None}, "camera.json: has no camera pose; give T_world_camera"),
+    "a short pose": ({"T_world_camera": [[1, 0], [0, 1]]}, "4×4 finite numbers"),
+    "no rotation": ({"T_world_camera": [[2 * (i == j) for i in range(4)] for j in range(4)]}, "camera.json"),
+    "no K": ({"K": "wide"}, "'K' is"),
+    "scale": ({"depth_scale": 0}, "'depth_scale' is 0"),
+    "a scale that is no number": ({"depth_scale": "mm"}, "'depth_scale' is"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_camera_that_cannot_be_used_is_one_line(folder, files, capsys, case):
+    camera, said = BAD[case]
+    options = files(0, **camera)
+    capsys.readouterr()
+    assert run_command("session", "add", folder, *options) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1
+    assert said in captured.err
+    assert not list((folder / "views").iterdir())
+
+
+@pytest.mark.parametrize("name", ["depth.png", "camera.json", "labels.png"])
+@pytest.mark.parametrize("content", [None, b"", b"{", b"\x89PNG\r\n\x1a\n", b"\xff"])
+def test_files_that_cannot_be_read_are_named(folder, files, capsys, name, content):
+    options = files(0)
+    path = folder.parent / name
+    path.unlink() if content is None else path.write_bytes(content)
+    assert run_command("session", "add", folder, *options) == 1
+    said = capsys.readouterr().err
+    assert name.split(".")[0] in said
+    assert said.count("\n") == 1
+    assert not list((folder / "views").iterdir())
+
+
+@pytest.mark.parametrize("step", ["add", "next", "graph", "undo"])
+def test_what_is_no_session_is_said(tmp_path, files, capsys, step):
+    options = files(0) if step == "add" else []
+    before = sorted(tmp_path.rglob("*"))
+    assert run_command("session", step, tmp_path, *options) == 1
+    assert "holds no session; begin one with `caryatid session new`" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_wrong_options_are_usage_errors(tmp_path, capsys):
+    for words in (
+        ["session"],
+        ["session", "forget"],
+        ["session", "new"],
+        ["session", "new", tmp_path, "--seed=x"],
+    ):
+        assert run_command(*words) == 2
+    assert run_command("session", "new", tmp_path / "x", "--set", "fit.hypotheses=0") == 1
+    assert not (tmp_path / "x").exists()

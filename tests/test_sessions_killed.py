@@ -1,0 +1,89 @@
+"""Killed at any moment, or asked by many at once: what was acknowledged is there, and is what it would be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import kill
+import load
+from robot_client import RobotClient
+from sessions import Starter, depth_png, labels_png, views_around
+
+from caryatid.sessions import Session
+
+
+@pytest.fixture(scope="module")
+def around():
+    return views_around("tower", 8)
+
+
+def test_however_adding_is_killed_no_view_is_lost(tmp_path, around):
+    tally = kill.kill_adding(tmp_path, around, kills=10, seed=2)
+    assert tally["kept"] + tally["not kept"] == 10
+    assert tally["acknowledged"]
+
+
+def test_however_a_service_is_killed_no_view_is_lost(tmp_path, around):
+    tally = kill.kill_serving(tmp_path, around, kills=4, seed=1)
+    assert tally["kills"] == 4
+    assert tally["acknowledged"] >= 2
+
+
+def test_many_clients_at_once_lose_nothing(tmp_path, around):
+    outcome = load.put_load(tmp_path, around * 2, clients=4, sessions=2, options=("--open-sessions", 1))
+    assert sorted(n for order in outcome.order.values() for n in order) == list(range(16))
+    assert all(len(order) == 8 for order in outcome.order.values())
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_service_that_is_told_to_stop_finishes_the_view_in_hand(tmp_path, around, number):
+    starter = Starter()
+    process = starter.start(["serve", tmp_path / "s", "--port", 0, "--json"], tmp_path / "said")
+    robot = RobotClient(kill._address(tmp_path / "said"))
+    robot.begin("table", segmentation="labels")
+    view, answers = around[0], []
+    thread = threading.Thread(
+        target=lambda: answers.append(
+            robot.add(
+                "table",
+                depth_png(view),
+                view.K.tolist(),
+                view.pose.tolist(),
+                labels=labels_png(view),
+                number=0,
+            )
+        )
+    )
+    thread.start()
+    while not any((tmp_path / "s/table/views").glob("*")) and thread.is_alive():
+        # The first view takes long: kernels are loaded. Told to stop as soon as the request is under way.
+        thread.join(0.15)
+        break
+    os.kill(process, number)
+    assert starter.end() == 0
+    thread.join(20.0)
+    assert [answer["view"] for answer in answers] == [0]
+    with Session.open(tmp_path / "s/table") as session:
+        assert session.views == 1
+    assert "Traceback" not in (tmp_path / "said").read_text()
+    starter.close()
+
+
+def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        command = [sys.executable, "-m", "caryatid", "serve", str(tmp_path), "--port", port]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith(f"error: 127.0.0.1:{port}: cannot be listened at (address already in use")
+    assert done.stderr.count("\n") == 1
