@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import json
 import re
 import shlex
 import shutil
@@ -18,6 +19,7 @@ from bag_files import write_bag, write_tum
 from conftest import SMALL, run_command, without_labels
 
 import caryatid as ct
+from caryatid.formats.images import png
 from caryatid.formats.reachability_npz import write_reachability
 from caryatid.reachability import sample_reachability
 from caryatid.settings import write_settings
@@ -41,6 +43,10 @@ def workplace(tmp_path, monkeypatch, kept_recording, scene_file, points, views, 
     write_reachability(
         tmp_path / "arm.npz", sample_reachability(gantry, SLIDES, 100_000, np.random.default_rng(0))
     )
+    camera = {"K": views[0].K.tolist(), "T_world_camera": views[0].pose.tolist()}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    (tmp_path / "depth.png").write_bytes(png(np.round(1e3 * views[0].depth).astype(np.uint16)))
+    (tmp_path / "labels.png").write_bytes(png(views[0].labels.astype(np.uint16)))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -75,6 +81,7 @@ def test_commands_run(workplace, benchmark_folder, capsys, monkeypatch):
         "export",
         "benchmark",
         "config",
+        "session",
     }
     assert {command[0] for command in commands} == named
     for command in commands:
