@@ -46,10 +46,12 @@ def body(view, **changes):
 
 
 @asynccontextmanager
-async def serving(folder, *, token=None, max_request=1_000_000, open_sessions=2, waiting=8, base=None):
+async def serving(
+    folder, *, token=None, max_request=1_000_000, open_sessions=2, waiting=8, base=None, **more
+):
     """A client of the application in this process."""
     desk = Desk(folder, Config(), open_sessions, waiting)
-    app = make_app(desk, token=token, max_request=max_request)
+    app = make_app(desk, token=token, max_request=max_request, **more)
     transport = httpx.ASGITransport(app=app)
     client = httpx.AsyncClient(transport=transport, base_url=base or "http://127.0.0.1")
     client.desk = desk
@@ -357,7 +359,10 @@ def test_without_a_token_pages_of_others_have_no_business_here(tmp_path):
         return await client.get("/sessions")
 
     assert served(talk, tmp_path, base="http://evil.example").status_code == 400
-    assert served(talk, tmp_path, base="http://localhost:8765").status_code == 200
+    for base in ("http://localhost:8765", "http://[::1]:8765"):
+        assert served(talk, tmp_path, base=base).status_code == 200
+    assert served(talk, tmp_path, base="http://127.3.2.1:80").status_code == 400
+    assert served(talk, tmp_path, base="http://127.3.2.1:80", host="127.3.2.1").status_code == 200
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "localhost", "::1"])

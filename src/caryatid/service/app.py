@@ -70,13 +70,14 @@ BEARER = HTTPBearer(auto_error=False, description="The token the service was sta
 SessionName = Annotated[Name, Path(description="Name of the session")]
 
 
-def make_app(desk: Desk, *, token: str | None, max_request: int) -> FastAPI:
+def make_app(desk: Desk, *, token: str | None, max_request: int, host: str = "127.0.0.1") -> FastAPI:
     """Make the application.
 
     Args:
         desk: The sessions; started and stopped with the application.
         token: What requests have to bear; None = only this machine's own may come, and need none.
         max_request: Size of a request at the most [bytes].
+        host: Address it listens at.
     """
 
     @asynccontextmanager
@@ -95,7 +96,7 @@ def make_app(desk: Desk, *, token: str | None, max_request: int) -> FastAPI:
         dependencies=[] if token is None else [Depends(_bearer(token))],
     )
     if token is None:
-        app.add_middleware(TrustedHostMiddleware, allowed_hosts=LOCAL)
+        app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*LOCAL, host])
     app.add_exception_handler(CaryatidError, _refuse)
     app.add_exception_handler(RequestValidationError, _refuse_request)
     _add_pages(app, desk)

@@ -69,7 +69,9 @@ def run_service(
         folder.mkdir(parents=True, exist_ok=True)
     listener = _listen(host, port)
     compile_kernels(lambda line: None if quiet or json else _say(line))
-    app = make_app(Desk(folder, config, open_sessions, waiting), token=token, max_request=max_request)
+    app = make_app(
+        Desk(folder, config, open_sessions, waiting), token=token, max_request=max_request, host=host
+    )
     server = uvicorn.Server(
         uvicorn.Config(
             app,
