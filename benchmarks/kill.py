@@ -86,7 +86,7 @@ def kill_serving(
 
     Args:
         folder: An empty folder.
-        views: Added one after the other; when they are used up they are taken back.
+        views: Added one after the other; when they are used up a new session begins.
         kills: How many times.
         seed: Of the moments.
         clients: How many.
@@ -98,12 +98,12 @@ def kill_serving(
         AssertionError: A view was lost, or a session does not open, or is not what its views make it.
     """
     chance, tally, graphs, starter = random.Random(seed), Counter[str](), graphs_of(views), Starter()
-    names = [f"table-{n}" for n in range(clients)]
-    for name in names:
+    kept = {f"table-{n}": 0 for n in range(clients)}
+    for name in kept:
         Session.begin(folder / name, segmentation="labels").close()
     sent = [(depth_png(v), v.K.tolist(), v.pose.tolist(), labels_png(v)) for v in views]
-    kept = dict.fromkeys(names, 0)
     for _ in range(kills):
+        (folder / "said").unlink(missing_ok=True)
         process = starter.start(["serve", folder, "--port", 0, "--json"], folder / "said")
         address = _address(folder / "said")
         acknowledged, robot = dict(kept), RobotClient(address)
@@ -119,26 +119,28 @@ def kill_serving(
             except (OSError, ValueError, RuntimeError):
                 return  # the service is gone
 
-        threads = [threading.Thread(target=add, args=(name,), daemon=True) for name in names]
+        threads = [threading.Thread(target=add, args=(name,), daemon=True) for name in kept]
         for thread in threads:
             thread.start()
-        _wait_for_views(acknowledged, chance.choice((0, 1, 1, 2, 3)))
+        _wait_for_views(threads, acknowledged, chance.choice((0, 1, 1, 2, 3)))
         time.sleep(chance.uniform(0.0, 0.4))
         starter.kill(process)
         robot.patience = 0.0
         for thread in threads:
             thread.join(30.0)
         tally["kills"] += 1
-        for name in names:
+        for name in list(kept):
             with Session.open(folder / name) as opened:
                 found, sure = opened.views, acknowledged[name]
                 assert found in (sure, sure + 1), f"{found} views where {sure} were acknowledged"
                 assert graph_text(opened.graph) == graphs[found], "a session is not what its views make it"
                 tally["acknowledged"] += sure - kept[name]
                 tally["kept unsaid"] += found - sure
-                while opened.views and found == len(views):
-                    opened.undo()
-                kept[name] = opened.views
+                kept[name] = found
+            if found == len(views):
+                del kept[name]
+                kept[f"{name}-"] = 0
+                Session.begin(folder / f"{name}-", segmentation="labels").close()
     starter.close()
     return tally
 
@@ -153,10 +155,10 @@ def _wait(session: Path, chance: random.Random, usual: float, *, writing: bool) 
         time.sleep(0.0005)
 
 
-def _wait_for_views(acknowledged: dict[str, int], more: int) -> None:
-    """Wait until so many more views are acknowledged, as long as that comes to anything."""
-    before, end = sum(acknowledged.values()), time.monotonic() + 15.0
-    while sum(acknowledged.values()) < before + more and time.monotonic() < end:
+def _wait_for_views(threads: Sequence[threading.Thread], acknowledged: dict[str, int], more: int) -> None:
+    """Wait until so many more views are acknowledged, or there are no more to come."""
+    wanted = sum(acknowledged.values()) + more
+    while sum(acknowledged.values()) < wanted and any(thread.is_alive() for thread in threads):
         time.sleep(0.002)
 
 

@@ -28,14 +28,14 @@ def around():
 
 
 def test_however_adding_is_killed_no_view_is_lost(tmp_path, around):
-    tally = kill.kill_adding(tmp_path, around, kills=10, seed=2)
-    assert tally["kept"] + tally["not kept"] == 10
+    tally = kill.kill_adding(tmp_path, around, kills=12, seed=2)
+    assert tally["kept"] + tally["not kept"] == 12
     assert tally["acknowledged"]
 
 
 def test_however_a_service_is_killed_no_view_is_lost(tmp_path, around):
-    tally = kill.kill_serving(tmp_path, around, kills=4, seed=1)
-    assert tally["kills"] == 4
+    tally = kill.kill_serving(tmp_path, around, kills=8, seed=1)
+    assert tally["kills"] == 8
     assert tally["acknowledged"] >= 2
 
 
