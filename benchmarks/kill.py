@@ -8,6 +8,7 @@ After each kill the session is opened and its graph compared with that of the sa
 from __future__ import annotations
 
 import argparse
+import http.client
 import json
 import random
 import sys
@@ -101,6 +102,7 @@ def kill_serving(
     kept = {f"table-{n}": 0 for n in range(clients)}
     for name in kept:
         Session.begin(folder / name, segmentation="labels").close()
+    faults: list[Exception] = []
     sent = [(depth_png(v), v.K.tolist(), v.pose.tolist(), labels_png(v)) for v in views]
     for _ in range(kills):
         (folder / "said").unlink(missing_ok=True)
@@ -116,8 +118,10 @@ def kill_serving(
                     told = robot.add(name, depth, K, T_world_camera, labels=labels, number=number)
                     assert told["view"] == number
                     acknowledged[name] = number + 1
-            except (OSError, ValueError, RuntimeError):
+            except (OSError, http.client.HTTPException):
                 return  # the service is gone
+            except Exception as fault:
+                faults.append(fault)
 
         threads = [threading.Thread(target=add, args=(name,), daemon=True) for name in kept]
         for thread in threads:
@@ -128,6 +132,8 @@ def kill_serving(
         robot.patience = 0.0
         for thread in threads:
             thread.join(30.0)
+        if faults:
+            raise faults[0]
         tally["kills"] += 1
         for name in list(kept):
             with Session.open(folder / name) as opened:

@@ -9,6 +9,7 @@ robot.next("table")["T_world_camera"]
 from __future__ import annotations
 
 import base64
+import http.client
 import json
 import struct
 import time
@@ -92,7 +93,7 @@ class RobotClient:
             except urllib.error.HTTPError as error:
                 if error.code != 503 or time.monotonic() - begun > self.patience:
                     raise RuntimeError(f"{method} {path}: {error.code} {error.read().decode()}") from None
-            except OSError:
+            except (OSError, http.client.HTTPException):
                 # What takes a view back would take another one back.
                 if method == "DELETE" or path == "/sessions" or time.monotonic() - begun > self.patience:
                     raise
