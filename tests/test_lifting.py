@@ -47,8 +47,7 @@ def test_the_one_below_disturbs_what_it_carries_and_nothing_else(stack):
     assert done.distance[UPPER] > 0.05
 
 
-def test_it_does_not_where_the_one_above_is_held(stack):
-    """Held a hand's breadth above, since a hold is no cure for a lift from below."""
+def test_what_is_held_stays_and_what_is_not_falls(stack):
     lift, state = stack
     aloft = state.copy()
     aloft[UPPER, 2] += 0.3

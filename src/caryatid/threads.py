@@ -1,7 +1,8 @@
-"""BLAS on one thread: our matrices are small, and waiting threads cost more than they bring."""
+"""How many cores there are, and BLAS on one thread: our matrices are small, waiting threads cost more."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import cache, wraps
 from typing import ParamSpec, TypeVar
@@ -21,6 +22,11 @@ def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return limited
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache

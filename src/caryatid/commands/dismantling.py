@@ -8,7 +8,7 @@ from contextlib import nullcontext
 from caryatid.commands.dismantle import Dismantle
 from caryatid.commands.exploring import finish_run, look_around
 from caryatid.commands.progress import Progress
-from caryatid.commands.taking import print_dismantling, threads
+from caryatid.commands.taking import print_dismantling
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
@@ -18,6 +18,7 @@ from caryatid.manipulation.order import plan_order
 from caryatid.manipulation.telling import dismantling_record
 from caryatid.report.strip import draw_lifts
 from caryatid.simulation.camera import SimulatedCamera
+from caryatid.threads import cores
 
 
 def run_dismantling(options: Dismantle, config: Config) -> int:
@@ -35,7 +36,7 @@ def run_dismantling(options: Dismantle, config: Config) -> int:
             )
         scene, graph, seed = camera.scene, done.end.graph, options.modelling.seed
         with progress.working("rehearsing"):
-            order = plan_order(graph, config, hands=options.hands, seed=seed, threads=threads())
+            order = plan_order(graph, config, hands=options.hands, seed=seed, threads=cores())
         taken: list[Taken] = []
         for t in dismantle(scene, order.steps, bodies_of(graph, truth), config):
             taken.append(t)

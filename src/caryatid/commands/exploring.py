@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from caryatid.commands.dismantle import Dismantle
 from caryatid.commands.explore import Explore
-from caryatid.commands.options import Modelling
 from caryatid.commands.profile import print_profile, profile_record
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import run_record, step_record, view_record
 from caryatid.commands.sources import Source, open_source
-from caryatid.config import Config, NoiseModel, SegmentationMethod
+from caryatid.config import Config
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, score
 from caryatid.exploration import Step, explore
@@ -24,24 +24,8 @@ from caryatid.formats.runs import RunWriter
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.report import Figure, ViewPage, draw_view, render_report
 
-
-class Exploring(Protocol):
-    """Options of a command that explores."""
-
-    @property
-    def source(self) -> str: ...  # noqa: D102
-    @property
-    def planner(self) -> str: ...  # noqa: D102
-    @property
-    def robot(self) -> str: ...  # noqa: D102
-    @property
-    def segmentation(self) -> SegmentationMethod | None: ...  # noqa: D102
-    @property
-    def noise(self) -> NoiseModel: ...  # noqa: D102
-    @property
-    def no_early_stop(self) -> bool: ...  # noqa: D102
-    @property
-    def modelling(self) -> Modelling: ...  # noqa: D102
+Exploring = Explore | Dismantle
+"""Options of the commands that explore."""
 
 
 @dataclass(slots=True)

@@ -34,18 +34,19 @@ class Order(ModellingCommand):
     def __call__(self) -> int:
         """Run the command."""
         from caryatid.commands.progress import Progress
-        from caryatid.commands.taking import print_order, threads
+        from caryatid.commands.taking import print_order
         from caryatid.formats.json_files import json_text
         from caryatid.formats.runs import read_run
         from caryatid.manipulation.order import plan_order
         from caryatid.manipulation.telling import order_record
+        from caryatid.threads import cores
 
         progress = Progress(self.general.quiet or self.general.json)
         config = self.modelling.settings()
         graph = read_run(self.run).graph
         with progress.working("rehearsing"):
             order = plan_order(
-                graph, config, goal=self.goal, hands=self.hands, seed=self.modelling.seed, threads=threads()
+                graph, config, goal=self.goal, hands=self.hands, seed=self.modelling.seed, threads=cores()
             )
         if self.general.json:
             sys.stdout.write(json_text(order_record(order)))

@@ -1,8 +1,7 @@
-"""What `caryatid order` and `caryatid dismantle` print, and how they use the machine."""
+"""What `caryatid order` and `caryatid dismantle` print."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -12,11 +11,6 @@ from rich.text import Text
 from caryatid.manipulation.dismantling import Taken
 from caryatid.manipulation.order import Order
 from caryatid.manipulation.telling import succeeded
-
-
-def threads() -> int:
-    """Cores this process may use: so many rehearsals run at a time."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def print_order(order: Order, title: str) -> None:

@@ -33,6 +33,7 @@ from numba import types
 
 from caryatid.interrupts import interrupts_held
 from caryatid.kernels import CACHE
+from caryatid.threads import cores
 
 log = logging.getLogger(__name__)
 
@@ -163,7 +164,7 @@ def _run_processes(work: Path, kernels: Sequence[Kernel]) -> None:
     end = time.monotonic() + PATIENCE
     try:
         with interrupts_held():
-            for number in range(min(_cores(), PROCESSES, len(kernels))):
+            for number in range(min(cores(), PROCESSES, len(kernels))):
                 own = {MARK: "1", "NUMBA_CACHE_DIR": str(work / f"cache-{number}")}
                 with open(work / f"{number}.log", "wb") as told:
                     processes.append(
@@ -257,8 +258,3 @@ def _alone(path: Path) -> Iterator[None]:
         yield
     finally:
         lock.close()
-
-
-def _cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

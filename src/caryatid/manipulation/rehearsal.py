@@ -26,6 +26,12 @@ from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.mjcf import Solid, add_solid, quaternion
 from caryatid.simulation.world import TABLE
 
+TIME_STEP = 0.004
+"""Of rehearsals [s]: twice MuJoCo's own, which its implicit integrator bears, for half the time."""
+
+TABLE_FRICTION = 0.1
+"""Of the table [1]. Contacts take the larger of two: it is not to hide how slippery objects are."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Trial:
@@ -75,6 +81,7 @@ class Rehearsal:
         self._graph, self._config, self._threads = graph, config, threads
         self._scenes: list[_Scene] = []
         self._states: list[Array] = []
+        self._trials: dict[tuple[str, ...], Trial] = {}
         draws = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
         for scene, state in self._each(lambda k: _settled(draws[k], self.ids, config)):
             self._scenes.append(scene)
@@ -91,12 +98,18 @@ class Rehearsal:
         return [i for k, i in enumerate(self.ids) if self._states[0][k, 2] < ASIDE / 2.0]
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> Trial:
-        """Lift an object in every scene; nothing is changed by it.
+        """Lift an object in every scene; nothing is changed by it, and asked again it is not done again.
 
         Args:
             object_id: Which.
             hold: Objects that are held where they are meanwhile.
         """
+        asked = (object_id, *sorted(hold))
+        if asked not in self._trials:
+            self._trials[asked] = self._tried(object_id, hold)
+        return self._trials[asked]
+
+    def _tried(self, object_id: str, hold: Collection[str]) -> Trial:
         lifts = self._each(lambda k: self._lift(k, object_id, hold))
         harm = np.array([lift.disturbed | self._bereft(k, object_id, hold) for k, lift in enumerate(lifts)])
         shares = harm.mean(axis=0)
@@ -106,6 +119,7 @@ class Rehearsal:
     def take(self, object_id: str, trial: Trial) -> None:
         """Go on without an object that has been lifted: where others moved, they are put back."""
         index = self.ids.index(object_id)
+        self._trials.clear()
         for k, (lift, scene) in enumerate(zip(trial.lifts, self._scenes, strict=True)):
             calm = not lift.disturbed.any()
             state = (lift.state if calm else self._states[k]).copy()
@@ -148,7 +162,7 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
     if number == 0:
         frictions[:], densities[:] = np.mean(settings.friction), np.mean(settings.density)
     spec = mujoco.MjSpec()
-    spec.option.timestep = 0.004
+    spec.option.timestep = TIME_STEP
     spec.option.impratio = 10.0
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
@@ -165,8 +179,7 @@ def _add_table(spec: Any, table: SceneObject, rim: float) -> None:
     up = int(np.argmax(np.abs(T[2, :3])))
     half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, rim)
     body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
-    # Contacts take the larger friction of the two: the table's is not to hide how slippery objects are.
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[TABLE_FRICTION, 0.005, 0.001])
 
 
 def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[_Scene, Array]:

@@ -129,8 +129,8 @@ class Lifting:
                     continue
                 if _beyond(distance, angle, config).any() or (speed == 0.0 and _at_rest(film)):
                     return Lift(now, distance, angle, _beyond(distance, angle, config), np.array(film))
-            data = self._data_with_aside(data, index)
-        now = self._objects(data)
+            if speed > 0.0:
+                self._put_aside(data, index)
         return Lift(now, distance, angle, _beyond(distance, angle, config), np.array(film))
 
     def strayed(self, before: Array, after: Array, config: LiftConfig) -> NDArray[np.bool_]:
@@ -148,14 +148,13 @@ class Lifting:
         mujoco.mj_kinematics(self.model, data)
         return data
 
-    def _data_with_aside(self, data: Any, index: int) -> Any:
+    def _put_aside(self, data: Any, index: int) -> None:
         """Put an object out of the way, at rest, in place."""
         place = np.array([0.0, 0.0, ASIDE + index])
         data.qpos[self._qpos[index, :3]] = data.mocap_pos[self._hand[index]] = place
         joint = self.model.body_jntadr[self.model.body(self.bodies[index]).id]
         velocity = int(self.model.jnt_dofadr[joint])
         data.qvel[velocity : velocity + 6] = 0.0
-        return data
 
     def _after(self, data: Any, speed: float, seconds: float, index: int = 0) -> Array:
         """Simulate for some time [s], in place, while one hand goes up [m/s]; the objects' state then."""
