@@ -14,8 +14,8 @@ from caryatid.planners import offered
 LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
 """Libraries whose release may change a figure."""
 
-BYSTANDERS = frozenset({"benchmark", "commands", "report"})
-"""Parts of caryatid that only arrange, draw or tell what others found, but for `DECIDING`."""
+BYSTANDERS = frozenset({"benchmark", "commands", "exports", "recordings", "report", "service", "sessions"})
+"""Parts of caryatid that only arrange, hand on, draw or tell what others found, but for `DECIDING`."""
 
 DECIDING = frozenset({"benchmark/episodes.py", "benchmark/records.py", "benchmark/scenes.py"})
 """Modules in these parts that decide figures."""
