@@ -17,10 +17,13 @@ from caryatid.errors import InputError
 from caryatid.floor import FloorGrid
 from caryatid.formats.reachability_npz import write_reachability
 from caryatid.reachability import sample_reachability
-from caryatid.robot import HumanoidRobot
+from caryatid.robot import HumanoidRobot, Posture
 from caryatid.robots import Surroundings, find_robot
+from caryatid.sessions import Session
+from caryatid.sessions.next_view import table_floor
 from caryatid.simulation import load_scene
 from caryatid.simulation.stage import set_stage
+from caryatid.view_sphere import ViewSphere
 
 QUICK = [*SMALL, "--views=2", "--no-report", "--quiet"]
 
@@ -123,3 +126,26 @@ class TestCommandLine:
         arm = ["--robot", "test_robots:make_arm", "--views=2", "--no-report", "--quiet"]
         assert run_command("explore", kept_recording, "--out", tmp_path / "run", *arm) == 1
         assert "is a recording" in capsys.readouterr().err
+
+    def test_a_session_keeps_its_arm(self, map_file, views, tmp_path, monkeypatch, capsys):
+        monkeypatch.chdir(map_file.parent)
+        table = tmp_path / "table"
+        assert run_command("session", "new", table, "--robot", f"arm:{map_file.name}", "--quiet") == 0
+        monkeypatch.chdir(tmp_path)
+        with Session.open(table) as session:
+            session.add(views[0])
+        capsys.readouterr()
+        assert run_command("session", "next", table) == 0
+        told = json.loads(capsys.readouterr().out)
+        T, config = np.array(told["T_world_camera"]), Config()
+        with Session.open(table, read_only=True) as session:
+            centre, floor = session.scene.sphere.centre_world, table_floor(session.scene, config)
+        arm = find_robot(f"arm:{map_file}")(Surroundings(centre, floor, config))
+        assert isinstance(arm.solve(T), Posture)
+        sphere = arm.view_sphere(ViewSphere.around(centre, config.active))
+        assert np.isclose(np.linalg.norm(T[:3, 3] - centre), sphere.radius)
+
+    def test_a_session_of_no_robot_is_not_begun(self, tmp_path, capsys):
+        assert run_command("session", "new", tmp_path / "table", "--robot", "arm:none.npz") == 1
+        assert "none.npz: the file is missing" in " ".join(capsys.readouterr().err.split())
+        assert not (tmp_path / "table").exists()

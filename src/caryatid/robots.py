@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caryatid.errors import InputError
@@ -84,6 +85,11 @@ def find_robot(name: str) -> RobotMaker:
             "robot", f"'{point.value}' cannot be imported ({error})", "give module:callable of Python's path"
         ) from None
     return maker
+
+
+def located(name: str) -> str:
+    """Return a robot's name with the file in it as an absolute path, for use from other folders."""
+    return f"{ARM}{Path(name.removeprefix(ARM)).resolve()}" if name.startswith(ARM) else name
 
 
 def _humanoid(around: Surroundings) -> Robot:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from caryatid.commands.names import PlannerName
+from caryatid.commands.names import PlannerName, RobotName
 from caryatid.commands.options import SAID, General, Modelling, defaults_to
 from caryatid.config import SegmentationMethod
 
@@ -25,6 +25,7 @@ class New:
     To try:
       caryatid session new table
       caryatid session new table --segmentation auto --set "robot.camera_height=[1.2, 1.8]"
+      caryatid session new table --robot arm:arm.npz
     """
 
     folder: Folder
@@ -35,6 +36,8 @@ class New:
     """Where parts come from: label images that are given, or automatic."""
     planner: PlannerName = "support"
     """Who chooses the next view."""
+    robot: RobotName = "humanoid"
+    """Who takes it: arm:FILE.npz is an arm with a map of what it reaches, module:callable one of your own."""
     modelling: tyro.conf.OmitArgPrefixes[Modelling] = MODELLING
     general: tyro.conf.OmitArgPrefixes[General] = GENERAL
 

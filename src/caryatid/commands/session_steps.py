@@ -11,6 +11,7 @@ from caryatid.commands.session import Add, Graph, New, Next, Undo
 from caryatid.config import Config
 from caryatid.formats.graph_json import graph_text, graph_to_json
 from caryatid.formats.json_files import json_text, read_json
+from caryatid.robots import located
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.next_view import candidates_from
 
@@ -19,8 +20,9 @@ def begin_session(options: New, config: Config) -> int:
     """Begin a session."""
     seed = options.modelling.seed
     with Session.begin(
-        options.folder, config, segmentation=options.segmentation, seed=seed, planner=options.planner
-    ):
+        options.folder, config, segmentation=options.segmentation, seed=seed, planner=options.planner,
+        robot=located(options.robot),
+    ):  # fmt: skip
         _tell(options.general, {"session": str(options.folder), "views": 0}, f"session: {options.folder}")
     return 0
 

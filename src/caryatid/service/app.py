@@ -155,7 +155,7 @@ def _add_pages(app: FastAPI, desk: Desk) -> None:
 
     @app.get("/sessions/{name}/next", response_model=NextAnswer)
     async def tell_next(name: SessionName) -> Response:
-        """Say where to look next, for the humanoid of the settings."""
+        """Say where to look next, for the robot the session was begun with."""
         return _json(await desk.do(lambda: desk.session(name).next().to_json()))
 
     @app.post("/sessions/{name}/next", response_model=NextAnswer)

@@ -21,6 +21,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError
 from caryatid.formats.json_files import field, read_json
 from caryatid.formats.staging import said_clearly
+from caryatid.robots import HUMANOID
 from caryatid.sessions.captures import Capture, Entry, read_entry
 from caryatid.sessions.durable import publish_durably, remove_durably, settle, write_durably
 from caryatid.settings import changed_settings
@@ -42,12 +43,14 @@ class Beginning:
         segmentation: `labels`, `auto`, or None to use labels where the first view has them.
         seed: Seed of every random choice.
         planner: Name of who chooses the next view.
+        robot: Name of who takes it.
     """
 
     config: Config
     segmentation: SegmentationMethod | None
     seed: int
     planner: str
+    robot: str = HUMANOID
 
     def to_json(self) -> dict[str, Any]:
         """What session.json says."""
@@ -57,6 +60,7 @@ class Beginning:
             "segmentation": self.segmentation,
             "seed": self.seed,
             "planner": self.planner,
+            "robot": self.robot,
             "settings": asdict(self.config),
         }
 
@@ -159,4 +163,5 @@ def _read_beginning(path: Path) -> Beginning:
     if seed < 0:
         raise InputError(path, f"'seed' is {seed}", "give 0 or more")
     settings = changed_settings(Config(), field(document, "settings", dict, str(path)), str(path))
-    return Beginning(settings, segmentation, seed, field(document, "planner", str, str(path)))
+    planner, robot = (field(document, key, str, str(path)) for key in ("planner", "robot"))
+    return Beginning(settings, segmentation, seed, planner, robot)

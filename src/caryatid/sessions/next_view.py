@@ -17,7 +17,8 @@ from caryatid.floor import FloorGrid
 from caryatid.formats.json_files import field, numbers
 from caryatid.frames import Array
 from caryatid.planners import Decision
-from caryatid.robot import HumanoidRobot, Posture, Unreachable
+from caryatid.robot import OwnViews, Posture, Unreachable, refusal_of, view_sphere_of
+from caryatid.robots import HUMANOID, Surroundings, find_robot
 from caryatid.scene import Scene
 from caryatid.view_sphere import ViewSphere
 
@@ -29,7 +30,7 @@ class NextView:
     Attributes:
         number: Which view it would be, 0 the first.
         decision: Pose, expected gain, cost, and why.
-        posture: How the humanoid would stand there; None where the robot said itself what it reaches.
+        posture: How the session's robot would stand there; None where candidates were given.
         stop: Why the next view may as well be left out, or None.
     """
 
@@ -62,6 +63,7 @@ def plan_next(
     planner: str,
     candidates: tuple[Array, Array | None] | None,
     stop: str | None,
+    robot_name: str = HUMANOID,
 ) -> NextView:
     """Choose the next view.
 
@@ -70,21 +72,23 @@ def plan_next(
         T_world_cameras: Where the views so far were taken (4, 4), the last one last.
         planner: Name of who chooses.
         candidates: Poses (N, 4, 4) the robot reaches and the way (N,) [m] to each, or None for straight
-            lines; None for the humanoid's, which knows the table.
+            lines; None for those of the robot of this name, which knows the table.
         stop: Why looking on may not pay, or None.
+        robot_name: As `find_robot` knows it.
 
     Raises:
         PlanningError: Nothing has been seen yet, or no view can be reached.
-        InputError: A candidate is no pose, or ways are not as many, or negative.
+        InputError: A candidate is no pose, or ways are not as many, or negative; or there is no such robot.
     """
     if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; add a first view")
-    visited = np.stack([scene.sphere.direction_of(T) for T in T_world_cameras])
     robot: _Reaching | _Standing
     if candidates is None:
-        robot = _Standing(scene, T_world_cameras[-1])
+        robot = _Standing(scene, robot_name, T_world_cameras[-1])
     else:
         robot = _Reaching(T_world_cameras[-1], *candidates)
+    sphere = view_sphere_of(robot, scene.sphere)
+    visited = np.stack([sphere.direction_of(T) for T in T_world_cameras])
     decision = next_best_view(scene, robot, visited, planner=planner, seed=scene.seed)
     posture = robot.solve(decision.T_world_camera)
     return NextView(len(T_world_cameras), decision, posture if isinstance(posture, Posture) else None, stop)
@@ -122,24 +126,35 @@ def table_floor(scene: Scene, config: Config) -> FloorGrid:
     return FloorGrid.from_boxes([centre], [sides], [R], config.robot, scene.sphere.centre_world[:2])
 
 
-class _Standing:
-    """The humanoid, which stands where the last view was taken."""
+class _Standing(OwnViews):
+    """A robot by the table, which stands where the last view was taken."""
 
-    def __init__(self, scene: Scene, T_world_camera: Array) -> None:
+    def __init__(self, scene: Scene, name: str, T_world_camera: Array) -> None:
         self.T_world_camera = T_world_camera
-        self._robot = HumanoidRobot(table_floor(scene, scene.config), scene.config.robot)
-        self._placed = scene.sphere is not None and self._place(scene.sphere.centre_world)
+        floor = table_floor(scene, scene.config)
+        if scene.sphere is None:
+            raise PlanningError("nothing has been seen yet; add a first view")
+        around = Surroundings(scene.sphere.centre_world, floor, scene.config)
+        self._robot = find_robot(name)(around)
+        self._placed = self._place(around.centre_world)
 
     def _place(self, centre_world: Array) -> bool:
-        """Put it where the camera is, looking at the scene without roll; whether it can stand so."""
+        """Put it where the camera is, as it is held or looking at the scene without roll; whether it can."""
         eye = self.T_world_camera[:3, 3]
-        if np.linalg.norm(eye - centre_world) < 1e-6:
-            return False
-        level = frames.look_at(eye, centre_world)
-        if isinstance(self._robot.solve(level), Unreachable):
-            return False
-        self._robot.move_to(level)
-        return True
+        ways = [self.T_world_camera]
+        if np.linalg.norm(eye - centre_world) > 1e-6:
+            ways.append(frames.look_at(eye, centre_world))
+        for T in ways:
+            if isinstance(self._robot.solve(T), Posture):
+                self._robot.move_to(T)
+                return True
+        return False
+
+    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
+        return view_sphere_of(self._robot, proposed)
+
+    def confirm(self, T_world_camera: Array) -> Unreachable | None:
+        return refusal_of(self._robot, T_world_camera)
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
         return self._robot.solve(T_world_camera)

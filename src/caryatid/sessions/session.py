@@ -18,6 +18,7 @@ from caryatid.errors import InputError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.planners import make_planner
+from caryatid.robots import HUMANOID, find_robot
 from caryatid.scene import Scene
 from caryatid.sessions.captures import Capture, Entry
 from caryatid.sessions.checks import check_camera, check_labels, check_pose, check_same_camera
@@ -90,6 +91,7 @@ class Session:
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
         planner: str = "support",
+        robot: str = HUMANOID,
     ) -> Session:
         """Begin a session in a new or empty folder, to write to it.
 
@@ -100,12 +102,16 @@ class Session:
                 first view has them.
             seed: Seed of every random choice.
             planner: Name of who chooses the next view.
+            robot: Name of who takes it, as `find_robot` knows it; it stands by the table, and there is
+                nothing else on its floor.
 
         Raises:
-            InputError: The place is taken, there is no such planner, or nothing can be written there.
+            InputError: The place is taken, there is no such planner or robot, or nothing can be written
+                there.
         """
         make_planner(planner)
-        folder = begin(Path(path), Beginning(config or Config(), segmentation, seed, planner))
+        find_robot(robot)
+        folder = begin(Path(path), Beginning(config or Config(), segmentation, seed, planner, robot))
         return cls(folder, FolderLock(folder.lock))
 
     @classmethod
@@ -208,15 +214,16 @@ class Session:
         """Choose where to look next.
 
         Args:
-            candidates: Camera poses (N, 4, 4) that the robot can reach; None = those of the humanoid that
-                `config.robot` describes, on a floor with nothing but the table on it.
+            candidates: Camera poses (N, 4, 4) that can be reached; None = those the session's robot reaches,
+                on a floor with nothing but the table on it.
             path_length: Way (N,) [m] to each candidate; None = straight lines.
 
         Raises:
             PlanningError: There is no view yet, or none can be reached.
             InputError: Candidates are no poses.
         """
-        config = self.beginning.config
+        begun = self.beginning
+        config = begun.config
         stop = None
         if self.views >= config.active.max_views:
             stop = f"{config.active.max_views} views were asked for"
@@ -226,9 +233,8 @@ class Session:
         if candidates is not None:
             poses = np.asarray(candidates, dtype=np.float64).reshape(-1, 4, 4)
             reach = poses, None if path_length is None else np.asarray(path_length, dtype=np.float64)
-        return plan_next(
-            self.scene, [v.T_world_camera for v in self._views], self.beginning.planner, reach, stop
-        )
+        poses_so_far = [v.T_world_camera for v in self._views]
+        return plan_next(self.scene, poses_so_far, begun.planner, reach, stop, begun.robot)
 
     def undo(self) -> int:
         """Take the last view back; returns how many are left.
