@@ -599,3 +599,51 @@ def test_colour_of_another_size(tmp_path, views, capsys):
         Image.fromarray(views[0].rgb[:60]).save(path)
     told = refused(capsys, folder, "--camera", camera_file(tmp_path, views[0].K), "--out", tmp_path / "out")
     assert "its colour image is of another size" in told
+
+
+def lying(views):
+    """The same pictures in a world that lies on its side."""
+    T = frames.rigid(frames.rotation_from_vector((1.4, 0.5, 0.0)), (0.3, -0.2, 1.0))
+    return [replace(view, T_world_camera=T @ view.pose) for view in views]
+
+
+def up_from(view, upright):
+    """Angle [deg] between up in a view and up in the same view of an upright world."""
+    up, right = view.pose[2, :3], upright.pose[2, :3]
+    return np.rad2deg(frames.angle_between(up, right))
+
+
+def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views, capsys):
+    folder = tum_folder(tmp_path, lying(views))
+    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
+    levelled = list(imported(tmp_path, folder, *options))
+    assert "so that the table is level" in capsys.readouterr().err
+    assert max(up_from(view, upright) for view, upright in zip(levelled, views, strict=True)) < 0.5
+    before, after = (frames.invert(a.pose) @ b.pose for a, b in (views[:2], levelled[:2]))
+    assert np.allclose(before, after, atol=1e-5)
+    scenes = []
+    for those in (views, levelled):
+        scenes.append(Scene(segmentation="auto", seed=3))
+        for view in without_labels(those):
+            scenes[-1].update(view)
+    counts = [(len(s.graph.objects), len(s.graph.supports)) for s in scenes]
+    assert counts[0] == counts[1]
+
+
+def test_a_level_world_is_hardly_turned(tmp_path, views):
+    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
+    levelled = imported(tmp_path, tum_folder(tmp_path, views), *options)
+    assert max(up_from(view, upright) for view, upright in zip(levelled, views, strict=True)) < 0.5
+
+
+def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, capsys):
+    turns = [
+        frames.rigid(frames.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0)) for n in range(3)
+    ]
+    folder = tum_folder(
+        tmp_path, [replace(v, T_world_camera=T @ v.pose) for v, T in zip(views, turns, strict=True)]
+    )
+    camera = camera_file(tmp_path, views[0].K)
+    told = refused(capsys, folder, "--camera", camera, "--level", "--out", tmp_path / "out")
+    assert "1 of 3 views agree on where up is" in told
+    assert not (tmp_path / "out").exists()

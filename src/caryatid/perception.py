@@ -95,7 +95,7 @@ def perceive(
     if isinstance(source, View) and source.T_world_camera is None:
         if known is not None:
             raise InputError(source.name, "has no camera pose", "only a single view may come without one")
-        source = _levelled(source, config, use_labels, rng)
+        source = levelled(source, config, rng, use_labels=use_labels)
     cloud, pixels = _points(source, config, known)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     surface = _surface(cloud, given, known, UP, config, rng)
@@ -171,8 +171,18 @@ def _not_below(view: View, surface: SupportSurface, depth: float) -> NDArray[np.
     return among if among.any() else None
 
 
-def _levelled(view: View, config: Config, use_labels: bool, rng: np.random.Generator) -> View:
-    """Give a view without a pose the world frame of its support plane."""
+def levelled(view: View, config: Config, rng: np.random.Generator, *, use_labels: bool = False) -> View:
+    """Give a view without a pose the world frame of its support plane.
+
+    Args:
+        view: Without a pose.
+        config: How points and planes are found.
+        rng: Draws the hypotheses.
+        use_labels: Leave out what belongs to a labelled object.
+
+    Raises:
+        PerceptionError: There are no readings, or no support surface.
+    """
     cloud, pixels = _points(view, config)
     given = np.take(view.labels, pixels) if use_labels and view.labels is not None else None
     surface = _surface(cloud, given, None, None, config, rng)

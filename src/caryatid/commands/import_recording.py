@@ -40,6 +40,9 @@ class Import:
     """Frame to be the world, level with z up, such as map or base_link. Without: one frame, no pose."""
     camera: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.json"), SAID] = None
     """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. Without: as published, by the folder's name."""
+    level: bool = False
+    """Turn the world so that the table, which most views must show, is level: for poses whose z does not
+    point up."""
     views: Annotated[Views, defaults_to(DEFAULTS.recording.max_views)] = None
     """Views at the most."""
     settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
@@ -50,4 +53,4 @@ class Import:
         config = self.settings.settings()
         from caryatid.commands.importing import run_import
 
-        return run_import(self, config.recording)
+        return run_import(self, config)

@@ -8,21 +8,26 @@ from typing import Any
 
 from caryatid.commands.import_recording import Import
 from caryatid.commands.progress import Progress
-from caryatid.config import RecordingConfig
+from caryatid.config import Config
 from caryatid.formats.json_files import json_text
 from caryatid.recordings.bag_footage import Topics
 from caryatid.recordings.importing import Imported, import_recording, reasons
 
 
-def run_import(options: Import, config: RecordingConfig) -> int:
+def run_import(options: Import, config: Config) -> int:
     """Import the recording and say what came of it."""
     if options.views is not None:
-        config = replace(config, max_views=options.views)
+        config = replace(config, recording=replace(config.recording, max_views=options.views))
     progress = Progress(options.general.quiet or options.general.json)
     topics = Topics(options.depth, options.info, options.rgb, options.tf)
     with progress.working(f"reading {options.source.name}"):
         imported = import_recording(
-            options.source, options.out, topics, camera_file=options.camera, config=config
+            options.source,
+            options.out,
+            topics,
+            camera_file=options.camera,
+            level=options.level,
+            config=config,
         )
     if options.general.json:
         sys.stdout.write(json_text(_document(options, imported)))

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from caryatid.config import RecordingConfig
+from caryatid import frames
+from caryatid.config import Config, RecordingConfig
 from caryatid.errors import InputError
 from caryatid.formats.bop_writer import RecordingWriter
+from caryatid.frames import Array
 from caryatid.recordings import sources
 from caryatid.recordings.bag_footage import BagFootage, Topics
 from caryatid.recordings.bags import SUFFIXES, is_bag
 from caryatid.recordings.choosing import choose_views
+from caryatid.recordings.levelling import level_rotation
 from caryatid.recordings.sources import Footage, Shot
 from caryatid.recordings.tum import TumFootage, is_tum_folder, read_tum_camera
 
@@ -52,7 +55,8 @@ def import_recording(
     topics: Topics = NO_TOPICS,
     *,
     camera_file: Path | None = None,
-    config: RecordingConfig | None = None,
+    level: bool = False,
+    config: Config | None = None,
 ) -> Imported:
     """Choose sharp frames from different viewpoints and write them as a BOP scene folder.
 
@@ -61,14 +65,16 @@ def import_recording(
         out: Folder to write; must not exist, or be empty. It appears whole or not at all.
         topics: What to take from a bag.
         camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
-        config: What is sharp, what is different, and how many views there may be.
+        level: Turn the world so that the table is level: for poses whose z axis does not point up.
+        config: What is sharp, what is different, and how many views there may be; and how a table is found.
 
     Raises:
         InputError: The recording is damaged or does not fit the options, no frame of it can become a view,
-            or `out` cannot be written.
+            there is no table to level the world by, or `out` cannot be written.
     """
-    config = config or RecordingConfig()
-    footage = _open(Path(source), topics, camera_file, config)
+    settings = config or Config()
+    choosing = settings.recording
+    footage = _open(Path(source), topics, camera_file, choosing)
     with RecordingWriter(out) as writer:
         shots = footage.look_through()
         skipped = dict(shots.skipped)
@@ -76,10 +82,17 @@ def import_recording(
             raise _nothing_usable(footage.path, shots.read, skipped)
         poses = [shot.T_world_camera for shot in shots.usable if shot.T_world_camera is not None]
         sharpness = np.array([shot.sharpness for shot in shots.usable])
-        choice = choose_views(shots.times, sharpness, np.stack(poses) if poses else None, config)
+        choice = choose_views(shots.times, sharpness, np.stack(poses) if poses else None, choosing)
         chosen = tuple(shots.usable[index] for index in choice.kept)
+        T_level_world = np.eye(4)
+        if level and poses:
+            T_level_world = level_rotation(
+                footage.path, footage.load(chosen), settings, np.random.default_rng(0)
+            )
         for view in footage.load(chosen):
-            writer.add_view(view, shots.depth_scale)
+            T = view.T_world_camera
+            posed = view if T is None else replace(view, T_world_camera=T_level_world @ T)
+            writer.add_view(posed, shots.depth_scale)
         writer.finish()
     counts = {
         sources.BLURRED: choice.blurred,
@@ -87,12 +100,18 @@ def import_recording(
         sources.SPARE: choice.spare,
     }
     skipped |= {reason: count for reason, count in counts.items() if count}
-    return Imported(shots.read, chosen, skipped, shots.notes)
+    return Imported(shots.read, chosen, skipped, (*shots.notes, *_levelled(T_level_world)))
 
 
 def reasons(skipped: Mapping[str, int]) -> str:
     """How many were skipped, by reason, the most frequent one first."""
     return ", ".join(f"{skipped[reason]} {reason}" for reason in sorted(skipped, key=lambda r: -skipped[r]))
+
+
+def _levelled(T_level_world: Array) -> list[str]:
+    """What a person should know of a turn (4, 4) of the world: nothing of none."""
+    turn = np.rad2deg(frames.angle_between(T_level_world[2, :3], np.array([0.0, 0.0, 1.0])))
+    return [f"world: turned by {turn:.1f}°, so that the table is level"] if turn > 0.0 else []
 
 
 def _open(source: Path, topics: Topics, camera_file: Path | None, config: RecordingConfig) -> Footage:
