@@ -17,6 +17,7 @@ def make_row(view, f1, path=0.0, planning=0.2, **measures):
         view=view, precision=f1, recall=f1, f1=f1, vertex_precision=f1, vertex_recall=f1, vertex_f1=f1,
         edge_precision=edge, edge_recall=edge, edge_f1=edge, mean_iou=measures.pop("mean_iou", 0.8),
         angle=path / 1.5, path=path, planning_seconds=planning if view > 1 else 0.0, perception_seconds=0.4,
+        **measures,
     )  # fmt: skip
 
 

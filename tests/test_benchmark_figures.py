@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import re
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,6 +15,8 @@ from PIL import Image
 
 from caryatid.benchmark.figures import draw_figures, table_views, write_figures
 from caryatid.benchmark.plotting import marks, spread
+from caryatid.benchmark.records import Outcome, Record
+from caryatid.benchmark.sections import tables
 from caryatid.benchmark.statistics import summarise
 from caryatid.benchmark.words import say_difference, say_estimate, say_number, say_time
 from caryatid.config import StatisticsConfig
@@ -88,6 +91,27 @@ def test_several_conditions_have_figures_each_and_one_of_all():
     assert {"f1-over-views-none", "f1-over-views-carmine-2", "f1-by-condition"} < set(names)
     assert not any("dense" in name for name in names)
     assert len(set(names)) == len(names)
+
+
+def test_of_scenes_taken_apart_harm_is_told_and_no_f1():
+    records = []
+    for record in make_suite(("one hand", "random"), scenes=4, seeds=1, views=3):
+        share = 1.0 if record.member.method == "one hand" else 0.25
+        rows = tuple(replace(r, unharmed=round(share), lifts=share) for r in record.outcome.rows)
+        records.append(Record(record.member, Outcome(rows)))
+    summary = summary_of(records)
+    names = [figure.name for figure in draw_figures(summary)]
+    assert names[:3] == ["unharmed-over-views", "lifts-over-views", "unharmed-differences"]
+    assert not any("f1" in name or "planning" in name for name in names)
+    told = tables(summary.conditions[0], summary)
+    assert [table.title for table in told] == [
+        "Scenes taken apart without harm",
+        "Lifts without harm",
+        "Scenes taken apart without harm compared with one hand",
+    ]
+    assert told[1].rows[1][1].startswith("0.250")
+    assert told[2].rows[0][1] == "−1.000 [−1.000, −1.000]"
+    assert (0, 1) in told[2].strong
 
 
 def test_what_cannot_be_drawn_is_left_out():

@@ -72,7 +72,7 @@ def render_document(
             here = [f for f in _shown(suite) if (f.condition, f.family) == (group.condition, group.family)]
             parts += [_draw(figure, suite, folder) for figure in here]
             parts += [_show(table) for table in tables(group, suite.summary, brief=True)]
-            if group.budget > 0.0:
+            if group.budget > 0.0 and not group.taken:
                 parts.append(f"F1 along the path is over {group.budget:.2f} m.")
         if suite.summary.failures:
             parts.append(_show(failures(suite.summary)))

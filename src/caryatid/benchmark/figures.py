@@ -22,6 +22,11 @@ OVER_VIEWS = (
     ("mean_iou", "Mean IoU", "of the matched objects"),
 )
 """Measures drawn over views: name, what the axis says, what it is of."""
+TAKING = (
+    ("unharmed", "Scenes without harm", "share of those taken apart without any object being disturbed"),
+    ("lifts", "Lifts without harm", "share of all lifts"),
+)
+"""The same of scenes that are taken apart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +70,8 @@ def draw_figures(summary: Summary) -> tuple[Figure, ...]:
 
     For each condition: F1, edge F1, vertex F1 and mean IoU over views, F1 over path, differences from the
     reference and planning time. Where there is but one, F1 over views and over path and the differences for
-    each family too; where there are several, F1 by condition. A figure with nothing to show is left out.
+    each family too; where there are several, F1 by condition. Of scenes that are taken apart: what came to no
+    harm over views, and the differences. A figure with nothing to show is left out.
     """
     looks = marks(summary.methods)
     groups = summary.conditions
@@ -116,12 +122,12 @@ def _draw_group(group: Group, looks: Mapping[str, Mark], summary: Summary) -> li
         svg, png = render(plot, height, file)
         figures.append(Figure(file, title, caption, group.condition, group.family, svg, png))
 
-    for measure, axis, what in OVER_VIEWS[:1] if group.family else OVER_VIEWS:
+    for measure, axis, what in TAKING if group.taken else OVER_VIEWS[:1] if group.family else OVER_VIEWS:
         caption = f"{axis} ({what}) after each view: {mean}, with {intervals}{beside}."
         goals = thresholds if measure == "f1" else ()
         name = f"{measure}-over-views"
         add(name, f"{axis} over views", caption, plot_over_views(known, measure, axis, goals, looks))
-    if group.budget > 0.0:
+    if group.budget > 0.0 and not group.taken:
         caption = f"F1 over the path travelled, a mark a view: {mean}"
         caption += f"; bars are {intervals} of both. " if len(known) <= MOST_BANDS else ". "
         caption += "Names stand in the order of the last F1."
@@ -129,17 +135,18 @@ def _draw_group(group: Group, looks: Mapping[str, Mark], summary: Summary) -> li
     rows = [difference for difference in group.differences if difference.scenes]
     if rows:
         reference = summary.reference
+        of, name, _ = (TAKING if group.taken else OVER_VIEWS)[0]
         caption = (
-            f"F1 minus that of {reference} over the scenes and seeds both have: mean and "
+            f"{name} minus that of {reference} over the scenes and seeds both have: mean and "
             f"{_percent(summary)} % interval; to the right is better. Pale: the interval holds 0."
         )
         views = later_views(summary, [group])
         add(
-            "f1-differences", f"F1 compared with {reference}", caption,
-            plot_differences(rows, views, reference, looks),
+            f"{of}-differences", f"{name} compared with {reference}", caption,
+            plot_differences(rows, views, reference, looks, of, name),
         )  # fmt: skip
     timed = [method for method in known if method.planning]
-    if timed and not group.family:
+    if timed and not group.family and not group.taken:
         caption = (
             "Time the choice of a view takes: median (written on the right), the middle half of them all "
             "and, as a thin line, the middle 95 %."

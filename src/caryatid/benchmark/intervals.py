@@ -21,9 +21,22 @@ SHORTEST = 1e-6
 
 
 def plot_differences(
-    rows: Sequence[Difference], views: Sequence[int], reference: str, looks: Mapping[str, Mark]
+    rows: Sequence[Difference],
+    views: Sequence[int],
+    reference: str,
+    looks: Mapping[str, Mark],
+    measure: str = "f1",
+    name: str = "F1",
 ) -> tuple[Plot, float]:
-    """Draw how F1 differs from a reference's: a panel a view, a row a method.
+    """Draw how a measure differs from a reference's: a panel a view, a row a method.
+
+    Args:
+        rows: One a method.
+        views: Which views.
+        reference: The method they are compared with.
+        looks: Mark of each method.
+        measure: Name of the measure.
+        name: What the axis says.
 
     Returns:
         What draws it, and its height [in].
@@ -31,12 +44,12 @@ def plot_differences(
 
     def plot(figure: Any) -> None:
         names = [difference.method for difference in rows]
-        panels = _panels(figure, views, names, right=0.2, label=f"F1 minus that of {reference}")
+        panels = _panels(figure, views, names, right=0.2, label=f"{name} minus that of {reference}")
         for panel, view in zip(panels, views, strict=True):
             panel.axvline(0.0, color=SOFT, linewidth=0.9)
             for y, difference in enumerate(rows):
-                if view <= len(difference.measures["f1"]):
-                    estimate = difference.measures["f1"][view - 1]
+                if view <= len(difference.measures[measure]):
+                    estimate = difference.measures[measure][view - 1]
                     _interval(panel, y, estimate, looks[difference.method], fade=True)
 
     return plot, 0.95 + LINE * max(len(rows), 2)

@@ -24,7 +24,9 @@ TAKING = (
     ("unharmed", "Scenes taken apart without harm", 3),
     ("lifts", "Lifts without harm", 3),
 )
-"""The same of suites whose scenes are taken apart."""
+"""The same of scenes that are taken apart."""
+MAIN = ("f1", TAKING[0][0])
+"""Measures that are not told beside the main ones."""
 AT_THE_END = (
     ("precision", "precision", 3),
     ("recall", "recall", 3),
@@ -137,10 +139,14 @@ def tables(group: Group, summary: Summary, *, brief: bool = False) -> tuple[Tabl
     known = [method for method in group.methods if method.episodes]
     if not known:
         return ()
-    shown = BY_VIEW[:1] if brief and group.family else BY_VIEW[:2] if brief else BY_VIEW
-    taken = any(e.value > 0.0 for method in known for e in method.curves["lifts"])
-    made = [_by_view(known, group, summary, *measure) for measure in (*(TAKING if taken else ()), *shown)]
     rows = [difference for difference in group.differences if difference.scenes]
+    if group.taken:
+        made = [_by_view(known, group, summary, *measure) for measure in TAKING]
+        if rows:
+            made.append(_differences(rows, group, summary, *TAKING[0]))
+        return tuple(made)
+    shown = BY_VIEW[:1] if brief and group.family else BY_VIEW[:2] if brief else BY_VIEW
+    made = [_by_view(known, group, summary, *measure) for measure in shown]
     if rows:
         made.append(_differences(rows, group, summary, "f1", "F1", 3))
         if not brief:
@@ -191,7 +197,7 @@ def _by_view(
     )
     head = ("method", *(f"view {v}" for v in views), "scenes / episodes / failed")
     note = "Mean and interval after so many views."
-    return Table(name, note, head, rows, aside=measure != "f1")
+    return Table(name, note, head, rows, aside=measure not in MAIN)
 
 
 def _differences(
@@ -219,7 +225,7 @@ def _differences(
         ("method", *(f"view {v}" for v in views), "scenes / episodes"),
         cells,
         frozenset(strong),
-        aside=measure != "f1",
+        aside=measure not in MAIN,
     )
 
 

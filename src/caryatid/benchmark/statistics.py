@@ -99,6 +99,11 @@ class Group:
         """The most views a method has."""
         return max((len(m.curves["f1"]) for m in self.methods), default=0)
 
+    @property
+    def taken(self) -> bool:
+        """Whether its scenes were taken apart; until then all its methods have done the same."""
+        return any(lifts.value > 0.0 for method in self.methods for lifts in method.curves.get("lifts", ()))
+
 
 @dataclass(frozen=True, slots=True)
 class Failure:
