@@ -436,3 +436,8 @@ def test_a_fault_of_our_own_is_one_line_too_and_debug_shows_it(tmp_path, scene_f
     with pytest.raises(ZeroDivisionError):
         run_command(*command, "--debug")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_cloud_whose_table_has_the_label_of_an_object(points, write_pcd, refused):
+    says = refused("extract", write_pcd(points[0], points[1] + 3), names="cloud.pcd", says="none is left")
+    assert "--label-divisor" in says

@@ -199,6 +199,11 @@ def _surface(
 ) -> SupportSurface:
     """Find the support surface in points that belong to no given object: near the known one, or anywhere."""
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
+    if known is None and not loose.any():
+        raise PerceptionError(
+            f"{cloud.name}: every point has the label of an object, none is left for the table; give the "
+            "table label 0 (of a cloud --label-divisor may do so), or use --segmentation auto"
+        )
     if known is None:
         return _found(_spread(cloud, loose, config.surface.max_points), up, config.surface, rng)
     near = np.abs(known.height(cloud.points_world)) < config.surface.search
