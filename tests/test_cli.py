@@ -54,7 +54,7 @@ def kept_run(tmp_path_factory, scene_file):
 def test_a_run_folder_holds_what_the_interfaces_say(kept_run, scene_file):
     files = {str(p.relative_to(kept_run)) for p in kept_run.rglob("*") if p.is_file()}
     views = {f"views/{k:02d}/{name}" for k in (0, 1) for name in ("graph.json", "labels.png", "view.json")}
-    assert files == {"run.json", "graph.json", "report.html"} | views
+    assert files == {"run.json", "graph.json", "report.html", "report.json"} | views
 
     record = json.loads((kept_run / "run.json").read_text())
     assert record["source"] == str(scene_file)

@@ -9,15 +9,11 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from report_steps import SMALL, K, at, good, make_cloud, make_graph, make_step, make_view
 
 from caryatid import frames
 from caryatid.candidates import Candidates
-from caryatid.config import ReportConfig
-from caryatid.evaluation.scores import Score
-from caryatid.exploration import Step
-from caryatid.graph import SceneObject, Stability, Support, SupportGraph
-from caryatid.interest import PointOfInterest
-from caryatid.planners import Decision
+from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.report import draw_model, draw_view, render_report
 from caryatid.report.charts import Line, bar_chart, line_chart
 from caryatid.report.colours import PALETTE, object_colour
@@ -26,88 +22,10 @@ from caryatid.report.images import draw_image
 from caryatid.report.layout import arrange, layers
 from caryatid.report.svg import keep_apart
 from caryatid.report.wireframes import Projection, wireframe
-from caryatid.shapes import Box, Cylinder, Sphere, fibonacci_sphere
-from caryatid.view_sphere import ViewSphere
+from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.views import SUPPORT_LABEL, Cloud, View
 
-SMALL = ReportConfig(cloud_width=240, sphere_width=80)
-K = np.array([[200.0, 0.0, 79.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
-TOP = 0.7
 VOID = {"meta", "input", "br", "link", "img", "hr"}
-
-
-def at(x: float, y: float, z: float) -> np.ndarray:
-    return frames.rigid(np.eye(3), (x, y, z))
-
-
-def make_graph() -> SupportGraph:
-    table = SceneObject("o0", 0, Box(at(0, 0, TOP - 0.02), np.array([0.6, 0.8, 0.04])), "support_surface")
-    box = SceneObject("o1", 1, Box(at(0, 0, TOP + 0.05), np.array([0.1, 0.16, 0.1])), why="three faces seen")
-    can = SceneObject("o2", 2, Cylinder(at(0, 0.02, TOP + 0.16), 0.03, 0.12), residual=0.0024, poor_fit=True)
-    ball = SceneObject("o7", 7, Sphere(at(0.2, 0.2, TOP + 0.04), 0.04), occurrences=1, opportunities=2)
-    supports = (
-        Support("o0", "o1", occurrences=2, opportunities=2, why="the table lies below <o1>"),
-        Support("o1", "o2", occurrences=1, opportunities=2),
-        Support("o0", "o2", certain=False, occurrences=1, opportunities=5, why="o2 tips"),
-        Support("o2", "o1", "top-down", certain=False, occurrences=3, opportunities=4),
-    )
-    stability = {"o1": Stability(1.0, -0.05, False, False), "o2": Stability(0.06, 0.012, True, True)}
-    return SupportGraph((table, box, can, ball), supports, stability)
-
-
-def make_view(graph: SupportGraph, rgb: bool = True) -> View:
-    """A view in which every surface point of every shape is a pixel, the nearest wins."""
-    T_world_camera = frames.look_at((1.0, 0.2, TOP + 0.6), (0.0, 0.0, TOP + 0.05))
-    depth = np.zeros((120, 160), dtype=np.float32)
-    labels = np.zeros((120, 160), dtype=np.int32)
-    projection = Projection(T_world_camera, K, depth)
-    for item in graph.objects:
-        points, _ = item.shape.surface(0.003)
-        pixels, z = projection.project(points)
-        for (u, v), distance in zip(np.rint(pixels).astype(int), z, strict=True):
-            if 0 <= u < 160 and 0 <= v < 120 and (depth[v, u] == 0.0 or distance < depth[v, u]):
-                depth[v, u], labels[v, u] = distance, item.label
-    colour = np.full((120, 160, 3), 90, dtype=np.uint8) if rgb else None
-    return View(depth, K, T_world_camera, colour, labels, name="view <7> & more")
-
-
-def make_cloud(graph: SupportGraph) -> Cloud:
-    points, normals, labels = [], [], []
-    for item in graph.objects:
-        surface, outward = item.shape.surface(0.015)
-        points.append(surface)
-        normals.append(outward)
-        labels.append(np.full(len(surface), item.label or SUPPORT_LABEL, dtype=np.int32))
-    return Cloud(np.concatenate(points), np.concatenate(normals), np.concatenate(labels), name="fused")
-
-
-def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
-    graph = make_graph()
-    directions = fibonacci_sphere(2000)
-    sphere = ViewSphere(np.array([0.0, 0.0, TOP]), 1.5, directions)
-    reached = np.flatnonzero((directions[:, 2] > 0.3) & (directions[:, 2] < 0.7))
-    poses = sphere.poses(directions[reached])
-    candidates = Candidates(poses, directions[reached], np.ones(len(reached)), {"too low": 12}, reached)
-    point = PointOfInterest(
-        np.array([0, 0, TOP + 0.1]), np.array([0.6, 0, 0.8]), 0.62, ("o1", "o2"), "seen once <i>"
-    )
-    saliency = np.linspace(-1.0, 1.0, len(directions))
-    decision = Decision(poses[3], 3, 0.8, 0.25, 0.55, "sees o2 & o7 best", (point,), None, saliency)
-    return Step(
-        index=index,
-        view=make_view(graph, rgb),
-        labels=make_view(graph).labels,
-        graph=graph,
-        cloud=make_cloud(graph),
-        sphere=sphere,
-        visited=frames.unit(np.array([[0.8, 0.1, 0.5], [0.0, 0.8, 0.5]]))[: index + 1],
-        candidates=candidates if decide else None,
-        decision=decision if decide else None,
-        timings={"capture": 0.04, "fit": 0.2},
-        angle_travelled=0.9 * index,
-        path_travelled=1.4 * index,
-        stop=None if decide else "the graph did not change",
-    )
 
 
 @pytest.fixture(scope="module")
@@ -117,10 +35,6 @@ def html() -> str:
     return render_report(
         pages, title="Run <script>alert(1)</script>", settings=settings, scores=[good(0.5), good(0.9)]
     )
-
-
-def good(f1: float) -> Score:
-    return Score(f1 + 0.02, f1 - 0.02, f1, f1, f1, f1, f1, 0.8)
 
 
 class Balanced(HTMLParser):
@@ -331,6 +245,14 @@ def test_uncertain_edges_and_unsupported_objects_are_marked_and_dashed(html: str
     assert unsupported == ["o7"]
     for selector in ("svg .edge.uncertain path", "svg .node.unsupported rect"):
         assert "stroke-dasharray" in html.split(selector)[1].split("}")[0]
+
+
+def test_what_the_boxes_hide_is_in_the_page(html: str) -> None:
+    """Parts and shapes can be taken off the camera's picture: their rules name what is drawn."""
+    head, body = html.split("<body>")
+    for name in ("tinted", "wire", "tag"):
+        assert f".camera .{name}" in head
+        assert re.search(rf'class="{name}[" ]', body)
 
 
 def test_evidence_is_written_on_the_edges() -> None:

@@ -11,6 +11,7 @@ from conftest import SMALL, run_command
 from caryatid.benchmark.episodes import run_episode
 from caryatid.benchmark.records import ORDERS, Episode
 from caryatid.formats.runs import read_run
+from caryatid.report.colours import object_colour
 
 QUICK = ["--set=rehearsal.draws=2", "--set=lift.watch=1.0"]
 BRIEF = (
@@ -78,7 +79,10 @@ def test_a_scene_is_taken_apart(scene_file, tmp_path, capsys):
     ]
     assert read_run(tmp_path / "run").record["dismantling"] == document
     report = (tmp_path / "run/report.html").read_text()
-    assert report.count('<figure class="lift">') == 2
+    lifts = re.findall(r'<figure class="lift">.*?</figure>', report, re.S)
+    assert len(lifts) == 2
+    for name, label in (("o2", 2), ("o1", 1)):
+        assert re.search(rf'fill="{object_colour(label)}"/><text [^>]*>{name}<', lifts[0])
 
 
 def test_without_a_place_nothing_is_written(scene_file, tmp_path, capsys, monkeypatch, leftovers):

@@ -47,6 +47,7 @@ def _run(arguments: Sequence[str]) -> int:
     from caryatid.commands.extract import Extract
     from caryatid.commands.import_recording import Import
     from caryatid.commands.order import Order
+    from caryatid.commands.report import ReportCommand
     from caryatid.commands.serve import Serve
     from caryatid.commands.session import SessionCommand
     from caryatid.commands.show_config import ShowConfig
@@ -60,6 +61,7 @@ def _run(arguments: Sequence[str]) -> int:
             "order": Order,
             "dismantle": Dismantle,
             "import": Import,
+            "report": ReportCommand,
             "export": Export,
             "benchmark": Benchmark,
             "session": SessionCommand,

@@ -48,7 +48,7 @@ def run_dismantling(options: Dismantle, config: Config) -> int:
         record = dismantling_record(order, taken, left)
         if writer is not None:
             T_world_camera = done.end.sphere.poses(done.end.visited[:1])[0]
-            strip = draw_lifts(scene, taken, T_world_camera, config)
+            strip = draw_lifts(scene, taken, graph, T_world_camera, config)
             more = {"dismantling": record}
             finish_run("dismantle", options, config, done, writer, report=report, more=more, strip=strip)
     if options.general.json:

@@ -22,7 +22,7 @@ from caryatid.formats.graph_json import graph_to_json
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
 from caryatid.kernels.compiling import compile_kernels
-from caryatid.report import Figure, ViewPage, draw_view, render_report
+from caryatid.report import Figure, ViewPage, compose_report, draw_view, render_html, store_report
 
 Exploring = Explore | Dismantle
 """Options of the commands that explore."""
@@ -154,7 +154,7 @@ def finish_run(
         config: All settings.
         done: The exploration.
         writer: Has taken its views.
-        report: Write report.html.
+        report: Write report.html, and report.json.
         more: What else run.json is to hold.
         strip: Pictures for the end of the report.
     """
@@ -166,18 +166,19 @@ def finish_run(
         "early_stop": not options.no_early_stop,
     }
     seed = options.modelling.seed
-    text = None
+    html = stored = None
     if report:
         settings = {"source": options.source, "seed": seed} | told
-        text = render_report(
+        said = compose_report(
             done.pages,
             title=f"caryatid: {done.source.name}",
             settings=settings | {"fusion": config.fusion.method, "views": config.active.max_views},
             scores=done.scores or None,
             strip=strip,
         )
+        html, stored = render_html(said), store_report(said)
     record = run_record(command, options.source, seed, told, config, done.steps, done.scores)
-    writer.finish(done.end.graph, record | (more or {}), text)
+    writer.finish(done.end.graph, record | (more or {}), html, stored)
 
 
 def _scored(step: Step, source: Source) -> list[Score]:

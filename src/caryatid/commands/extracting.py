@@ -25,7 +25,7 @@ from caryatid.formats.runs import RunWriter
 from caryatid.frames import Array
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.perception import level_cloud
-from caryatid.report import ViewPage, draw_model, render_report
+from caryatid.report import ViewPage, compose_report, draw_model, render_html, store_report
 from caryatid.scene import Scene
 
 
@@ -40,12 +40,13 @@ def run_extraction(options: Extract, config: Config) -> int:
         else:
             scene, steps, pages = _extract_recording(options, config, writer, progress)
         told = {"segmentation": options.segmentation, "label_divisor": options.label_divisor}
-        report = None
+        html = stored = None
         if not options.no_report:
             settings = {"source": options.source, "seed": seed} | told | {"fusion": config.fusion.method}
-            report = render_report(pages, title=f"caryatid: {name}", settings=settings)
+            said = compose_report(pages, title=f"caryatid: {name}", settings=settings)
+            html, stored = render_html(said), store_report(said)
         record = run_record("extract", options.source, seed, told, config, steps, [])
-        writer.finish(scene.graph, record, report)
+        writer.finish(scene.graph, record, html, stored)
     if options.general.json:
         document = {"run": str(options.out), "graph": graph_to_json(scene.graph)}
         sys.stdout.write(json_text(document | (profile_record(steps) if options.profile else {})))

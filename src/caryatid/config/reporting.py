@@ -38,6 +38,8 @@ class ReportConfig(Stage):
 
     image_width: Count = 640
     """Width camera images are reduced to [px]; a report of ten views stays below 8 MB."""
+    thumbnail_width: Count = 320
+    """Width camera images are reduced to in the contact sheet [px]; a third of a page at 120 dots an inch."""
     jpeg_quality: Annotated[int, Range(1, 95)] = 82
     """Quality of camera images, 1 … 95."""
     cloud_width: Count = 720

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import secrets
 from pathlib import Path
 from typing import Final
 
 from caryatid.config import ExportConfig
 from caryatid.config.choices import ExportFormat
 from caryatid.errors import InputError
-from caryatid.formats.staging import said_clearly
+from caryatid.formats.staging import write_file
 from caryatid.graph import SupportGraph
 
 ENDINGS: Final[dict[ExportFormat, tuple[str, ...]]] = {
@@ -58,18 +57,10 @@ def export_graph(
     if path.suffix.lower() not in ENDINGS[chosen]:
         endings = " or ".join(ENDINGS[chosen])
         raise InputError(path, f"does not end as {chosen} does", f"end its name in {endings}")
-    if path.is_dir():
-        raise InputError(path, "is a folder", "give a file")
     if not graph.objects:
         raise InputError("the scene model", "holds no objects", "nothing was written")
     content = _content(graph, path, chosen, config or ExportConfig())
-    partial = path.with_name(f".{path.name}.partial-{secrets.token_hex(4)}")
-    with said_clearly(path):
-        try:
-            partial.write_bytes(content)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+    write_file(path, content)
 
 
 def _content(graph: SupportGraph, path: Path, format_: ExportFormat, config: ExportConfig) -> bytes:

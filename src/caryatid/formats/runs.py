@@ -92,13 +92,20 @@ class RunWriter:
         self._staged.write(f"{folder}/view.json", json_text(document | dict(record or {})).encode())
         self.views += 1
 
-    def finish(self, graph: SupportGraph, record: Mapping[str, Any], report: str | None = None) -> None:
+    def finish(
+        self,
+        graph: SupportGraph,
+        record: Mapping[str, Any],
+        report: str | None = None,
+        stored: str | None = None,
+    ) -> None:
         """Write the rest and put the folder in its place.
 
         Args:
             graph: The final fused graph.
             record: For run.json: settings, seed, versions, source, timings [s], angle and path travelled.
             report: Text of report.html.
+            stored: Text of report.json, from which report.html is made again.
 
         Raises:
             CaryatidError: No view was added.
@@ -111,6 +118,8 @@ class RunWriter:
         self._staged.write("graph.json", graph_text(graph).encode())
         if report is not None:
             self._staged.write("report.html", report.encode())
+        if stored is not None:
+            self._staged.write("report.json", stored.encode())
         document = {"format": FORMAT, "version": VERSION, "views": self.views} | dict(record)
         self._staged.write("run.json", json_text(document).encode())
         self._staged.publish()

@@ -114,6 +114,23 @@ class StagedFolder:
             raise InputError(self.folder, "is there already and holds other files", self._remedy)
 
 
+def write_file(path: Path, content: bytes) -> None:
+    """Write one file, whole or not at all; one already there is replaced.
+
+    Raises:
+        InputError: It is a folder, or the disk is full or refuses; nothing is left behind.
+    """
+    if path.is_dir():
+        raise InputError(path, "is a folder", "give a file")
+    partial = path.with_name(f".{path.name}.partial-{secrets.token_hex(4)}")
+    with said_clearly(path):
+        try:
+            partial.write_bytes(content)
+            partial.replace(path)
+        finally:
+            partial.unlink(missing_ok=True)
+
+
 @contextmanager
 def said_clearly(folder: Path) -> Iterator[None]:
     """Turn an OSError while writing into one sentence that names the folder, the reason and the remedy.

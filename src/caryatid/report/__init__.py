@@ -1,9 +1,26 @@
-"""The report: every view drawn, in one HTML file that opens anywhere.
+"""The report: every view drawn, in one HTML file that opens anywhere, and as a print.
 
 `draw_view` turns each step of an exploration into a page as soon as it is there, so that its images and
-clouds need not be kept; `draw_model` draws a model without planning; `render_report` puts the pages together.
+clouds need not be kept; `draw_model` draws a model without planning. `compose_report` puts pages together;
+`render_html` and `render_pdf` write them; `store_report` and `read_report` keep them.
 """
 
-from caryatid.report.page import Figure, ViewPage, draw_model, draw_view, render_report
+from caryatid.report.contents import Report, compose_report
+from caryatid.report.html import render_html, render_report
+from caryatid.report.page import Figure, ViewPage, draw_model, draw_view
+from caryatid.report.pdf import render_pdf
+from caryatid.report.stored import read_report, store_report
 
-__all__ = ["Figure", "ViewPage", "draw_model", "draw_view", "render_report"]
+__all__ = [
+    "Figure",
+    "Report",
+    "ViewPage",
+    "compose_report",
+    "draw_model",
+    "draw_view",
+    "read_report",
+    "render_html",
+    "render_pdf",
+    "render_report",
+    "store_report",
+]

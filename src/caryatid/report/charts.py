@@ -18,6 +18,10 @@ LEFT, RIGHT, TOP, BOTTOM = 50.0, 14.0, 34.0, 40.0
 """Free space around the axes [px]."""
 LEGEND_COLUMNS, LEGEND_ROW = 4, 17.0
 """Names side by side in the legend, and height of a row of it [px]."""
+DASHES, MARKS = ("-", (0, (4, 2)), (0, (1, 1.6)), (0, (6, 2, 1, 2))), "osD^"
+"""Styles of lines and of their points: what tells lines apart beside their colours."""
+GAP = 0.5
+"""Width of the line between a bar's parts [px]."""
 MOST_TICKS, FEW_TICKS = 12, 5
 """Steps of an axis at the most: of views, and of anything else."""
 SOFT, LINE = "#5d666f", "#dcdfe2"
@@ -47,7 +51,7 @@ STYLE = {
     "ytick.major.pad": 7.0,
     "legend.frameon": False,
     "legend.labelcolor": SOFT,
-    "legend.handlelength": 1.0,
+    "legend.handlelength": 1.6,
     "legend.handleheight": 1.0,
     "legend.handletextpad": 0.5,
     "legend.columnspacing": 1.2,
@@ -76,6 +80,8 @@ def line_chart(
 ) -> str:
     """Draw lines over x, the first on top and the others' points wider, so that all are seen where they meet.
 
+    Each has a colour, a dash and a kind of points of its own.
+
     Args:
         x: Abscissae, ascending.
         lines: The lines, each as long as x; NaN leaves a gap.
@@ -88,11 +94,13 @@ def line_chart(
     def plot(axes: Any) -> None:
         for k, line in enumerate(lines):
             look = {"color": SERIES[k % len(SERIES)], "zorder": 3.0 - 0.1 * k, "clip_on": False}
-            axes.plot(x, line.values, linewidth=2.0, label=line.name, **look)
+            dash, mark = DASHES[k % len(DASHES)], MARKS[k % len(MARKS)]
+            axes.plot(x, line.values, linewidth=2.0, linestyle=dash, label=line.name, **look)
             for px, py in zip(x, line.values, strict=True):
                 if np.isfinite(py):
                     note = f"{NOTE}{line.name} {py:.3g}"
-                    axes.plot([px], [py], "o", markersize=6.2 + 2.2 * k, markeredgewidth=0, gid=note, **look)
+                    size = 6.2 + 2.2 * k
+                    axes.plot([px], [py], mark, markersize=size, markeredgewidth=0, gid=note, **look)
         last = x[-1] if x[-1] > x[0] else x[0] + 1.0
         axes.update_datalim([(x[0], 0.0), (last, 1.0)])
         axes.autoscale_view()
@@ -113,6 +121,7 @@ def bar_chart(bars: Sequence[Mapping[str, float]], *, title: str, x_name: str, y
         for k, name in enumerate(parts):
             heights = [bar.get(name, 0.0) for bar in bars]
             look = {"label": name, "color": SERIES[k % len(SERIES)], "clip_on": False}
+            look |= {"edgecolor": "white", "linewidth": GAP}
             drawn = axes.bar(range(len(bars)), heights, width, base, **look)
             for patch, height in zip(drawn, heights, strict=True):
                 patch.set_gid(f"{NOTE}{name} {height:.3g}")

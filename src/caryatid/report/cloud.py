@@ -29,6 +29,8 @@ AMBIENT = 0.5
 """Share of a colour that is left where light only grazes."""
 PALE = 0.7
 """Share of white in the colour of points seen from behind."""
+STRIPE = 15.0
+"""From stripe to stripe of objects whose colour alone does not tell them from others [px]."""
 TAG_SIZE = 15.0
 """Height of letters [px]."""
 
@@ -108,9 +110,9 @@ def _splat(
     facing = np.nan_to_num(normals_world @ towards_eye)
     light = np.nan_to_num(normals_world @ frames.unit(towards_eye + LAMP))
     shade = AMBIENT + (1.0 - AMBIENT) * np.abs(light)
-    colour = colours.label_colours(labels) * shade[:, None]
-    colour = np.where(facing[:, None] < 0.0, PALE * 255.0 + (1.0 - PALE) * colour, colour)
     at, z = projection.project(points_world)
+    colour = colours.striped_colours(labels, at[:, 0], at[:, 1], STRIPE) * shade[:, None]
+    colour = np.where(facing[:, None] < 0.0, PALE * 255.0 + (1.0 - PALE) * colour, colour)
     order = np.argsort(-z)
     height, width = projection.depth.shape
     half = max(1, round(size * projection.K[0, 0] / 2.0))

@@ -11,11 +11,18 @@ from caryatid.views import SUPPORT_LABEL
 Colour = tuple[int, int, int]
 
 PALETTE = (
-    "#e69f00", "#56b4e9", "#009e73", "#d55e00", "#0072b2", "#cc79a7", "#f0e442",
-    "#882255", "#44aa99", "#999933", "#aa4499", "#332288", "#ddcc77", "#117733",
+    "#0072b2", "#d55e00", "#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7",
+    "#332288", "#44aa99", "#999933", "#882255", "#ddcc77", "#aa4499", "#117733",
 )  # fmt: skip
-"""Colours for objects 1, 2, …: first the seven of Okabe and Ito, then seven of Tol's muted set."""
-SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#999933", "#8a8f96")
+"""Colours for objects 1, 2, …: first the seven of Okabe and Ito, then seven of Tol's muted set, each in the
+order in which neighbours stay furthest apart also for the colour-blind."""
+PLAIN = 7
+"""So many colours are told apart by everyone; the next so many are striped as well."""
+STRIPES = ((), (1,), (-1,), (1, -1))
+"""Directions of the stripes on objects of the first, second, … such turn: 1 rises to the right, −1 falls."""
+STRIPE_WHITE = 0.5
+"""Share of white in a stripe."""
+SERIES = ("#0072b2", "#d55e00", "#56b4e9", "#882255", "#e69f00", "#8a8f96", "#f0e442", "#009e73")
 """Colours of a chart's lines and of its bars' parts, on light and dark; none of them means an object."""
 SURFACE_COLOUR = "#9c9184"
 """The support surface."""
@@ -51,6 +58,30 @@ def object_colour(label: int) -> str:
     shade = (1.0, 0.72, 0.5)[turn % 3]
     red, green, blue = (round(shade * c) for c in rgb(PALETTE[position]))
     return css((red, green, blue))
+
+
+def object_stripes(label: int) -> tuple[int, ...]:
+    """Return the directions of the stripes on the object with this label, which tell like colours apart."""
+    if label in (0, SUPPORT_LABEL):
+        return ()
+    return STRIPES[(label - 1) // PLAIN % len(STRIPES)]
+
+
+def striped_colours(labels: NDArray[np.int32], u: Array, v: Array, pitch: float) -> Array:
+    """Return the colours (..., 3), 0 … 255, of labelled pixels, with the stripes of those that have some.
+
+    Args:
+        labels: Of the pixels (...).
+        u: Their columns (...) [px].
+        v: Their rows (...) [px].
+        pitch: From stripe to stripe along a row or column [px]; the stripe takes a third of it.
+    """
+    stripe = np.zeros(labels.shape, dtype=np.bool_)
+    for label in np.unique(labels):
+        for direction in object_stripes(int(label)):
+            stripe |= (labels == label) & ((u + direction * v) % pitch < pitch / 3.0)
+    colour = label_colours(labels).astype(np.float64)
+    return np.where(stripe[..., None], 255.0 * STRIPE_WHITE + (1.0 - STRIPE_WHITE) * colour, colour)
 
 
 def label_colours(labels: NDArray[np.int32]) -> NDArray[np.uint8]:

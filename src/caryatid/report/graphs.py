@@ -16,6 +16,10 @@ COLUMN, ROW = 78.0, 110.0
 """Distance of vertices within a layer, and of layers [px]."""
 NODE_WIDTH, NODE_HEIGHT = 56.0, 40.0
 """Size of a vertex [px]."""
+STRIPE = 11.0
+"""From stripe to stripe of vertices whose colour alone does not tell them from others [px]."""
+STRIPE_STYLE = "fill:none;stroke:#fff;stroke-opacity:.5;stroke-width:3.2;stroke-dasharray:none"
+"""How they look, whatever other lines of a vertex look like."""
 BORDER, BOTTOM = 46.0, 30.0
 """Free space around the outermost vertices' centres, and below the table's [px]."""
 LEAST_WIDTH = 560.0
@@ -195,11 +199,14 @@ def _node(item: SceneObject, at: tuple[float, float], graph: SupportGraph) -> st
         case "cylinder":
             start = f"M{x - w / 2:.1f} {y - h / 2 + 5:.1f}a{w / 2} 5 0 0"
             lid, d = f"{start} 0 {w} 0", f"{start} 1 {w} 0v{h - 10}a{w / 2} 5 0 0 1 {-w} 0z"
-            body = svg.element("path", d=d) + svg.element("path", d=lid, fill="none")
+            body = svg.element("path", d=d) + _stripes(item.label, x, y, (w, h - 18.0))
+            body += svg.element("path", d=lid, fill="none")
         case "sphere":
             body = svg.element("ellipse", cx=x, cy=y, rx=w / 2, ry=h / 2)
+            body += _stripes(item.label, x, y, (w, h), round_=True)
         case _:
             body = svg.element("rect", x=x - w / 2, y=y - h / 2, width=w, height=h, rx=3)
+            body += _stripes(item.label, x, y, (w, h))
     stability = graph.stability.get(item.id)
     remarks = [f"{item.id}: {item.shape.kind}, extracted in {item.occurrences} of {item.opportunities} views"]
     remarks += ["nothing is known to support it"] if unsupported else []
@@ -209,12 +216,36 @@ def _node(item: SceneObject, at: tuple[float, float], graph: SupportGraph) -> st
         "g",
         svg.tooltip("; ".join(remarks)),
         body,
-        svg.text(x, y + 4.0, item.id, fill=ink, class_="id"),
-        svg.text(x, y + 15.5, f"{item.occurrences}/{item.opportunities}", fill=ink, class_="count"),
+        svg.text(x, y + 4.0, item.id, fill=ink, stroke=colour, class_="id"),
+        svg.text(
+            x, y + 15.5, f"{item.occurrences}/{item.opportunities}", fill=ink, stroke=colour, class_="count"
+        ),
         class_="node unsupported" if unsupported else "node",
         fill=colour,
         data_object=item.id,
     )
+
+
+def _stripes(label: int, x: float, y: float, size: tuple[float, float], round_: bool = False) -> str:
+    """Draw the stripes of an object's vertex, a rectangle or an ellipse about (x, y)."""
+    import shapely
+
+    directions = colours.object_stripes(label)
+    if not directions:
+        return ""
+    w, h = size
+    area = shapely.box(x - w / 2, y - h / 2, x + w / 2, y + h / 2)
+    if round_:
+        area = shapely.affinity.scale(shapely.Point(x, y).buffer(0.5), w, h)
+    reach = w + h
+    lines = [
+        [(x + shift - d * reach, y + reach), (x + shift + d * reach, y - reach)]
+        for d in directions
+        for shift in np.arange(-w - h, w + h, STRIPE)
+    ]
+    parts = shapely.get_parts(shapely.intersection(shapely.MultiLineString(lines), area.buffer(-1.5)))
+    data = "".join(svg.path(shapely.get_coordinates(part)) for part in parts)
+    return svg.element("path", d=data, class_="stripes", style=STRIPE_STYLE)
 
 
 def _table(item: SceneObject, width: float, y: float) -> str:

@@ -16,6 +16,14 @@ from caryatid.views import SUPPORT_LABEL, View
 
 TAG_SIZE = 15.0
 """Height of letters on a picture 640 px wide [px]."""
+THUMBNAIL_TAG_SIZE = 28.0
+"""Height of letters on a small picture, were it 640 px wide [px]."""
+STRIPE = 18.0
+"""From stripe to stripe of objects whose colour alone does not tell them from others, likewise [px]."""
+TINT = 0.62
+"""Share of its object's colour in the colour of a part; the rest is the image's grey."""
+GREY = np.array([0.299, 0.587, 0.114])
+"""Shares of red, green and blue in the grey of an image."""
 ROOM, LEAST_SHARE = 1.35, 0.5
 """The part shown is this much larger than the objects in it, and this share of the image at the least."""
 DEPTH_SHARE = (2.0, 98.0)
@@ -31,32 +39,56 @@ def draw_image(view: View, labels: NDArray[np.int32], graph: SupportGraph, confi
         graph: The shapes, in the world frame.
         config: Sizes and qualities.
     """
-    height, width = view.depth.shape
-    left, top, shown_width, shown_height = 0.0, 0.0, float(width), float(height)
-    step = max(1, round(width / config.image_width))
-    base = view.rgb if view.rgb is not None else _depth_colours(view.depth)
-    reduced = np.asarray(Image.fromarray(base).reduce(step))
+    found = [o for o in graph.objects if o.role != "support_surface"]
+    window = _window(found, view)
+    left, top, width, height = window
+    base = _base(view)
     layers = [
-        svg.raster(reduced, 0, 0, width, height, jpeg=config.jpeg_quality),
+        _cut(base, window, config.image_width, config),
         svg.element(
-            "g", svg.raster(_mask_colours(labels[::step, ::step]), 0, 0, width, height), class_="parts"
+            "g", _cut(tinted(base, labels, width), window, config.image_width, config), class_="tinted"
         ),
     ]
     if view.T_world_camera is not None:
         projection = Projection(view.T_world_camera, view.K, view.depth)
-        found = [o for o in graph.objects if o.role != "support_surface"]
-        left, top, shown_width, shown_height = _window(found, projection)
-        size = TAG_SIZE * shown_width / 640.0
-        names = [tag for o in found if (tag := _name(o, labels, projection)) is not None]
+        size = TAG_SIZE * width / 640.0
+        names = [tag for o in found if (tag := name_on(o, labels, projection)) is not None]
         layers.append(draw_shapes(graph.objects, projection, config.hidden))
-        layers.append(svg.tags(names, (left, top, left + shown_width, top + shown_height), size))
+        layers.append(svg.tags(names, (left, top, left + width, top + height), size))
     name = f"{view.name} with the fitted shapes drawn over it"
-    return svg.picture(shown_width, shown_height, *layers, name=name, corner=(left, top))
+    return svg.picture(width, height, *layers, name=name, corner=(left, top))
 
 
-def _window(objects: Sequence[SceneObject], projection: Projection) -> tuple[float, float, float, float]:
+def draw_thumbnail(view: View, labels: NDArray[np.int32], graph: SupportGraph, config: ReportConfig) -> str:
+    """Draw one view small, as SVG: its image, its parts and their names, as large as can be read.
+
+    Args:
+        view: The view.
+        labels: Object number of each pixel (H, W), 0 = nothing.
+        graph: The objects the labels are of.
+        config: Sizes and qualities.
+    """
+    found = [o for o in graph.objects if o.role != "support_surface"]
+    window = _window(found, view)
+    left, top, width, height = window
+    size = THUMBNAIL_TAG_SIZE * width / 640.0
+    names = [tag for o in found if (tag := name_on(o, labels)) is not None]
+    return svg.picture(
+        width,
+        height,
+        _cut(tinted(_base(view), labels, width), window, config.thumbnail_width, config),
+        svg.tags(names, (left, top, left + width, top + height), size),
+        name=f"{view.name} with the parts found in it",
+        corner=(left, top),
+    )
+
+
+def _window(objects: Sequence[SceneObject], view: View) -> tuple[float, float, float, float]:
     """Part of the image that is shown (x, y, width, height) [px]: the objects with room around them."""
-    height, width = projection.depth.shape
+    height, width = view.depth.shape
+    if view.T_world_camera is None:
+        return 0.0, 0.0, float(width), float(height)
+    projection = Projection(view.T_world_camera, view.K, view.depth)
     pixels = [at[z > 0.0] for at, z in (projection.project(o.shape.outline()) for o in objects)]
     inside = np.clip(np.concatenate([*pixels, np.empty((0, 2))]), 0.0, (width, height))
     if len(inside) == 0:
@@ -68,26 +100,59 @@ def _window(objects: Sequence[SceneObject], projection: Projection) -> tuple[flo
     return float(corner[0]), float(corner[1]), float(size[0]), float(size[1])
 
 
-def _name(item: SceneObject, labels: NDArray[np.int32], projection: Projection) -> svg.Tag | None:
-    """Put an object's id on its pixels, or faint on its projected centre where it has none."""
+def name_on(
+    item: SceneObject, labels: NDArray[np.int32], projection: Projection | None = None
+) -> svg.Tag | None:
+    """Put an object's id on its pixels, or faint on its projected centre where it has none.
+
+    Args:
+        item: The object.
+        labels: Object number of each pixel (H, W).
+        projection: Of the picture; without one an object without pixels has no name there.
+    """
     height, width = labels.shape
     v, u = np.nonzero(labels == item.label)
     colour = colours.object_colour(item.label)
     if len(u):
         return svg.Tag(float(np.median(u)), float(np.median(v)), item.id, colour)
+    if projection is None:
+        return None
     (pixel,), (z,) = projection.project(item.centre_world[None, :])
     if z <= 0.0 or not (0.0 <= pixel[0] < width and 0.0 <= pixel[1] < height):
         return None
     return svg.Tag(float(pixel[0]), float(pixel[1]), item.id, colour, faint=True)
 
 
-def _mask_colours(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Colours (H, W, 4) of the parts, transparent where there is none."""
+def _base(view: View) -> NDArray[np.uint8]:
+    """The image (H, W, 3) under parts and shapes."""
+    return view.rgb if view.rgb is not None else _depth_colours(view.depth)
+
+
+def _cut(
+    image: NDArray[np.uint8], window: tuple[float, float, float, float], most: int, config: ReportConfig
+) -> str:
+    """Put the part of an image (H, W, 3) that a window shows into a picture, about `most` pixels wide."""
+    left, top = int(window[0]), int(window[1])
+    right, bottom = int(np.ceil(window[0] + window[2])), int(np.ceil(window[1] + window[3]))
+    part = Image.fromarray(image).crop((left, top, right, bottom))
+    shrunk = np.asarray(part.reduce(max(1, round(part.width / most))))
+    return svg.raster(shrunk, left, top, right - left, bottom - top, jpeg=config.jpeg_quality)
+
+
+def tinted(image: NDArray[np.uint8], labels: NDArray[np.int32], width: float) -> NDArray[np.uint8]:
+    """An image (H, W, 3) whose parts have their objects' colours, lit as they are in the image.
+
+    Args:
+        image: The image.
+        labels: Object number of each pixel (H, W), 0 = nothing.
+        width: Of what is shown of it [px]; stripes keep their size in what is shown.
+    """
     part = (labels != 0) & (labels != SUPPORT_LABEL)
-    opaque = np.where(part, np.uint8(255), np.uint8(0))
-    return np.concatenate(
-        [np.where(part[..., None], colours.label_colours(labels), 0), opaque[..., None]], -1
-    )
+    v, u = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in labels.shape), indexing="ij")
+    colour = colours.striped_colours(labels, u, v, STRIPE * width / 640.0)
+    grey = image @ GREY
+    tint = TINT * colour + (1.0 - TINT) * grey[..., None]
+    return np.where(part[..., None], tint.round(), image).astype(np.uint8)
 
 
 def _depth_colours(depth: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -1,10 +1,9 @@
-"""From steps to pages to one HTML file."""
+"""One view, drawn: from a step, or a model, to the pictures and tables the report shows of it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from importlib import resources
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -14,7 +13,7 @@ from caryatid.config import ReportConfig
 from caryatid.graph import SupportGraph
 from caryatid.report.cloud import draw_cloud
 from caryatid.report.graphs import BESIDE, draw_graph
-from caryatid.report.images import draw_image
+from caryatid.report.images import draw_image, draw_thumbnail
 from caryatid.report.layout import arrange
 from caryatid.report.rows import (
     ObjectRow,
@@ -22,15 +21,12 @@ from caryatid.report.rows import (
     SupportRow,
     object_rows,
     point_rows,
-    settings_rows,
     support_rows,
 )
 from caryatid.report.sphere import draw_sphere
-from caryatid.report.summary import cards, changes, charts
 from caryatid.views import Cloud, View
 
 if TYPE_CHECKING:
-    from caryatid.evaluation.scores import Score
     from caryatid.exploration import Step
 
 
@@ -57,10 +53,12 @@ class ViewPage:
         supports: The table of supports.
         points: The table of points of interest.
         choice: Why the next view was chosen, with its figures; empty where none was.
+        reason: The same without figures.
         timings: Time of each stage [s].
         angle_travelled: Around the view sphere so far [rad].
         path_travelled: Over the floor so far [m].
         stop: Why the exploration ended here, or None.
+        thumbnail: SVG of the view's picture, small, with its parts; empty for a cloud.
     """
 
     index: int
@@ -70,10 +68,12 @@ class ViewPage:
     supports: tuple[SupportRow, ...]
     points: tuple[PointRow, ...] = ()
     choice: str = ""
+    reason: str = ""
     timings: Mapping[str, float] = field(default_factory=dict)
     angle_travelled: float = 0.0
     path_travelled: float = 0.0
     stop: str | None = None
+    thumbnail: str = ""
 
     @property
     def number(self) -> str:
@@ -110,6 +110,7 @@ def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
         figures=figures,
         points=point_rows(step.decision),
         choice=_choice(step),
+        reason="" if step.decision is None else step.decision.why,
         timings=dict(step.timings),
         angle_travelled=step.angle_travelled,
         path_travelled=step.path_travelled,
@@ -139,6 +140,7 @@ def draw_model(
     """
     config = config or ReportConfig()
     figures = []
+    thumbnail = ""
     if view is not None:
         parts = np.zeros(view.depth.shape, dtype=np.int32) if labels is None else labels
         kind = "colour image" if view.rgb is not None else "depth image, near bright and far dark"
@@ -148,6 +150,7 @@ def draw_model(
             "belongs to has no pixel here."
         )
         drawn = draw_image(view, parts, graph, config)
+        thumbnail = draw_thumbnail(view, parts, graph, config)
         figures.append(Figure("camera", drawn, "What the camera saw", caption))
     caption = (
         "Arrows run from supporter to supported; beside them, in how many of the views that could have shown "
@@ -156,7 +159,7 @@ def draw_model(
     )
     layout = arrange(graph)
     drawn = draw_graph(graph, layout)
-    figures.append(Figure("graph", drawn, "What supports what", caption, wide=layout.width > BESIDE))
+    figures.append(Figure("graph", drawn, "What supports what", caption, wide=bool(layout.width > BESIDE)))
     side_seen = _sensor_azimuth(view, cloud) if azimuth is None else azimuth
     for turn, side in ((0.0, "from the first view's side"), (np.pi, "from the opposite side")):
         drawn = draw_cloud(cloud, graph, side_seen + turn, config)
@@ -166,50 +169,7 @@ def draw_model(
         )
         figures.append(Figure("cloud", drawn, f"The cloud {side}", caption))
     name = cloud.name if view is None else view.name
-    return ViewPage(0, name, tuple(figures), object_rows(graph), support_rows(graph))
-
-
-def render_report(
-    pages: Sequence[ViewPage],
-    *,
-    title: str,
-    settings: Mapping[str, object],
-    scores: Sequence[Score] | None = None,
-    strip: Sequence[Figure] = (),
-) -> str:
-    """Write the report: one HTML file that loads nothing from anywhere.
-
-    Args:
-        pages: The views, in order.
-        title: Heading of the report.
-        settings: Names and values of the run's settings; mappings and dataclasses in it are flattened.
-        scores: Score after each view, where the truth is known; as many as pages.
-        strip: Pictures of the objects being taken away, in order.
-
-    Raises:
-        ValueError: There are scores, but not one for each page, or there is no page.
-    """
-    import jinja2
-
-    if not pages:
-        raise ValueError("a report needs one view at least")
-    if scores is not None and len(scores) != len(pages):
-        raise ValueError(f"{len(scores)} scores for {len(pages)} views")
-    source = resources.files("caryatid.report").joinpath("page.html.jinja").read_text(encoding="utf-8")
-    environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    return environment.from_string(source).render(
-        title=title,
-        pages=pages,
-        last=pages[-1],
-        changes=[changes(a, b) for a, b in zip([None, *pages[:-1]], pages, strict=True)],
-        cards=cards(pages, scores),
-        charts=charts(pages, scores),
-        scores=scores,
-        settings=settings_rows(settings),
-        strip=strip,
-    )
+    return ViewPage(0, name, tuple(figures), object_rows(graph), support_rows(graph), thumbnail=thumbnail)
 
 
 def _sensor_azimuth(view: View | None, cloud: Cloud) -> float:

@@ -9,8 +9,10 @@ import numpy as np
 from caryatid import frames
 from caryatid.config import Config
 from caryatid.frames import Array
+from caryatid.graph import SupportGraph
 from caryatid.manipulation.dismantling import Taken, posed, poses_of
 from caryatid.report import svg
+from caryatid.report.images import name_on, tinted
 from caryatid.report.page import Figure
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.lifting import ASIDE
@@ -20,22 +22,34 @@ HEADROOM = 0.25
 """Room above the objects that a picture shows [m]: the lifted one is to be seen."""
 AROUND = 0.07
 """Room around the objects' middles, as a share of their distance [1]: 10 cm at 1.5 m."""
+TAG_SIZE = 28.0
+"""Height of letters on a picture 640 px wide [px]."""
 HALF_WAY = 0.5
 """A lift that does no harm is shown when so much of it is done [1]; one that does, at its end."""
 
 
 def draw_lifts(
-    scene: SimulatedScene, taken: Sequence[Taken], T_world_camera: Array, config: Config
+    scene: SimulatedScene,
+    taken: Sequence[Taken],
+    graph: SupportGraph,
+    T_world_camera: Array,
+    config: Config,
 ) -> tuple[Figure, ...]:
-    """Draw each lift as it looked on the way up.
+    """Draw each lift as it looked on the way up, bodies in the colours of the objects they were found as.
 
     Args:
         scene: The scene in physics.
         taken: The steps, done.
+        graph: The objects they took.
         T_world_camera: Where it is seen from (4, 4).
         config: Sizes of the pictures.
     """
     names = list(scene.object_bodies.values())
+    by_id = {o.id: o for o in graph.objects}
+    found = {t.body: by_id[t.step.object_id] for t in taken if t.body is not None}
+    label_of = np.zeros(max(scene.object_bodies, default=0) + 1, dtype=np.int32)
+    for label, name in scene.object_bodies.items():
+        label_of[label] = found[name].label if name in found else 0
     K = _zoomed(intrinsics(config.sensor), poses_of(scene)[:, :3], T_world_camera, config)
     figures = []
     for number, t in enumerate(taken, start=1):
@@ -43,15 +57,18 @@ def draw_lifts(
             continue
         rising = np.flatnonzero(t.film[:, names.index(t.body), 2] < ASIDE / 2.0)
         moment = t.film[rising[int((len(rising) - 1) * HALF_WAY)]] if t.ok else t.film[-1]
-        image = render(posed(scene, moment), T_world_camera, K, config.sensor).rgb
+        image = render(posed(scene, moment), T_world_camera, K, config.sensor)
         step = max(1, round(2 * config.sensor.width / config.report.image_width))
-        height, width = image[::step, ::step].shape[:2]
-        name = f"lift {number}: {t.step.object_id}"
+        labels = label_of[image.labels][::step, ::step]
+        height, width = labels.shape
+        pixels = tinted(image.rgb[::step, ::step], labels, width)
+        tags = [tag for item in found.values() if (tag := name_on(item, labels)) is not None]
         picture = svg.picture(
             width,
             height,
-            svg.raster(image[::step, ::step], 0, 0, width, height, jpeg=config.report.jpeg_quality),
-            name=name,
+            svg.raster(pixels, 0, 0, width, height, jpeg=config.report.jpeg_quality),
+            svg.tags(tags, (0, 0, width, height), TAG_SIZE * width / 640.0),
+            name=f"lift {number}: {t.step.object_id}",
         )
         held = f", {', '.join(t.step.hold)} held" if t.held else ""
         outcome = "Nothing else moved" if t.ok else f"{', '.join(t.disturbed)} moved"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from caryatid.report.charts import Line, bar_chart, line_chart
 
 if TYPE_CHECKING:
-    from caryatid.evaluation.scores import Score
+    from caryatid.report.contents import Report
     from caryatid.report.page import ViewPage
 
 
@@ -46,8 +45,9 @@ def changes(before: ViewPage | None, after: ViewPage) -> str:
     return "; ".join(f"{name}: {', '.join(items)}" for name, items in parts if items) or "nothing new"
 
 
-def cards(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[tuple[str, str, str]]:
+def cards(report: Report) -> list[tuple[str, str, str]]:
     """Big figures of the summary: (name, figure, what it is made of)."""
+    pages, scores = report.pages, report.scores
     last = pages[-1]
     objects = [o for o in last.objects if not o.surface]
     kinds = [(kind, sum(o.shape == kind for o in objects)) for kind in ("box", "cylinder", "sphere")]
@@ -71,7 +71,7 @@ def cards(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[tup
     if last.angle_travelled > 0.0 or last.path_travelled > 0.0:
         travelled = f"{np.rad2deg(last.angle_travelled):.0f}°"
         figures.append(("travelled", travelled, f"around the scene; {last.path_travelled:.1f} m of way"))
-    if scores is not None:
+    if scores:
         final = scores[-1]
         figures.insert(
             0, ("F1", f"{final.f1:.3f}", f"precision {final.precision:.3f}, recall {final.recall:.3f}")
@@ -79,34 +79,34 @@ def cards(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[tup
     return figures
 
 
-def charts(pages: Sequence[ViewPage], scores: Sequence[Score] | None) -> list[str]:
-    """Draw the summary's charts as SVG: scores over views and path, what was found, time."""
+def charts(report: Report) -> dict[str, str]:
+    """Draw the summary's charts as SVG, by their titles: scores over views and path, what was found, time."""
+    pages, scores = report.pages, report.scores
     number = [float(page.index) for page in pages]
-    drawn = []
-    if scores is not None:
+    drawn = {}
+
+    def draw_lines(title: str, x: list[float], x_name: str, lines: list[Line], y_name: str) -> None:
+        y_range = (0.0, 1.0) if title.startswith("F1") else None
+        drawn[title] = line_chart(x, lines, title=title, x_name=x_name, y_name=y_name, y_range=y_range)
+
+    if scores:
         kinds = (("F1", "f1"), ("precision", "precision"), ("recall", "recall"))
         lines = [Line(name, [float(getattr(score, key)) for score in scores]) for name, key in kinds]
-        names = ", ".join(line.name for line in lines)
-        drawn.append(
-            line_chart(number, lines, title="F1 over views", x_name="view", y_name=names, y_range=(0.0, 1.0))
-        )
+        draw_lines("F1 over views", number, "view", lines, ", ".join(line.name for line in lines))
         path, unit = [page.path_travelled for page in pages], "path [m]"
         if path[-1] == 0.0:
             path = [float(np.rad2deg(page.angle_travelled)) for page in pages]
             unit = "angle around the scene [°]"
         if path[-1] > path[0]:
-            title = "F1 over travelled path"
-            drawn.append(
-                line_chart(path, lines[:1], title=title, x_name=unit, y_name="F1", y_range=(0.0, 1.0))
-            )
+            draw_lines("F1 over travelled path", path, unit, lines[:1], "F1")
     if len(pages) > 1:
         found = [
             Line("objects", [sum(not o.surface for o in page.objects) for page in pages]),
             Line("supports", [len(page.supports) for page in pages]),
             Line("uncertain supports", [sum(not s.certain for s in page.supports) for page in pages]),
         ]
-        drawn.append(line_chart(number, found, title="Found so far", x_name="view", y_name="number"))
+        draw_lines("Found so far", number, "view", found, "number")
     if any(page.timings for page in pages):
-        times = [page.timings for page in pages]
-        drawn.append(bar_chart(times, title="Time of each stage", x_name="view", y_name="time [s]"))
+        times, title = [page.timings for page in pages], "Time of each stage"
+        drawn[title] = bar_chart(times, title=title, x_name="view", y_name="time [s]")
     return drawn
