@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test check accuracy-gate bench bench-gate format clean
+.PHONY: install demo test check accuracy-gate bench bench-gate gif format clean
 
 install: $(VENV)/.installed
 
@@ -38,6 +38,9 @@ bench: $(VENV)/.peers
 
 bench-gate: $(VENV)/.peers
 	$(BIN)/python benchmarks/bench.py --gate
+
+gif: install
+	$(BIN)/python benchmarks/pictures/film.py
 
 format: install
 	$(BIN)/ruff check --fix-only .
