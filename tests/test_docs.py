@@ -81,6 +81,7 @@ def test_commands_run(workplace, benchmark_folder, capsys, monkeypatch):
         "export",
         "benchmark",
         "config",
+        "report",
         "session",
     }
     assert {command[0] for command in commands} == named
