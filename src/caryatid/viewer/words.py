@@ -1,0 +1,115 @@
+"""What the page says beside its scene, as HTML: of a view, of an object, and the support graph drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from html import escape
+from importlib import resources
+
+from caryatid.graph import SupportGraph
+from caryatid.manipulation.effects import Effect
+from caryatid.report.graphs import draw_graph
+from caryatid.report.layout import arrange
+from caryatid.report.rows import ObjectRow, object_rows, support_rows
+from caryatid.viewer.moments import Moment
+
+NOTHING_CHOSEN = "Click an object in the scene to see what is known of it."
+
+
+def in_page(content: str) -> str:
+    """Put content into a block that the page's style applies to."""
+    return f'<style>{_style()}</style><div class="caryatid">{content}</div>'
+
+
+@cache
+def _style() -> str:
+    return resources.files("caryatid.viewer").joinpath("page.css").read_text(encoding="utf-8")
+
+
+def tell_view(moment: Moment, views: int) -> str:
+    """Say what a view brought, and where to look next."""
+    graph = moment.graph
+    objects = sum(o.role == "object" for o in graph.objects)
+    uncertain = sum(not s.certain for s in graph.supports)
+    doubt = f' <span class="doubt">({uncertain} uncertain)</span>' if uncertain else ""
+    parts = [
+        f"<p><b>View {moment.index}</b> of {views - 1} · {escape(moment.name)}</p>",
+        f"<p>{objects} objects, {len(graph.supports)} supports{doubt}</p>",
+    ]
+    if moment.dots is not None:
+        parts.append(f'<p class="soft">{len(moment.dots):,} points</p>')
+    if moment.score is not None:
+        parts.append(f"<p>F1 <b>{moment.score:.3f}</b></p>")
+    decision = moment.decision
+    if decision is not None:
+        who = "chosen by hand" if moment.by_hand else escape(decision.why)
+        parts.append(f"<p><b>Next:</b> {who}</p>")
+        figures = f"saliency {decision.saliency:.2f} − cost {decision.cost:.2f} = {decision.score:.2f}"
+        parts.append(f'<p class="soft">{figures}</p>')
+    if moment.stop is not None:
+        parts.append(f'<p class="good">Done: {escape(moment.stop)}.</p>')
+    return in_page("".join(parts))
+
+
+def tell_graph(graph: SupportGraph) -> str:
+    """Draw the support graph as the report does."""
+    caption = (
+        "Arrows run from supporter to supported, with how often each was found; dashed ones are uncertain. "
+        "In the scene a ball on an arrow means leaning, a cube weight from above."
+    )
+    return in_page(f'{draw_graph(graph, arrange(graph))}<p class="soft">{caption}</p>')
+
+
+def tell_object(moment: Moment, object_id: str, effects: Sequence[Effect] | None) -> str:
+    """Say of an object what it is, how it is known, its edges, and what falls without it.
+
+    Args:
+        moment: What is known.
+        object_id: Which.
+        effects: What would move were it taken away; None for the support surface.
+    """
+    rows = {row.id: row for row in object_rows(moment.graph)}
+    if object_id not in rows:
+        return in_page(f"<p>{escape(object_id)} is not known after this view.</p>")
+    row = rows[object_id]
+    head = f'<p><span class="chip" style="background:{row.colour}"></span><b>{row.id}</b> · {row.shape}</p>'
+    return in_page(head + _facts(row) + _edges(moment.graph, object_id) + _falls(object_id, effects))
+
+
+def _facts(row: ObjectRow) -> str:
+    facts = [
+        ("size", row.size),
+        ("found in", f"{row.seen} views"),
+        ("unseen sides", row.unseen),
+        ("residual", row.residual + (" · poor fit" if row.poor_fit else "")),
+        ("stability", row.stability),
+        ("because", row.why),
+    ]
+    lines = "".join(f"<tr><td>{name}</td><td>{escape(said)}</td></tr>" for name, said in facts if said)
+    return f"<table>{lines}</table>"
+
+
+def _edges(graph: SupportGraph, object_id: str) -> str:
+    rows = [row for row in support_rows(graph) if object_id in (row.supporter, row.supported)]
+    if not rows:
+        return '<p class="doubt">Nothing is known to support it, and it supports nothing.</p>'
+    items = []
+    for row in rows:
+        doubt = "" if row.certain else ' <span class="doubt">uncertain</span>'
+        said = f"{row.supporter} → {row.supported}, {row.kind}{doubt}, {row.evidence}"
+        items.append(f'<li>{said}<br><span class="soft">{escape(row.why)}</span></li>')
+    return f"<p><b>Supports</b></p><ul>{''.join(items)}</ul>"
+
+
+def _falls(object_id: str, effects: Sequence[Effect] | None) -> str:
+    if effects is None:
+        return ""
+    if not effects:
+        return f'<p><b>Without {object_id}</b> <span class="good">nothing falls.</span></p>'
+    items = "".join(
+        f"<li><b>{e.object_id}</b> {'falls' if e.certain else 'may fall'}: "
+        f'<span class="soft">{escape(e.why)}</span></li>'
+        for e in effects
+    )
+    return f"<p><b>Without {object_id}</b></p><ul>{items}</ul>"
