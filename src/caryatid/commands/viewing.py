@@ -3,41 +3,84 @@
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
 from threading import Event
 
 from caryatid.commands.progress import Progress
+from caryatid.commands.sources import open_source
 from caryatid.commands.view import View
 from caryatid.config import Config
 from caryatid.formats.json_files import json_text
-from caryatid.formats.runs import read_run
-from caryatid.viewer.page import Page
+from caryatid.formats.runs import is_run, read_run
+from caryatid.kernels.compiling import compile_kernels
+from caryatid.viewer.controls import Controls
+from caryatid.viewer.loop import Loop
+from caryatid.viewer.page import MOST_POINTS, Page
 from caryatid.viewer.runs import config_of_run, moments_of_run
 
 
 def run_viewer(options: View, config: Config) -> int:
     """Show a run, a scene or a recording until Ctrl-C."""
     progress = Progress(options.general.quiet or options.general.json)
-    run = read_run(options.source)
-    moments = moments_of_run(run)
-    page = Page(
-        f"caryatid: {run.folder.name}", config_of_run(run).support, host=options.host, port=options.port
-    )
-    for moment in moments:
-        page.add(moment)
-    return _kept_open(page, options, progress)
+    with ExitStack() as stack:
+        opened = _open_run if is_run(Path(options.source)) else _open_loop
+        page = opened(options, config, progress, stack)
+        if options.general.json:
+            sys.stdout.write(json_text({"address": page.url, "source": options.source}))
+            sys.stdout.flush()
+        progress.say(f"{options.source} at {page.url}; Ctrl-C ends")
+        if not options.no_browser:
+            page.open_browser()
+        wait_for_interrupt()
+    return 0
 
 
-def _kept_open(page: Page, options: View, progress: Progress) -> int:
-    if options.general.json:
-        sys.stdout.write(json_text({"address": page.url, "source": options.source}))
-        sys.stdout.flush()
-    progress.say(f"{options.source} at {page.url}; Ctrl-C ends")
-    if not options.no_browser:
-        page.open_browser()
+def wait_for_interrupt() -> None:
+    """Return at Ctrl-C."""
     try:
         Event().wait()
     except KeyboardInterrupt:
-        return 0
-    finally:
-        page.close()
-    return 0
+        return
+
+
+def _open_run(options: View, config: Config, progress: Progress, stack: ExitStack) -> Page:
+    run = read_run(options.source)
+    moments = moments_of_run(run)
+    title = f"caryatid: {run.folder.name}"
+    page = Page(title, config_of_run(run).support, host=options.host, port=options.port)
+    stack.callback(page.close)
+    for moment in moments:
+        page.add(moment)
+    return page
+
+
+def _open_loop(options: View, config: Config, progress: Progress, stack: ExitStack) -> Page:
+    seed = options.modelling.seed
+    opening = partial(
+        open_source,
+        options.source,
+        noise=options.noise,
+        segmentation=options.segmentation,
+        seed=seed,
+        robot=options.robot,
+    )
+    with progress.working("opening"):
+        loop = Loop(
+            opening,
+            config,
+            planner=options.planner,
+            segmentation=options.segmentation,
+            seed=seed,
+            most_points=MOST_POINTS,
+        )
+    with progress.working("compiling"):
+        compile_kernels(progress.say)
+    title = f"caryatid: {loop.source.name}"
+    page = Page(title, config.support, host=options.host, port=options.port)
+    stack.callback(page.close)
+    controls = Controls(page, loop, seed=seed)
+    stack.callback(controls.close)
+    controls.start()
+    return page

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -34,12 +35,12 @@ class Canvas:
         return dict(self._drawn)
 
     def show(self, drawing: Drawing) -> None:
-        """Show a drawing in place of the last one; marks that are the same objects are not sent again."""
+        """Show a drawing in place of the last one; marks that are as they were are not sent again."""
         with self._server.atomic():
             for name in self._drawn.keys() - drawing.keys():
                 self._nodes.pop(name).remove()
             for name, mark in drawing.items():
-                if self._drawn.get(name) is not mark:
+                if name not in self._drawn or not same(self._drawn[name], mark):
                     self._nodes[name] = self._put(f"/{name}", mark)
         self._drawn = dict(drawing)
 
@@ -87,6 +88,14 @@ class Canvas:
                     name, mark.text, position=mark.position_world, anchor="bottom-center",
                     font_screen_scale=0.85,
                 )  # fmt: skip
+
+
+def same(a: Mark, b: Mark) -> bool:
+    """Whether two marks look the same."""
+    if a is b or type(a) is not type(b):
+        return a is b
+    values = ((getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
+    return all(x is y or np.array_equal(x, y) for x, y in values)
 
 
 def _pose(T: Array) -> dict[str, Array]:

@@ -14,6 +14,7 @@ import numpy as np
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.frames import Array
+from caryatid.graph import SupportGraph
 from caryatid.manipulation.effects import predict_removal
 from caryatid.report.colours import SERIES
 from caryatid.viewer import words
@@ -61,6 +62,8 @@ class Page:
         self._shown = -1
         self._chosen = ""
         self._by_hand: Array | None = None
+        self._staged: Moment | None = None
+        self._graph_drawn: SupportGraph | None = None
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
         self._listeners: list[Callable[[Moment], None]] = []
@@ -116,6 +119,7 @@ class Page:
         index = min(max(index, 0), len(self._moments) - 1)
         if index != self._shown:
             self._shown = index
+            self._staged = None
             self.redraw()
 
     def choose(self, object_id: str) -> None:
@@ -127,6 +131,12 @@ class Page:
         """Show a view (4, 4) a person has chosen, or none."""
         self._by_hand = T_world_camera
         self.redraw()
+
+    def stage(self, moment: Moment | None) -> None:
+        """Show a moment that is none of those after a view; None goes back to those."""
+        if moment is not self._staged:
+            self._staged = moment
+            self.redraw()
 
     def when_shown(self, tell: Callable[[Moment], None]) -> None:
         """Have a moment told to somebody each time one has been drawn."""
@@ -195,7 +205,7 @@ class Page:
         camera.position = centre + 2.4 * backward + [0.0, 0.0, 1.5]
 
     def _draw(self) -> None:
-        moment, chosen = self.shown, self._chosen
+        moment, chosen = self._staged or self.shown, self._chosen
         if moment is None:
             self._canvas.show({})
             return
@@ -215,7 +225,9 @@ class Page:
         self._slider.disabled = last == 0
         self._slider.value = self._shown
         self._told.content = words.tell_view(moment, len(self._moments))
-        self._graph.content = words.tell_graph(moment.graph)
+        if moment.graph is not self._graph_drawn:
+            self._graph_drawn = moment.graph
+            self._graph.content = words.tell_graph(moment.graph)
         self._draw_scores()
         for tell in self._listeners:
             tell(moment)
