@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from html import escape
 from threading import Event
 from typing import Any, get_args
 
@@ -17,7 +16,6 @@ from caryatid.manipulation.order import plan_order
 from caryatid.planners import BUILT_IN, ORACLE, offered
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.threads import cores
-from caryatid.viewer import words
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.moments import Moment
 from caryatid.viewer.page import Page
@@ -80,7 +78,6 @@ class Controls:
         gui = self._page.server.gui
         names = [*BUILT_IN, *sorted(offered()), *([ORACLE] if self._loop.planner == ORACLE else [])]
         with gui.add_folder("loop", order=-10):
-            self._status = gui.add_html("", order=0)
             self._next = self._button("next view", self.next_view, "Take one turn of the loop", 1)
             self._go = self._button("run", self.run, "Take turn after turn", 2)
             self._pause = self._button("pause", self.pause, "Stop after this turn", 3)
@@ -128,7 +125,7 @@ class Controls:
 
     def _say(self, text: str, *, busy: bool) -> None:
         ended = self._loop.ended is not None
-        self._status.content = words.in_page(f"<p>{escape(text)}</p>") if text else ""
+        self._page.say(text)
         self._next.disabled = self._go.disabled = busy or ended
         self._pause.disabled = not busy
         self._dismantle.disabled = busy or not self._loop.moments
@@ -218,7 +215,7 @@ class Controls:
             if picture.done:
                 harm = f", {', '.join(picture.disturbed)} disturbed" if picture.disturbed else ""
                 said = f"{picture.number + 1} of {len(order.steps)} taken: {picture.step.object_id}{harm}"
-                self._status.content = words.in_page(f"<p>{escape(said)}</p>")
+                self._page.say(said)
             time.sleep(PICTURE_TIME)
         return f"{order.refusal or 'a safe order'}; {said}"
 

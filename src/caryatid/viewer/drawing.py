@@ -14,10 +14,10 @@ from caryatid.viewer.moments import Dots, Moment, Shot
 
 LAYERS = ("cloud", "shapes", "names", "supports", "sphere", "interest", "cameras", "robot")
 """What can be shown and hidden, as the page has it."""
-SPHERE_DOTS, SPHERE_SIZE = 2500, 0.011
-"""Points of the view sphere that are drawn at the most, and their size [m]."""
-BEYOND = (206, 209, 213)
-"""Points of the view sphere the robot cannot bring its camera to."""
+SPHERE_DOTS, SPHERE_SIZE = 7000, 0.016
+"""Points that are drawn of a whole view sphere, and their size [m]; a robot reaches a quarter of them."""
+BEYOND_DOTS, BEYOND = 700, (206, 209, 213)
+"""How many points are drawn where the robot cannot bring its camera, and their colour."""
 INTEREST_SIZE = 0.02
 """Of a point of interest [m]."""
 EARLIER, NEWEST, NEXT, BY_HAND = (128, 136, 146), (26, 32, 40), (11, 92, 148), (170, 30, 120)
@@ -81,13 +81,13 @@ def _draw_sphere(moment: Moment) -> Drawing:
     drawing: Drawing = {}
     directions = sphere.directions
     beyond = directions[directions[:, 2] > 0.0]
-    beyond = beyond[:: max(1, len(beyond) // (SPHERE_DOTS // 8))]
+    beyond = beyond[:: max(1, len(beyond) // BEYOND_DOTS)]
     if candidates is not None and len(candidates):
-        stride = max(1, -(-len(candidates) // SPHERE_DOTS))
-        reachable = candidates.directions[::stride]
-        saliency = np.zeros(len(reachable))
+        few = candidates.looks(SPHERE_DOTS).chosen
+        reachable = candidates.directions[few]
+        saliency = np.zeros(len(few))
         if decision is not None and decision.candidate_saliency is not None:
-            saliency = _stretched(decision.candidate_saliency)[::stride]
+            saliency = _stretched(decision.candidate_saliency)[few]
         colours = scale(saliency, SALIENCY_STOPS)
         at = (sphere.radius * reachable).astype(np.float32)
         size = SPHERE_SIZE if len(reachable) > 200 else 3.0 * SPHERE_SIZE

@@ -40,7 +40,6 @@ class Loop:
         planner: Name of who chooses the next view.
         segmentation: Where parts come from.
         seed: Seed of every random choice.
-        most_points: Points of the cloud that moments keep at the most.
 
     Attributes:
         source: What is explored.
@@ -61,10 +60,8 @@ class Loop:
         planner: str = "support",
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
-        most_points: int = 1_000_000,
     ) -> None:
         self._open_source, self._segmentation, self._seed = open_source, segmentation, seed
-        self._most_points = most_points
         self._began_with = planner
         self._planner_name = planner
         self.config = config
@@ -211,7 +208,7 @@ class Loop:
         if self.source.truth is not None:
             f1 = score(step.graph, self.source.truth, np.random.default_rng(0)).f1
         standing = standing_of(self.source.robot, self.config)
-        return moment_of_step(step, most_points=self._most_points, robot=standing, score=f1)
+        return moment_of_step(step, robot=standing, score=f1)
 
     def _would_stop(self, before: SupportGraph, after: SupportGraph) -> str | None:
         views = len(self.moments)

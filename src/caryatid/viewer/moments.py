@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from caryatid.robot import Posture
     from caryatid.scene import Scene
 
+MOST_POINTS = 1_000_000
+"""Points of the fused cloud that are kept at the most, evenly picked."""
 PICTURE_WIDTH = 240
 """Width a camera's picture is reduced to, about [px]."""
 
@@ -120,7 +122,7 @@ class Moment:
 
 
 def moment_of_step(
-    step: Step, *, most_points: int, robot: Standing | None = None, score: float | None = None
+    step: Step, *, most_points: int = MOST_POINTS, robot: Standing | None = None, score: float | None = None
 ) -> Moment:
     """Keep of a step what is drawn.
 
@@ -147,7 +149,7 @@ def moment_of_step(
     )
 
 
-def moment_of_scene(scene: Scene, *, most_points: int) -> Moment:
+def moment_of_scene(scene: Scene, *, most_points: int = MOST_POINTS) -> Moment:
     """What a scene knows now; it need not have been explored."""
     visited = np.zeros((0, 3))
     if scene.sphere is not None and scene.T_world_camera is not None:

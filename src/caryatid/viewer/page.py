@@ -6,6 +6,7 @@ import contextlib
 import webbrowser
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from html import escape
 from threading import RLock
 from typing import Any
 
@@ -22,12 +23,10 @@ from caryatid.viewer.canvas import Canvas
 from caryatid.viewer.drawing import LAYERS, draw_moment
 from caryatid.viewer.moments import Moment
 
-MOST_POINTS = 1_000_000
-"""Points of the fused cloud that are shown at the most, evenly picked."""
 POINT_SIZE = 0.004
 """Diameter of a point at first [m]."""
 ACCENT = (11, 92, 148)
-BESIDE = 430
+BESIDE = 380
 """Width of the panel with the graph [px]."""
 
 
@@ -91,6 +90,11 @@ class Page:
     def canvas(self) -> Canvas:
         """The scene in the page."""
         return self._canvas
+
+    def say(self, text: str) -> None:
+        """Say something at the top of the page, in place of what was said before."""
+        self._notice.content = words.in_page(f"<p>{escape(text)}</p>")
+        self._notice.visible = bool(text)
 
     def open_browser(self) -> None:
         """Open the page in the user's browser, if there is one."""
@@ -160,6 +164,7 @@ class Page:
 
     def _build(self) -> None:
         gui = self._server.gui
+        self._notice = gui.add_html("", order=-20, visible=False)
         self._slider = gui.add_slider("view", 0, 1, 1, 0, disabled=True, hint="Go back to an earlier view")
         self._slider.on_update(lambda _: self.go_to(int(self._slider.value)))
         self._told = gui.add_html("")
@@ -177,6 +182,7 @@ class Page:
         with self._scores:
             self._no_chart = gui.add_html(words.in_page("<p>The truth is not known here.</p>"))
         self._chart: Any = None
+        gui.main_panel.dock_right()
         panel.dock_left()
         panel.set_width(BESIDE)
         about = gui.add_panel()
@@ -202,7 +208,7 @@ class Page:
             backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
         backward /= max(float(np.linalg.norm(backward)), 1e-9)
         camera.look_at = centre
-        camera.position = centre + 2.4 * backward + [0.0, 0.0, 1.5]
+        camera.position = centre + 2.0 * backward + [0.0, 0.0, 1.35]
 
     def _draw(self) -> None:
         moment, chosen = self._staged or self.shown, self._chosen

@@ -7,7 +7,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 from caryatid.viewer.moments import moment_of_scene
-from caryatid.viewer.page import MOST_POINTS, Page
+from caryatid.viewer.page import Page
 
 if TYPE_CHECKING:
     from caryatid.scene import Scene
@@ -30,7 +30,7 @@ class Shown:
 
     def update(self, scene: Scene) -> None:
         """Add what a scene knows by now; the page's slider goes back to what it knew before."""
-        self.page.add(moment_of_scene(scene, most_points=MOST_POINTS))
+        self.page.add(moment_of_scene(scene))
 
     def close(self) -> None:
         """Stop serving the page."""
