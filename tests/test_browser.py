@@ -100,7 +100,7 @@ def test_a_click_on_an_object_says_what_falls_without_it(live, tab):
 
 
 def test_a_view_is_chosen_by_hand(live, tab):
-    page, controls = live
+    page, _ = live
     tab.open(page.url)
     tab.page.get_by_role("checkbox", name="choose the next view by hand").click()
     moment = page.shown

@@ -85,13 +85,9 @@ def draw_supports(graph: SupportGraph) -> Drawing:
             balls.append(middle)
         elif support.kind == "top-down":
             cubes.append(middle)
-    bodies = (
-        ("shafts", "rod", shafts),
-        ("heads", "cone", heads),
-        ("lean", "ball", balls),
-        ("top", "cube", cubes),
-    )
-    return {f"supports/{name}": _copies(body, placed) for name, body, placed in bodies if placed}
+    parts = {"shafts": shafts, "heads": heads, "lean": balls, "top-down": cubes}
+    bodies = {"shafts": "rod", "heads": "cone", "lean": "ball", "top-down": "cube"}
+    return {f"supports/{name}": _copies(bodies[name], placed) for name, placed in parts.items() if placed}
 
 
 def draw_robot(robot: Standing) -> Drawing:

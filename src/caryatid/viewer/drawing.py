@@ -14,9 +14,9 @@ from caryatid.viewer.moments import Dots, Moment, Shot
 
 LAYERS = ("cloud", "shapes", "names", "supports", "sphere", "interest", "cameras", "robot")
 """What can be shown and hidden, as the page has it."""
-SPHERE_DOTS, SPHERE_SIZE = 7000, 0.016
+SPHERE_DOTS, SPHERE_SIZE = 10_000, 0.01
 """Points that are drawn of a whole view sphere, and their size [m]; a robot reaches a quarter of them."""
-BEYOND_DOTS, BEYOND = 700, (206, 209, 213)
+BEYOND_DOTS, BEYOND = 900, (206, 209, 213)
 """How many points are drawn where the robot cannot bring its camera, and their colour."""
 INTEREST_SIZE = 0.02
 """Of a point of interest [m]."""
@@ -84,14 +84,13 @@ def _draw_sphere(moment: Moment) -> Drawing:
     beyond = beyond[:: max(1, len(beyond) // BEYOND_DOTS)]
     if candidates is not None and len(candidates):
         few = candidates.looks(SPHERE_DOTS).chosen
-        reachable = candidates.directions[few]
-        saliency = np.zeros(len(few))
-        if decision is not None and decision.candidate_saliency is not None:
-            saliency = _stretched(decision.candidate_saliency)[few]
-        colours = scale(saliency, SALIENCY_STOPS)
-        at = (sphere.radius * reachable).astype(np.float32)
-        size = SPHERE_SIZE if len(reachable) > 200 else 3.0 * SPHERE_SIZE
-        drawing["sphere/reachable"] = Points(sphere.centre_world, at, colours, size)
+        rated = None if decision is None else decision.candidate_saliency
+        saliency = np.zeros(len(few)) if rated is None else _stretched(rated)[few]
+        at = (sphere.radius * candidates.directions[few]).astype(np.float32)
+        size = SPHERE_SIZE if len(few) > 100 else 4.0 * SPHERE_SIZE
+        drawing["sphere/reachable"] = Points(
+            sphere.centre_world, at, scale(saliency, SALIENCY_STOPS), 0.6 * size if rated is None else size
+        )
     pale = np.tile(np.array(BEYOND, np.uint8), (len(beyond), 1))
     at = (sphere.radius * beyond).astype(np.float32)
     drawing["sphere/beyond"] = Points(sphere.centre_world, at, pale, 0.5 * SPHERE_SIZE)
@@ -117,7 +116,7 @@ def _draw_interest(moment: Moment) -> Drawing:
     }
     if moment.sphere is not None:
         ends = moment.sphere.centre_world + moment.sphere.radius * np.array([p.direction for p in points])
-        drawing["interest/rays"] = Lines(np.stack([at, ends], axis=1), colours, 1.5)
+        drawing["interest/rays"] = Lines(np.stack([at, ends], axis=1), colours, 1.0)
     return drawing
 
 

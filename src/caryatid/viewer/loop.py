@@ -142,11 +142,10 @@ class Loop:
             if moment is None:
                 return
             goes_to = before.decision
-            if before is not earlier[-1] and goes_to is not None:
+            own = moment.decision
+            if before is not earlier[-1] and goes_to is not None and not _same_view(own, goes_to):
                 self._robot.go_instead(goes_to.T_world_camera)
-                own = moment.decision
-                if own is None or not np.allclose(own.T_world_camera, goes_to.T_world_camera):
-                    moment = self.moments[-1] = moment.going_to(goes_to, by_hand=before.by_hand)
+                moment = self.moments[-1] = moment.going_to(goes_to, by_hand=before.by_hand)
             yield moment
 
     def use_planner(self, name: str) -> Moment | None:
@@ -217,6 +216,11 @@ class Loop:
         if views > 1 and not changed(before, after, self.config.fusion):
             return "the last view changed nothing"
         return None
+
+
+def _same_view(own: Decision | None, other: Decision) -> bool:
+    """Whether the loop goes there by itself; poses from a file are rounded, its own are not."""
+    return own is not None and np.allclose(own.T_world_camera, other.T_world_camera, atol=1e-6)
 
 
 def standing_of(robot: Robot, config: Config) -> Standing | None:

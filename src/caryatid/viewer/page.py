@@ -26,6 +26,8 @@ from caryatid.viewer.moments import Moment
 POINT_SIZE = 0.004
 """Diameter of a point at first [m]."""
 ACCENT = (11, 92, 148)
+FIELD_OF_VIEW = 0.72
+"""Of the eye [rad]; narrow, so that what is near does not hide what is far."""
 BESIDE = 380
 """Width of the panel with the graph [px]."""
 
@@ -181,6 +183,8 @@ class Page:
         self._scores = panel.add_tab("F1")
         with self._scores:
             self._no_chart = gui.add_html(words.in_page("<p>The truth is not known here.</p>"))
+        with panel.add_tab("key"):
+            gui.add_html(words.tell_key())
         self._chart: Any = None
         gui.main_panel.dock_right()
         panel.dock_left()
@@ -208,7 +212,8 @@ class Page:
             backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
         backward /= max(float(np.linalg.norm(backward)), 1e-9)
         camera.look_at = centre
-        camera.position = centre + 2.0 * backward + [0.0, 0.0, 1.35]
+        camera.position = centre + 3.2 * backward + [0.0, 0.0, 2.2]
+        camera.fov = FIELD_OF_VIEW
 
     def _draw(self) -> None:
         moment, chosen = self._staged or self.shown, self._chosen

@@ -9,6 +9,7 @@ from importlib import resources
 
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.effects import Effect
+from caryatid.report.colours import SALIENCY_STOPS
 from caryatid.report.graphs import draw_graph
 from caryatid.report.layout import arrange
 from caryatid.report.rows import ObjectRow, object_rows, support_rows
@@ -54,11 +55,26 @@ def tell_view(moment: Moment, views: int) -> str:
 
 def tell_graph(graph: SupportGraph) -> str:
     """Draw the support graph as the report does."""
-    caption = (
-        "Arrows run from supporter to supported, with how often each was found; dashed ones are uncertain. "
-        "In the scene a ball on an arrow means leaning, a cube weight from above."
-    )
+    caption = "Arrows run from supporter to supported, with how often each was found; dashed: uncertain."
     return in_page(f'{draw_graph(graph, arrange(graph))}<p class="soft">{caption}</p>')
+
+
+def tell_key() -> str:
+    """Say what the signs in the scene mean."""
+    stops = ", ".join(f"{colour} {50.0 * (at + 1.0):.0f}%" for at, colour in SALIENCY_STOPS)
+    scale = f'<div class="scale" style="background:linear-gradient(90deg, {stops})"></div>'
+    signs = (
+        ("Arrow", "supporter → supported; dashed where uncertain"),
+        ("Ball, cube on an arrow", "it leans; weight from above. Neither: carried from below"),
+        ("Dots on the sphere", "where the robot can bring its camera, coloured by saliency"),
+        ("Fine grey dots", "where it cannot"),
+        ("Balls with rays", "points of interest, and from where they are seen best"),
+        ("Grey cameras", "views so far, with what they saw; the newest is black and larger"),
+        ("Filled camera", "the next view: blue the planner's choice, pink one by hand"),
+    )
+    rows = "".join(f"<tr><td>{sign}</td><td>{meaning}</td></tr>" for sign, meaning in signs)
+    ends = '<p class="soft ends"><span>seen before</span><span>nothing</span><span>look here</span></p>'
+    return in_page(f"<p><b>Saliency</b>, the highest of each view red</p>{scale}{ends}<table>{rows}</table>")
 
 
 def tell_object(moment: Moment, object_id: str, effects: Sequence[Effect] | None) -> str:
