@@ -40,8 +40,10 @@ class Canvas:
             for name in self._drawn.keys() - drawing.keys():
                 self._nodes.pop(name).remove()
             for name, mark in drawing.items():
-                if name not in self._drawn or not same(self._drawn[name], mark):
-                    self._nodes[name] = self._put(f"/{name}", mark)
+                before = self._drawn.get(name)
+                if before is not None and (same(before, mark) or _adjusted(self._nodes[name], before, mark)):
+                    continue
+                self._nodes[name] = self._put(f"/{name}", mark)
         self._drawn = dict(drawing)
 
     def show_layer(self, name: str, visible: bool) -> None:
@@ -96,6 +98,22 @@ def same(a: Mark, b: Mark) -> bool:
         return a is b
     values = ((getattr(a, field.name), getattr(b, field.name)) for field in fields(a))
     return all(x is y or np.array_equal(x, y) for x, y in values)
+
+
+def _adjusted(node: Any, before: Mark, mark: Mark) -> bool:
+    """Change what is there where that takes less than putting it there anew; whether it did."""
+    match before, mark:
+        case Label(), Label() if before.text == mark.text:
+            node.position = mark.position_world
+        case Mesh(), Mesh() if before.colour == mark.colour and before.faces is mark.faces:
+            node.position, node.wxyz = mark.T_world_mesh[:3, 3], quaternion(mark.T_world_mesh[:3, :3])
+            if not np.array_equal(before.vertices, mark.vertices):
+                node.vertices = mark.vertices
+            if before.opacity != mark.opacity:
+                node.opacity = mark.opacity
+        case _:
+            return False
+    return True
 
 
 def _pose(T: Array) -> dict[str, Array]:

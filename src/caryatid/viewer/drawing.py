@@ -60,7 +60,7 @@ def draw_moment(
 
 def draw_dots(dots: Dots, size: float, *, true_colours: bool = False) -> Points:
     """Draw a cloud in its objects' colours, or as the camera saw it where it has colour."""
-    middle = (dots.points_world.min(axis=0) + dots.points_world.max(axis=0)) / 2.0
+    middle = dots.points_world[:: max(1, len(dots) // 1000)].mean(axis=0)
     colours = dots.rgb if true_colours and dots.rgb is not None else _label_colours(dots)
     return Points(middle.astype(np.float64), dots.points_world - middle, colours, size)
 
