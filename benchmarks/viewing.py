@@ -26,6 +26,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from browser import browser
 
 from caryatid.commands.sources import open_source
 from caryatid.config import Config
@@ -33,8 +34,6 @@ from caryatid.exploration import Step, explore
 from caryatid.viewer.loop import Loop, standing_of
 from caryatid.viewer.moments import Dots, Moment, moment_of_step
 from caryatid.viewer.page import Page
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 SCENE = "clutter"
 SIZES = (300_000, 1_000_000)
@@ -80,8 +79,6 @@ def with_points(moment: Moment, count: int, rng: np.random.Generator) -> Moment:
 
 def latency(size: int, runs: int) -> list[float]:
     """Seconds from adding a view of `size` points to the browser having them."""
-    from browser import browser
-
     config, rng = Config(), np.random.default_rng(0)
     seen = moments(config, 3)
     page = Page("latency", config.support)

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import os
+import sys
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
-from browser import browser, chromium
 
 from caryatid import frames
 from caryatid.commands.sources import open_source
 from caryatid.viewer.controls import Controls
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.page import Page
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+from browser import browser, chromium
 
 pytest.importorskip("viser")
 pytest.importorskip("playwright")

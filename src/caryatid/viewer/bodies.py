@@ -19,7 +19,7 @@ from caryatid.viewer.moments import Standing
 
 ROUND = 40
 """Corners of a drawn circle."""
-OPACITY, TABLE_OPACITY = 0.42, 0.16
+OPACITY, CHOSEN_OPACITY, TABLE_OPACITY = 0.36, 0.7, 0.16
 """Of shapes: one sees the points and the arrows in them."""
 CERTAIN, UNCERTAIN = (26, 32, 40), (196, 78, 12)
 """Colours of supports; uncertain ones are dashed too."""
@@ -45,9 +45,11 @@ def draw_shapes(graph: SupportGraph, chosen: str = "") -> Drawing:
         surface = item.role == "support_surface"
         colour = rgb(object_colour(item.label))
         vertices, faces = _mesh(item.shape)
-        opacity = TABLE_OPACITY if surface else (0.8 if item.id == chosen else OPACITY)
+        opacity = TABLE_OPACITY if surface else (CHOSEN_OPACITY if item.id == chosen else OPACITY)
         T = item.shape.T_world_object
-        drawing[f"shapes/{item.id}"] = Mesh(T, vertices, faces, colour, opacity, item.id)
+        drawing[f"shapes/{item.id}"] = Mesh(
+            T, vertices, faces, colour, opacity, item.id, flat=item.shape.kind == "box"
+        )
         outline = frames.transform(T, _outline(item.shape).reshape(-1, 3)).reshape(-1, 2, 3)
         ends.append(outline)
         ink = (17, 17, 17) if item.id == chosen else tuple(int(0.55 * c) for c in colour)

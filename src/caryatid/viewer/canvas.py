@@ -61,7 +61,7 @@ class Canvas:
             case Mesh():
                 node = scene.add_mesh_simple(
                     name, mark.vertices, mark.faces, color=mark.colour, opacity=mark.opacity,
-                    flat_shading=False, side="double", cast_shadow=False, receive_shadow=False,
+                    flat_shading=mark.flat, side="double", cast_shadow=False, receive_shadow=False,
                     **_pose(mark.T_world_mesh),
                 )  # fmt: skip
                 if mark.object_id:

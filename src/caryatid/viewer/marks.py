@@ -42,6 +42,7 @@ class Mesh:
         colour: Its colour.
         opacity: 1 = one sees nothing through it.
         object_id: Whose shape it is: a click on it chooses the object; empty for anything else.
+        flat: Its faces are, and not parts of something round.
     """
 
     T_world_mesh: Array
@@ -50,6 +51,7 @@ class Mesh:
     colour: Colour
     opacity: float = 1.0
     object_id: str = ""
+    flat: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -11,6 +11,7 @@ from threading import RLock
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
@@ -23,7 +24,7 @@ from caryatid.viewer.canvas import Canvas
 from caryatid.viewer.drawing import LAYERS, draw_moment
 from caryatid.viewer.moments import Moment
 
-POINT_SIZE = 0.004
+POINT_SIZE = 0.003
 """Diameter of a point at first [m]."""
 ACCENT = (11, 92, 148)
 FIELD_OF_VIEW = 0.72
@@ -127,6 +128,12 @@ class Page:
             self._shown = index
             self._staged = None
             self.redraw()
+
+    def look_from(self, eye_world: ArrayLike, target_world: ArrayLike) -> None:
+        """Have everybody look from one point (3,) at another (3,) [m]."""
+        for client in self._server.get_clients().values():
+            client.camera.position = np.asarray(eye_world, dtype=np.float64)
+            client.camera.look_at = np.asarray(target_world, dtype=np.float64)
 
     def choose(self, object_id: str) -> None:
         """Show what is known of an object."""

@@ -90,15 +90,15 @@ def tell_object(moment: Moment, object_id: str, effects: Sequence[Effect] | None
         return in_page(f"<p>{escape(object_id)} is not known after this view.</p>")
     row = rows[object_id]
     head = f'<p><span class="chip" style="background:{row.colour}"></span><b>{row.id}</b> · {row.shape}</p>'
-    return in_page(head + _facts(row) + _edges(moment.graph, object_id) + _falls(object_id, effects))
+    return in_page(head + _facts(row) + _falls(object_id, effects) + _edges(moment.graph, object_id))
 
 
 def _facts(row: ObjectRow) -> str:
     facts = [
-        ("size", row.size),
+        ("size [mm]", row.size),
         ("found in", f"{row.seen} views"),
         ("unseen sides", row.unseen),
-        ("residual", row.residual + (" · poor fit" if row.poor_fit else "")),
+        ("residual [mm]", row.residual + (" · poor fit" if row.poor_fit else "")),
         ("stability", row.stability),
         ("because", row.why),
     ]

@@ -1,4 +1,4 @@
-"""A headless Chromium for tests and pictures of the viewer, cut off from everything but this machine."""
+"""A headless Chromium for tests, pictures and figures of the viewer, cut off from all but this machine."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlparse
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
@@ -40,19 +42,25 @@ def chromium() -> str | None:
 
 
 class Tab:
-    """A page in Chromium, and what it did: errors on its console, addresses it asked for."""
+    """A page in Chromium, and what it did.
 
-    def __init__(self, page) -> None:
+    Attributes:
+        page: Playwright's.
+        errors: What its console called an error, and what nobody caught.
+        hosts: What it asked, or wanted to.
+    """
+
+    def __init__(self, page: Any) -> None:
         self.page = page
         self.errors: list[str] = []
-        self.hosts: set[str] = set()
+        self.hosts: set[str | None] = set()
         page.set_default_timeout(PATIENCE)
         page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.on("websocket", lambda socket: self.hosts.add(urlparse(socket.url).hostname))
         page.route("**/*", self._asked)
 
-    def _asked(self, route) -> None:
+    def _asked(self, route: Any) -> None:
         address = urlparse(route.request.url)
         if address.scheme in ("blob", "data"):
             route.continue_()
@@ -80,9 +88,11 @@ class Tab:
         self.page.wait_for_function(test)
 
     def wait_for_text(self, text: str) -> None:
+        """Wait until the page says something."""
         self.page.get_by_text(text).first.wait_for()
 
     def press(self, label: str) -> None:
+        """Press a button."""
         self.page.get_by_role("button", name=label, exact=True).click()
 
     def settle(self) -> None:
@@ -91,12 +101,12 @@ class Tab:
             "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
         )
 
-    def picture(self):
+    def picture(self) -> NDArray[np.uint8]:
         """The scene as pixels (H, W, 3): what the canvas shows, without the panels."""
         self.settle()
         box = self.page.locator("canvas").first.bounding_box()
         shot = Image.open(io.BytesIO(self.page.screenshot(clip=box)))
-        return np.asarray(shot.convert("RGB"))
+        return np.asarray(shot.convert("RGB"), dtype=np.uint8)
 
 
 @contextmanager
