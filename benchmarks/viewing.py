@@ -5,8 +5,9 @@
 The first is measured in a headless Chromium, from the call that adds a view to the page having all its
 points, with clouds of 300,000 and of a million points. The second compares turns of the loop on a scene whose
 cloud grows to some 300,000 points, with a page that another process receives, and without. A machine without
-a graphics card draws in software, which takes the cores the loop wants: so what receives the page there does
-not draw it.
+a graphics card draws in software, where a picture of so many points takes longer than all else, and takes the
+cores the loop wants: so views are also handed over with their layer hidden, and what receives the page while
+the loop is measured does not draw it.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from browser import browser
 from caryatid.commands.sources import open_source
 from caryatid.config import Config
 from caryatid.exploration import Step, explore
+from caryatid.viewer.apart import PageApart
 from caryatid.viewer.loop import Loop, standing_of
 from caryatid.viewer.moments import Dots, Moment, moment_of_step
 from caryatid.viewer.page import Page
@@ -77,8 +79,14 @@ def with_points(moment: Moment, count: int, rng: np.random.Generator) -> Moment:
     return replace(moment, dots=Dots(points, dots.labels[drawn], None))
 
 
-def latency(size: int, runs: int) -> list[float]:
-    """Seconds from adding a view of `size` points to the browser having them."""
+def latency(size: int, runs: int, *, drawn: bool) -> list[float]:
+    """Seconds from adding a view of `size` points to the browser having them.
+
+    Args:
+        size: Points of each view.
+        runs: Views.
+        drawn: The cloud is shown; else its layer is hidden, and drawing in software holds nothing up.
+    """
     config, rng = Config(), np.random.default_rng(0)
     seen = moments(config, 3)
     page = Page("latency", config.support)
@@ -87,6 +95,7 @@ def latency(size: int, runs: int) -> list[float]:
     with TemporaryDirectory() as folder, browser(Path(folder), (640, 480)) as tab:
         tab.open(page.url)
         tab.page.evaluate(SEEN)
+        page.canvas.show_layer("cloud", drawn)
         for run in range(runs):
             moment = replace(with_points(seen[run % 3], size, rng), index=run + 1)
             tab.page.wait_for_timeout(1000)
@@ -101,7 +110,7 @@ def latency(size: int, runs: int) -> list[float]:
     return found
 
 
-def turns(config: Config, page: Page | None) -> tuple[list[float], int]:
+def turns(config: Config, page: PageApart | None) -> tuple[list[float], int]:
     """Seconds of each turn of the loop but the first, and points at its end."""
     source = open_source(SCENE, config, noise="carmine", segmentation=None, seed=0)
     found, points = [], 0
@@ -120,7 +129,7 @@ def _moment(step: Step, robot: Any, config: Config) -> Moment:
 
 
 @contextmanager
-def receiver(page: Page) -> Iterator[None]:
+def receiver(page: PageApart) -> Iterator[None]:
     """Another process that is sent all that a browser would be."""
     command = [sys.executable, __file__, "--receive", page.url]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
@@ -157,10 +166,9 @@ def cost(voxel: float | None, runs: int) -> dict[str, Any]:
     for run in range(2 * runs):
         watched = run % 2 == 1
         if watched:
-            page = Page("cost", config.support)
+            page = PageApart("cost", config.support)
             with receiver(page):
                 seconds, points = turns(config, page)
-                page.wait()
             page.close()
         else:
             seconds, points = turns(config, None)
@@ -187,9 +195,11 @@ def main() -> int:
         return 0
     document: dict[str, Any] = {"latency": {}, "cost": {}}
     for size in SIZES:
-        found = latency(size, options.runs)
-        document["latency"][str(size)] = {"median": float(np.median(found)), "slowest": max(found)}
-        print(f"shown with {size:,} points after {np.median(found):.3f} s, at the latest {max(found):.3f} s")
+        for drawn in (False, True):
+            found = latency(size, options.runs, drawn=drawn)
+            how = "drawn in software" if drawn else "handed over"
+            document["latency"][f"{size}, {how}"] = {"median": float(np.median(found)), "slowest": max(found)}
+            print(f"{size:,} points, {how}: {np.median(found):.3f} s, at the latest {max(found):.3f} s")
     for name, voxel in (("default", None), ("fine", FINE)):
         result = cost(voxel, options.runs)
         document["cost"][name] = result

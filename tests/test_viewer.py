@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import urllib.request
 from dataclasses import replace
 from functools import partial
@@ -20,6 +21,7 @@ from caryatid.manipulation.effects import Effect, predict_removal
 from caryatid.manipulation.order import TakeStep
 from caryatid.report.colours import object_colour, rgb
 from caryatid.viewer import words
+from caryatid.viewer.apart import PageApart
 from caryatid.viewer.canvas import same
 from caryatid.viewer.drawing import BY_HAND, LAYERS, draw_dots, draw_moment
 from caryatid.viewer.loop import Loop
@@ -29,6 +31,7 @@ from caryatid.viewer.replay import replayed
 from caryatid.viewer.runs import config_of_run, moments_of_run
 from caryatid.viewer.steering import candidate_under
 from caryatid.viewer.taking import Picture, lifts_told, pictured
+from caryatid.viewer.wire import MomentReader, MomentWriter
 
 
 @pytest.fixture(scope="module")
@@ -322,6 +325,35 @@ def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatc
     assert pages[1] == 200
     assert (out / "run.json").is_file()
     assert pages[0] in capsys.readouterr().err
+
+
+def test_moments_come_through_a_pipe_as_they_were(loop):
+    stream = io.BytesIO()
+    writer = MomentWriter(stream)
+    sent = [loop.turn(), loop.turn()]
+    for moment in sent:
+        writer.write(moment)
+    stream.seek(0)
+    reader = MomentReader(stream)
+    for moment in sent:
+        read = reader.read()
+        before, after = (draw_moment(m, [m.shot]) for m in (moment, read))
+        assert before.keys() == after.keys()
+        # Shapes are rounded to a nanometre, as in graph.json.
+        loose = {name for name in before if name.split("/")[0] in ("shapes", "names", "supports")}
+        assert all(same(before[name], after[name]) for name in before.keys() - loose)
+        assert words.tell_view(read, 1) == words.tell_view(moment, 1)
+        assert graph_text(read.graph) == graph_text(moment.graph)
+    assert reader.read() is None
+
+
+def test_a_page_apart_shows_what_is_added_and_ends_with_its_maker(moment, settings):
+    page = PageApart("apart", settings.support)
+    page.add(moment)
+    assert urllib.request.urlopen(page.url).status == 200
+    page.close()
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(page.url)
 
 
 def test_without_viser_the_extra_to_install_is_named(monkeypatch):

@@ -128,7 +128,7 @@ def look_around(
     )
     done = Exploration(source)
     try:
-        steps = explore(
+        for step in explore(
             camera,
             source.robot,
             planner=planner,
@@ -136,8 +136,7 @@ def look_around(
             segmentation=options.segmentation,
             seed=seed,
             early_stop=not options.no_early_stop,
-        )
-        for step in steps if watcher is None else watcher.in_turn(steps):
+        ):
             scored = _scored(step, source)
             if watcher is not None:
                 watcher.show(step, source, scored[-1].f1 if scored else None)

@@ -24,9 +24,14 @@ from caryatid.viewer.page import Page
 from caryatid.viewer.replay import replayed
 from caryatid.viewer.runs import config_of_run, moments_of_run
 
+SWITCH_INTERVAL = 0.0005
+"""After which Python turns to another thread that waits [s]; a tenth of its own."""
+
 
 def run_viewer(options: View, config: Config) -> int:
     """Show a run, a scene or a recording until Ctrl-C."""
+    # Drawing is to give way to the loop at once, which it shares the interpreter with.
+    sys.setswitchinterval(SWITCH_INTERVAL)
     progress = Progress(options.general.quiet or options.general.json)
     with ExitStack() as stack:
         opened = _open_run if is_run(Path(options.source)) else _open_loop

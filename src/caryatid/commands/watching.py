@@ -1,4 +1,4 @@
-"""What `caryatid explore --view` adds: the page shows every view as soon as it is there."""
+"""What `--view` adds to exploring: a page that shows every view as soon as it is there."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from caryatid.commands.progress import Progress
 from caryatid.commands.sources import Source
 from caryatid.config import Config
 from caryatid.exploration import Step
+from caryatid.viewer.apart import PageApart
 from caryatid.viewer.loop import standing_of
 from caryatid.viewer.moments import moment_of_step
-from caryatid.viewer.page import Page
 
 PORT = 8770
 """Where the page is, or at the next port that is free; that of `caryatid view`."""
@@ -25,17 +25,8 @@ class Watcher:
         config: All settings.
     """
 
-    def __init__(self, page: Page, config: Config) -> None:
+    def __init__(self, page: PageApart, config: Config) -> None:
         self._page, self._config = page, config
-
-    def in_turn(self, steps: Iterator[Step]) -> Iterator[Step]:
-        """Pass steps on, such that the page computes nothing of its own while one is made."""
-        while True:
-            with self._page.working:
-                step = next(steps, None)
-            if step is None:
-                return
-            yield step
 
     def show(self, step: Step, source: Source, score: float | None) -> None:
         """Show a step; F1 is shown where it is known."""
@@ -53,7 +44,7 @@ def watched(name: str, config: Config, progress: Progress, wait: Callable[[], No
         progress: Told where the page is.
         wait: Returns when the page may be closed.
     """
-    page = Page(f"caryatid: {name}", config.support, port=PORT)
+    page = PageApart(f"caryatid: {name}", config.support, port=PORT)
     progress.say(f"{name} at {page.url}")
     page.open_browser()
     try:

@@ -280,13 +280,18 @@ class Page:
             )
 
 
+def needs_viser() -> InputError:
+    """The error where viser is not installed."""
+    return InputError("viewer", "needs viser", 'pip install "caryatid[view]"')
+
+
 def _serve(title: str, host: str, port: int) -> Any:
     try:
         import viser
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
-        raise InputError("viewer", "needs viser", 'pip install "caryatid[view]"') from None
+        raise needs_viser() from None
 
     class Server(viser.ViserServer):
         """A server whose page stays on this machine: nobody can ask for a public address."""
