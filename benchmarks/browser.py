@@ -32,7 +32,7 @@ ARGUMENTS = [
     "--mute-audio",
 ]
 
-PATIENCE = 30_000
+PATIENCE = 60_000
 """How long anything may take on a loaded machine [ms]."""
 
 
@@ -71,9 +71,14 @@ class Tab:
         else:
             route.abort()
 
-    def open(self, url: str) -> None:
-        """Go to a viewer's page and wait for its scene."""
-        self.page.goto(url)
+    def open(self, url: str, resolution: float = 0.5) -> None:
+        """Go to a viewer's page and wait for its scene.
+
+        Args:
+            url: Where it is.
+            resolution: Pixels drawn for each of the window along an axis [1]; drawing in software is slow.
+        """
+        self.page.goto(f"{url}?fixedDpr={resolution:g}")
         self.page.wait_for_selector("canvas")
         self.wait_for_node("/shapes/o1")
         self.page.locator("#webgl-software-rendering button").click()

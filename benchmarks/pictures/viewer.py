@@ -72,7 +72,7 @@ def main() -> int:
         browser(Path(data), SIZE) as tab,
         worked("clutter") as (page, controls),
     ):
-        tab.open(page.url)
+        tab.open(page.url, resolution=1.0)
         for _ in range(2):
             controls.next_view()
             controls.wait()

@@ -133,7 +133,6 @@ class Controls:
 
     def _turn(self) -> str | None:
         self._page.stage(None)
-        self._page.point_at(None)
         with self._page.working:
             moment = self._loop.turn()
         if moment is not None:
@@ -153,7 +152,6 @@ class Controls:
             return None
         with self._page.working:
             moment = self._loop.use_planner(self._planner.value)
-        self._page.point_at(None)
         if moment is None:
             return None
         self._page.add(moment)

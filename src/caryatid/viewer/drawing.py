@@ -33,7 +33,6 @@ def draw_moment(
     chosen: str = "",
     point_size: float = 0.004,
     true_colours: bool = False,
-    next_by_hand: Array | None = None,
 ) -> Drawing:
     """Say what is drawn for a moment.
 
@@ -43,7 +42,6 @@ def draw_moment(
         chosen: Id of the object that stands out.
         point_size: Diameter of the cloud's points [m].
         true_colours: Points as the camera saw them, not in their objects' colours.
-        next_by_hand: The view (4, 4) a person has chosen, or None.
     """
     drawing: Drawing = {}
     if moment.dots is not None and len(moment.dots):
@@ -52,7 +50,7 @@ def draw_moment(
     drawing |= draw_supports(moment.graph)
     drawing |= _draw_sphere(moment)
     drawing |= _draw_interest(moment)
-    drawing |= _draw_cameras(moment, shots, next_by_hand)
+    drawing |= _draw_cameras(moment, shots)
     if moment.robot is not None:
         drawing |= draw_robot(moment.robot)
     return drawing
@@ -120,7 +118,7 @@ def _draw_interest(moment: Moment) -> Drawing:
     return drawing
 
 
-def _draw_cameras(moment: Moment, shots: Sequence[Shot], next_by_hand: Array | None) -> Drawing:
+def _draw_cameras(moment: Moment, shots: Sequence[Shot]) -> Drawing:
     drawing: Drawing = {}
     for number, shot in enumerate(shots):
         newest = number == len(shots) - 1
@@ -140,11 +138,6 @@ def _draw_cameras(moment: Moment, shots: Sequence[Shot], next_by_hand: Array | N
             T, lens.field_of_view, lens.aspect, CAMERA_SIZE, colour, filled=True
         )
         drawing["cameras/next-name"] = Label(_over(T), "next")
-    if next_by_hand is not None:
-        drawing["cameras/yours"] = Frustum(
-            next_by_hand, lens.field_of_view, lens.aspect, CAMERA_SIZE, BY_HAND, filled=True
-        )
-        drawing["cameras/yours-name"] = Label(_over(next_by_hand), "yours")
     return drawing
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import webbrowser
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
 from threading import RLock
@@ -15,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
-from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.effects import predict_removal
 from caryatid.report.colours import SERIES
@@ -63,12 +63,10 @@ class Page:
         self._moments: list[Moment] = []
         self._shown = -1
         self._chosen = ""
-        self._by_hand: Array | None = None
         self._staged: Moment | None = None
         self._graph_drawn: SupportGraph | None = None
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
-        self._listeners: list[Callable[[Moment], None]] = []
         server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=ACCENT)
         server.scene.set_up_direction("+z")
         self._canvas = Canvas(server, LAYERS, self.choose)
@@ -116,11 +114,6 @@ class Page:
             self._look_at(moment)
         self.redraw()
 
-    def clear(self) -> None:
-        """Forget all moments."""
-        self._moments.clear()
-        self._shown = -1
-
     def go_to(self, index: int) -> None:
         """Show the moment after a view."""
         index = min(max(index, 0), len(self._moments) - 1)
@@ -140,30 +133,24 @@ class Page:
         self._chosen = object_id
         self.redraw()
 
-    def point_at(self, T_world_camera: Array | None) -> None:
-        """Show a view (4, 4) a person has chosen, or none."""
-        self._by_hand = T_world_camera
-        self.redraw()
-
     def stage(self, moment: Moment | None) -> None:
         """Show a moment that is none of those after a view; None goes back to those."""
         if moment is not self._staged:
             self._staged = moment
             self.redraw()
 
-    def when_shown(self, tell: Callable[[Moment], None]) -> None:
-        """Have a moment told to somebody each time one has been drawn."""
-        self._listeners.append(tell)
-
     def redraw(self) -> None:
         """Draw what is to be shown, soon; where that is already about to be done, once."""
         if self._pending is None or self._pending.running() or self._pending.done():
             with contextlib.suppress(RuntimeError):
                 self._pending = self._drawer.submit(self._draw)
+                self._pending.add_done_callback(_said)
 
     def wait(self) -> None:
-        """Wait until all that has been asked for is drawn."""
+        """Wait until all that has been asked for is drawn; what went wrong meanwhile is raised."""
         self._drawer.submit(lambda: None).result()
+        if self._pending is not None:
+            self._pending.result()
 
     def close(self) -> None:
         """Stop serving the page."""
@@ -235,7 +222,6 @@ class Page:
                 chosen=chosen,
                 point_size=self._size.value / 1000.0,
                 true_colours=self._true_colours.value,
-                next_by_hand=self._by_hand,
             )
         )
         last = len(self._moments) - 1
@@ -247,8 +233,6 @@ class Page:
             self._graph_drawn = moment.graph
             self._graph.content = words.tell_graph(moment.graph)
         self._draw_scores()
-        for tell in self._listeners:
-            tell(moment)
         if chosen:
             self._about.content = self._object(moment, chosen)
 
@@ -278,6 +262,13 @@ class Page:
                 scales={"x": {"time": False}, "y": {"range": (0.0, 1.0)}},
                 aspect=1.6,
             )
+
+
+def _said(drawn: Future[None]) -> None:
+    """Say what went wrong in the thread that draws; the page then shows what it showed before."""
+    error = None if drawn.cancelled() else drawn.exception()
+    if error is not None:
+        logging.getLogger(__name__).error("a view could not be drawn", exc_info=error)
 
 
 def needs_viser() -> InputError:

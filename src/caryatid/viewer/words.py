@@ -89,7 +89,8 @@ def tell_object(moment: Moment, object_id: str, effects: Sequence[Effect] | None
     if object_id not in rows:
         return in_page(f"<p>{escape(object_id)} is not known after this view.</p>")
     row = rows[object_id]
-    head = f'<p><span class="chip" style="background:{row.colour}"></span><b>{row.id}</b> · {row.shape}</p>'
+    chip = f'<span class="chip" style="background:{row.colour}"></span>'
+    head = f"<p>{chip}<b>{escape(row.id)}</b> · {row.shape}</p>"
     return in_page(head + _facts(row) + _falls(object_id, effects) + _edges(moment.graph, object_id))
 
 
@@ -113,7 +114,8 @@ def _edges(graph: SupportGraph, object_id: str) -> str:
     items = []
     for row in rows:
         doubt = "" if row.certain else ' <span class="doubt">uncertain</span>'
-        said = f"{row.supporter} → {row.supported}, {row.kind}{doubt}, {row.evidence}"
+        pair = escape(f"{row.supporter} → {row.supported}")
+        said = f"{pair}, {row.kind}{doubt}, {row.evidence}"
         items.append(f'<li>{said}<br><span class="soft">{escape(row.why)}</span></li>')
     return f"<p><b>Supports</b></p><ul>{''.join(items)}</ul>"
 
@@ -121,11 +123,12 @@ def _edges(graph: SupportGraph, object_id: str) -> str:
 def _falls(object_id: str, effects: Sequence[Effect] | None) -> str:
     if effects is None:
         return ""
+    head = f"<b>Without {escape(object_id)}</b>"
     if not effects:
-        return f'<p><b>Without {object_id}</b> <span class="good">nothing falls.</span></p>'
+        return f'<p>{head} <span class="good">nothing falls.</span></p>'
     items = "".join(
-        f"<li><b>{e.object_id}</b> {'falls' if e.certain else 'may fall'}: "
+        f"<li><b>{escape(e.object_id)}</b> {'falls' if e.certain else 'may fall'}: "
         f'<span class="soft">{escape(e.why)}</span></li>'
         for e in effects
     )
-    return f"<p><b>Without {object_id}</b></p><ul>{items}</ul>"
+    return f"<p>{head}</p><ul>{items}</ul>"
