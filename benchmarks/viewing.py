@@ -32,6 +32,7 @@ from browser import browser
 from caryatid.commands.sources import open_source
 from caryatid.config import Config
 from caryatid.exploration import Step, explore
+from caryatid.frames import Array
 from caryatid.viewer.apart import PageApart
 from caryatid.viewer.loop import Loop, standing_of
 from caryatid.viewer.moments import Dots, Moment, moment_of_step
@@ -110,18 +111,20 @@ def latency(size: int, runs: int, *, drawn: bool) -> list[float]:
     return found
 
 
-def turns(config: Config, page: PageApart | None) -> tuple[list[float], int]:
-    """Seconds of each turn of the loop but the first, and points at its end."""
+def turns(config: Config, page: PageApart | None) -> tuple[Array, int]:
+    """Turns of the loop but the first: seconds (N, 2) by clock and by processor, and points at its end."""
     source = open_source(SCENE, config, noise="carmine", segmentation=None, seed=0)
-    found, points = [], 0
-    started = time.perf_counter()
+    marks, points = [_now()], 0
     for step in explore(source.camera, source.robot, config=config, early_stop=False):
         if page is not None:
             page.add(_moment(step, source.robot, config))
-        found.append(time.perf_counter() - started)
+        marks.append(_now())
         points = len(step.cloud)
-        started = time.perf_counter()
-    return found[1:], points
+    return np.diff(marks, axis=0)[1:], points
+
+
+def _now() -> tuple[float, float]:
+    return time.perf_counter(), time.process_time()
 
 
 def _moment(step: Step, robot: Any, config: Config) -> Moment:
@@ -161,7 +164,7 @@ def cost(voxel: float | None, runs: int) -> dict[str, Any]:
         config = replace(config, cloud=replace(config.cloud, voxel=voxel))
     config = replace(config, active=replace(config.active, max_views=VIEWS))
     turns(config, None)
-    found: dict[bool, list[list[float]]] = {False: [], True: []}
+    found: dict[bool, list[Array]] = {False: [], True: []}
     points = 0
     for run in range(2 * runs):
         watched = run % 2 == 1
@@ -174,12 +177,13 @@ def cost(voxel: float | None, runs: int) -> dict[str, Any]:
             seconds, points = turns(config, None)
         found[watched].append(seconds)
     # The same view of every run is the same work: of each the fastest, which nothing else held up.
-    without, with_it = (float(np.min(found[k], axis=0).sum()) for k in (False, True))
+    without, with_it = (np.min(found[k], axis=0).mean(axis=0) for k in (False, True))
     return {
         "points": points,
-        "turn_without": without / (VIEWS - 1),
-        "turn_with": with_it / (VIEWS - 1),
-        "cost": with_it / without - 1.0,
+        "turn_without": float(without[0]),
+        "turn_with": float(with_it[0]),
+        "cost": float(with_it[0] / without[0] - 1.0),
+        "processor": float(with_it[1] / without[1] - 1.0),
     }
 
 
@@ -205,7 +209,8 @@ def main() -> int:
         document["cost"][name] = result
         print(
             f"a turn at {result['points']:,} points takes {result['turn_without']:.3f} s, "
-            f"with the viewer {result['turn_with']:.3f} s: {100.0 * result['cost']:+.1f} %"
+            f"with the viewer {result['turn_with']:.3f} s: {100.0 * result['cost']:+.1f} %, "
+            f"and {100.0 * result['processor']:+.1f} % of the loop's own processor time"
         )
     if options.out is not None:
         options.out.write_text(json.dumps(document, indent=1) + "\n")

@@ -29,6 +29,8 @@ POINT_SIZE = 0.003
 ACCENT = (11, 92, 148)
 FIELD_OF_VIEW = 0.72
 """Of the eye [rad]; narrow, so that what is near does not hide what is far."""
+FAR, NEAR = 3.2, 1.7
+"""How far from the scene the eye begins over the floor [m]: with all cameras in sight, or the table only."""
 BESIDE = 380
 """Width of the panel with the graph [px]."""
 
@@ -44,6 +46,7 @@ class Page:
         support: The numbers the graphs were inferred with: they say what would fall.
         host: Address to listen at; at 127.0.0.1 only this machine's own programs come.
         port: Port to listen at, or the next free one; 0 = any that is free.
+        small: It has little room, as within a notebook: panels begin folded up.
 
     Attributes:
         url: Where the page is.
@@ -54,7 +57,13 @@ class Page:
     """
 
     def __init__(
-        self, title: str, support: SupportConfig | None = None, *, host: str = "127.0.0.1", port: int = 0
+        self,
+        title: str,
+        support: SupportConfig | None = None,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        small: bool = False,
     ) -> None:
         self.working = RLock()
         self._support = support or SupportConfig()
@@ -70,7 +79,8 @@ class Page:
         server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=ACCENT)
         server.scene.set_up_direction("+z")
         self._canvas = Canvas(server, LAYERS, self.choose)
-        self._build()
+        self._distance = NEAR if small else FAR
+        self._build(small)
 
     @property
     def server(self) -> Any:
@@ -158,7 +168,7 @@ class Page:
         with _silent():
             self._server.stop()
 
-    def _build(self) -> None:
+    def _build(self, small: bool) -> None:
         gui = self._server.gui
         self._notice = gui.add_html("", order=-20, visible=False)
         self._slider = gui.add_slider("view", 0, 1, 1, 0, disabled=True, hint="Go back to an earlier view")
@@ -180,13 +190,16 @@ class Page:
         with panel.add_tab("key"):
             gui.add_html(words.tell_key())
         self._chart: Any = None
-        gui.main_panel.dock_right()
+        if not small:
+            gui.main_panel.dock_right()
         panel.dock_left()
         panel.set_width(BESIDE)
         about = gui.add_panel()
         with about.add_tab("object"):
             self._about = gui.add_html(words.in_page(words.NOTHING_CHOSEN))
         about.dock_below(panel)
+        if small:
+            panel.minimize()
 
     def _layer(self, name: str) -> None:
         box = self._server.gui.add_checkbox(name, True)
@@ -206,7 +219,7 @@ class Page:
             backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
         backward /= max(float(np.linalg.norm(backward)), 1e-9)
         camera.look_at = centre
-        camera.position = centre + 3.2 * backward + [0.0, 0.0, 2.2]
+        camera.position = centre + self._distance * (backward + [0.0, 0.0, 0.7])
         camera.fov = FIELD_OF_VIEW
 
     def _draw(self) -> None:
@@ -259,7 +272,7 @@ class Page:
                 data,
                 ({"label": "view"}, {"label": "F1", "stroke": SERIES[0], "width": 2, "points": {"size": 7}}),
                 title="F1 after each view",
-                scales={"x": {"time": False}, "y": {"range": (0.0, 1.0)}},
+                scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
                 aspect=1.6,
             )
 

@@ -56,7 +56,7 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Shown:
     Raises:
         InputError: viser is not installed.
     """
-    page = Page("caryatid", scene.config.support, host=host, port=port)
+    page = Page("caryatid", scene.config.support, host=host, port=port, small=True)
     shown = Shown(page.url, page)
     shown.update(scene)
     return shown
