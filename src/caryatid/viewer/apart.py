@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -17,6 +18,9 @@ from caryatid.errors import InputError
 from caryatid.viewer.moments import Moment
 from caryatid.viewer.page import Page, needs_viser
 from caryatid.viewer.wire import MomentReader, MomentWriter
+
+BEHIND = 10
+"""How far drawing stands behind the loop where cores are short, as `nice` counts."""
 
 
 class PageApart:
@@ -77,6 +81,8 @@ class PageApart:
 def main() -> int:
     """Serve a page and show the moments that come on stdin, until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "nice"):
+        os.nice(BEHIND)
     told = json.loads(sys.argv[1])
     page = Page(told["title"], SupportConfig(**told["support"]), host=told["host"], port=told["port"])
     sys.stdout.write(f"{page.url}\n")
