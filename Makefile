@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test check accuracy-gate bench bench-gate gif format clean
+.PHONY: install demo test chromium check accuracy-gate bench bench-gate gif format clean
 
 install: $(VENV)/.installed
 
@@ -17,6 +17,14 @@ demo: install
 
 test: install
 	$(BIN)/python -m pytest -n auto
+
+# What the viewer's tests look at it with. Elsewhere than on Debian and its like, install one and set CHROMIUM.
+chromium:
+	@for name in "$$CHROMIUM" chromium chromium-browser google-chrome google-chrome-stable chrome; do \
+		test -n "$$name" && command -v "$$name" && exit 0; done; \
+	as_root=""; test "$$(id -u)" = 0 || as_root=sudo; \
+	$$as_root apt-get update -qq && \
+	DEBIAN_FRONTEND=noninteractive $$as_root apt-get install -y -qq --no-install-recommends chromium
 
 check: install
 	$(BIN)/ruff check .

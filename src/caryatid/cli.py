@@ -51,12 +51,14 @@ def _run(arguments: Sequence[str]) -> int:
     from caryatid.commands.serve import Serve
     from caryatid.commands.session import SessionCommand
     from caryatid.commands.show_config import ShowConfig
+    from caryatid.commands.view import View
 
     command = tyro.extras.subcommand_cli_from_dict(
         {
             "demo": Demo,
             "explore": Explore,
             "extract": Extract,
+            "view": View,
             "evaluate": Evaluate,
             "order": Order,
             "dismantle": Dismantle,

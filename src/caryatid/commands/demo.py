@@ -11,6 +11,7 @@ import tyro
 from caryatid.commands.explore import Explore
 from caryatid.commands.options import (
     DEFAULTS,
+    SAID,
     ModellingCommand,
     OutPath,
     Profile,
@@ -37,6 +38,8 @@ class Demo(ModellingCommand):
     """A built-in scene, say tower, bridge or dense-12-0."""
     views: Annotated[Views, defaults_to(VIEWS)] = None
     """Views at the most, the first one too."""
+    view: Annotated[bool, SAID] = False
+    """Show every view in the browser as soon as it is there; the page then stays until Ctrl-C."""
     profile: Profile = False
     """Print the time of each stage when all is done; with --json into the document."""
 
@@ -47,6 +50,7 @@ class Demo(ModellingCommand):
             source=self.scene,
             out=self.out,
             noise="carmine",
+            view=self.view,
             profile=self.profile,
             modelling=self.modelling,
             general=self.general,

@@ -49,6 +49,8 @@ class Explore(ModellingCommand):
     """Go on until the views are used up; without this the loop ends when a view changes nothing."""
     no_report: Annotated[bool, SAID] = False
     """Leave report.html out."""
+    view: Annotated[bool, SAID] = False
+    """Show every view in the browser as soon as it is there; the page then stays until Ctrl-C."""
     profile: Profile = False
     """Print the time of each stage when all is done; with --json into the document."""
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +24,9 @@ from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.report import Figure, ViewPage, compose_report, draw_view, render_html, store_report
+
+if TYPE_CHECKING:
+    from caryatid.commands.watching import Watcher
 
 Exploring = Explore | Dismantle
 """Options of the commands that explore."""
@@ -57,8 +61,14 @@ class Exploration:
 def run_exploration(options: Explore, config: Config) -> int:
     """Explore and write the run folder; Ctrl-C ends it with the views done so far."""
     progress = Progress(options.general.quiet or options.general.json)
+    with _watched(options, config, progress) as watcher:
+        _explore_into(options, config, progress, watcher)
+    return 0
+
+
+def _explore_into(options: Explore, config: Config, progress: Progress, watcher: Watcher | None) -> None:
     with RunWriter(options.out) as writer:
-        done = look_around(options, config, progress, writer, report=not options.no_report)
+        done = look_around(options, config, progress, writer, report=not options.no_report, watcher=watcher)
         finish_run("explore", options, config, done, writer, report=not options.no_report)
     if options.general.json:
         document = {"run": str(options.out), "graph": graph_to_json(done.end.graph)}
@@ -68,11 +78,25 @@ def run_exploration(options: Explore, config: Config) -> int:
     progress.say(f"run: {options.out}" + ("" if options.no_report else ", open its report.html"))
     if options.profile and not options.general.json:
         print_profile(done.steps)
-    return 0
+
+
+def _watched(options: Explore, config: Config, progress: Progress) -> AbstractContextManager[Watcher | None]:
+    if not options.view:
+        return nullcontext()
+    from caryatid.commands.viewing import wait_for_interrupt
+    from caryatid.commands.watching import watched
+
+    return watched(options.source, config, progress, wait_for_interrupt)
 
 
 def look_around(
-    options: Exploring, config: Config, progress: Progress, writer: RunWriter | None, *, report: bool
+    options: Exploring,
+    config: Config,
+    progress: Progress,
+    writer: RunWriter | None,
+    *,
+    report: bool,
+    watcher: Watcher | None = None,
 ) -> Exploration:
     """Explore; every view is drawn and written as soon as it is there.
 
@@ -82,6 +106,7 @@ def look_around(
         progress: Told of each view.
         writer: Takes the views, or None where no run is wanted.
         report: Draw the views.
+        watcher: Shows the views, or None.
 
     Raises:
         KeyboardInterrupt: Before the first view; later an interrupt ends the exploration.
@@ -113,6 +138,8 @@ def look_around(
             early_stop=not options.no_early_stop,
         ):
             scored = _scored(step, source)
+            if watcher is not None:
+                watcher.show(step, source, scored[-1].f1 if scored else None)
             page = [draw_view(step, config.report)] if report else []
             if writer is not None:
                 writer.add_view(

@@ -166,9 +166,13 @@ def _edge(
     size = np.array([len(note) * svg.GLYPH_WIDTH * TEXT + 2.0, TEXT + 2.0])
     around = np.concatenate([other for _, other in lines])
 
+    plates = np.array(taken).reshape(-1, 4)
+
     def covered(at: Array) -> float:
-        plates = sum(float(np.prod(np.clip((size + b[2:]) / 2 - np.abs(b[:2] - at), 0, size))) for b in taken)
-        return plates + 20.0 * float((np.abs(around - at) < size / 2.0).all(axis=1).sum())
+        overlaps = np.clip((size + plates[:, 2:]) / 2 - np.abs(plates[:, :2] - at), 0, size)
+        return float(overlaps.prod(axis=1).sum()) + 20.0 * float(
+            (np.abs(around - at) < size / 2.0).all(axis=1).sum()
+        )
 
     at = min(_spots(line, size), key=covered)
     taken.append(np.concatenate([at, size]))

@@ -1,0 +1,225 @@
+"""The loop worked from the page: next view, run and pause, planner, fusion, a view by hand, dismantling."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event
+from typing import Any, get_args
+
+import numpy as np
+
+from caryatid.config import FusionMethod
+from caryatid.errors import CaryatidError, in_one_line
+from caryatid.manipulation.order import plan_order
+from caryatid.planners import BUILT_IN, ORACLE, offered
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.threads import cores
+from caryatid.viewer.loop import Loop
+from caryatid.viewer.moments import Moment
+from caryatid.viewer.page import Page
+from caryatid.viewer.steering import candidate_under
+from caryatid.viewer.taking import Picture, lifts_in_physics, lifts_told, pictured
+
+PICTURE_TIME = 0.12
+"""How long each picture of a lift is shown [s]."""
+WITHIN = np.deg2rad(6.0)
+"""How far from a click on the view sphere the view may be that is taken for it [rad]."""
+
+
+class Controls:
+    """Buttons that work a loop, and the one thread that does the work.
+
+    Args:
+        page: Where they are shown.
+        loop: What they work.
+        seed: Seed of rehearsals.
+    """
+
+    def __init__(self, page: Page, loop: Loop, *, seed: int = 0) -> None:
+        self._page, self._loop, self._seed = page, loop, seed
+        self._worker = ThreadPoolExecutor(1, "loop")
+        self._running = Event()
+        self._closed = False
+        self._build()
+
+    def start(self) -> None:
+        """Take the first view."""
+        self._do("taking the first view", self._turn)
+
+    def next_view(self) -> None:
+        """Take one turn of the loop."""
+        self._running.clear()
+        self._do("taking a view", self._turn)
+
+    def run(self) -> None:
+        """Take turn after turn, until the loop would end by itself or `pause` is pressed."""
+        if not self._running.is_set():
+            self._running.set()
+            self._do("running", self._run_on)
+
+    def pause(self) -> None:
+        """Stop after the view that is being taken, or the lift that is being played."""
+        self._running.clear()
+
+    def wait(self) -> None:
+        """Wait until all that has been asked for is done and drawn."""
+        self._worker.submit(lambda: None).result()
+        self._page.wait()
+
+    def close(self) -> None:
+        """Stop working, once the view that is being taken is there."""
+        self._closed = True
+        self._running.clear()
+        self._worker.shutdown(wait=True, cancel_futures=True)
+
+    def _build(self) -> None:
+        gui = self._page.server.gui
+        names = [*BUILT_IN, *sorted(offered()), *([ORACLE] if self._loop.planner == ORACLE else [])]
+        with gui.add_folder("loop", order=-10):
+            self._next = self._button("next view", self.next_view, "Take one turn of the loop", 1)
+            self._go = self._button("run", self.run, "Take turn after turn", 2)
+            self._pause = self._button("pause", self.pause, "Stop after this turn", 3)
+            self._planner = gui.add_dropdown("planner", names, initial_value=self._loop.planner, order=4)
+            fusions = get_args(FusionMethod)
+            self._fusion = gui.add_dropdown("fusion", fusions, initial_value=self._loop.fusion, order=5)
+            hint = "Then click the view sphere: the view you point at is taken next"
+            self._by_hand = gui.add_checkbox("choose the next view by hand", False, hint=hint, order=6)
+            hint = "Find a safe order to take everything away, and play it"
+            self._dismantle = self._button("dismantle", self.dismantle, hint, 7)
+        self._pause.disabled = True
+        self._planner.on_update(lambda _: self._do("planning anew", self._replan))
+        self._fusion.on_update(lambda _: self._do("taking the same views again", self._refuse))
+        self._by_hand.on_update(lambda _: self._listen(self._by_hand.value))
+
+    def _button(self, label: str, press: Callable[[], None], hint: str, order: int) -> Any:
+        button = self._page.server.gui.add_button(label, hint=hint, order=order)
+        button.on_click(lambda _: press())
+        return button
+
+    def dismantle(self) -> None:
+        """Find a safe order and play it: in physics where there is a simulation, else as it is told."""
+        if self._loop.moments and not self._running.is_set():
+            self._running.set()
+            self._do("rehearsing lifts", self._take_apart)
+
+    def _do(self, what: str, work: Callable[[], str | None]) -> None:
+        """Have work done, after what is being done, and say what it returns at its end."""
+
+        def done() -> None:
+            if self._closed:
+                return
+            self._say(what + " …", busy=True)
+            try:
+                said = work()
+            except CaryatidError as error:
+                said = f"{error}"
+            except Exception as error:
+                said = in_one_line(error)
+            self._running.clear()
+            self._say(said or "", busy=False)
+
+        if not self._closed:
+            self._worker.submit(done)
+
+    def _say(self, text: str, *, busy: bool) -> None:
+        ended = self._loop.ended is not None
+        self._page.say(text)
+        self._next.disabled = self._go.disabled = busy or ended
+        self._pause.disabled = not busy
+        self._dismantle.disabled = busy or not self._loop.moments
+        self._planner.disabled = self._fusion.disabled = busy
+
+    def _turn(self) -> str | None:
+        self._page.stage(None)
+        with self._page.working:
+            moment = self._loop.turn()
+        if moment is not None:
+            self._page.add(moment)
+        return self._loop.pause
+
+    def _run_on(self) -> str | None:
+        said = None
+        while self._running.is_set() and not self._closed:
+            said = self._turn()
+            if said is not None or self._loop.ended is not None:
+                return said
+        return "paused"
+
+    def _replan(self) -> str | None:
+        if self._planner.value == self._loop.planner:
+            return None
+        with self._page.working:
+            moment = self._loop.use_planner(self._planner.value)
+        if moment is None:
+            return None
+        self._page.add(moment)
+        return f"{self._loop.planner} chose the next view"
+
+    def _refuse(self) -> str | None:
+        if self._fusion.value == self._loop.fusion:
+            return None
+        self._page.stage(None)
+        with self._page.working:
+            for moment in self._loop.use_fusion(self._fusion.value):
+                self._page.add(moment)
+        return f"the same views, fused by {self._loop.fusion}"
+
+    def _listen(self, wanted: bool) -> None:
+        scene = self._page.server.scene
+        scene.remove_click_callback("all")
+        if wanted:
+            scene.on_click()(self._pointed)
+
+    def _pointed(self, event: Any) -> None:
+        moment = self._loop.moments[-1] if self._loop.moments else None
+        if moment is None or moment.sphere is None or moment.candidates is None:
+            return
+        index = candidate_under(
+            np.array(event.ray_origin),
+            np.array(event.ray_direction),
+            moment.sphere,
+            moment.candidates,
+            WITHIN,
+        )
+        if index is not None:
+            self.choose(index)
+
+    def choose(self, index: int) -> None:
+        """Take this candidate next, whatever the planner says."""
+        self._do("choosing", lambda: self._choose(index))
+
+    def _choose(self, index: int) -> str:
+        planned = self._loop.planned
+        chosen = self._loop.choose(index)
+        if isinstance(chosen, str):
+            return chosen
+        self._page.add(chosen)
+        if planned is None or chosen.decision is None:
+            return "your view is next"
+        yours = chosen.decision.score
+        return f"your view is next: score {yours:.2f}, the choice of {self._loop.planner} {planned.score:.2f}"
+
+    def _take_apart(self) -> str:
+        moment, config = self._loop.moments[-1], self._loop.config
+        with self._page.working:
+            order = plan_order(moment.graph, config, seed=self._seed, threads=cores())
+        said = ""
+        for picture in self._pictures(moment, order.steps):
+            if not self._running.is_set() or self._closed:
+                return "paused"
+            self._page.stage(pictured(moment, picture))
+            if picture.done:
+                harm = f", {', '.join(picture.disturbed)} disturbed" if picture.disturbed else ""
+                said = f"{picture.number + 1} of {len(order.steps)} taken: {picture.step.object_id}{harm}"
+                self._page.say(said)
+            time.sleep(PICTURE_TIME)
+        return f"{order.refusal or 'a safe order'}; {said}"
+
+    def _pictures(self, moment: Moment, steps: Any) -> Iterator[Picture]:
+        source = self._loop.source
+        camera = source.camera
+        if isinstance(camera, SimulatedCamera) and source.truth is not None:
+            return lifts_in_physics(camera.scene, moment.graph, source.truth, steps, self._loop.config)
+        return lifts_told(steps)

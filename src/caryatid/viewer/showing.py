@@ -1,0 +1,62 @@
+"""A scene shown from Python, in a notebook or beside it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING
+
+from caryatid.viewer.moments import moment_of_scene
+from caryatid.viewer.page import Page
+
+if TYPE_CHECKING:
+    from caryatid.scene import Scene
+
+HEIGHT = 620
+"""Height of the page within a notebook [px]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """A page that shows a scene, until it is closed.
+
+    Attributes:
+        url: Where it is.
+        page: The page, to add moments to.
+    """
+
+    url: str
+    page: Page
+
+    def update(self, scene: Scene) -> None:
+        """Add what a scene knows by now; the page's slider goes back to what it knew before."""
+        self.page.add(moment_of_scene(scene))
+
+    def close(self) -> None:
+        """Stop serving the page."""
+        self.page.close()
+
+    def _repr_html_(self) -> str:
+        """The page within a notebook."""
+        source = escape(self.url, quote=True)
+        return f'<iframe src="{source}" width="100%" height="{HEIGHT}" style="border:0"></iframe>'
+
+
+def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Shown:
+    """Open a page that shows what a scene knows.
+
+    Args:
+        scene: Of any number of views.
+        host: Address to listen at; at 127.0.0.1 only this machine's own programs come.
+        port: Port to listen at, or the next free one; 0 = any that is free.
+
+    Returns:
+        A handle with the page's `url`; within a notebook it shows itself.
+
+    Raises:
+        InputError: viser is not installed.
+    """
+    page = Page("caryatid", scene.config.support, host=host, port=port, small=True)
+    shown = Shown(page.url, page)
+    shown.update(scene)
+    return shown
