@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test check accuracy-gate bench bench-gate format clean
+.PHONY: install demo test check accuracy-gate bench bench-gate docs pictures format clean
 
 install: $(VENV)/.installed
 
@@ -39,9 +39,20 @@ bench: $(VENV)/.peers
 bench-gate: $(VENV)/.peers
 	$(BIN)/python benchmarks/bench.py --gate
 
+$(VENV)/.docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs,ros,serve]"
+	touch $@
+
+docs: $(VENV)/.docs
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
+pictures: install
+	$(BIN)/python benchmarks/pictures/concepts.py
+
 format: install
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist demo-run
+	rm -rf $(VENV) build dist demo-run docs/_build docs/gallery

@@ -1,0 +1,77 @@
+"""How the documentation is built: `make docs`."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS / "extensions"))
+os.environ.setdefault("MPLBACKEND", "agg")
+
+from gallery import RUN, copy_examples  # noqa: E402
+
+import caryatid  # noqa: E402
+
+project = "caryatid"
+author = "the authors of caryatid"
+copyright = author
+version = release = caryatid.__version__
+language = "en"
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "reference",
+]
+exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py"]
+suppress_warnings = ["toc.empty_glob", "config.cache"]
+default_role = "code"
+
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 4
+
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+autodoc_type_aliases = {"Array": "Array"}
+autodoc_class_signature = "separated"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+python_use_unqualified_type_names = True
+
+copy_examples(DOCS.parent / "examples", DOCS / "_build" / "examples")
+sphinx_gallery_conf = {
+    "examples_dirs": "_build/examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": RUN.pattern,
+    "show_memory": False,
+    "show_signature": False,
+    "min_reported_time": 1e9,
+    "write_computation_times": False,
+    "download_all_examples": False,
+    "abort_on_example_error": True,
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "caryatid"
+html_static_path = ["static"]
+html_css_files = ["caryatid.css"]
+html_copy_source = False
+html_show_sourcelink = False
+
+
+def lead_to_the_gallery(app: object, name: str, source: list[str]) -> None:
+    """Let links to programs, which the repository shows as they are, lead to their pages here."""
+    source[0] = re.sub(r"\]\(\.\./examples/(\w+)\.py\)", r"](gallery/\1.rst)", source[0])
+
+
+def setup(app: object) -> None:
+    """Tell Sphinx of what is done here."""
+    app.connect("source-read", lead_to_the_gallery)  # type: ignore[attr-defined]
