@@ -43,7 +43,7 @@ autodoc_type_aliases = {"Array": "Array"}
 autodoc_class_signature = "separated"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
-napoleon_use_ivar = True
+napoleon_custom_sections = [("Attributes", "params_style")]
 python_use_unqualified_type_names = True
 
 copy_examples(DOCS.parent / "examples", DOCS / "_build" / "examples")
@@ -57,12 +57,21 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
     "download_all_examples": False,
     "abort_on_example_error": True,
+    "within_subsection_order": "FileNameSortKey",
 }
 
 html_theme = "pydata_sphinx_theme"
 html_title = "caryatid"
 html_static_path = ["static"]
 html_css_files = ["caryatid.css"]
+html_theme_options = {
+    "show_prev_next": True,
+    "secondary_sidebar_items": {"**": ["page-toc"], "settings": [], "commands": [], "index": []},
+    "footer_start": [],
+    "footer_end": ["theme-version"],
+    "navigation_with_keys": False,
+}
+html_sidebars = {"index": [], "start": [], "concepts": []}
 html_copy_source = False
 html_show_sourcelink = False
 

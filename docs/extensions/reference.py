@@ -58,13 +58,12 @@ def table_of(stage: str) -> str:
     values = kind()
     ranges = kinds(kind)
     reasons = _reasons(kind)
-    lines = ["| setting | default | unit | allowed | what, and why this value |", "|---|---|---|---|---|"]
+    lines = ["| setting | default | allowed | what, and why this value |", "|---|---|---|---|"]
     for field in fields(kind):
         unit, reason = _unit(reasons.get(field.name, ""))
         cells = [
             f"`{stage}.{field.name}`",
-            f"`{_toml(getattr(values, field.name))}`",
-            unit,
+            f"`{_toml(getattr(values, field.name))}` {unit}".rstrip(),
             _allowed(ranges[field.name]),
             reason,
         ]
