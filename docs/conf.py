@@ -11,6 +11,9 @@ DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS / "extensions"))
 os.environ.setdefault("MPLBACKEND", "agg")
 
+from array_types import keep_their_names  # noqa: E402
+
+keep_their_names()
 from gallery import RUN, copy_examples  # noqa: E402
 
 import caryatid  # noqa: E402
@@ -39,12 +42,20 @@ myst_heading_anchors = 4
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_typehints_format = "short"
-autodoc_type_aliases = {"Array": "Array"}
-autodoc_class_signature = "separated"
+python_display_short_literal_types = True
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
 napoleon_custom_sections = [("Attributes", "params_style")]
 python_use_unqualified_type_names = True
+
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!caryatid\.).*"),  # other packages' names: nothing is fetched from their sites
+    (
+        "py:.*",
+        r"caryatid\.(kernels|shape_arrays|recordings\.sources|sessions\.(lock|folder)|simulation\.lifting)\..*",
+    ),
+]
 
 copy_examples(DOCS.parent / "examples", DOCS / "_build" / "examples")
 sphinx_gallery_conf = {
@@ -81,6 +92,20 @@ def lead_to_the_gallery(app: object, name: str, source: list[str]) -> None:
     source[0] = re.sub(r"\]\(\.\./examples/(\w+)\.py\)", r"](gallery/\1.rst)", source[0])
 
 
+def leave_settings_out(
+    app: object,
+    what: str,
+    name: str,
+    value: object,
+    options: object,
+    arguments: str | None,
+    gives: str | None,
+) -> tuple[str | None, str | None]:
+    """Let classes of settings stand without their dozens of arguments: a page of their own lists these."""
+    return ("", None) if name.startswith("caryatid.config.") else (arguments, gives)
+
+
 def setup(app: object) -> None:
     """Tell Sphinx of what is done here."""
+    app.connect("autodoc-process-signature", leave_settings_out)  # type: ignore[attr-defined]
     app.connect("source-read", lead_to_the_gallery)  # type: ignore[attr-defined]
