@@ -14,9 +14,12 @@ os.environ.setdefault("MPLBACKEND", "agg")
 from array_types import keep_their_names  # noqa: E402
 
 keep_their_names()
+import results  # noqa: E402
 from gallery import RUN, copy_examples  # noqa: E402
 
 import caryatid  # noqa: E402
+
+results.watch()
 
 project = "caryatid"
 author = "the authors of caryatid"
@@ -25,19 +28,23 @@ version = release = caryatid.__version__
 language = "en"
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
+    "formulas",
     "reference",
 ]
-exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py"]
-suppress_warnings = ["toc.empty_glob", "config.cache"]
+exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py", "notebooks/*.py"]
+suppress_warnings = ["config.cache"]
 default_role = "code"
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 4
+nb_execution_mode = "off"  # notebooks are kept with what they showed when they were run
+nb_merge_streams = True
+html_math_renderer = "drawn"
 
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
@@ -68,6 +75,9 @@ sphinx_gallery_conf = {
     "write_computation_times": False,
     "download_all_examples": False,
     "abort_on_example_error": True,
+    "image_scrapers": ("results.take_picture",),
+    "reset_modules": ("results.forget",),
+    "default_thumb_file": str(DOCS / "pictures" / "concepts" / "view.png"),
     "within_subsection_order": "FileNameSortKey",
 }
 
@@ -87,9 +97,15 @@ html_copy_source = False
 html_show_sourcelink = False
 
 
-def lead_to_the_gallery(app: object, name: str, source: list[str]) -> None:
-    """Let links to programs, which the repository shows as they are, lead to their pages here."""
-    source[0] = re.sub(r"\]\(\.\./examples/(\w+)\.py\)", r"](gallery/\1.rst)", source[0])
+def adapt(app: object, name: str, source: list[str]) -> None:
+    """Adapt a page, as the repository shows it, to this site.
+
+    Links to programs lead to their pages; what a table of contents would hold, if it were there, is left out.
+    """
+    text = re.sub(r"\]\(\.\./examples/(\w+)\.py\)", r"](gallery/\1.rst)", source[0])
+    source[0] = re.sub(
+        r"^[\w/-]+\*$", lambda m: m[0] if any(DOCS.glob(f"{m[0]}.*")) else "", text, flags=re.M
+    )
 
 
 def leave_settings_out(
@@ -108,4 +124,4 @@ def leave_settings_out(
 def setup(app: object) -> None:
     """Tell Sphinx of what is done here."""
     app.connect("autodoc-process-signature", leave_settings_out)  # type: ignore[attr-defined]
-    app.connect("source-read", lead_to_the_gallery)  # type: ignore[attr-defined]
+    app.connect("source-read", adapt)  # type: ignore[attr-defined]

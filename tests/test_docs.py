@@ -254,6 +254,18 @@ def test_the_modules_a_page_names_exist(page):
         assert importlib.import_module(f"caryatid.{name}")
 
 
+def test_what_the_method_page_says_of_departures_is_what_the_pages_it_names_say():
+    table = (DOCS / "method.md").read_text().split("what it changes\n")[1]
+    rows = [row.strip("| ").split(" | ") for row in table.splitlines() if row.startswith("| ")]
+    measured = [(row[3], row[4]) for row in rows if "](" in row[-1]]
+    assert len(measured) > 10
+    for effect, source in measured:
+        (page,) = re.findall(r"\]\(([\w-]+\.md)", source)
+        told = (DOCS / page).read_text()
+        for figure in re.findall(r"[−+]?\d\.\d{2,}", effect):
+            assert figure in told, f"{figure} is not in {page}"
+
+
 def said_by_the_code() -> list[str]:
     """What errors may say, as regular expressions."""
     patterns = []

@@ -9,7 +9,8 @@ HEADING = """Examples
 ========
 
 Programs of under sixty lines, each run when this page was built; what it printed stands below it. Each proves
-what it says against a truth it knows, and the tests run them all.
+what it says against a truth it knows, and the tests run them all. The client is only shown: by itself it has
+nobody to ask.
 """
 RUN = re.compile(r"/\d\d_")
 """Which of the programs are run: those with a number. The client has nobody to ask by itself."""
@@ -43,5 +44,7 @@ def title_of(path: Path) -> str:
 def _titled(path: Path) -> str:
     """Return a program with its title as the first lines of its docstring, which is then reStructuredText."""
     title = title_of(path)
+    # An indented block after a colon is code.
     opening, text, rest = path.read_text(encoding="utf-8").split('"""', 2)
+    text = re.sub(r":\n\n(?= {4})", "::\n\n", text)
     return f'{opening}"""{title}\n{"=" * len(title)}\n\n{text}"""{rest}'
