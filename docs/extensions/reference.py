@@ -1,4 +1,4 @@
-"""Directives that write the reference from the code: `command-help` and `settings-of`."""
+"""Directives that write the reference from the code: `every-command` and `settings-of`."""
 
 from __future__ import annotations
 
@@ -38,23 +38,41 @@ def help_of(command: str) -> str:
     return "\n".join(line.rstrip() for line in text.strip("\n").splitlines())
 
 
-class CommandHelp(SphinxDirective):
-    """The help of a command, say `explore` or `session add`; of `caryatid` itself without an argument."""
+def commands_of(command: str) -> list[str]:
+    """Return the commands that a command has; of `caryatid` itself for an empty one."""
+    listed = re.search(r"^usage:.*?\{([\w,-]+)\}", help_of(command), re.M | re.S)
+    return listed[1].split(",") if listed else []
 
-    optional_arguments = 1
-    final_argument_whitespace = True
+
+def command_pages() -> str:
+    """Return the help of all commands, and of theirs, as Markdown."""
+    lines = []
+    for name in commands_of(""):
+        lines.append(f"## {name}\n")
+        for command in [name, *(f"{name} {own}" for own in commands_of(name))]:
+            lines.append(f"```text\n{help_of(command)}\n```\n")
+    return "\n".join(lines)
+
+
+class EveryCommand(SphinxDirective):
+    """The help of every command, one section each."""
 
     def run(self) -> list[nodes.Node]:
         """Write the help."""
-        self.env.note_dependency(cli.__file__)
-        block = nodes.literal_block(text := help_of(self.arguments[0] if self.arguments else ""), text)
-        block["language"] = "text"
-        return [block]
+        for name, module in sys.modules.items():
+            if name.startswith("caryatid.commands.") or module is cli:
+                self.env.note_dependency(module.__file__ or "")
+        return list(self.parse_text_to_nodes(command_pages(), allow_section_headings=True))
+
+
+def kind_of(stage: str) -> Any:
+    """Return the class of a stage's settings; a stage that no file holds is named by its class."""
+    return getattr(config, stage) if stage in config.__all__ else type(getattr(config.Config(), stage))
 
 
 def table_of(stage: str) -> str:
     """Return the settings of a stage as Markdown, with what the code says of each."""
-    kind = type(getattr(config.Config(), stage))
+    kind = kind_of(stage)
     values = kind()
     ranges = kinds(kind)
     reasons = _reasons(kind)
@@ -123,13 +141,13 @@ class SettingsOf(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """Write the table."""
-        kind = type(getattr(config.Config(), self.arguments[0]))
+        kind = kind_of(self.arguments[0])
         self.env.note_dependency(sys.modules[kind.__module__].__file__ or "")
         return list(self.parse_text_to_nodes(table_of(self.arguments[0])))
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directives."""
-    app.add_directive("command-help", CommandHelp)
+    app.add_directive("every-command", EveryCommand)
     app.add_directive("settings-of", SettingsOf)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
