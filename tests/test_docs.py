@@ -40,7 +40,7 @@ PAGES = [
 ]
 GENERATED = {"benchmark.md", "performance.md"}
 """Pages a command writes; what they show is how they were made, which takes hours."""
-LANGUAGES = {"python", "sh", "text", "json", "toml", "xml", ""}
+LANGUAGES = {"python", "sh", "console", "bash", "text", "json", "toml", "xml", ""}
 FENCE = re.compile(r"^(`{3,})([^\n`]*)\n(.*?)^\1$", re.M | re.S)
 COMMAND = re.compile(r"^(?:\$ )?(?:caryatid|pip|make|python|dask|docker|git|import|from) ", re.M)
 STAYS = {"serve", "view"}
@@ -63,9 +63,16 @@ def blocks(page: Path) -> list[tuple[str, str, str]]:
 
 
 def runs(page: Path) -> list[tuple[str, str]]:
-    return [
-        (language, text) for language, rest, text in blocks(page) if language in ("python", "sh") and not rest
-    ]
+    """Language and content of the blocks that are run; of a console what was typed."""
+    found = []
+    for language, rest, text in blocks(page):
+        if language == "python" and not rest:
+            found.append((language, text))
+        elif language in ("sh", "bash") and not rest:
+            found.append(("sh", re.sub(r"^source <\((.*)\)$", r"\1", text, flags=re.M)))
+        elif language == "console" and not rest:
+            found.append(("sh", "\n".join(re.findall(r"^\$ (.*)$", text, re.M))))
+    return found
 
 
 RUNNING = [page for page in PAGES if page.name not in GENERATED and runs(page)]
