@@ -212,6 +212,16 @@ def test_every_page_of_the_site_can_be_got_to():
     assert reached == {str(p.relative_to(DOCS).with_suffix("")) for p in PAGES[1:]}
 
 
+def test_the_names_people_use_are_in_the_reference_of_python():
+    pages = "".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
+    documented = set(re.findall(r"^\.\. automodule:: (\S+)$", pages, re.M))
+    index = (DOCS / "api/index.md").read_text()
+    for name in ct.__all__:
+        home = getattr(ct, name).__module__
+        assert home in documented or f"autoclass:: {name}\n" in pages, name
+        assert f"`ct.{name} <{home}.{name}>`" in index, name
+
+
 def slugs(page: Path) -> set[str]:
     """What the headings of a page are called in links."""
     headings = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text()), re.M)
