@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test chromium check accuracy-gate bench bench-gate gif format clean
+.PHONY: install demo test chromium check accuracy-gate bench bench-gate docs pictures gif format clean
 
 install: $(VENV)/.installed
 
@@ -47,6 +47,17 @@ bench: $(VENV)/.peers
 bench-gate: $(VENV)/.peers
 	$(BIN)/python benchmarks/bench.py --gate
 
+$(VENV)/.docs: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs,ros,serve]"
+	touch $@
+
+docs: $(VENV)/.docs
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet docs docs/_build/html
+	@echo "open docs/_build/html/index.html"
+
+pictures: install
+	$(BIN)/python benchmarks/pictures/concepts.py
+
 gif: install
 	$(BIN)/python benchmarks/pictures/film.py
 
@@ -55,4 +66,4 @@ format: install
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) build dist demo-run
+	rm -rf $(VENV) build dist demo-run docs/_build docs/gallery

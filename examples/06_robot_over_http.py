@@ -14,7 +14,7 @@ import caryatid as ct
 from caryatid.simulation import load_scene
 from caryatid.simulation.stage import Stage, set_stage
 
-sys.path.append(str(Path(__file__).parent))
+sys.path.append(str(Path(sys.argv[0]).parent))
 from robot_client import RobotClient, png16
 
 

@@ -1,9 +1,9 @@
 """Drive a caryatid service from a robot's own software; needs nothing but Python. Copy this file.
 
-robot = RobotClient("http://127.0.0.1:8765")
-robot.begin("table", segmentation="auto")
-robot.add("table", png16(640, 480, depth_mm_big_endian), K, T_world_camera)
-robot.next("table")["T_world_camera"]
+>>> robot = RobotClient("http://127.0.0.1:8765")
+>>> robot.begin("table", segmentation="auto")
+>>> robot.add("table", png16(640, 480, depth_mm_big_endian), K, T_world_camera)
+>>> robot.next("table")["T_world_camera"]
 """
 
 from __future__ import annotations

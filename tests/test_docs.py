@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import ast
+import fnmatch
 import importlib
 import importlib.util
 import json
 import re
 import shlex
 import shutil
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,104 +23,346 @@ from bag_files import write_bag, write_tum
 from conftest import SMALL, run_command, without_labels
 
 import caryatid as ct
+from caryatid import config
 from caryatid.formats.images import png
 from caryatid.formats.reachability_npz import write_reachability
 from caryatid.reachability import sample_reachability
 from caryatid.settings import write_settings
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-NAMED = [path.name for path in PAGES]
+DOCS = ROOT / "docs"
+SOURCE = ROOT / "src/caryatid"
+BUILT = ("_build", "gallery", "notebooks")
+"""Folders in docs that hold no pages of this kind."""
+PAGES = [
+    ROOT / "README.md",
+    *sorted(p for p in DOCS.rglob("*.md") if p.relative_to(DOCS).parts[0] not in BUILT),
+]
+GENERATED = {"benchmark.md", "performance.md"}
+"""Pages a command writes; what they show is how they were made, which takes hours."""
+LANGUAGES = {"python", "sh", "console", "bash", "text", "json", "toml", "xml", ""}
+FENCE = re.compile(r"^(`{3,})([^\n`]*)\n(.*?)^\1$", re.M | re.S)
+COMMAND = re.compile(r"^(?:\$ )?(?:caryatid|pip|make|python|dask|docker|git|import|from) ", re.M)
+STAYS = {"serve", "view"}
+"""Commands that go on until they are stopped."""
+SHORT = {"explore", "demo", "dismantle"}
+"""Commands that are given few pixels and views here."""
 
 
-def blocks(path, language):
-    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.M | re.S)
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT)).removeprefix("docs/")
 
 
-@pytest.fixture
-def workplace(tmp_path, monkeypatch, kept_recording, scene_file, points, views, write_pcd):
-    """The files the pages speak of, in the current folder."""
-    write_pcd(*points, name="table.pcd")
-    write_bag(tmp_path / "pour.bag", views)
-    shutil.copytree(kept_recording, tmp_path / "recording")
-    shutil.copytree(scene_file.parent, tmp_path / "my-scene")
+def blocks(page: Path) -> list[tuple[str, str, str]]:
+    """Language, the rest of what is said of it, and content of a page's blocks."""
+    found = []
+    for match in FENCE.finditer(page.read_text()):
+        language, _, rest = match[2].strip().partition(" ")
+        found.append((language, rest, match[3]))
+    return found
+
+
+def runs(page: Path) -> list[tuple[str, str]]:
+    """Language and content of the blocks that are run; of a console what was typed."""
+    found = []
+    for language, rest, text in blocks(page):
+        if language == "python" and not rest:
+            found.append((language, text))
+        elif language in ("sh", "bash") and not rest:
+            found.append(("sh", re.sub(r"^source <\((.*)\)$", r"\1", text, flags=re.M)))
+        elif language == "console" and not rest:
+            found.append(("sh", "\n".join(re.findall(r"^\$ (.*)$", text, re.M))))
+    return found
+
+
+RUNNING = [page for page in PAGES if page.name not in GENERATED and runs(page)]
+
+
+@pytest.fixture(scope="session")
+def prepared(tmp_path_factory, kept_recording, scene_file, points, views):
+    """The files the pages speak of."""
+    folder = tmp_path_factory.mktemp("pages")
+    positions, labels = points
+    header = "VERSION .7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
+    header += f"WIDTH {len(labels)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(labels)}\nDATA ascii\n"
+    rows = "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in np.column_stack([positions, labels]))
+    (folder / "table.pcd").write_text(header + rows)
+    write_bag(folder / "pour.bag", views)
+    write_tum(
+        folder / "rgbd_dataset_freiburg1_desk",
+        [replace(v, depth=enlarged(v.depth), rgb=enlarged(v.rgb)) for v in without_labels(views)],
+    )
+    shutil.copytree(kept_recording, folder / "recording")
+    shutil.copytree(scene_file.parent, folder / "my-scene")
     write_reachability(
-        tmp_path / "arm.npz", sample_reachability(gantry, SLIDES, 100_000, np.random.default_rng(0))
+        folder / "arm.npz", sample_reachability(gantry, SLIDES, 100_000, np.random.default_rng(0))
     )
     camera = {"K": views[0].K.tolist(), "T_world_camera": views[0].pose.tolist()}
-    (tmp_path / "camera.json").write_text(json.dumps(camera))
-    (tmp_path / "depth.png").write_bytes(png(np.round(1e3 * views[0].depth).astype(np.uint16)))
-    (tmp_path / "labels.png").write_bytes(png(views[0].labels.astype(np.uint16)))
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    (folder / "camera.json").write_text(json.dumps(camera))
+    (folder / "depth.png").write_bytes(png(np.round(1e3 * views[0].depth).astype(np.uint16)))
+    (folder / "labels.png").write_bytes(png(views[0].labels.astype(np.uint16)))
+    (folder / "my-depth.png").write_bytes(png(enlarged(np.round(1e3 * views[0].depth).astype(np.uint16))))
+    return folder
 
 
-@pytest.mark.parametrize("page", PAGES, ids=NAMED)
-def test_python_blocks_run(page, workplace, capsys):
-    for block in blocks(page, "python"):
-        exec(compile(block, str(page), "exec"), {"__name__": "__main__"})
+def enlarged(image):
+    """An image of 160×120 as one of 640×480."""
+    return np.kron(image, np.ones((4, 4) + (1,) * (image.ndim - 2), image.dtype))
 
 
 @pytest.fixture
-def benchmark_folder(workplace, views):
-    """A folder of the TUM RGB-D benchmark in the current folder, of 640×480 images."""
-    large = [
-        replace(v, depth=np.kron(v.depth, np.ones((4, 4))), rgb=np.kron(v.rgb, np.ones((4, 4, 1), np.uint8)))
-        for v in without_labels(views)
-    ]
-    write_tum(workplace / "rgbd_dataset_freiburg1_desk", large)
-
-
-def test_commands_run(workplace, benchmark_folder, capsys, monkeypatch):
+def workplace(prepared, tmp_path, monkeypatch):
+    """A copy of these files, in the current folder."""
+    place = shutil.copytree(prepared, tmp_path / "here")
+    monkeypatch.chdir(place)
     monkeypatch.setattr("caryatid.commands.benchmarking.run_all", lambda *arguments: None)
-    lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
-    commands = [shlex.split(line)[1:] for line in lines if line.startswith("caryatid ")]
-    named = {
-        "explore",
-        "extract",
-        "evaluate",
-        "order",
-        "dismantle",
-        "import",
-        "export",
-        "benchmark",
-        "config",
-        "report",
-        "session",
-    }
-    assert {command[0] for command in commands} == named
-    for command in commands:
-        redirected = command[command.index(">") + 1] if ">" in command else None
-        arguments = command[: command.index(">")] if redirected else command
-        small = [*SMALL, "--views=2"] if arguments[0] in ("explore", "demo", "dismantle") else []
-        capsys.readouterr()
-        assert run_command(*arguments, *small) == 0, command
-        if redirected:
-            Path(redirected).write_text(capsys.readouterr().out)
-    assert (workplace / "run/report.html").is_file()
+    return place
 
 
-@pytest.mark.parametrize("page", PAGES, ids=NAMED)
+@pytest.mark.parametrize("page", RUNNING, ids=name_of)
+def test_blocks_run_as_they_stand(page, workplace, capsys):
+    for language, text in runs(page):
+        if language == "python":
+            exec(compile(text, str(page), "exec"), {"__name__": "__main__"})
+        else:
+            for line in text.replace("\\\n", " ").splitlines():
+                run_line(shlex.split(line, comments=True), capsys)
+
+
+def run_line(words: list[str], capsys) -> None:
+    """Run a line of a shell: a command of ours as it is; of others see that what they name is there."""
+    match words:
+        case []:
+            pass
+        case ["make", *targets]:
+            assert {f"{t}:" for t in targets} <= set(
+                re.findall(r"^\S+:", (ROOT / "Makefile").read_text(), re.M)
+            )
+        case ["pip", "install", *packages]:
+            for package in packages:
+                check_package(package)
+        case ["python", program, *_]:
+            assert (ROOT / program).is_file(), program
+        case [".venv/bin/caryatid", *rest]:
+            run_line(["caryatid", *rest], capsys)
+        case ["caryatid", name, *options] if name in STAYS or "--view" in options:
+            assert run_command(name, "--help") == 0
+            shown = capsys.readouterr().out
+            assert all(option.split("=")[0] in shown for option in options if option.startswith("--"))
+        case ["caryatid", *command]:
+            redirected = command[command.index(">") + 1] if ">" in command else None
+            arguments = command[: command.index(">")] if redirected else command
+            small = [*SMALL, "--views=2"] if arguments[0] in SHORT else []
+            given = {word.split("=")[1] for word in arguments if word.startswith("sensor.")}
+            small = [] if given else small
+            capsys.readouterr()
+            assert run_command(*arguments, *small) == 0, command
+            if redirected:
+                Path(redirected).write_text(capsys.readouterr().out)
+        case _:
+            pytest.fail(f"'{' '.join(words)}' is not run; say why, as in `sh norun`")
+
+
+def check_package(package: str) -> None:
+    """See that a package to be installed is this one, with extras it has, or one in this repository."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    name, _, rest = package.partition("[")
+    assert name in ("caryatid", ".") or (ROOT / name / "pyproject.toml").is_file(), package
+    assert set(filter(None, rest.rstrip("]").split(","))) <= set(extras), package
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p.name not in GENERATED], ids=name_of)
+def test_what_is_not_run_says_why(page):
+    before = page.read_text()
+    for language, rest, text in blocks(page):
+        if language.startswith("{"):
+            continue
+        assert language in LANGUAGES, language
+        if rest:
+            assert rest == "norun"
+            above = before.split(f"```{language} {rest}\n{text}")[0].rstrip().splitlines()[-1]
+            assert re.fullmatch(r"\*Not run .*: .+\.\*|\*Not run .*, as .+\.\*", above), text
+        elif language == "":
+            assert not COMMAND.search(text), f"say which language it is, so that it is run: {text}"
+
+
+def directives(page: Path) -> list[tuple[str, str]]:
+    return re.findall(r"^```\{([\w-]+)\} ?(.*)$", page.read_text(), re.M)
+
+
+def test_every_stage_has_its_settings_in_the_reference():
+    shown = [stage for name, stage in directives(DOCS / "settings.md") if name == "settings-of"]
+    own = [name for name in config.__all__ if name.endswith("Config") and name != "Config"]
+    stages = tomllib.loads(write_settings(ct.Config()))
+    kinds = {type(getattr(ct.Config(), stage)).__name__ for stage in stages}
+    assert sorted(shown) == sorted([*stages, *(set(own) - kinds)])
+
+
+def test_every_page_of_the_site_can_be_got_to():
+    reached = {"index"}
+    for page in PAGES[1:]:
+        folder = page.parent.relative_to(DOCS)
+        for language, _, text in blocks(page):
+            if language != "{toctree}":
+                continue
+            for entry in re.findall(r"^(?!:)(\S+)$", text, re.M):
+                pattern = str(folder / entry)
+                names = [str(p.relative_to(DOCS).with_suffix("")) for p in PAGES[1:]]
+                found = fnmatch.filter(names, pattern)
+                assert found or pattern.split("/")[0] in BUILT or "*" in pattern, f"{page.name}: {entry}"
+                reached.update(found)
+    assert reached == {str(p.relative_to(DOCS).with_suffix("")) for p in PAGES[1:]}
+
+
+def test_the_names_people_use_are_in_the_reference_of_python():
+    pages = "".join(page.read_text() for page in (DOCS / "api").glob("*.md"))
+    documented = set(re.findall(r"^\.\. automodule:: (\S+)$", pages, re.M))
+    index = (DOCS / "api/index.md").read_text()
+    for name in ct.__all__:
+        home = getattr(ct, name).__module__
+        assert home in documented or f"autoclass:: {name}\n" in pages, name
+        assert f"`ct.{name} <{home}.{name}>`" in index, name
+
+
+def slugs(page: Path) -> set[str]:
+    """What the headings of a page are called in links."""
+    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", page.read_text()), re.M)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_links_lead_somewhere(page):
-    for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", page.read_text()):
-        assert (page.parent / target).exists(), target
+    for target, anchor in re.findall(
+        r"\]\((?!https?:)([^)#]*)(?:#([^)]+))?\)", FENCE.sub("", page.read_text())
+    ):
+        path = page.parent / target if target else page
+        assert path.exists(), target
+        assert not anchor or anchor in slugs(path), f"{target}#{anchor}"
 
 
-def test_the_settings_the_method_page_names_exist():
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_pictures_are_small_and_say_what_they_show(page):
+    for text, target in re.findall(r"!\[(.*?)\]\((?!https?:)([^)]+)\)", page.read_text()):
+        assert len(text) > 10, target
+        assert (page.parent / target).stat().st_size <= (3_000_000 if target.endswith("gif") else 150_000)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_the_settings_a_page_names_exist(page):
     settings = tomllib.loads(write_settings(ct.Config()))
-    text = (ROOT / "docs/method.md").read_text()
-    named = set(re.findall(r"`([a-z]+)\.([a-z_]+)(?: = [^`]+)?`", text))
-    known = {(stage, name) for stage in settings for name in settings[stage]}
-    assert len(named & known) > 5
-    for module, name in named - known:
-        home = importlib.import_module(f"caryatid.{module}")
-        assert hasattr(home, name) or importlib.util.find_spec(f"{home.__name__}.{name}"), f"{module}.{name}"
+    for stage, name in re.findall(r"`([a-z]+)\.([a-z_]+)(?: = [^`]+|=[^`]+)?`", page.read_text()):
+        if stage not in settings or name in settings[stage] or name == "html":
+            continue
+        home = importlib.import_module(f"caryatid.{stage}")
+        inside = hasattr(home, "__path__") and importlib.util.find_spec(f"{home.__name__}.{name}")
+        assert hasattr(home, name) or inside, f"{stage}.{name}"
 
 
-def test_the_modules_the_method_page_names_exist():
-    text = (ROOT / "docs/method.md").read_text()
+@pytest.mark.parametrize("page", ["method.md", "concepts.md"])
+def test_the_modules_a_page_names_exist(page):
+    text = (DOCS / page).read_text()
     groups = re.findall(r"^(?:\*\*[^*]+\*\*|#+ [^(\n]+) \(([^)]+)\)", text, re.M)
     modules = [name for group in groups for name in re.findall(r"`([a-z_.]+)`", group)]
-    assert len(modules) > 15
+    assert len(modules) > 10
     for name in modules:
         assert importlib.import_module(f"caryatid.{name}")
+
+
+def test_what_the_method_page_says_of_departures_is_what_the_pages_it_names_say():
+    table = (DOCS / "method.md").read_text().split("what it changes\n")[1]
+    rows = [row.strip("| ").split(" | ") for row in table.splitlines() if row.startswith("| ")]
+    measured = [(row[3], row[4]) for row in rows if "](" in row[-1]]
+    assert len(measured) > 10
+    for effect, source in measured:
+        (page,) = re.findall(r"\]\(([\w-]+\.md)", source)
+        told = (DOCS / page).read_text()
+        for figure in re.findall(r"[−+]?\d\.\d{2,}", effect):
+            assert figure in told, f"{figure} is not in {page}"
+
+
+def said_by_the_code() -> list[str]:
+    """What errors may say, as regular expressions."""
+    patterns = []
+    for path in SOURCE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and str(getattr(node.func, "id", "")).endswith("Error"):
+                first, *others = [pattern(argument) for argument in node.args] or [""]
+                text = "; ".join(others)
+                patterns.append(f"{first}: {text}" if others else first)
+            elif isinstance(node, ast.Return) and isinstance(node.value, ast.JoinedStr):
+                patterns.append(f".+: {pattern(node.value)}")
+    return [p for p in patterns if len(p.replace(".+", "")) > 15]
+
+
+def pattern(node: ast.AST) -> str:
+    """What an expression that gives a text may give, as a regular expression."""
+    match node:
+        case ast.Constant(value=str() as text):
+            return re.escape(text)
+        case ast.JoinedStr(values=values):
+            return "".join(pattern(value) for value in values)
+        case _:
+            return ".+"
+
+
+def test_the_errors_the_questions_quote_are_what_the_code_says():
+    quoted = re.findall(r"^error: (.+)$", (DOCS / "faq.md").read_text(), re.M)
+    assert len(quoted) > 15
+    known = said_by_the_code()
+    for line in quoted:
+        assert any(re.fullmatch(p, line) for p in known), line
+
+
+def test_a_message_of_ros_becomes_a_view_as_the_page_does_it(workplace, views):
+    (text,) = [text for language, text in runs(DOCS / "how-to-ros.md") if "def view_of" in text]
+    names: dict = {}
+    exec(compile(text, "how-to-ros.md", "exec"), names)
+    image = np.round(1e3 * views[0].depth).astype("<u2")
+    rows = np.pad(image, ((0, 0), (0, 3)))  # drivers may pad rows
+    depth = SimpleNamespace(
+        encoding="16UC1", height=image.shape[0], width=image.shape[1], data=rows.tobytes()
+    )
+    still = SimpleNamespace(
+        rotation=SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0), translation=SimpleNamespace(x=1.0, y=2.0, z=3.0)
+    )
+    view = names["view_of"](depth, SimpleNamespace(k=views[0].K.ravel()), still)
+    np.testing.assert_allclose(view.depth, views[0].depth, atol=6e-4)
+    np.testing.assert_allclose(view.pose[:3, 3], (1.0, 2.0, 3.0))
+
+
+def test_a_graph_of_ones_own_image_takes_ten_lines():
+    (text,) = [text for language, text in runs(DOCS / "start.md") if "my-depth.png" in text]
+    assert len([line for line in text.splitlines() if line]) <= 10
+
+
+def test_the_reference_is_written_from_the_code(monkeypatch):
+    pytest.importorskip("sphinx")
+    monkeypatch.setattr(sys, "path", [str(DOCS / "extensions"), *sys.path])
+    reference = importlib.import_module("reference")
+    text = reference.command_pages()
+    assert {"explore", "session", "config"} <= set(re.findall(r"^## (\S+)$", text, re.M))
+    assert "--planner" in text
+    assert "caryatid session add" in text
+    assert "\x1b" not in text
+    for stage in tomllib.loads(write_settings(ct.Config())):
+        rows = reference.table_of(stage).splitlines()[2:]
+        assert rows
+        for row in rows:
+            name, default, _, reason = re.split(r" (?<!\\)\| ", row.strip("| "))
+            assert name.startswith(f"`{stage}."), row
+            assert default, row
+            assert len(reason) > 10, row
+            assert "[m]" not in reason, row
+
+
+def test_examples_get_a_title_for_the_gallery(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [str(DOCS / "extensions"), *sys.path])
+    gallery = importlib.import_module("gallery")
+    gallery.copy_examples(ROOT / "examples", tmp_path)
+    for path in sorted((ROOT / "examples").glob("*.py")):
+        text = ast.get_docstring(ast.parse((tmp_path / path.name).read_text()))
+        title, rule, *_ = text.splitlines()
+        assert title == gallery.title_of(path)
+        assert rule == "=" * len(title)
+        own, copied = path.read_text(), (tmp_path / path.name).read_text()
+        assert own.split('"""', 2)[2] == copied.split('"""', 2)[2]

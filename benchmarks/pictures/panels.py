@@ -151,10 +151,13 @@ def arrow(panel: Any, eye: Eye, supporter: Shape | None, supported: Shape, top: 
     panel.annotate("", pixels[1], pixels[0], arrowprops=style | {"linewidth": 3.0, "path_effects": HALO})
 
 
-def png(figure: Any) -> bytes:
-    """Write a figure as PNG."""
+def png(figure: Any, palette: int | None = None) -> bytes:
+    """Write a figure as PNG, of so many colours where a number is given."""
     written, packed = io.BytesIO(), io.BytesIO()
     figure.savefig(written, format="png")
     plt.close(figure)
-    Image.open(written).convert("RGB").save(packed, format="png", optimize=True)
+    image = Image.open(written).convert("RGB")
+    if palette is not None:
+        image = image.quantize(palette, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    image.save(packed, format="png", optimize=True)
     return packed.getvalue()

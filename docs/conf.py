@@ -1,0 +1,127 @@
+"""How the documentation is built: `make docs`."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).parent
+sys.path.insert(0, str(DOCS / "extensions"))
+os.environ.setdefault("MPLBACKEND", "agg")
+
+from array_types import keep_their_names  # noqa: E402
+
+keep_their_names()
+import results  # noqa: E402
+from gallery import RUN, copy_examples  # noqa: E402
+
+import caryatid  # noqa: E402
+
+results.watch()
+
+project = "caryatid"
+author = "the authors of caryatid"
+copyright = author
+version = release = caryatid.__version__
+language = "en"
+
+extensions = [
+    "myst_nb",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "formulas",
+    "reference",
+]
+exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py", "notebooks/*.py"]
+suppress_warnings = ["config.cache"]
+default_role = "code"
+
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 4
+nb_execution_mode = "off"  # notebooks are kept with what they showed when they were run
+nb_merge_streams = True
+html_math_renderer = "drawn"
+
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_typehints_format = "short"
+python_display_short_literal_types = True
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_custom_sections = [("Attributes", "params_style")]
+python_use_unqualified_type_names = True
+
+nitpicky = True
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!caryatid\.).*"),  # other packages' names: nothing is fetched from their sites
+    (
+        "py:.*",
+        r"caryatid\.(kernels|shape_arrays|recordings\.sources|sessions\.(lock|folder)|simulation\.lifting)\..*",
+    ),
+]
+
+copy_examples(DOCS.parent / "examples", DOCS / "_build" / "examples")
+sphinx_gallery_conf = {
+    "examples_dirs": "_build/examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": RUN.pattern,
+    "show_memory": False,
+    "show_signature": False,
+    "min_reported_time": 1e9,
+    "write_computation_times": False,
+    "download_all_examples": False,
+    "abort_on_example_error": True,
+    "image_scrapers": ("results.take_picture",),
+    "reset_modules": ("results.forget",),
+    "default_thumb_file": str(DOCS / "pictures" / "concepts" / "view.png"),
+    "within_subsection_order": "FileNameSortKey",
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "caryatid"
+html_static_path = ["static"]
+html_css_files = ["caryatid.css"]
+html_theme_options = {
+    "show_prev_next": True,
+    "secondary_sidebar_items": {"**": ["page-toc"], "settings": [], "commands": [], "index": []},
+    "footer_start": [],
+    "footer_end": ["theme-version"],
+    "navigation_with_keys": False,
+}
+html_sidebars = {"index": [], "start": [], "concepts": []}
+html_copy_source = False
+html_show_sourcelink = False
+
+
+def adapt(app: object, name: str, source: list[str]) -> None:
+    """Adapt a page, as the repository shows it, to this site.
+
+    Links to programs lead to their pages; what a table of contents would hold, if it were there, is left out.
+    """
+    text = re.sub(r"\]\(\.\./examples/(\w+)\.py\)", r"](gallery/\1.rst)", source[0])
+    source[0] = re.sub(
+        r"^[\w/-]+\*$", lambda m: m[0] if any(DOCS.glob(f"{m[0]}.*")) else "", text, flags=re.M
+    )
+
+
+def leave_settings_out(
+    app: object,
+    what: str,
+    name: str,
+    value: object,
+    options: object,
+    arguments: str | None,
+    gives: str | None,
+) -> tuple[str | None, str | None]:
+    """Let classes of settings stand without their dozens of arguments: a page of their own lists these."""
+    return ("", None) if name.startswith("caryatid.config.") else (arguments, gives)
+
+
+def setup(app: object) -> None:
+    """Tell Sphinx of what is done here."""
+    app.connect("autodoc-process-signature", leave_settings_out)  # type: ignore[attr-defined]
+    app.connect("source-read", adapt)  # type: ignore[attr-defined]

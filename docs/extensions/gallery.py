@@ -1,0 +1,50 @@
+"""The programs of `examples/` as sphinx-gallery wants them: copied, each with a title over its docstring."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+HEADING = """Examples
+========
+
+Programs of under sixty lines, each run when this page was built; what it printed stands below it. Each proves
+what it says against a truth it knows, and the tests run them all. The client is only shown: by itself it has
+nobody to ask.
+"""
+RUN = re.compile(r"/\d\d_")
+"""Which of the programs are run: those with a number. The client has nobody to ask by itself."""
+
+
+def copy_examples(examples: Path, destination: Path) -> None:
+    """Copy the programs, titled by their names; what has not changed is not written anew.
+
+    Args:
+        examples: Where they are.
+        destination: Where sphinx-gallery looks for them.
+    """
+    destination.mkdir(parents=True, exist_ok=True)
+    texts = {path.name: _titled(path) for path in sorted(examples.glob("*.py"))}
+    texts["GALLERY_HEADER.rst"] = HEADING
+    for old in destination.iterdir():
+        if old.name not in texts:
+            old.unlink()
+    for name, text in texts.items():
+        path = destination / name
+        if not path.is_file() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+
+
+def title_of(path: Path) -> str:
+    """Make a title of a program's name: `06_robot_over_http.py` is Robot over HTTP."""
+    words = re.sub(r"^\d+_", "", path.stem).replace("_", " ").replace("http", "HTTP")
+    return words[0].upper() + words[1:]
+
+
+def _titled(path: Path) -> str:
+    """Return a program with its title as the first lines of its docstring, which is then reStructuredText."""
+    title = title_of(path)
+    # An indented block after a colon is code.
+    opening, text, rest = path.read_text(encoding="utf-8").split('"""', 2)
+    text = re.sub(r":\n\n(?= {4})", "::\n\n", text)
+    return f'{opening}"""{title}\n{"=" * len(title)}\n\n{text}"""{rest}'

@@ -1,0 +1,153 @@
+"""Directives that write the reference from the code: `every-command` and `settings-of`."""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import inspect
+import io
+import os
+import re
+import sys
+from dataclasses import fields
+from typing import Annotated, Any, Literal, get_args, get_origin
+from unittest.mock import patch
+
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+from caryatid import cli, config
+from caryatid.config.ranges import kinds
+
+WIDTH = 100
+"""Columns of the help."""
+
+
+def help_of(command: str) -> str:
+    """Return what `caryatid COMMAND --help` prints, without colours."""
+    printed = io.StringIO()
+    environment = os.environ | {"COLUMNS": str(WIDTH), "NO_COLOR": "1", "TERM": "dumb"}
+    with (
+        patch.dict(os.environ, environment),
+        contextlib.redirect_stdout(printed),
+        contextlib.suppress(SystemExit),
+    ):
+        cli.main([*command.split(), "--help"])
+    text = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue())
+    return "\n".join(line.rstrip() for line in text.strip("\n").splitlines())
+
+
+def commands_of(command: str) -> list[str]:
+    """Return the commands that a command has; of `caryatid` itself for an empty one."""
+    listed = re.search(r"^usage:.*?\{([\w,-]+)\}", help_of(command), re.M | re.S)
+    return listed[1].split(",") if listed else []
+
+
+def command_pages() -> str:
+    """Return the help of all commands, and of theirs, as Markdown."""
+    lines = []
+    for name in commands_of(""):
+        lines.append(f"## {name}\n")
+        for command in [name, *(f"{name} {own}" for own in commands_of(name))]:
+            lines.append(f"```text\n{help_of(command)}\n```\n")
+    return "\n".join(lines)
+
+
+class EveryCommand(SphinxDirective):
+    """The help of every command, one section each."""
+
+    def run(self) -> list[nodes.Node]:
+        """Write the help."""
+        for name, module in sys.modules.items():
+            if name.startswith("caryatid.commands.") or module is cli:
+                self.env.note_dependency(module.__file__ or "")
+        return list(self.parse_text_to_nodes(command_pages(), allow_section_headings=True))
+
+
+def kind_of(stage: str) -> Any:
+    """Return the class of a stage's settings; a stage that no file holds is named by its class."""
+    return getattr(config, stage) if stage in config.__all__ else type(getattr(config.Config(), stage))
+
+
+def table_of(stage: str) -> str:
+    """Return the settings of a stage as Markdown, with what the code says of each."""
+    kind = kind_of(stage)
+    values = kind()
+    ranges = kinds(kind)
+    reasons = _reasons(kind)
+    lines = ["| setting | default | allowed | what, and why this value |", "|---|---|---|---|"]
+    for field in fields(kind):
+        unit, reason = _unit(reasons.get(field.name, ""))
+        cells = [
+            f"`{stage}.{field.name}`",
+            f"`{_toml(getattr(values, field.name))}` {unit}".rstrip(),
+            _allowed(ranges[field.name]),
+            reason,
+        ]
+        lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(lines)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(_toml, value)) + "]"
+    return f'"{value}"' if isinstance(value, str) else repr(value)
+
+
+def _reasons(kind: type) -> dict[str, str]:
+    """Names of a dataclass's fields → the strings below them."""
+    tree = ast.parse(inspect.getsource(kind)).body[0]
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for field, below in zip(tree.body, tree.body[1:], strict=False):
+        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
+            assert isinstance(field.target, ast.Name)
+            assert isinstance(below.value, ast.Constant)
+            found[field.target.id] = " ".join(str(below.value.value).split())
+    return found
+
+
+def _unit(reason: str) -> tuple[str, str]:
+    """Split the unit, in brackets in the first sentence, from a setting's description."""
+    match = re.search(r" ?\[((?:1|m|deg|px|rad|s|kg|points|views|voxels|nats|N|%)[^\]]*)\]", reason)
+    if match is None:
+        return "", reason
+    unit = "" if match[1] == "1" else match[1]
+    return unit, reason[: match.start()] + reason[match.end() :]
+
+
+def _allowed(kind: Any) -> str:
+    """Say which values a type allows."""
+    if get_origin(kind) is Annotated:
+        plain, *rules = get_args(kind)
+        return "; ".join(filter(None, [_allowed(plain), *map(str, rules)]))
+    if get_origin(kind) is Literal:
+        return ", ".join(f"`{name}`" for name in get_args(kind))
+    if get_origin(kind) is tuple:
+        parts = [part for part in get_args(kind) if part is not Ellipsis]
+        each = "; ".join(sorted({allowed for part in parts if (allowed := _allowed(part))}))
+        count = "a list" if Ellipsis in get_args(kind) else f"{len(parts)} numbers"
+        return count + (f", each {each}" if each else "")
+    return {bool: "`true`, `false`"}.get(kind, "")
+
+
+class SettingsOf(SphinxDirective):
+    """A table of the settings of a stage."""
+
+    required_arguments = 1
+
+    def run(self) -> list[nodes.Node]:
+        """Write the table."""
+        kind = kind_of(self.arguments[0])
+        self.env.note_dependency(sys.modules[kind.__module__].__file__ or "")
+        return list(self.parse_text_to_nodes(table_of(self.arguments[0])))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Register the directives."""
+    app.add_directive("every-command", EveryCommand)
+    app.add_directive("settings-of", SettingsOf)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
