@@ -94,3 +94,7 @@ class Candidates:
         others = replace(self, path_length=path_length)
         object.__setattr__(others, "_looks", self._looks)
         return others
+
+    def __repr__(self) -> str:
+        refused = ", ".join(f"{count} {reason}" for reason, count in self.rejected.items())
+        return f"Candidates({len(self)}{f'; refused: {refused}' if refused else ''})"

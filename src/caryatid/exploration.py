@@ -18,6 +18,7 @@ from caryatid.graph import SupportGraph
 from caryatid.planners import Decision, Planner, PlanningState, make_planner
 from caryatid.robot import Robot, refusal_of, view_sphere_of
 from caryatid.scene import Scene
+from caryatid.shown import Shown
 from caryatid.stopwatch import Stopwatch
 from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
@@ -25,7 +26,7 @@ from caryatid.views import Camera, Cloud, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Step:
+class Step(Shown):
     """One turn of the loop.
 
     Attributes:
@@ -57,6 +58,10 @@ class Step:
     angle_travelled: float
     path_travelled: float
     stop: str | None
+
+    def __repr__(self) -> str:
+        following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
+        return f"Step({self.index}: {self.graph}; {following})"
 
 
 def explore(

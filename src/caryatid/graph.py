@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from caryatid import frames
 from caryatid.frames import Array
 from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.shown import Shown
 from caryatid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
@@ -16,9 +17,12 @@ if TYPE_CHECKING:
 Role = Literal["object", "support_surface"]
 Kind = Literal["bottom-up", "lean", "top-down"]
 
+EDGES_TOLD = 8
+"""Edges a graph's `repr` names at the most."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
-class SceneObject:
+class SceneObject(Shown):
     """A vertex of the support graph.
 
     Attributes:
@@ -54,6 +58,9 @@ class SceneObject:
         """Centre (3,) [m] of the shape."""
         return self.shape.T_world_object[:3, 3]
 
+    def __repr__(self) -> str:
+        return f"SceneObject({self.id}: {self.shape})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Support:
@@ -86,9 +93,14 @@ class Support:
         """(supporter, supported)."""
         return self.supporter, self.supported
 
+    def __repr__(self) -> str:
+        doubt = "" if self.certain else ", uncertain"
+        found = f"{self.occurrences} of {self.opportunities}"
+        return f"Support({self.supporter} → {self.supported}, {self.kind}{doubt}, found in {found})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
-class SupportGraph:
+class SupportGraph(Shown):
     """G_s = (V, E) of the paper, section III-A, in the order of the objects' labels.
 
     Attributes:
@@ -143,6 +155,12 @@ class SupportGraph:
         for s in self.supports:
             graph.add_edge(s.supporter, s.supported, data=s, kind=s.kind, certain=s.certain)
         return graph
+
+    def __repr__(self) -> str:
+        edges = [f"{s.supporter} → {s.supported}{'' if s.certain else '?'}" for s in self.supports]
+        told = edges if len(edges) <= EDGES_TOLD else [*edges[: EDGES_TOLD - 1], "…"]
+        counts = f"{len(self.objects)} vertices, {len(edges)} edges"
+        return f"SupportGraph({counts}{': ' if told else ''}{', '.join(told)})"
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from caryatid.manipulation.effects import Effect, predict_removal
 from caryatid.object_models import ObjectModels
 from caryatid.perception import UP, Percept, label_image, perceive
 from caryatid.plausibility import reconcile
+from caryatid.shown import Shown
 from caryatid.stopwatch import Stopwatch
 from caryatid.support import explain, infer
 from caryatid.surface import SupportSurface, refitted
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     import networkx as nx
 
 
-class Scene:
+class Scene(Shown):
     """The scene model of section III, updated view by view.
 
     The first one after installation takes some seconds to come: kernels are compiled.
@@ -85,6 +86,11 @@ class Scene:
     def cloud(self) -> Cloud:
         """All points so far, thinned view by view, with the labels of their objects."""
         return self._models.points.everything()
+
+    def __repr__(self) -> str:
+        return (
+            f"Scene({self.views} views, {len(self.graph.objects)} vertices, {len(self.graph.supports)} edges)"
+        )
 
     def explain(self, supporter: str, supported: str) -> str:
         """Say why one object is, or is not, taken to support another; with figures.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.frames import Array
+from caryatid.shown import Shown
 
 
 class Shape(Protocol):
@@ -66,7 +67,7 @@ class Shape(Protocol):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Box:
+class Box(Shown):
     """A cuboid.
 
     Attributes:
@@ -123,9 +124,13 @@ class Box:
         """Return the box moved by a rigid transform of the world."""
         return Box(T @ self.T_world_object, self.extents)
 
+    def __repr__(self) -> str:
+        x, y, z = self.extents
+        return f"Box({x:.3f} × {y:.3f} × {z:.3f} m at {_place(self)})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cylinder:
+class Cylinder(Shown):
     """A straight circular cylinder.
 
     Attributes:
@@ -193,9 +198,12 @@ class Cylinder:
         """Return the cylinder moved by a rigid transform of the world."""
         return Cylinder(T @ self.T_world_object, self.radius, self.height)
 
+    def __repr__(self) -> str:
+        return f"Cylinder(radius {self.radius:.3f} m, height {self.height:.3f} m at {_place(self)})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sphere:
+class Sphere(Shown):
     """A ball.
 
     Attributes:
@@ -244,6 +252,9 @@ class Sphere:
         """Return the sphere moved by a rigid transform of the world."""
         return Sphere(T @ self.T_world_object, self.radius)
 
+    def __repr__(self) -> str:
+        return f"Sphere(radius {self.radius:.3f} m at {_place(self)})"
+
 
 def from_size(
     kind: str, T_world_object: Array, size: Mapping[str, float] | list[float], source: str
@@ -277,6 +288,11 @@ def fibonacci_sphere(count: int) -> Array:
     azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
     ring = np.sqrt(1.0 - z * z)
     return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=-1)
+
+
+def _place(shape: Shape) -> str:
+    x, y, z = shape.T_world_object[:3, 3]
+    return f"({x:.3f}, {y:.3f}, {z:.3f})"
 
 
 def _local(shape: Shape, points_world: Array) -> Array:

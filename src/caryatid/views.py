@@ -14,13 +14,14 @@ from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.frames import Array
 from caryatid.kernels import points as kernels
+from caryatid.shown import Shown
 
 SUPPORT_LABEL = 65535
 """The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class View(Shown):
     """One registered RGB-D view.
 
     Attributes:
@@ -108,9 +109,14 @@ class View:
         object.__setattr__(other, "T_world_camera", T)
         return other
 
+    def __repr__(self) -> str:
+        given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
+        given += [] if self.T_world_camera is None else ["pose"]
+        return f"View({self.name}: depth {_size(self.depth)}{''.join(f', {name}' for name in given)})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cloud:
+class Cloud(Shown):
     """Oriented points in the world frame, organised or not.
 
     Attributes:
@@ -155,6 +161,10 @@ class Cloud:
             normals_world=kernels.rotate(T[None], only, self.normals_world),
             viewpoint_world=None if eye is None else frames.transform(T, eye),
         )
+
+    def __repr__(self) -> str:
+        given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
+        return f"Cloud({self.name}: {len(self)} points{''.join(f', {name}' for name in given)})"
 
 
 class Camera(Protocol):

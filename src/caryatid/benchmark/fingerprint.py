@@ -14,7 +14,19 @@ from caryatid.planners import offered
 LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
 """Libraries whose release may change a figure."""
 
-BYSTANDERS = frozenset({"benchmark", "commands", "exports", "recordings", "report", "service", "sessions"})
+BYSTANDERS = frozenset(
+    {
+        "benchmark",
+        "commands",
+        "exports",
+        "notebook",
+        "recordings",
+        "report",
+        "service",
+        "sessions",
+        "viewer",
+    }
+)
 """Parts of caryatid that only arrange, hand on, draw or tell what others found, but for `DECIDING`."""
 
 DECIDING = frozenset({"benchmark/episodes.py", "benchmark/records.py", "benchmark/scenes.py"})

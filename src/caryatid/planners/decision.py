@@ -17,6 +17,7 @@ from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.interest import PointOfInterest
+from caryatid.shown import Shown
 from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from caryatid.voxels import VoxelMap
@@ -42,6 +43,9 @@ class PlanningState:
     candidates: Candidates
     config: ActiveVisionConfig
 
+    def __repr__(self) -> str:
+        return f"PlanningState({len(self.visited)} views, {len(self.candidates)} candidates; {self.graph})"
+
 
 class Painted:
     """A field whose value is given, or painted when it is first looked at: most pictures are never drawn."""
@@ -62,7 +66,7 @@ class Painted:
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class Decision(Shown):
     """The next best view and why.
 
     Attributes:
@@ -87,6 +91,9 @@ class Decision:
     points_of_interest: tuple[PointOfInterest, ...] = ()
     candidate_saliency: Array | None = None
     sphere_saliency: Painted = Painted()
+
+    def __repr__(self) -> str:
+        return f"Decision(candidate {self.index}, score {self.score:.3f}: {self.why})"
 
 
 class Planner(Protocol):
