@@ -15,10 +15,10 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
+from caryatid.pictured import Pictured
 from caryatid.planners import Decision, Planner, PlanningState, make_planner
 from caryatid.robot import Robot, refusal_of, view_sphere_of
 from caryatid.scene import Scene
-from caryatid.shown import Shown
 from caryatid.stopwatch import Stopwatch
 from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
@@ -26,7 +26,7 @@ from caryatid.views import Camera, Cloud, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Step(Shown):
+class Step(Pictured):
     """One turn of the loop.
 
     Attributes:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 from caryatid import frames
 from caryatid.frames import Array
+from caryatid.pictured import Pictured
 from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.shown import Shown
 from caryatid.uncertainty import Uncertainty
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ EDGES_TOLD = 8
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class SceneObject(Shown):
+class SceneObject(Pictured):
     """A vertex of the support graph.
 
     Attributes:
@@ -100,7 +100,7 @@ class Support:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class SupportGraph(Shown):
+class SupportGraph(Pictured):
     """G_s = (V, E) of the paper, section III-A, in the order of the objects' labels.
 
     Attributes:

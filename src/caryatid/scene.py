@@ -20,8 +20,8 @@ from caryatid.kernels.compiling import compile_kernels
 from caryatid.manipulation.effects import Effect, predict_removal
 from caryatid.object_models import ObjectModels
 from caryatid.perception import UP, Percept, label_image, perceive
+from caryatid.pictured import Pictured
 from caryatid.plausibility import reconcile
-from caryatid.shown import Shown
 from caryatid.stopwatch import Stopwatch
 from caryatid.support import explain, infer
 from caryatid.surface import SupportSurface, refitted
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import networkx as nx
 
 
-class Scene(Shown):
+class Scene(Pictured):
     """The scene model of section III, updated view by view.
 
     The first one after installation takes some seconds to come: kernels are compiled.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.frames import Array
-from caryatid.shown import Shown
+from caryatid.pictured import Pictured
 
 
 class Shape(Protocol):
@@ -67,7 +67,7 @@ class Shape(Protocol):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Box(Shown):
+class Box(Pictured):
     """A cuboid.
 
     Attributes:
@@ -130,7 +130,7 @@ class Box(Shown):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cylinder(Shown):
+class Cylinder(Pictured):
     """A straight circular cylinder.
 
     Attributes:
@@ -203,7 +203,7 @@ class Cylinder(Shown):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sphere(Shown):
+class Sphere(Pictured):
     """A ball.
 
     Attributes:

@@ -14,14 +14,14 @@ from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.frames import Array
 from caryatid.kernels import points as kernels
-from caryatid.shown import Shown
+from caryatid.pictured import Pictured
 
 SUPPORT_LABEL = 65535
 """The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
 
 
 @dataclass(frozen=True, eq=False)
-class View(Shown):
+class View(Pictured):
     """One registered RGB-D view.
 
     Attributes:
@@ -116,7 +116,7 @@ class View(Shown):
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cloud(Shown):
+class Cloud(Pictured):
     """Oriented points in the world frame, organised or not.
 
     Attributes:

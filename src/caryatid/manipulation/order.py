@@ -12,7 +12,7 @@ from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.rehearsal import Rehearsal, Trial
-from caryatid.shown import Shown
+from caryatid.pictured import Pictured
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class TakeStep:
 
 
 @dataclass(frozen=True, slots=True)
-class Order(Shown):
+class Order(Pictured):
     """An order to take objects away.
 
     Attributes:

@@ -17,7 +17,7 @@ from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.interest import PointOfInterest
-from caryatid.shown import Shown
+from caryatid.pictured import Pictured
 from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from caryatid.voxels import VoxelMap
@@ -66,7 +66,7 @@ class Painted:
 
 
 @dataclass(frozen=True, eq=False)
-class Decision(Shown):
+class Decision(Pictured):
     """The next best view and why.
 
     Attributes:

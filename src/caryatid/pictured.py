@@ -1,7 +1,7 @@
 """What shows itself in a notebook."""
 
 
-class Shown:
+class Pictured:
     """Gives a class its picture in a notebook; `caryatid.notebook` draws it, imported when it is asked."""
 
     __slots__ = ()
