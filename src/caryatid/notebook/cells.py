@@ -72,7 +72,7 @@ def _of_step(step: Step) -> Cell:
         f"{tables.census(step.graph)}; {taken}",
         note=note,
         figures=figures,
-        tables=(*tables.of_graph(step.graph), *tables.of_points(step.decision), *tables.of_timings(step)),
+        tables=(*tables.of_graph(step.graph), *tables.of_points(step.decision)),
     )
 
 

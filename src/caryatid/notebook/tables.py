@@ -11,7 +11,6 @@ from caryatid.report.colours import object_colour
 from caryatid.report.rows import object_rows, point_rows, support_rows
 
 if TYPE_CHECKING:
-    from caryatid.exploration import Step
     from caryatid.frames import Array
     from caryatid.graph import SupportGraph
     from caryatid.manipulation.order import Order
@@ -67,12 +66,6 @@ def of_points(decision: Decision | None) -> tuple[Table, ...]:
     """The table of points of interest, the most salient first; none where there are none."""
     rows = tuple((Entry(r.subject), Entry(r.saliency), Entry(r.why)) for r in point_rows(decision))
     return (Table("Points of interest", ("about", "saliency", "why"), rows),) if rows else ()
-
-
-def of_timings(step: Step) -> tuple[Table, ...]:
-    """The table of what each stage took."""
-    rows = tuple((Entry(name), Entry(f"{1e3 * taken:.0f}")) for name, taken in step.timings.items())
-    return (Table("Time", ("stage", "[ms]"), rows),) if rows else ()
 
 
 def of_order(order: Order) -> Table:
