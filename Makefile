@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test check accuracy-gate bench bench-gate format clean
+.PHONY: install demo test check notebooks accuracy-gate bench bench-gate format clean
 
 install: $(VENV)/.installed
 
@@ -22,6 +22,9 @@ check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+notebooks: install
+	$(BIN)/python docs/notebooks/execute.py
 
 accuracy-gate: install
 	$(BIN)/python benchmarks/accuracy.py suite --gate

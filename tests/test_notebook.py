@@ -198,7 +198,7 @@ def test_plain_lines_tell_one_from_another():
     )
     edges = tuple(Support("o1", f"o{k}") for k in range(2, 30))
     many = repr(SupportGraph((SceneObject("o1", 1, ct.Sphere(upright, 0.1)),), edges))
-    assert many.startswith("SupportGraph(1 vertices, 28 edges: o1 → o2, ")
+    assert many.startswith("SupportGraph(vertices=1, edges=28: o1 → o2, ")
     assert many.endswith("…)")
     candidates = Candidates(np.empty((0, 4, 4)), np.empty((0, 3)), np.empty(0), {"too low": 3})
     assert repr(candidates) == "Candidates(0; refused: 3 too low)"

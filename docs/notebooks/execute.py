@@ -11,7 +11,10 @@ from pathlib import Path
 
 import nbformat
 from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode
+
+__all__ = ["CellExecutionError", "execute", "notebooks"]
 
 FOLDER = Path(__file__).parent
 TIME_LIMIT = 600

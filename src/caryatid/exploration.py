@@ -61,7 +61,8 @@ class Step(Pictured):
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
-        return f"Step({self.index}: {self.graph}; {following})"
+        vertices, edges = len(self.graph.objects), len(self.graph.supports)
+        return f"Step(index={self.index}, vertices={vertices}, edges={edges}; {following})"
 
 
 def explore(

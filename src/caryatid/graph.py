@@ -159,7 +159,7 @@ class SupportGraph(Pictured):
     def __repr__(self) -> str:
         edges = [f"{s.supporter} → {s.supported}{'' if s.certain else '?'}" for s in self.supports]
         told = edges if len(edges) <= EDGES_TOLD else [*edges[: EDGES_TOLD - 1], "…"]
-        counts = f"{len(self.objects)} vertices, {len(edges)} edges"
+        counts = f"vertices={len(self.objects)}, edges={len(edges)}"
         return f"SupportGraph({counts}{': ' if told else ''}{', '.join(told)})"
 
 

@@ -88,9 +88,8 @@ class Scene(Pictured):
         return self._models.points.everything()
 
     def __repr__(self) -> str:
-        return (
-            f"Scene({self.views} views, {len(self.graph.objects)} vertices, {len(self.graph.supports)} edges)"
-        )
+        vertices, edges = len(self.graph.objects), len(self.graph.supports)
+        return f"Scene(views={self.views}, vertices={vertices}, edges={edges})"
 
     def explain(self, supporter: str, supported: str) -> str:
         """Say why one object is, or is not, taken to support another; with figures.

@@ -44,7 +44,8 @@ class PlanningState:
     config: ActiveVisionConfig
 
     def __repr__(self) -> str:
-        return f"PlanningState({len(self.visited)} views, {len(self.candidates)} candidates; {self.graph})"
+        views, candidates = len(self.visited), len(self.candidates)
+        return f"PlanningState(views={views}, candidates={candidates}, graph={self.graph})"
 
 
 class Painted:
