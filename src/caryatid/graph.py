@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     import networkx as nx
 
 Role = Literal["object", "support_surface"]
+"""What a vertex is."""
 Kind = Literal["bottom-up", "lean", "top-down"]
+"""How a support holds: from below, from the side, or by weight from above."""
 
 EDGES_TOLD = 8
 """Edges a graph's `repr` names at the most."""
@@ -125,7 +127,12 @@ class SupportGraph(Pictured):
         return next((o for o in self.objects if o.role == "support_surface"), None)
 
     def support(self, supporter: str, supported: str) -> Support | None:
-        """Return the edge between two ids, or None."""
+        """Return the edge between two ids, or None.
+
+        Args:
+            supporter: Id of the one that holds, such as `o1`.
+            supported: Id of the one that is held.
+        """
         return next((s for s in self.supports if s.pair == (supporter, supported)), None)
 
     def supporters(self, object_id: str) -> list[Support]:
@@ -192,6 +199,7 @@ def object_id(label: int) -> str:
 
 
 SUPPORT_SURFACE_ID = "o0"
+"""Id of the support surface."""
 
 __all__ = [
     "SUPPORT_SURFACE_ID",

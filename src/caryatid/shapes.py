@@ -62,7 +62,7 @@ class Shape(Protocol):
         ...
 
     def moved(self, T: Array) -> Self:
-        """Return the shape moved by a rigid transform of the world: T @ T_world_object."""
+        """Return the shape moved by a rigid transform (4, 4) of the world: T @ T_world_object."""
         ...
 
 
@@ -71,6 +71,7 @@ class Box(Pictured):
     """A cuboid.
 
     Attributes:
+        kind: `box`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; axes along the edges.
         extents: Full edge lengths (3,) [m] along the object's x, y, z.
     """
@@ -121,7 +122,7 @@ class Box(Pictured):
         return frames.transform(self.T_world_object, signs * self.extents / 2.0)
 
     def moved(self, T: Array) -> Box:
-        """Return the box moved by a rigid transform of the world."""
+        """Return the box moved by a rigid transform (4, 4) of the world."""
         return Box(T @ self.T_world_object, self.extents)
 
     def __repr__(self) -> str:
@@ -134,6 +135,7 @@ class Cylinder(Pictured):
     """A straight circular cylinder.
 
     Attributes:
+        kind: `cylinder`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; the axis is the object's z.
         radius: [m].
         height: Full length along the axis [m].
@@ -195,7 +197,7 @@ class Cylinder(Pictured):
         return frames.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
 
     def moved(self, T: Array) -> Cylinder:
-        """Return the cylinder moved by a rigid transform of the world."""
+        """Return the cylinder moved by a rigid transform (4, 4) of the world."""
         return Cylinder(T @ self.T_world_object, self.radius, self.height)
 
     def __repr__(self) -> str:
@@ -207,6 +209,7 @@ class Sphere(Pictured):
     """A ball.
 
     Attributes:
+        kind: `sphere`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; its rotation means nothing.
         radius: [m].
     """
@@ -249,7 +252,7 @@ class Sphere(Pictured):
         return self.T_world_object[:3, 3] + self.radius * fibonacci_sphere(400)
 
     def moved(self, T: Array) -> Sphere:
-        """Return the sphere moved by a rigid transform of the world."""
+        """Return the sphere moved by a rigid transform (4, 4) of the world."""
         return Sphere(T @ self.T_world_object, self.radius)
 
     def __repr__(self) -> str:
@@ -260,6 +263,12 @@ def from_size(
     kind: str, T_world_object: Array, size: Mapping[str, float] | list[float], source: str
 ) -> Box | Cylinder | Sphere:
     """Build a shape from its name and sizes [m] as graph.json writes them.
+
+    Args:
+        kind: `box`, `cylinder` or `sphere`.
+        T_world_object: Pose (4, 4) of its centre.
+        size: Full extents of a box, radius and height of a cylinder, radius of a sphere.
+        source: What to call it in the error.
 
     Raises:
         InputError: The name is not one of the three, or the sizes do not fit it.
@@ -283,7 +292,7 @@ def from_size(
 
 
 def fibonacci_sphere(count: int) -> Array:
-    """Spread `count` unit vectors (count, 3) evenly over the sphere by the golden angle."""
+    """Spread `count` = N unit vectors (N, 3) evenly over the sphere by the golden angle."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
     ring = np.sqrt(1.0 - z * z)

@@ -93,7 +93,7 @@ class View(Pictured):
 
     @property
     def pose(self) -> Array:
-        """`T_world_camera`, for code that cannot go on without one.
+        """`T_world_camera` (4, 4), for code that cannot go on without one.
 
         Raises:
             InputError: The view has no pose.
@@ -103,7 +103,11 @@ class View(Pictured):
         return self.T_world_camera
 
     def with_pose(self, T_world_camera: Array) -> View:
-        """Return the same view seen from another pose."""
+        """Return the same view seen from another pose (4, 4).
+
+        Raises:
+            InputError: The pose is no rigid transform.
+        """
         other = copy.copy(self)
         T = frames.as_rigid(T_world_camera, f"{self.name}: T_world_camera")
         object.__setattr__(other, "T_world_camera", T)
@@ -180,7 +184,11 @@ class Camera(Protocol):
 
 
 def check_intrinsics(K: Array, name: str) -> Array:
-    """Check a pinhole matrix (3, 3) and return it as float64.
+    """Check a pinhole matrix and return it as float64 (3, 3).
+
+    Args:
+        K: Pinhole matrix (3, 3) [px].
+        name: What to call it in the error.
 
     Raises:
         InputError: Wrong shape, NaN, or a focal length that is not positive.

@@ -93,7 +93,7 @@ def readings_of(view: View) -> str:
 
 
 def pose_of(T_world_camera: Array | None) -> str:
-    """Say where a camera stands and how it looks down, or that this is not known."""
+    """Say where a camera stands and how it looks down from its pose (4, 4), or that this is not known."""
     if T_world_camera is None:
         return "pose not known"
     x, y, z = T_world_camera[:3, 3]
