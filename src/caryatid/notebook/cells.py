@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from caryatid.config import ReportConfig
 from caryatid.exploration import Step
@@ -162,7 +163,21 @@ def _graph(graph: SupportGraph) -> Figure:
 def _image(
     view: View, labels: NDArray[np.int32], graph: SupportGraph, caption: str = "parts and fitted shapes"
 ) -> Figure:
-    return Figure(draw_image(view, labels, graph, SMALL), PICTURE, caption)
+    return Figure(draw_image(*_shrunk(view, labels), graph, SMALL), PICTURE, caption)
+
+
+def _shrunk(view: View, labels: NDArray[np.int32]) -> tuple[View, NDArray[np.int32]]:
+    """A view and its labels as small as they are shown: so they are drawn in a quarter of the time."""
+    step = max(1, round(view.depth.shape[1] / SMALL.image_width))
+    height, width = (n // step * step for n in view.depth.shape)
+    small = View(
+        depth=view.depth[:height:step, :width:step],
+        K=np.diag([1.0 / step, 1.0 / step, 1.0]) @ view.K,
+        T_world_camera=view.T_world_camera,
+        rgb=None if view.rgb is None else np.asarray(Image.fromarray(view.rgb[:height, :width]).reduce(step)),
+        name=view.name,
+    )
+    return small, labels[:height:step, :width:step]
 
 
 def _cloud(cloud: Cloud, graph: SupportGraph, T_world_camera: Array | None) -> Figure:
