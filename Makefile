@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test chromium check accuracy-gate bench bench-gate docs pictures gif format clean
+.PHONY: install demo test chromium check notebooks accuracy-gate bench bench-gate docs pictures gif format clean
 
 install: $(VENV)/.installed
 
@@ -30,6 +30,9 @@ check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+notebooks: install
+	$(BIN)/python docs/notebooks/execute.py
 
 accuracy-gate: install
 	$(BIN)/python benchmarks/accuracy.py suite --gate

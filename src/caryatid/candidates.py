@@ -25,7 +25,12 @@ class Looks:
     nearest: NDArray[np.intp]
 
     def without(self, left_out: NDArray[np.bool_], directions: Array) -> Looks:
-        """Leave some of the chosen (C,) out; unit directions (N, 3) tell which is nearest now."""
+        """Leave some of the chosen (C,) out; unit directions (N, 3) tell which is nearest now.
+
+        Args:
+            left_out: Which of the chosen (C,).
+            directions: Unit vectors (N, 3) of all views.
+        """
         kept = np.flatnonzero(~left_out)
         place = np.full(len(self.chosen), -1)
         place[kept] = np.arange(len(kept))
@@ -80,7 +85,12 @@ class Candidates:
         return self._looks[count]
 
     def without(self, index: int, reason: str) -> Candidates:
-        """Return the other views, one more being refused for a reason."""
+        """Return the other views, one more being refused for a reason.
+
+        Args:
+            index: Which is left out.
+            reason: Why, for `rejected`.
+        """
         T_world_camera, directions, way = (
             np.delete(of_each, index, axis=0)
             for of_each in (self.T_world_camera, self.directions, self.path_length)
@@ -94,3 +104,7 @@ class Candidates:
         others = replace(self, path_length=path_length)
         object.__setattr__(others, "_looks", self._looks)
         return others
+
+    def __repr__(self) -> str:
+        refused = ", ".join(f"{count} {reason}" for reason, count in self.rejected.items())
+        return f"Candidates({len(self)}{f'; refused: {refused}' if refused else ''})"

@@ -116,7 +116,12 @@ def local_frames(
 
 
 def find_gap(a: Shape, b: Shape) -> float:
-    """Distance [m] between two shapes however far apart; negative where they overlap."""
+    """Distance [m] between two shapes however far apart; negative where they overlap.
+
+    Args:
+        a: The one.
+        b: The other.
+    """
     data = _collide([a, b], np.zeros(2))
     apart = float(np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3]))
     return float(mujoco.mj_geomDistance(data.model, data, 0, 1, apart, np.empty(6)))

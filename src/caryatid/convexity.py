@@ -84,7 +84,15 @@ def convex_parts(
 
 
 def gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, seeds: Index) -> Surfels:
-    """Give each sample (N, 3) to the seed (S,) nearest along the edges (E, 2) at their costs (E,)."""
+    """Give each sample (N, 3) to the seed (S,) nearest along the edges (E, 2) at their costs (E,).
+
+    Args:
+        points: Samples (N, 3) [m].
+        normals: Unit normals (N, 3).
+        edges: Both ends (E, 2) of each.
+        costs: What an edge takes (E,).
+        seeds: Samples that begin a surfel (S,).
+    """
     owner = nearest_seeds(len(points), edges, costs, seeds)
     count = len(seeds)
     sizes = np.bincount(owner + 1, minlength=count + 1)[1:]
@@ -136,7 +144,7 @@ def convex_together(first: Array, second: Array, share: float, config: Segmentat
 
 
 def number_by_appearance(part: NDArray[np.integer]) -> NDArray[np.int32]:
-    """Number parts 1 … n in the order of their first samples; negative = 0."""
+    """Number the parts (N,) of samples 1 … n in the order of their first ones; negative = 0."""
     first = np.full(int(part.max(initial=-1)) + 2, len(part))
     first[part[::-1] + 1] = np.arange(len(part))[::-1]
     known = np.flatnonzero(first[1:] < len(part))

@@ -45,17 +45,31 @@ class Evidence:
     voxels: VoxelMap | None
 
     def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> Evidence:
-        """Return the evidence of some of the points."""
+        """Return the evidence of some of the points, by a mask (N,) or indices (M,)."""
         return replace(self, points=self.points[kept], normals=self.normals[kept], weights=self.weights[kept])
 
 
 def gather(cloud: Cloud, noise: float, voxels: VoxelMap | None, config: ExplanationConfig) -> Evidence:
-    """Thin an object's points to evidence: a place counts once, as all that is seen there errs alike."""
+    """Thin an object's points to evidence: a place counts once, as all that is seen there errs alike.
+
+    Args:
+        cloud: Points of one object, oriented.
+        noise: How far readings are off [m].
+        voxels: What is known to be free, or None.
+        config: Sizes and prices.
+    """
     return evidence_of(cloud.select(thin(cloud.points_world, config.spacing)), noise, voxels, config)
 
 
 def evidence_of(cloud: Cloud, noise: float, voxels: VoxelMap | None, config: ExplanationConfig) -> Evidence:
-    """Take points that are thinned already for evidence."""
+    """Take points that are thinned already for evidence.
+
+    Args:
+        cloud: Points of one object, oriented.
+        noise: How far readings are off [m].
+        voxels: What is known to be free, or None.
+        config: Sizes and prices.
+    """
     weights = np.full(len(cloud), config.spacing**2 / config.reading)
     return Evidence(cloud.points_world, cloud.normals_world, weights, noise, voxels)
 

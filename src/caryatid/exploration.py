@@ -15,6 +15,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
+from caryatid.pictured import Pictured
 from caryatid.planners import Decision, Planner, PlanningState, make_planner
 from caryatid.robot import Robot, refusal_of, view_sphere_of
 from caryatid.scene import Scene
@@ -25,7 +26,7 @@ from caryatid.views import Camera, Cloud, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Step:
+class Step(Pictured):
     """One turn of the loop.
 
     Attributes:
@@ -57,6 +58,11 @@ class Step:
     angle_travelled: float
     path_travelled: float
     stop: str | None
+
+    def __repr__(self) -> str:
+        following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
+        vertices, edges = len(self.graph.objects), len(self.graph.supports)
+        return f"Step(index={self.index}, vertices={vertices}, edges={edges}; {following})"
 
 
 def explore(

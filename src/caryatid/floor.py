@@ -24,7 +24,7 @@ class FloorGrid:
 
     Attributes:
         free: Cells (H, W) where the platform's centre may stand: obstacles are grown by its footprint.
-        origin_world: Corner (x, y) [m] of cell [0, 0].
+        origin_world: Corner (2,) of cell [0, 0], x and y [m].
         cell: Edge of a cell [m].
         boxes: Static furniture as T_world_box (B, 4, 4) and half extents (B, 3) [m], for lines of sight.
     """
@@ -50,7 +50,7 @@ class FloorGrid:
             half_extents: Half edge lengths (B, 3) [m].
             R_world_boxes: Box orientations (B, 3, 3).
             config: Footprint, cell, size of the floor and heights that matter.
-            around_world: Middle (x, y) [m] of the floor the robot may use.
+            around_world: Middle (2,) of the floor the robot may use, x and y [m].
         """
         centres = np.asarray(centres_world, dtype=np.float64).reshape(-1, 3)
         half = np.asarray(half_extents, dtype=np.float64).reshape(-1, 3)
@@ -80,8 +80,8 @@ class FloorGrid:
         """Build the grid from a map of obstacles (H, W), rows along y, as a robot's own mapping gives.
 
         Args:
-            occupied: Cells with an obstacle.
-            origin_world: Corner (x, y) [m] of cell [0, 0].
+            occupied: Cells (H, W) with an obstacle.
+            origin_world: Corner (2,) of cell [0, 0], x and y [m].
             cell: Edge of a cell [m].
             config: Footprint. Heights are not known, so no wall hides anything.
         """
@@ -130,8 +130,8 @@ class FloorGrid:
         """Test which eyes (N, 3) have furniture between themselves and a target (3,) [m].
 
         Args:
-            eyes_world: Camera positions.
-            target_world: The view sphere's centre.
+            eyes_world: Camera positions (N, 3) [m].
+            target_world: The view sphere's centre (3,) [m].
             table_margin: Furniture met only this near to the target does not count [m]: it is the table.
         """
         blocked = np.zeros(len(eyes_world), dtype=np.bool_)

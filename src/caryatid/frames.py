@@ -8,16 +8,17 @@ from numpy.typing import ArrayLike, NDArray
 from caryatid.errors import InputError
 
 Array = NDArray[np.float64]
+"""An array of float64; its shape is told where it is used."""
 
 RIGID_TOLERANCE = 1e-4
 """How far RᵀR may be from the identity (per entry, no unit) before a matrix is refused as a rotation."""
 
 
 def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
-    """Check that `T` is a rigid transform and return it as float64.
+    """Check that `T` is a rigid transform and return it as float64 (4, 4).
 
     Args:
-        T: 4×4 homogeneous matrix, translation in metres.
+        T: Homogeneous matrix (4, 4), translation in metres.
         name: What to call it in the error.
 
     Raises:
@@ -41,7 +42,12 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
 
 
 def rigid(R: ArrayLike, t: ArrayLike) -> Array:
-    """Put a 3×3 rotation and a translation (3,) [m] together into a 4×4 transform."""
+    """Put a rotation and a translation together into a transform (4, 4).
+
+    Args:
+        R: Rotation (3, 3).
+        t: Translation (3,) [m].
+    """
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = t
@@ -59,12 +65,22 @@ def invert(T_a_b: Array) -> Array:
 
 
 def transform(T_a_b: Array, points_b: Array) -> Array:
-    """Move points (..., 3) [m] from frame b to frame a."""
+    """Move points (..., 3) [m] from frame b to frame a.
+
+    Args:
+        T_a_b: Rigid transform (4, 4).
+        points_b: Points (..., 3) [m].
+    """
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def rotate(T_a_b: Array, vectors_b: Array) -> Array:
-    """Turn vectors (..., 3) from frame b into frame a, without the translation."""
+    """Turn vectors (..., 3) from frame b into frame a, without the translation.
+
+    Args:
+        T_a_b: Rigid transform (4, 4).
+        vectors_b: Vectors (..., 3).
+    """
     return vectors_b @ T_a_b[:3, :3].T
 
 
@@ -76,7 +92,12 @@ def unit(vectors: ArrayLike) -> Array:
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
-    """Angle between vectors (..., 3) [rad], exact for small and for opposite directions."""
+    """Angle (...) between vectors [rad], exact for small and for opposite directions.
+
+    Args:
+        a: Vectors (..., 3), not zero.
+        b: Vectors (..., 3), not zero; broadcast against the others.
+    """
     u, v = unit(a), unit(b)
     return 2.0 * np.arctan2(np.linalg.norm(u - v, axis=-1), np.linalg.norm(u + v, axis=-1))
 
@@ -117,7 +138,7 @@ def random_rotation(rng: np.random.Generator) -> Array:
 
 
 def look_at(eye_world: ArrayLike, target_world: ArrayLike, up_world: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """Pose `T_world_camera` of an OpenCV camera (x right, y down, z forward) at `eye` that looks at `target`.
+    """`T_world_camera` (4, 4) of an OpenCV camera (x right, y down, z forward) that looks from eye to target.
 
     Straight up or down, where `up` gives no roll, the image's top points along world +x (or +y).
 
@@ -142,7 +163,7 @@ def look_at(eye_world: ArrayLike, target_world: ArrayLike, up_world: ArrayLike =
 
 
 def level_world(normal: ArrayLike, point: ArrayLike) -> Array:
-    """`T_world_camera` for a frame without a pose, from the support plane seen by the camera.
+    """`T_world_camera` (4, 4) for a frame without a pose, from the support plane seen by the camera.
 
     World z is the plane's normal, the world's origin is the plane's point below the camera, and world x
     is the camera's viewing direction laid into the plane.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from caryatid import frames
 from caryatid.frames import Array
+from caryatid.pictured import Pictured
 from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.uncertainty import Uncertainty
 
@@ -14,11 +15,16 @@ if TYPE_CHECKING:
     import networkx as nx
 
 Role = Literal["object", "support_surface"]
+"""What a vertex is."""
 Kind = Literal["bottom-up", "lean", "top-down"]
+"""How a support holds: from below, from the side, or by weight from above."""
+
+EDGES_TOLD = 8
+"""Edges a graph's `repr` names at the most."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class SceneObject:
+class SceneObject(Pictured):
     """A vertex of the support graph.
 
     Attributes:
@@ -54,6 +60,9 @@ class SceneObject:
         """Centre (3,) [m] of the shape."""
         return self.shape.T_world_object[:3, 3]
 
+    def __repr__(self) -> str:
+        return f"SceneObject({self.id}: {self.shape})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Support:
@@ -86,9 +95,14 @@ class Support:
         """(supporter, supported)."""
         return self.supporter, self.supported
 
+    def __repr__(self) -> str:
+        doubt = "" if self.certain else ", uncertain"
+        found = f"{self.occurrences} of {self.opportunities}"
+        return f"Support({self.supporter} → {self.supported}, {self.kind}{doubt}, found in {found})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
-class SupportGraph:
+class SupportGraph(Pictured):
     """G_s = (V, E) of the paper, section III-A, in the order of the objects' labels.
 
     Attributes:
@@ -113,7 +127,12 @@ class SupportGraph:
         return next((o for o in self.objects if o.role == "support_surface"), None)
 
     def support(self, supporter: str, supported: str) -> Support | None:
-        """Return the edge between two ids, or None."""
+        """Return the edge between two ids, or None.
+
+        Args:
+            supporter: Id of the one that holds, such as `o1`.
+            supported: Id of the one that is held.
+        """
         return next((s for s in self.supports if s.pair == (supporter, supported)), None)
 
     def supporters(self, object_id: str) -> list[Support]:
@@ -143,6 +162,12 @@ class SupportGraph:
         for s in self.supports:
             graph.add_edge(s.supporter, s.supported, data=s, kind=s.kind, certain=s.certain)
         return graph
+
+    def __repr__(self) -> str:
+        edges = [f"{s.supporter} → {s.supported}{'' if s.certain else '?'}" for s in self.supports]
+        told = edges if len(edges) <= EDGES_TOLD else [*edges[: EDGES_TOLD - 1], "…"]
+        counts = f"vertices={len(self.objects)}, edges={len(edges)}"
+        return f"SupportGraph({counts}{': ' if told else ''}{', '.join(told)})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +199,7 @@ def object_id(label: int) -> str:
 
 
 SUPPORT_SURFACE_ID = "o0"
+"""Id of the support surface."""
 
 __all__ = [
     "SUPPORT_SURFACE_ID",

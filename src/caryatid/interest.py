@@ -25,7 +25,7 @@ class PointOfInterest:
     Attributes:
         position_world: (3,) [m].
         direction: Where it is projected on the view sphere (3,), unit, from the sphere's centre.
-        saliency: How much it is worth.
+        saliency: How much it is worth, −1 … 1 [1].
         subject: Ids of the objects it is about.
         why: For a person to read.
     """
@@ -100,6 +100,11 @@ def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) 
 
     s = λ_s + (1 − λ_s) · cos(2π · #occ / #views) as printed (`paper`), or with π in place of 2π
     (`decreasing`), which falls from 1 for a relation never seen to 2λ_s − 1 for one always seen.
+
+    Args:
+        occurrences: #occ(e): in how many views it was extracted.
+        views: #views: how many there have been.
+        config: λ_s, and the period.
     """
     period = 2.0 * np.pi if config.saliency == "paper" else np.pi
     share = min(1.0, occurrences / max(1, views))
@@ -107,7 +112,12 @@ def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) 
 
 
 def surface_point(shape: Shape, towards_world: Array) -> Array:
-    """Where the line from a shape's centre to an outer point (3,) [m] leaves the shape (3,) [m]."""
+    """Where the line from a shape's centre to an outer point (3,) [m] leaves the shape (3,) [m].
+
+    Args:
+        shape: The shape.
+        towards_world: The outer point (3,) [m].
+    """
     centre = shape.T_world_object[:3, 3]
     inside, outside = 0.0, 1.0
     for _ in range(40):
@@ -134,7 +144,13 @@ def painted(points: Sequence[PointOfInterest], directions: Array, sigma: float) 
 
 
 def inhibition_of_return(visited: Array, directions: Array, config: ActiveVisionConfig) -> Array:
-    """The negative saliency (M,) around earlier views that forces the robot to attend new ones."""
+    """The negative saliency (M,) around earlier views that forces the robot to attend new ones.
+
+    Args:
+        visited: Unit directions (V, 3) of the earlier views.
+        directions: Unit directions (M, 3) to be judged.
+        config: How deep and how wide it is.
+    """
     bumps = spread(visited, directions, float(np.deg2rad(config.spread)))
     return -config.inhibition * bumps.max(axis=1, initial=0.0)
 

@@ -17,6 +17,7 @@ from caryatid.surface import SupportSurface, find_support_surface
 from caryatid.views import SUPPORT_LABEL, Cloud, View
 
 UP = np.array([0.0, 0.0, 1.0])
+"""The world's vertical (3,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,7 +64,7 @@ class Percept:
         return replace(self, cloud=replace(self.cloud, labels=labels))
 
     def moved(self, T: Array) -> Percept:
-        """Return the percept moved by a rigid transform of the world."""
+        """Return the percept moved by a rigid transform (4, 4) of the world."""
         view = None if self.view is None else self.view.with_pose(T @ self.view.pose)
         return replace(self, view=view, cloud=self.cloud.moved(T), surface=self.surface.moved(T))
 
@@ -116,6 +117,12 @@ def level_cloud(
     cloud: Cloud, config: Config, *, segmentation: SegmentationMethod | None, rng: np.random.Generator
 ) -> Cloud:
     """Move a cloud from its sensor's frame into the world frame of its support plane.
+
+    Args:
+        cloud: The points, in the frame of their sensor.
+        config: How the plane is found.
+        segmentation: `auto` ignores labels.
+        rng: For every random choice.
 
     Raises:
         PerceptionError: There are no points, or no support surface.

@@ -150,7 +150,7 @@ def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, 
         rows: How much (K, 2, V) each variable of the two closes it.
         variance: Of each variable (N, V); zero for what cannot change.
         gaps: (K,).
-        noise: Variance of a gap that is closed.
+        noise: Variance of a gap that is closed [m²].
     """
     weighted = rows * variance[pairs]
     if len(pairs) <= _FEW:

@@ -78,7 +78,7 @@ class Ties:
         return (float(self.misfit.sum()) + missing * outlier) / max(int(self.asked.sum()), 1)
 
     def partners(self, views: int) -> Array:
-        """How many partners each of the views 0 … views−1 has in all others, or they have in it."""
+        """How many partners (V,) each of `views` = V views has in all others, or they have in it."""
         number = np.zeros(views)
         for ends in (self.still, self.moving):
             np.add.at(number, ends, self.found)

@@ -32,7 +32,7 @@ class Fit:
     Attributes:
         shape: In the points' frame.
         residual: Mean absolute distance of the points to the surface, truncated at the threshold [m].
-        inliers: Share of the points within the threshold.
+        inliers: Share of the points within the threshold [1].
         seen: Which sides (-x, +x, -y, +y, -z, +z of the object) points bear out.
         cost: What model choice compares [m].
         poor: No shape explains the points within the configured residual.
@@ -93,7 +93,7 @@ class Oriented:
         return every.select(np.flatnonzero(finite.all(axis=1)))
 
     def select(self, kept: NDArray[np.intp]) -> Oriented:
-        """Return some of the points."""
+        """Return some of the points, by indices (M,)."""
         return Oriented(self.points[kept], self.normals[kept])
 
     def __len__(self) -> int:

@@ -117,13 +117,20 @@ def distances(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Arra
 
 
 def arrays(shape: Box | Cylinder | Sphere) -> tuple[int, Array, Array, Array]:
-    """Code, axes, centre and half extents, as the kernels take them."""
+    """Code, axes (3, 3), centre (3,) [m] and half extents (3,) [m], as the kernels take them."""
     T = shape.T_world_object
     return CODES[shape.kind], np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), shape.extents / 2.0
 
 
 def from_arrays(kind: str, R: Array, centre: Array, half: Array) -> Box | Cylinder | Sphere:
-    """The shape with these axes (3, 3), centre (3,) [m] and half extents (3,) [m]."""
+    """The shape with these axes (3, 3), centre (3,) [m] and half extents (3,) [m].
+
+    Args:
+        kind: Name of the shape.
+        R: Its axes (3, 3).
+        centre: Its centre (3,) [m].
+        half: Its half extents (3,) [m].
+    """
     T = frames.rigid(R, centre)
     if kind == "sphere":
         return Sphere(T, float(half[0]))

@@ -130,7 +130,7 @@ class Gathering:
         Args:
             still: Number (E,) of the view in which each pair's are looked for.
             moving: Number (E,) of the one whose sample looks for them.
-            twists: Move of all views from where they were reported, whether here or not (≥ V, 6).
+            twists: Move of all views from where they were reported, whether here or not (M, 6), M ≥ V.
             pivot_world: What twists turn about (3,) [m].
             outlier: Distance beyond which partners lose their weight [m].
             config: Noise, reach, and how much directions may differ.
@@ -154,7 +154,7 @@ class Gathering:
         Gauss–Newton on the robust, symmetric point-to-plane distance, maximum a posteriori.
 
         Args:
-            twists: Move of all views from where they were reported, whether here or not (≥ V, 6).
+            twists: Move of all views from where they were reported, whether here or not (M, 6), M ≥ V.
             information: Inverse covariance (6, 6) of the last one's reported pose.
             pivot_world: What twists turn about (3,) [m].
             reach: How far away a partner may be [m].
@@ -218,7 +218,7 @@ def twist_transform(twist: Array, pivot_world: Array) -> Array:
     """The rigid transform that turns about a pivot (3,) [m] and moves; leading axes (..., 6) are kept.
 
     Args:
-        twist: 3 × m, 3 × rad.
+        twist: Twists (..., 6): 3 × m, 3 × rad.
         pivot_world: What is turned about (3,) [m].
 
     Returns:

@@ -34,7 +34,7 @@ class Posture:
     """How the robot holds its camera at a pose.
 
     Attributes:
-        platform_world: Platform [x, y, yaw] [m, m, rad].
+        platform_world: Platform (3,): x, y, yaw [m, m, rad].
         camera_height: Height of the camera centre over the floor [m], set by the torso lift.
         head_yaw: Against the platform, to the left [rad].
         head_pitch: Upwards [rad].
@@ -66,15 +66,26 @@ class Robot(Protocol):
         ...
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot."""
+        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot.
+
+        Args:
+            T_world_camera: Pose of its camera (4, 4).
+        """
         ...
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Return the views of the sphere that can be reached."""
+        """Return the views of the sphere that can be reached.
+
+        Args:
+            sphere: The view sphere.
+        """
         ...
 
     def move_to(self, T_world_camera: Array) -> float:
         """Go there and return the length of the way [m].
+
+        Args:
+            T_world_camera: Pose of its camera (4, 4).
 
         Raises:
             PlanningError: The pose cannot be reached.
@@ -295,12 +306,22 @@ class _Offer:
 
 
 def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
-    """Return the sphere a robot's views lie on: its own where it has one, else the proposed."""
+    """Return the sphere a robot's views lie on: its own where it has one, else the proposed.
+
+    Args:
+        robot: Is asked where it inherits `OwnViews`.
+        proposed: The sphere of the settings around the middle of the table top.
+    """
     return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
 
 
 def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
-    """Why a robot, looking closer where it can, does not take a candidate (4, 4), or None."""
+    """Why a robot, looking closer where it can, does not take a candidate (4, 4), or None.
+
+    Args:
+        robot: Is asked where it inherits `OwnViews`.
+        T_world_camera: The candidate (4, 4).
+    """
     return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
 
 

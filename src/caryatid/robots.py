@@ -52,6 +52,7 @@ class Surroundings:
 
 
 RobotMaker = Callable[[Surroundings], "Robot"]
+"""Makes a robot that stands in such surroundings."""
 
 
 def offered() -> dict[str, EntryPoint]:

@@ -110,6 +110,12 @@ def take_samples(
 
     Where the view has no normals of its own, point and normal are those of a plane through the readings
     around the pixel that ends at creases.
+
+    Args:
+        view: The view.
+        foreground: Its pixels above the surface.
+        config: The grid, and what is a crease.
+        clouds: How far readings count.
     """
     grid = _around(foreground.pixels, config.stride)
     chosen, depth = foreground.pixels[grid], view.depth[grid]

@@ -20,6 +20,7 @@ from caryatid.kernels.compiling import compile_kernels
 from caryatid.manipulation.effects import Effect, predict_removal
 from caryatid.object_models import ObjectModels
 from caryatid.perception import UP, Percept, label_image, perceive
+from caryatid.pictured import Pictured
 from caryatid.plausibility import reconcile
 from caryatid.stopwatch import Stopwatch
 from caryatid.support import explain, infer
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     import networkx as nx
 
 
-class Scene:
+class Scene(Pictured):
     """The scene model of section III, updated view by view.
 
     The first one after installation takes some seconds to come: kernels are compiled.
@@ -85,6 +86,10 @@ class Scene:
     def cloud(self) -> Cloud:
         """All points so far, thinned view by view, with the labels of their objects."""
         return self._models.points.everything()
+
+    def __repr__(self) -> str:
+        vertices, edges = len(self.graph.objects), len(self.graph.supports)
+        return f"Scene(views={self.views}, vertices={vertices}, edges={edges})"
 
     def explain(self, supporter: str, supported: str) -> str:
         """Say why one object is, or is not, taken to support another; with figures.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.frames import Array
+from caryatid.pictured import Pictured
 
 
 class Shape(Protocol):
@@ -61,15 +62,16 @@ class Shape(Protocol):
         ...
 
     def moved(self, T: Array) -> Self:
-        """Return the shape moved by a rigid transform of the world: T @ T_world_object."""
+        """Return the shape moved by a rigid transform (4, 4) of the world: T @ T_world_object."""
         ...
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Box:
+class Box(Pictured):
     """A cuboid.
 
     Attributes:
+        kind: `box`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; axes along the edges.
         extents: Full edge lengths (3,) [m] along the object's x, y, z.
     """
@@ -120,15 +122,20 @@ class Box:
         return frames.transform(self.T_world_object, signs * self.extents / 2.0)
 
     def moved(self, T: Array) -> Box:
-        """Return the box moved by a rigid transform of the world."""
+        """Return the box moved by a rigid transform (4, 4) of the world."""
         return Box(T @ self.T_world_object, self.extents)
+
+    def __repr__(self) -> str:
+        x, y, z = self.extents
+        return f"Box({x:.3f} × {y:.3f} × {z:.3f} m at {_place(self)})"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cylinder:
+class Cylinder(Pictured):
     """A straight circular cylinder.
 
     Attributes:
+        kind: `cylinder`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; the axis is the object's z.
         radius: [m].
         height: Full length along the axis [m].
@@ -190,15 +197,19 @@ class Cylinder:
         return frames.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
 
     def moved(self, T: Array) -> Cylinder:
-        """Return the cylinder moved by a rigid transform of the world."""
+        """Return the cylinder moved by a rigid transform (4, 4) of the world."""
         return Cylinder(T @ self.T_world_object, self.radius, self.height)
+
+    def __repr__(self) -> str:
+        return f"Cylinder(radius {self.radius:.3f} m, height {self.height:.3f} m at {_place(self)})"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Sphere:
+class Sphere(Pictured):
     """A ball.
 
     Attributes:
+        kind: `sphere`, as in graph.json.
         T_world_object: Pose (4, 4) of the centre; its rotation means nothing.
         radius: [m].
     """
@@ -241,14 +252,23 @@ class Sphere:
         return self.T_world_object[:3, 3] + self.radius * fibonacci_sphere(400)
 
     def moved(self, T: Array) -> Sphere:
-        """Return the sphere moved by a rigid transform of the world."""
+        """Return the sphere moved by a rigid transform (4, 4) of the world."""
         return Sphere(T @ self.T_world_object, self.radius)
+
+    def __repr__(self) -> str:
+        return f"Sphere(radius {self.radius:.3f} m at {_place(self)})"
 
 
 def from_size(
     kind: str, T_world_object: Array, size: Mapping[str, float] | list[float], source: str
 ) -> Box | Cylinder | Sphere:
     """Build a shape from its name and sizes [m] as graph.json writes them.
+
+    Args:
+        kind: `box`, `cylinder` or `sphere`.
+        T_world_object: Pose (4, 4) of its centre.
+        size: Full extents of a box, radius and height of a cylinder, radius of a sphere.
+        source: What to call it in the error.
 
     Raises:
         InputError: The name is not one of the three, or the sizes do not fit it.
@@ -272,11 +292,16 @@ def from_size(
 
 
 def fibonacci_sphere(count: int) -> Array:
-    """Spread `count` unit vectors (count, 3) evenly over the sphere by the golden angle."""
+    """Spread `count` = N unit vectors (N, 3) evenly over the sphere by the golden angle."""
     z = 1.0 - (2.0 * np.arange(count) + 1.0) / count
     azimuth = np.pi * (3.0 - np.sqrt(5.0)) * np.arange(count)
     ring = np.sqrt(1.0 - z * z)
     return np.stack([ring * np.cos(azimuth), ring * np.sin(azimuth), z], axis=-1)
+
+
+def _place(shape: Shape) -> str:
+    x, y, z = shape.T_world_object[:3, 3]
+    return f"({x:.3f}, {y:.3f}, {z:.3f})"
 
 
 def _local(shape: Shape, points_world: Array) -> Array:

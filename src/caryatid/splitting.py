@@ -100,7 +100,14 @@ def split(
 def unexplained(
     evidence: Evidence, whole: Explanation, near: NDArray[np.intp], costs: ExplanationConfig
 ) -> Array:
-    """Mean cost (N,) [nats] of the points around each point (`near`), under the single explanation."""
+    """Mean cost (N,) [nats] of the points around each point (`near`), under the single explanation.
+
+    Args:
+        evidence: N points of what may be several objects.
+        whole: The single explanation.
+        near: Indices (N, K) of the points around each.
+        costs: Prices.
+    """
     return np.asarray(_costs(whole, evidence, costs)[near].mean(axis=1))
 
 

@@ -135,7 +135,14 @@ def find_tipping(shape: Shape, polygon: Array) -> Tipping:
 
 
 def assess(shape: Shape, polygon: Array, tipping: Tipping, config: SupportConfig) -> Stability:
-    """Both tests of an object that rests on a support polygon: r_s of eq. 1 and the centre of mass."""
+    """Both tests of an object that rests on a support polygon: r_s of eq. 1 and the centre of mass.
+
+    Args:
+        shape: The object.
+        polygon: Its support polygon (N, 2) [m].
+        tipping: How it would tip over it.
+        config: r_s,min, and how far outside the centre of mass may lie.
+    """
     ratio = min(1.0, polygons.area(polygon) / polygons.area(ground_outline(shape)))
     overhang = tipping.overhang
     return Stability(ratio, overhang, ratio < config.min_area_ratio, overhang > config.overhang)

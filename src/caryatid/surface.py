@@ -69,7 +69,7 @@ class SupportSurface:
         return np.concatenate([outward, np.einsum("ij,ij->i", outward, corners)[:, None]], axis=-1)
 
     def moved(self, T: Array) -> SupportSurface:
-        """Return the surface moved by a rigid transform of the world."""
+        """Return the surface moved by a rigid transform (4, 4) of the world."""
         return SupportSurface(
             frames.rotate(T, self.normal_world),
             frames.transform(T, self.point_world),

@@ -106,7 +106,7 @@ def even_sample(surfels: Surfels, count: int) -> NDArray[np.intp]:
         count: How many at the most.
 
     Returns:
-        Indices, ascending.
+        Indices (M,), ascending.
     """
     if len(surfels) <= count:
         return np.arange(len(surfels))

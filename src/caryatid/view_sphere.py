@@ -29,7 +29,12 @@ class ViewSphere:
 
     @classmethod
     def around(cls, centre_world: ArrayLike, config: ActiveVisionConfig) -> ViewSphere:
-        """Build the sphere of `config.sphere_points` views around a point (3,) [m]."""
+        """Build the sphere of `config.sphere_points` views around a point.
+
+        Args:
+            centre_world: The centre (3,) [m].
+            config: Radius and number of views.
+        """
         centre = np.array(centre_world, dtype=np.float64)
         return cls(centre, config.sphere_radius, fibonacci_sphere(config.sphere_points))
 
@@ -86,7 +91,12 @@ def spread(direction_from: Array, directions: Array, sigma: float) -> Array:
 
 
 def direction(azimuth: float, elevation: float) -> Array:
-    """Unit vector (3,) with an azimuth from +x towards +y and an elevation over the horizontal [rad]."""
+    """Unit vector (3,) with an azimuth and an elevation.
+
+    Args:
+        azimuth: From +x towards +y [rad].
+        elevation: Over the horizontal [rad].
+    """
     return np.array(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     )

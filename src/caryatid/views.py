@@ -14,13 +14,14 @@ from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.frames import Array
 from caryatid.kernels import points as kernels
+from caryatid.pictured import Pictured
 
 SUPPORT_LABEL = 65535
 """The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class View(Pictured):
     """One registered RGB-D view.
 
     Attributes:
@@ -92,7 +93,7 @@ class View:
 
     @property
     def pose(self) -> Array:
-        """`T_world_camera`, for code that cannot go on without one.
+        """`T_world_camera` (4, 4), for code that cannot go on without one.
 
         Raises:
             InputError: The view has no pose.
@@ -102,15 +103,24 @@ class View:
         return self.T_world_camera
 
     def with_pose(self, T_world_camera: Array) -> View:
-        """Return the same view seen from another pose."""
+        """Return the same view seen from another pose (4, 4).
+
+        Raises:
+            InputError: The pose is no rigid transform.
+        """
         other = copy.copy(self)
         T = frames.as_rigid(T_world_camera, f"{self.name}: T_world_camera")
         object.__setattr__(other, "T_world_camera", T)
         return other
 
+    def __repr__(self) -> str:
+        given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
+        given += [] if self.T_world_camera is None else ["pose"]
+        return f"View({self.name}: depth {_size(self.depth)}{''.join(f', {name}' for name in given)})"
+
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Cloud:
+class Cloud(Pictured):
     """Oriented points in the world frame, organised or not.
 
     Attributes:
@@ -156,6 +166,10 @@ class Cloud:
             viewpoint_world=None if eye is None else frames.transform(T, eye),
         )
 
+    def __repr__(self) -> str:
+        given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
+        return f"Cloud({self.name}: {len(self)} points{''.join(f', {name}' for name in given)})"
+
 
 class Camera(Protocol):
     """What gives a view from a pose: simulation, recording or hardware."""
@@ -170,7 +184,11 @@ class Camera(Protocol):
 
 
 def check_intrinsics(K: Array, name: str) -> Array:
-    """Check a pinhole matrix (3, 3) and return it as float64.
+    """Check a pinhole matrix and return it as float64 (3, 3).
+
+    Args:
+        K: Pinhole matrix (3, 3) [px].
+        name: What to call it in the error.
 
     Raises:
         InputError: Wrong shape, NaN, or a focal length that is not positive.

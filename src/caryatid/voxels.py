@@ -53,7 +53,12 @@ class VoxelMap:
 
     @classmethod
     def around(cls, center_world: ArrayLike, config: VoxelConfig) -> VoxelMap:
-        """Build a map in which nothing is known, around the view sphere's centre (3,) [m]."""
+        """Build a map in which nothing is known, around the view sphere's centre.
+
+        Args:
+            center_world: The middle of the table top (3,) [m].
+            config: Size of the map and of its voxels, and the evidence.
+        """
         extent = np.asarray(config.extent, dtype=np.float64)
         shape = tuple(int(n) for n in np.ceil(extent / config.size - 1e-9))
         corner = np.array([-extent[0] / 2.0, -extent[1] / 2.0, -config.below])
@@ -136,7 +141,12 @@ class VoxelMap:
         return Solid(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
-        """Return the part of the map whose voxels lie, all or in part, between two corners (3,) [m]."""
+        """Return the part of the map whose voxels lie, all or in part, between two corners.
+
+        Args:
+            low_world: The lower corner (3,) [m].
+            high_world: The upper corner (3,) [m].
+        """
         ends = (low_world - self.origin_world, high_world - self.origin_world)
         low = np.clip(np.floor(ends[0] / self.config.size + 1e-9).astype(int), 0, self.hits.shape)
         high = np.clip(np.ceil(ends[1] / self.config.size - 1e-9).astype(int), low, self.hits.shape)

@@ -44,7 +44,16 @@ def compare(
     thresholds: tuple[float, ...],
     bootstrap: Bootstrap,
 ) -> Difference:
-    """Compare two methods over the scenes and seeds both have."""
+    """Compare two methods over the scenes and seeds both have.
+
+    Args:
+        method: Label of the one.
+        one: Its figures.
+        reference: Label of the other.
+        other: Its figures.
+        thresholds: F1 whose paths are compared.
+        bootstrap: Draws scenes anew.
+    """
     keys = sorted(set(one.keys) & set(other.keys))
     views = min(one.values.shape[1], other.values.shape[1])
     ours, theirs = (scene_means(s.restrict(keys)[:, :views], keys) for s in (one, other))

@@ -13,6 +13,7 @@ from caryatid.benchmark.records import Episode, Record, ViewRow
 from caryatid.errors import InputError
 
 MEMBER = ("method", "condition", "family")
+"""Columns that say to what an episode belongs."""
 COLUMNS: dict[str, type] = {
     **dict.fromkeys(MEMBER, str),
     **{f.name: int if f.type == "int" else str for f in fields(Episode)},

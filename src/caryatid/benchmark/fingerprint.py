@@ -15,7 +15,17 @@ LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
 """Libraries whose release may change a figure."""
 
 BYSTANDERS = frozenset(
-    {"benchmark", "commands", "exports", "recordings", "report", "service", "sessions", "viewer"}
+    {
+        "benchmark",
+        "commands",
+        "exports",
+        "notebook",
+        "recordings",
+        "report",
+        "service",
+        "sessions",
+        "viewer",
+    }
 )
 """Parts of caryatid that only arrange, hand on, draw or tell what others found, but for `DECIDING`."""
 

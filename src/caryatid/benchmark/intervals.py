@@ -60,6 +60,12 @@ def plot_conditions(
 ) -> tuple[Plot, float]:
     """Draw F1 under each condition: a panel a view, a row a condition, the methods one below the other.
 
+    Args:
+        groups: One a condition.
+        views: After which views.
+        methods: Labels, in order.
+        looks: Label → how it is drawn.
+
     Returns:
         What draws it, and its height [in].
     """

@@ -130,7 +130,15 @@ def render(plot: Callable[[Any], None], height: float, salt: str) -> tuple[str, 
 
 
 def add_axes(figure: Any, left: float, right: float, bottom: float = 0.52, top: float = 0.2) -> Any:
-    """Add axes with these margins [in]."""
+    """Add axes with these margins [in].
+
+    Args:
+        figure: Of matplotlib.
+        left: To the left edge.
+        right: To the right edge.
+        bottom: To the lower edge.
+        top: To the upper edge.
+    """
     width, height = figure.get_size_inches()
     place = (
         left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height,
@@ -149,7 +157,14 @@ def name_width(names: Sequence[str]) -> float:
 
 
 def spread(positions: Array, gap: float, low: float, high: float) -> Array:
-    """Move positions (N,), ascending, as little as it takes to be a gap apart and between two ends."""
+    """Move positions (N,), ascending, as little as it takes to be a gap apart and between two ends.
+
+    Args:
+        positions: Where they would best be (N,).
+        gap: Least distance of two.
+        low: Lower end.
+        high: Upper end.
+    """
     from scipy.optimize import isotonic_regression
 
     if len(positions) == 0:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Self
 
 UNKNOWN = "unknown"
+"""Where something cannot be found out."""
 LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx")
 """Whose versions figures may depend on."""
 

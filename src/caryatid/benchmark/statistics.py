@@ -107,7 +107,15 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """An episode that failed: where, and why."""
+    """An episode that failed: where, and why.
+
+    Attributes:
+        method: Label of the method.
+        condition: Label of the condition.
+        scene: Name of the scene.
+        seed: Of the episode.
+        error: What went wrong, in one line.
+    """
 
     method: str
     condition: str

@@ -19,6 +19,7 @@ from caryatid.frames import Array
 ROUNDING = 1e-9
 """A mean this far below a threshold reaches it [1]: what sums of equal figures differ by."""
 F1, PATH = MEASURES.index("f1"), MEASURES.index("path")
+"""Columns of a sample."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from caryatid.benchmark.bootstrap import Estimate
 NONE = "–"
 """Where there is no figure."""
 MINUS = "−"
+"""The sign, which a hyphen is not."""
 
 
 def say_number(value: float | None, digits: int = 3) -> str:

@@ -15,6 +15,7 @@ from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
 
 Count = Annotated[int | None, whole_number(1)]
 CORES = os.cpu_count() or 1
+"""Processes that are started where nobody says how many."""
 GENERAL = General()
 
 

@@ -22,6 +22,7 @@ from caryatid.commands.options import (
 
 SCENE = "clutter"
 VIEWS = 5
+"""What is explored, and how many views there are at the most."""
 
 
 @dataclass(frozen=True, kw_only=True)

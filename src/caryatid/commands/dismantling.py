@@ -22,7 +22,11 @@ from caryatid.threads import cores
 
 
 def run_dismantling(options: Dismantle, config: Config) -> int:
-    """Explore a scene, take it apart by what was extracted, and say what came of it."""
+    """Explore a scene, take it apart by what was extracted, and say what came of it.
+
+    Raises:
+        InputError: The source is no simulated scene.
+    """
     progress = Progress(options.general.quiet or options.general.json)
     report = options.out is not None
     with RunWriter(options.out) if options.out is not None else nullcontext() as writer:

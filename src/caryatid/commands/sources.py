@@ -24,6 +24,7 @@ from caryatid.simulation.truth import ground_truth, read_truth
 from caryatid.views import Camera
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
+"""Endings of files that are clouds."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

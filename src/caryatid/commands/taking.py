@@ -26,7 +26,14 @@ def print_order(order: Order, title: str) -> None:
 
 
 def print_dismantling(order: Order, taken: Sequence[Taken], left: Sequence[str], title: str) -> None:
-    """Print what came of an order as a table."""
+    """Print what came of an order as a table.
+
+    Args:
+        order: The order.
+        taken: What came of each step.
+        left: What was not taken.
+        title: Heading of the table.
+    """
     well = "all taken, nothing disturbed" if succeeded(taken, left) else "not without harm"
     if left and all(t.ok for t in taken):
         well = f"nothing disturbed, but {', '.join(left)} left"

@@ -53,7 +53,36 @@ from caryatid.config.simulation import (
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """All stages."""
+    """All stages.
+
+    Attributes:
+        cloud: From depth image to oriented points.
+        surface: The support surface.
+        registration: Refining the reported poses of views.
+        segmentation: Automatic parts by local convexity.
+        fit: Primitive fitting.
+        split: Parting what was taken for one object.
+        explanation: What it costs to explain points by shapes.
+        completion: How far shapes reach where nobody looked.
+        plausibility: Shapes that neither overlap nor float.
+        support: Support relations, section III-A.
+        fusion: Fusing graphs over views, section III-B.
+        voxels: The voxel map.
+        active: The choice of the next view, section IV.
+        robot: The simulated humanoid.
+        arm: An arm with a camera in its hand.
+        noise: Noise of the simulated camera.
+        sensor: The simulated camera's image.
+        physics: Settling a simulated scene, and its truth.
+        lift: One object lifted straight up.
+        rehearsal: Lifts tried before they are done.
+        recording: Which frames of a recording become views.
+        export: What other programs want to know.
+        report: The pictures of the report.
+        evaluation: Scores against a truth.
+        oracle: The planner that knows the truth.
+        session: What a session refuses.
+    """
 
     cloud: CloudConfig = field(default_factory=CloudConfig)
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)

@@ -5,7 +5,12 @@ from __future__ import annotations
 from typing import Literal
 
 FusionMethod = Literal["pc", "sg", "pc+sg"]
+"""What is fused over views: points, graphs, or both; section III-B."""
 SegmentationMethod = Literal["labels", "auto"]
+"""Where parts come from: given labels, or local convexity."""
 NoiseModel = Literal["none", "carmine"]
+"""Noise of the simulated camera."""
 ShapeKind = Literal["box", "cylinder", "sphere"]
+"""The primitives."""
 ExportFormat = Literal["mjcf", "urdf", "gltf", "graphml", "dot"]
+"""Formats a scene model is written in."""

@@ -28,7 +28,7 @@ class FitConfig(Stage):
     hypotheses: Count = 100
     """RANSAC hypotheses a shape at the most [1]; the predecessor's iterations."""
     confidence: Likelihood = 0.99
-    """RANSAC stops when a better sample is less likely than 1 − confidence."""
+    """RANSAC stops when a better sample is less likely than 1 − confidence [1]."""
     max_points: Count = 800
     """Points a shape is judged by [1]; 1.5 cm apart on the largest objects, as far as bare places count."""
     search_points: Count = 250
@@ -213,7 +213,7 @@ class SupportConfig(Stage):
     patch_tilt: Angle = 1.0
     """The same for faces that a fit turned against each other [deg]; a ball has none."""
     min_area_ratio: Share = 0.1
-    """r_s,min of eq. 1."""
+    """r_s,min of eq. 1 [1]."""
     overhang: NotNegative = 0.003
     """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
     lean_angle: Angle = 75.0
@@ -235,7 +235,7 @@ class FusionConfig(Stage):
     max_angle: Angle = 20.0
     """Axes further apart are two orientations [deg], up to the shape's symmetry."""
     max_ratio: Factor = 1.6
-    """Sorted extents that differ by more than this factor are two objects."""
+    """Sorted extents that differ by more than this factor [1] are two objects."""
     sigmas: NotNegative = 2.0
     """Standard deviations of centres and extents by which two sightings may differ beyond that [1]."""
     settled: NotNegative = 0.005
@@ -251,4 +251,4 @@ class FusionConfig(Stage):
     residual: Positive = 0.01
     """Mean distance of its points at which a sighting counts half in the merged shape (`sg`) [m]."""
     keep_share: Share = 0.5
-    """A support is kept while occurrences / opportunities is at least this."""
+    """A support is kept while occurrences / opportunities is at least this [1]."""

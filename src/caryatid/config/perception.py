@@ -58,7 +58,7 @@ class SurfaceConfig(Stage):
     storey: NotNegative = 0.3
     """A plane that has a table this far above it is the floor [m]."""
     storey_share: Share = 0.05
-    """Points the table above a floor has at least, as a share of the floor's; less is a shelf far behind."""
+    """Points the table above a floor has at least, as a share of the floor's [1]; less is a shelf behind."""
     min_points: Count = 200
     """Fewer inliers are no table [points]."""
     max_points: Count = 20_000

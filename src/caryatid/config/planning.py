@@ -54,7 +54,7 @@ class ActiveVisionConfig(Stage):
     sphere_radius: Positive = 1.5
     """Radius of the view sphere [m]; the paper's."""
     saliency_weight: Share = 0.75
-    """λ_s of eq. 2; the paper's."""
+    """λ_s of eq. 2 [1]; the paper's."""
     saliency: Literal["paper", "decreasing"] = "decreasing"
     """Eq. 2 with 2π as printed, or with π so that relations seen often matter less."""
     edge_point: Literal["midpoint", "contact"] = "contact"

@@ -16,7 +16,7 @@ class Range:
     """The numbers between two ends.
 
     Attributes:
-        least: Lower end.
+        least: Lower end, in the unit of what it is of.
         most: Upper end.
         above: Whether the lower end itself is left out.
         below: Whether the upper end itself is left out.

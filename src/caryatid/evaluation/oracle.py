@@ -211,7 +211,7 @@ def spread_out(directions: Array, visited: Array, count: int) -> NDArray[np.intp
         count: How many to pick; fewer where there are not so many.
 
     Returns:
-        Indices (min(count, N),), each once; of equally far ones the first.
+        Indices (M,), M = min(count, N), each once; of equally far ones the first.
     """
     nearness = (directions @ visited.T).max(axis=1)
     picked = []

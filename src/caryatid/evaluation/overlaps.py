@@ -68,7 +68,7 @@ def mask_ious(
 
     Args:
         labels: Label images (H, W), or labels of points (N,).
-        true_labels: The true ones, as many values each.
+        true_labels: The true ones, (H, W) or (N,) as those.
         found: F label numbers in `labels`.
         true: T label numbers in `true_labels`; numbers that are no object's match nothing.
 
@@ -96,7 +96,7 @@ def assign(iou: Array, min_iou: float) -> list[tuple[int, int]]:
 
     Args:
         iou: (F, T) [1].
-        min_iou: Pairs below this are no pairs.
+        min_iou: Pairs below this are no pairs [1].
 
     Returns:
         Pairs (row, column), by row.

@@ -128,7 +128,7 @@ def score_masks(
     Args:
         graph: The extracted graph.
         labels: Label images (H, W), k = the object with label k, one for each frame.
-        true_labels: The true ones, k = the vertex `object<k>`, of the same sizes.
+        true_labels: The true ones (H, W), k = the vertex `object<k>`.
         vertices: True vertices, the table's name among them where there is one.
         edges: True directed pairs of names.
         config: Least IoU.

@@ -19,6 +19,7 @@ from caryatid.frames import Array
 from caryatid.views import SUPPORT_LABEL, View, check_intrinsics
 
 COLOUR_ENDINGS: Final = (".png", ".jpg", ".jpeg")
+"""Files of colour images, the first that exists."""
 ROTATION_DRIFT: Final = 0.02
 """How far RᵀR of a recorded rotation may be from the identity (per entry): trackers that multiply up single
 precision drift by 5e-4 in 1000 frames; a scaled or sheared matrix is far beyond this."""
@@ -33,7 +34,7 @@ class Frame:
         number: Its number in the recording.
         name: Folder and number, as the view will be called.
         depth_path: 16-bit depth image.
-        depth_scale: Millimetres of one unit of depth.
+        depth_scale: One unit of depth [mm].
         rgb_path: Colour image, or None where the recording has no colour.
         masks: Mask file and label (`obj_id`) of each object, or None where the frame has no segmentation.
         K: Pinhole matrix (3, 3) [px].

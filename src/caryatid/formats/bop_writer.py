@@ -46,7 +46,7 @@ class RecordingWriter:
 
         Args:
             view: Labels become one mask each and `obj_id` = label.
-            depth_scale: Millimetres of one unit of depth; 0.1 reaches to 6.5 m.
+            depth_scale: One unit of depth [mm]; 0.1 reaches to 6.5 m.
 
         Raises:
             InputError: Depth beyond what 16 bits hold, or the disk is full or refuses.
@@ -81,7 +81,7 @@ def write_recording(folder: str | Path, views: Sequence[View], depth_scale: floa
     Args:
         folder: Where; must not exist, or be empty.
         views: In frame order. Labels become one mask each and `obj_id` = label.
-        depth_scale: Millimetres of one unit of depth; 0.1 reaches to 6.5 m.
+        depth_scale: One unit of depth [mm]; 0.1 reaches to 6.5 m.
 
     Raises:
         InputError: No views, depth beyond what 16 bits hold, or the folder cannot be written.

@@ -18,6 +18,7 @@ from caryatid.views import SUPPORT_LABEL
 
 FORMAT: Final = "caryatid/graph"
 VERSION: Final = 1
+"""What graph.json says it is."""
 
 
 def graph_to_json(graph: SupportGraph) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from caryatid.errors import InputError
 
 DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
+"""Pillow modes of depth images, and of masks."""
 
 
 def check_image(path: Path, modes: tuple[str, ...] | None = None, what: str = "") -> tuple[int, int]:
@@ -49,7 +50,7 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
 
     Args:
         path: The file.
-        depth_scale: Millimetres of one unit.
+        depth_scale: One unit [mm].
 
     Returns:
         Depth (H, W) [m], 0 = no reading.

@@ -102,7 +102,12 @@ def field(
 
 
 def numbers(value: Any, shape: tuple[int, ...], source: str) -> Array:
-    """Turn nested JSON lists of finite numbers into an array of the given shape.
+    """Turn nested JSON lists of finite numbers into an array (...) of the given shape.
+
+    Args:
+        value: What a JSON document holds.
+        shape: Sizes, such as (4, 4).
+        source: What to call it in the error.
 
     Raises:
         InputError: Another shape, or an entry that is no finite number.
@@ -120,7 +125,7 @@ def numbers(value: Any, shape: tuple[int, ...], source: str) -> Array:
 
 
 def rigid_transform(value: Any, source: str) -> Array:
-    """Turn a 4×4 nested list into a rigid transform.
+    """Turn a nested list into a rigid transform (4, 4).
 
     Raises:
         InputError: No 4×4 finite numbers, or no rigid transform.
@@ -130,6 +135,12 @@ def rigid_transform(value: Any, source: str) -> Array:
 
 def number(document: Mapping[str, Any], key: str, source: str, **default: Any) -> float:
     """Return one finite number of a JSON object.
+
+    Args:
+        document: The object.
+        key: Of the number.
+        source: What to call the object in the error.
+        **default: `default=…`, the number where the key is missing.
 
     Raises:
         InputError: The key is missing or holds no finite number.

@@ -82,6 +82,11 @@ class StoredCloud:
 def read_cloud(path: str | Path, config: CloudConfig, label_divisor: int = 1) -> Cloud:
     """Read the readings of a PCD or PLY file, with normals; see `read_stored_cloud`.
 
+    Args:
+        path: The file.
+        config: How normals are estimated, and what is too far.
+        label_divisor: Labels are divided by this: 10 where a part's label is 10 · object + part.
+
     Raises:
         InputError: The file is missing or broken, or holds no readings.
     """

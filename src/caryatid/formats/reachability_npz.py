@@ -17,15 +17,21 @@ from caryatid.formats.staging import said_clearly
 from caryatid.reachability import ReachabilityMap
 
 FORMAT, VERSION = "caryatid/reachability", 1
+"""What the file says it is."""
 
 MAX_BYTES = 2**31
 """A larger map is refused before it is unpacked; 3 m of cells of 2 cm with 600 directions are as much."""
 
 REMEDY = "sample it again and write it with write_reachability"
+"""What to do where a file is broken."""
 
 
 def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityMap) -> None:
     """Write a map; the file appears whole or not at all, and the same map gives the same bytes.
+
+    Args:
+        path: The file, `.npz`.
+        reachability: The map.
 
     Raises:
         InputError: The file cannot be written.

@@ -23,6 +23,7 @@ from caryatid.views import SUPPORT_LABEL
 
 FORMAT: Final = "caryatid/run"
 VERSION: Final = 1
+"""What run.json says it is."""
 
 
 class RunWriter:

@@ -36,6 +36,7 @@ from caryatid.kernels import CACHE
 from caryatid.threads import cores
 
 log = logging.getLogger(__name__)
+"""Tells that kernels are compiled, and why they cannot be."""
 
 HERE = Path(__file__).parent
 SIGNATURES = HERE / "signatures.json"
@@ -51,6 +52,7 @@ MARK = "CARYATID_COMPILES"
 """Set in the environment of such processes: whatever they are, they start no more of their kind."""
 
 IMPORT = re.compile(r"^from caryatid\.kernels\.(\w+) import", re.MULTILINE)
+"""A kernel module that imports another one."""
 
 CODE = """
 import sys

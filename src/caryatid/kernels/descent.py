@@ -27,7 +27,7 @@ def normal_equations(
         outlier: Distance beyond which partners lose their weight [m].
 
     Returns:
-        Of each group (count, SUMS).
+        Sums (G, SUMS), G = `count`.
     """
     sums, step = np.zeros((count, SUMS)), np.zeros(6)
     for task in range(len(rows)):

@@ -78,7 +78,8 @@ class RefineJob(NamedTuple):
         end: Index (J,) after the last of them.
         every: Of these every so many (J,).
         points: (N, 3) [m].
-        ridge, steps, min_extent, shrink, robust_width, noise_floor, converged: See `levenberg_marquardt`.
+        ridge: Added to the diagonal (9,), see `levenberg_marquardt`.
+        steps, …, converged: See `levenberg_marquardt`.
         R: Axes (J, 3, 3); replaced.
         centre: (J, 3) [m]; replaced.
         half: Half extents (J, 3) [m]; replaced.

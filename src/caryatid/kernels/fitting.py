@@ -61,7 +61,17 @@ def write_distances(
 
 @njit(cache=True, inline="always")
 def signed_distance(kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float) -> float:
-    """Signed distance [m] of one point in the object's frame to a shape with these half extents [m]."""
+    """Signed distance [m] of one point in the object's frame to a shape with these half extents [m].
+
+    Args:
+        kind: Code of the shape.
+        x: x of the point [m].
+        y: Its y.
+        z: Its z.
+        hx: Half extent along x [m].
+        hy: Along y.
+        hz: Along z.
+    """
     if kind == SPHERE:
         return np.sqrt(x * x + y * y + z * z) - hx
     if kind == CYLINDER:
@@ -85,7 +95,15 @@ def distances_and_gradients(
     half: NDArray[np.float64],
     points: NDArray[np.float64],
 ) -> tuple[Array, Array]:
-    """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame."""
+    """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame.
+
+    Args:
+        kind: Code of the shape.
+        R: Its axes (3, 3).
+        centre: Its centre (3,) [m].
+        half: Its half extents (3,) [m].
+        points: (N, 3) [m].
+    """
     distance = np.empty(len(points))
     gradients = np.empty((len(points), 3))
     hx, hy, hz = half[0], half[1], half[2]
@@ -188,6 +206,16 @@ def normal_equations(
 
     Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
     x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6).
+
+    Args:
+        kind: Code of the shape.
+        R: Its axes (3, 3).
+        centre: Its centre (3,) [m].
+        half: Its half extents (3,) [m].
+        points: (N, 3) [m].
+        scale: Width of the cost [m]: a point at this distance weighs a quarter.
+        H: Written to (9, 9).
+        g: Written to (9,).
     """
     J = np.empty(9)
     for a in range(9):
@@ -226,7 +254,17 @@ def normal_equations(
 def gradient(
     kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float
 ) -> tuple[float, float, float, float]:
-    """Signed distance [m] of one point in the object's frame, and its gradient there."""
+    """Signed distance [m] of one point in the object's frame, and its gradient there.
+
+    Args:
+        kind: Code of the shape.
+        x: x of the point [m].
+        y: Its y.
+        z: Its z.
+        hx: Half extent along x [m].
+        hy: Along y.
+        hz: Along z.
+    """
     if kind == SPHERE:
         length = np.sqrt(x * x + y * y + z * z)
         inverse = 1.0 / max(length, 1e-12)

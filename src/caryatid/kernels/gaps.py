@@ -21,13 +21,13 @@ def hidden_gaps(
     one says nothing, but one at least must be nearer.
 
     Args:
-        labels: Parts (H, W), 1 … n, 0 = none.
+        labels: Parts (H, W), 1 … N, 0 = none.
         inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
         jump: How much nearer [1/m].
         longest: Gaps longer than this are not looked over [px].
 
     Returns:
-        Counts (n+1, n+1), symmetric; row and column 0 are empty.
+        Counts (N + 1, N + 1), symmetric; row and column 0 are empty.
     """
     labels, inverse_depth = np.asarray(labels, np.int32), np.asarray(inverse_depth, np.float64)
     votes = np.zeros((int(labels.max(initial=0)) + 1,) * 2, dtype=np.intp)

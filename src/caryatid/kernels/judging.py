@@ -110,6 +110,15 @@ def misfit(
 ) -> tuple[float, float, float]:
     """How badly a shape explains oriented points.
 
+    Args:
+        kind: Code of the shape.
+        R: Its axes (3, 3).
+        centre: Its centre (3,) [m].
+        half: Its half extents (3,) [m].
+        points: (N, 3) [m].
+        normals: Unit normals (N, 3).
+        threshold: Distance beyond which points are none of its [m].
+
     Returns:
         Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, 1 at the most;
         share of the points within the threshold.

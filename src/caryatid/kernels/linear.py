@@ -17,7 +17,7 @@ def solve_positive(A: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
     not positive definite x has NaN.
 
     Args:
-        A: Overwritten by its factor.
+        A: (N, N); overwritten by its factor.
         b: Right side (N,).
     """
     size = len(b)

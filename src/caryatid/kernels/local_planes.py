@@ -22,6 +22,7 @@ TRUSTED = 3.5
 """Standard deviations of a reading within which another window's plane may speak for it."""
 
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
+"""Numbers that leave sums in single precision."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -50,11 +50,11 @@ class KnownObjects:
         )
 
     def keep(self, points: NDArray[np.intp]) -> KnownObjects:
-        """Return all the objects with some of their points."""
+        """Return all the objects with some of their points, by indices (M,)."""
         return replace(self, points=np.take(self.points, points, axis=0), owners=self.owners[points])
 
     def select(self, objects: NDArray[np.intp]) -> KnownObjects:
-        """Return some of the objects, in this order."""
+        """Return some of the objects, by indices (M,) in this order."""
         number = np.full(len(self.kinds), -1)
         number[objects] = np.arange(len(objects))
         kept = np.flatnonzero(number[self.owners] >= 0)

@@ -35,7 +35,7 @@ def nearest_neighbours(points: Array, count: int) -> NDArray[np.intp]:
         count: How many, the point itself among them; no more than there are.
 
     Returns:
-        Indices (N, count), the nearest first: the point itself, or one at the same place.
+        Indices (N, C), C = `count`, the nearest first: the point itself, or one at the same place.
     """
     axis = int(np.argmax(np.ptp(points, axis=0))) if len(points) else 0
     order = np.argsort(points[:, axis], kind="stable")

@@ -177,10 +177,10 @@ def join_parts(
 
     Args:
         counts: How many patches each part has (PARTS,), from where its readings begin.
-        voxels: See `Readings`; written to, like all that follow.
-        kinds: …
-        sums: …
-        slots: …
+        voxels: As in `Readings` (N,); written to, like all that follow.
+        kinds: As in `Readings` (N,).
+        sums: As in `Readings` (N, 13).
+        slots: As in `Readings` (S,).
 
     Returns:
         How many there are.

@@ -51,9 +51,8 @@ class PolishJob(NamedTuple):
         R_opened: Axes (P, 3, 3) once unseen sides were moved out of the way and the others refined.
         centre_opened: (P, 3) [m] then.
         half_opened: Half extents (P, 3) [m] then.
-
-    Then settings by their names in `FitConfig`, constants by their names in `refine`, and the fields of
-    `Polished`.
+        threshold, …, noise_floor: Settings by their names in `FitConfig`, constants by theirs in `refine`.
+        R, …, inliers: The fields of `Polished`, (P, 3, 3) … (P,).
     """
 
     kinds: NDArray[np.intp]

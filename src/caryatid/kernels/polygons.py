@@ -89,7 +89,7 @@ def _maybe_corners(points: NDArray[np.float64]) -> tuple[Array, int]:
 
 @njit(cache=True, error_model="numpy")
 def intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
-    """Common area of two polygons, found by cutting the one along each edge of the other."""
+    """Common area (K, 2) of two convex polygons (N, 2) and (M, 2): one cut along each edge of the other."""
     now, cut = np.empty((2 * (len(a) + len(b)), 2)), np.empty((2 * (len(a) + len(b)), 2))
     count = len(a) if len(b) > 2 else 0
     for i in range(count):
@@ -117,7 +117,7 @@ def intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
 
 @njit(cache=True, error_model="numpy")
 def area(polygon: NDArray[np.float64]) -> float:
-    """Area [m²]."""
+    """Area [m²] of a polygon (N, 2) [m]."""
     total = 0.0
     for i in range(2, len(polygon)):
         total += _turn(polygon, 0, i - 1, polygon[i, 0], polygon[i, 1])
@@ -126,7 +126,7 @@ def area(polygon: NDArray[np.float64]) -> float:
 
 @njit(cache=True, error_model="numpy")
 def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple[float, float, float, bool]:
-    """Distance [m] of a point to a polygon's border, where on it is nearest (x, y), and whether it is inside.
+    """Distance [m] of a point to a polygon's (N, 2) border, the point nearest there, and if it is inside.
 
     Nothing is inside a line or a point; what lies on the border of an area is.
     """
@@ -155,7 +155,7 @@ def cap(
     direction: NDArray[np.float64],
     depth: float,
 ) -> Array:
-    """Outline on the ground of the part of a convex solid near its outermost point along a direction.
+    """Outline (K, 2) on the ground of the part of a convex solid near its outermost point along a direction.
 
     Args:
         corners: (N, 3) [m].

@@ -105,6 +105,15 @@ def msac(
     """Sum of truncated squared distances in units of the threshold, and how many points lie within it.
 
     Ends early, with what it has, once the sum exceeds the limit.
+
+    Args:
+        kind: Code of the shape.
+        R: Its axes (3, 3).
+        centre: Its centre (3,) [m].
+        half: Its half extents (3,) [m].
+        points: (N, 3) [m].
+        threshold: Where distances are truncated [m].
+        limit: A sum that is of no use any more.
     """
     total = 0.0
     inliers = 0
@@ -205,7 +214,18 @@ def hypothesis(
 def set_axes(
     R: NDArray[np.float64], ux: float, uy: float, uz: float, x: float, y: float, z: float, column: int
 ) -> None:
-    """Set right-handed axes (3, 3): z, a unit vector across it as x or y (column 0 or 1), and the third."""
+    """Set right-handed axes (3, 3): z, a unit vector across it as x or y (column 0 or 1), and the third.
+
+    Args:
+        R: Written to (3, 3).
+        ux: x of the vector across.
+        uy: Its y.
+        uz: Its z.
+        x: x of the unit vector that becomes the third axis.
+        y: Its y.
+        z: Its z.
+        column: 0 or 1: which axis the one across becomes.
+    """
     R[0, column], R[1, column], R[2, column] = ux, uy, uz
     R[0, 2], R[1, 2], R[2, 2] = x, y, z
     sign = 1.0 - 2.0 * column
@@ -218,7 +238,15 @@ def set_axes(
 def trimmed_range(
     points: NDArray[np.float64], dx: float, dy: float, dz: float, trim: float
 ) -> tuple[float, float]:
-    """Least and greatest coordinate [m] of points (N, 3) along a direction, a share at each end left out."""
+    """Least and greatest coordinate [m] of points (N, 3) along a direction, a share at each end left out.
+
+    Args:
+        points: (N, 3) [m].
+        dx: x of the direction, a unit vector.
+        dy: Its y.
+        dz: Its z.
+        trim: The share left out at each end.
+    """
     beyond = min(int(trim * len(points)), (len(points) - 1) // 2)
     least, greatest = np.empty(beyond + 1), np.empty(beyond + 1)
     for k in range(beyond + 1):

@@ -26,7 +26,7 @@ BATCH = 8
 
 @njit(cache=True)
 def room(shape: Voxel) -> NDArray[np.int32]:
-    """Make room for the voxels of any ray through a grid: what `traverse` writes to."""
+    """Make room (3, M) for the voxels of any ray through a grid: what `traverse` writes to."""
     return np.empty((3, max(shape) + BATCH), dtype=np.int32)
 
 
@@ -40,7 +40,7 @@ def traverse(
     over if both other axes change. All slabs are worked alike, without a branch, so several at a time.
 
     Args:
-        found: Flat indices (3, `room`), written to: the voxels of each slab, which may be the same.
+        found: Flat indices (3, M), written to: the voxels of each slab, which may be the same; see `room`.
         shape: Voxels of the grid along each axis.
         start: Start of the ray in voxels from the grid's corner.
         ray: Its direction, length 1 in t, in voxels.

@@ -292,7 +292,14 @@ def find(layer: int, found: Found) -> None:
 
 @njit(cache=True, error_model="numpy")
 def voxels_at(points: Array, origin: Array, size: float, shape: Voxel) -> NDArray[np.intp]:
-    """Flat index (N,) of the voxel of a grid that holds each point (N, 3) [m]; −1 outside."""
+    """Flat index (N,) of the voxel of a grid that holds each point (N, 3) [m]; −1 outside.
+
+    Args:
+        points: (N, 3) [m].
+        origin: Corner of the grid (3,) [m].
+        size: Edge of a voxel [m].
+        shape: Voxels along each axis.
+    """
     index = np.empty(len(points), dtype=np.intp)
     for n in range(len(points)):
         i = int(np.floor((points[n, 0] - origin[0]) / size))

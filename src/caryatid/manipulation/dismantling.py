@@ -94,7 +94,12 @@ def poses_of(scene: SimulatedScene) -> Array:
 
 
 def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
-    """Return a scene with its objects elsewhere, for pictures: state (N, 7)."""
+    """Return a scene with its objects elsewhere, for pictures.
+
+    Args:
+        scene: Whose objects they are.
+        state: Positions [m] and quaternions (N, 7), w first.
+    """
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.data.qpos
     data.qpos[_addresses(scene)] = state

@@ -12,6 +12,7 @@ from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.rehearsal import Rehearsal, Trial
+from caryatid.pictured import Pictured
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,7 @@ class TakeStep:
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class Order(Pictured):
     """An order to take objects away.
 
     Attributes:
@@ -49,6 +50,10 @@ class Order:
     def safe(self) -> bool:
         """Every step is."""
         return not self.refusal
+
+    def __repr__(self) -> str:
+        taken = ", ".join(s.object_id + "".join(f" (hold {i})" for i in s.hold) for s in self.steps)
+        return f"Order({taken}; {self.refusal or 'safe'})"
 
 
 @dataclass(frozen=True, eq=False, slots=True)

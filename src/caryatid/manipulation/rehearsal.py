@@ -117,7 +117,12 @@ class Rehearsal:
         return Trial(float(harm.any(axis=1).mean()), harmed, tuple(lifts))
 
     def take(self, object_id: str, trial: Trial) -> None:
-        """Go on without an object that has been lifted: where others moved, they are put back."""
+        """Go on without an object that has been lifted: where others moved, they are put back.
+
+        Args:
+            object_id: Which.
+            trial: How its lift went.
+        """
         index = self.ids.index(object_id)
         self._trials.clear()
         for k, (lift, scene) in enumerate(zip(trial.lifts, self._scenes, strict=True)):

@@ -17,6 +17,7 @@ from caryatid.errors import PlanningError
 from caryatid.frames import Array
 from caryatid.graph import SupportGraph
 from caryatid.interest import PointOfInterest
+from caryatid.pictured import Pictured
 from caryatid.threads import one_blas_thread
 from caryatid.view_sphere import ViewSphere
 from caryatid.voxels import VoxelMap
@@ -42,6 +43,10 @@ class PlanningState:
     candidates: Candidates
     config: ActiveVisionConfig
 
+    def __repr__(self) -> str:
+        views, candidates = len(self.visited), len(self.candidates)
+        return f"PlanningState(views={views}, candidates={candidates}, graph={self.graph})"
+
 
 class Painted:
     """A field whose value is given, or painted when it is first looked at: most pictures are never drawn."""
@@ -62,15 +67,15 @@ class Painted:
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class Decision(Pictured):
     """The next best view and why.
 
     Attributes:
         T_world_camera: Pose (4, 4) to go to.
         index: Which of the candidates it is.
-        saliency: s of eq. 3 there, with the inhibition of return.
-        cost: h of eq. 3 there.
-        score: c = s − h, eq. 3.
+        saliency: s of eq. 3 there, with the inhibition of return [1].
+        cost: h of eq. 3 there [1].
+        score: c = s − h, eq. 3 [1].
         why: One sentence for a person to read.
         points_of_interest: What the planner took into account.
         candidate_saliency: s (N,) of every candidate, or None.
@@ -87,6 +92,9 @@ class Decision:
     points_of_interest: tuple[PointOfInterest, ...] = ()
     candidate_saliency: Array | None = None
     sphere_saliency: Painted = Painted()
+
+    def __repr__(self) -> str:
+        return f"Decision(candidate {self.index}, score {self.score:.3f}: {self.why})"
 
 
 class Planner(Protocol):
@@ -106,7 +114,14 @@ class Planner(Protocol):
 
 
 def check_candidates(state: PlanningState) -> None:
-    """Raise PlanningError, with the reasons, where no view can be reached."""
+    """Raise PlanningError, with the reasons, where no view can be reached.
+
+    Args:
+        state: What is known.
+
+    Raises:
+        PlanningError: There is none.
+    """
     if len(state.candidates) == 0:
         reasons = ", ".join(f"{reason} ({n})" for reason, n in state.candidates.rejected.items())
         raise PlanningError(f"no view is left to go to: {reasons or 'the robot offers no candidates'}")
@@ -167,7 +182,13 @@ def decide(
 
 
 def go_to(state: PlanningState, index: int, why: str) -> Decision:
-    """Take a candidate whatever there is to see: the decision of planners that do not look at the scene."""
+    """Take a candidate whatever there is to see: the decision of planners that do not look at the scene.
+
+    Args:
+        state: What is known.
+        index: Which of the candidates.
+        why: One sentence for a person to read.
+    """
     cost = float(path_cost(state)[index])
     return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
 

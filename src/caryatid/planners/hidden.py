@@ -145,7 +145,12 @@ def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
 
 
 def weighted(samples: Samples, weight: float | Array) -> Samples:
-    """Scale all weights, by one number or each by its own (K,)."""
+    """Scale all weights, by one number or each by its own (K,).
+
+    Args:
+        samples: The samples.
+        weight: One number, or one for each (K,).
+    """
     return replace(samples, weights=samples.weights * weight)
 
 
@@ -155,6 +160,12 @@ def visibility(samples: Samples, T_world_camera: Array, solid: Solid, config: Ac
     A sample is seen when its line of sight is free and within the image; surface turned away by more than
     `config.good_incidence` is seen less well, as the cosine. Lines of sight are all free where
     `config.occlusion` is `ignore`.
+
+    Args:
+        samples: K of them.
+        T_world_camera: Poses (T, 4, 4).
+        solid: What blocks lines of sight.
+        config: Image, incidence, and how occlusion is treated.
     """
     alike = replace(samples, weights=np.ones_like(samples.weights))
     return shown_anew(alike, np.zeros_like(samples.weights), T_world_camera, solid, config)
@@ -166,6 +177,13 @@ def shown_anew(
     """Worth (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).
 
     Lines of sight that could show nothing new are not followed.
+
+    Args:
+        samples: K of them.
+        before: How well they were seen before (K,), 0 … 1.
+        T_world_camera: Poses (T, 4, 4).
+        solid: What blocks lines of sight.
+        config: Image, incidence, and how occlusion is treated.
     """
     see_through = config.occlusion == "ignore"
     return shown(

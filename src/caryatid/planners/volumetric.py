@@ -86,6 +86,11 @@ def ray_information(state: PlanningState, T_world_camera: Array, proximity: floa
 
     Without a table or objects there is no box to look into, and nothing is gathered; without a `proximity`,
     d_max [m], nothing is near.
+
+    Args:
+        state: What is known.
+        T_world_camera: Poses (C, 4, 4).
+        proximity: d_max [m].
     """
     corners = space_above(state.graph, state.voxels)
     if corners is None:

@@ -77,7 +77,13 @@ def choose_views(
 
 
 def apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
-    """How far poses (N, 4, 4) are from another one (4, 4), in units of what makes a view another one (N,)."""
+    """How far poses (N, 4, 4) are from another one (4, 4), in units of what makes a view another one (N,).
+
+    Args:
+        T_world_camera: Poses (N, 4, 4).
+        T_world_other: The other one (4, 4).
+        config: What way and what angle make a view another one.
+    """
     distance = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_other[:3, 3], axis=1)
     cosine = (np.einsum("nij,ij->n", T_world_camera[:, :3, :3], T_world_other[:3, :3]) - 1.0) / 2.0
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))

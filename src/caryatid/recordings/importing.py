@@ -23,6 +23,7 @@ from caryatid.recordings.sources import Footage, Shot
 from caryatid.recordings.tum import TumFootage, is_tum_folder, read_tum_camera
 
 NO_TOPICS: Final = Topics()
+"""No topic is named: they are found."""
 _REMEDIES: Final[Mapping[str, str]] = {
     sources.NO_COLOUR: "leave colour out, or allow more with --set recording.colour_gap=SECONDS",
     sources.NO_POSE: "record its poses all the time, or allow more with --set recording.pose_gap=SECONDS",

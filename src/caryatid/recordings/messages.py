@@ -20,6 +20,7 @@ IMAGE: Final = "sensor_msgs/msg/Image"
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 CAMERA: Final = "sensor_msgs/msg/CameraInfo"
 TRANSFORMS: Final = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+"""Types of messages that are read."""
 
 DEPTH_ENCODINGS: Final[Mapping[str, str]] = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encodings of depth → type of a pixel: whole millimetres, or metres."""

@@ -22,6 +22,7 @@ DARK = "hardly any depth"
 BLURRED = "blurred"
 ALIKE = "seen from where another view is"
 SPARE = "more than are wanted"
+"""Why a frame does not become a view."""
 
 SCALES = (0.1, 0.2, 0.5, 1.0)
 """Units depth is written in [mm]: the finest that reaches far enough."""

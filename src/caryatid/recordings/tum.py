@@ -38,7 +38,7 @@ class TumCamera:
 
     Attributes:
         K: Pinhole matrix (3, 3) [px].
-        depth_scale: Millimetres of one unit of depth.
+        depth_scale: One unit of depth [mm].
         size: Width and height [px] where they are known.
         note: Where this is from.
     """

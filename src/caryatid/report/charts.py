@@ -63,7 +63,12 @@ STYLE = {
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line of a chart: its name and y of each point."""
+    """One line of a chart.
+
+    Attributes:
+        name: What it is of.
+        values: y of each point.
+    """
 
     name: str
     values: Sequence[float]
@@ -113,7 +118,14 @@ def line_chart(
 
 
 def bar_chart(bars: Sequence[Mapping[str, float]], *, title: str, x_name: str, y_name: str) -> str:
-    """Draw stacked bars, one for each mapping of part to height, numbered from 0."""
+    """Draw stacked bars, one for each mapping of part to height, numbered from 0.
+
+    Args:
+        bars: Part → height, bar by bar.
+        title: Heading.
+        x_name: What the numbers count.
+        y_name: What heights are.
+    """
     parts = list(dict.fromkeys(name for bar in bars for name in bar))
 
     def plot(axes: Any) -> None:

@@ -32,7 +32,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """One picture of the report: what it is of, its SVG markup, a heading and what is to be seen in it."""
+    """One picture of the report.
+
+    Attributes:
+        kind: What it is of.
+        svg: Its markup.
+        heading: Its heading.
+        caption: What is to be seen in it.
+        wide: It takes the whole width of the page.
+    """
 
     kind: Literal["camera", "graph", "cloud", "sphere"]
     svg: str

@@ -21,7 +21,25 @@ FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 
 @dataclass(frozen=True, slots=True)
 class ObjectRow:
-    """One line of the table of objects, ready to print."""
+    """One line of the table of objects, ready to print.
+
+    Attributes:
+        id: Its id.
+        colour: Its colour, `#rrggbb`.
+        shape: Name of the shape.
+        size: Sizes [mm].
+        seen: In how many views it was found.
+        unseen: Which sides no points bear out.
+        residual: Mean distance of its points [mm].
+        poor_fit: No shape explains its points.
+        stability: Which tests say that it falls.
+        unstable: Whether one does.
+        ratio: Support area ratio r_s of eq. 1.
+        overhang: How far its centre of mass lies outside [mm].
+        supporters: Ids of what holds it.
+        surface: It is the support surface.
+        why: How the shape came about, and what is doubtful.
+    """
 
     id: str
     colour: str
@@ -42,7 +60,18 @@ class ObjectRow:
 
 @dataclass(frozen=True, slots=True)
 class SupportRow:
-    """One line of the table of supports, ready to print."""
+    """One line of the table of supports, ready to print.
+
+    Attributes:
+        supporter: Id of what holds.
+        supporter_colour: Its colour, `#rrggbb`.
+        supported: Id of what is held.
+        supported_colour: Its colour, `#rrggbb`.
+        kind: How.
+        certain: Whether it is.
+        evidence: In how many views it was found.
+        why: Which test put it there.
+    """
 
     supporter: str
     supporter_colour: str
@@ -56,7 +85,14 @@ class SupportRow:
 
 @dataclass(frozen=True, slots=True)
 class PointRow:
-    """One line of the table of points of interest, ready to print."""
+    """One line of the table of points of interest, ready to print.
+
+    Attributes:
+        subject: Ids of the objects it is about.
+        colour: Colour of its saliency, `#rrggbb`.
+        saliency: How much it is worth.
+        why: What for.
+    """
 
     subject: str
     colour: str

@@ -34,7 +34,14 @@ def element(tag: str, *children: str, **attributes: object) -> str:
 
 
 def text(x: float, y: float, content: str, **attributes: object) -> str:
-    """Write a text; its content is escaped."""
+    """Write a text; its content is escaped.
+
+    Args:
+        x: Where it begins [px].
+        y: Its base line [px].
+        content: What it says.
+        **attributes: As in `element`.
+    """
     return element("text", escape(content), x=x, y=y, **attributes)
 
 
@@ -79,7 +86,16 @@ def picture(
 def raster(
     pixels: NDArray[np.uint8], x: float, y: float, width: float, height: float, jpeg: int | None = None
 ) -> str:
-    """Put pixels (H, W), (H, W, 3) or (H, W, 4) into a picture, as PNG, or as JPEG of a given quality."""
+    """Put pixels into a picture, as PNG or JPEG.
+
+    Args:
+        pixels: (H, W), (H, W, 3) or (H, W, 4).
+        x: Left edge [px].
+        y: Upper edge [px].
+        width: What it takes [px].
+        height: What it takes [px].
+        jpeg: Quality, or None for PNG.
+    """
     image = Image.fromarray(pixels)
     buffer = io.BytesIO()
     if jpeg is None:

@@ -62,10 +62,12 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
         503: "Too much waits; try again",
     }.items()
 }
+"""Answers to requests that fail, by their status."""
 PROBLEMS[413] = {"description": "Larger than a request may be", "content": {"text/plain": {}}}
 
 
 BEARER = HTTPBearer(auto_error=False, description="The token the service was started with")
+"""Where requests carry their token."""
 
 SessionName = Annotated[Name, Path(description="Name of the session")]
 

@@ -99,6 +99,13 @@ class Desk:
     ) -> Session:
         """Begin a session.
 
+        Args:
+            name: Of the session.
+            config: All stages' settings.
+            segmentation: Where parts come from, or None for the first view to say.
+            seed: Seed of every random choice.
+            planner: Name of who chooses the next view.
+
         Raises:
             InputError: There is one of that name, or a setting asks for more memory than a session may have.
         """

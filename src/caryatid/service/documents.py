@@ -29,13 +29,13 @@ class _Document(BaseModel):
 class Problem(_Document):
     """What went wrong, in one sentence."""
 
-    detail: str
+    detail: str = Field(description="What, where, and what can be done about it")
 
 
 class NewSession(_Document):
     """A session to begin."""
 
-    name: Name
+    name: Name = Field(description="What it is to be called")
     segmentation: Literal["labels", "auto"] | None = Field(
         None, description="Where parts come from; null = labels where the first view has them"
     )
@@ -50,17 +50,17 @@ class NewSession(_Document):
 class SessionAnswer(_Document):
     """A session."""
 
-    name: str
+    name: str = Field(description="What it is called")
     views: int = Field(description="How many it has")
-    segmentation: Literal["labels", "auto"] | None
-    seed: int
-    planner: str
+    segmentation: Literal["labels", "auto"] | None = Field(description="Where parts come from")
+    seed: int = Field(description="Seed of every random choice")
+    planner: str = Field(description="Who chooses the next view")
 
 
 class SessionList(_Document):
     """All sessions."""
 
-    sessions: list[str]
+    sessions: list[str] = Field(description="Their names")
 
 
 class Camera(_Document):
@@ -74,7 +74,7 @@ class Camera(_Document):
 class NewView(_Document):
     """A view; its images are files in base64."""
 
-    camera: Camera
+    camera: Camera = Field(description="Where it was taken, and with what")
     depth: Base64 = Field(description="16-bit PNG, or .npy (H, W) of floats in metres; 0 = no reading")
     rgb: Base64 | None = Field(None, description="PNG, JPEG, or .npy (H, W, 3) of uint8")
     labels: Base64 | None = Field(
@@ -112,14 +112,16 @@ class ViewAnswer(_Document):
 class UndoAnswer(_Document):
     """What is left."""
 
-    views: int
+    views: int = Field(description="How many are left")
     graph: dict[str, Any] = Field(description="graph.json")
 
 
 class Candidates(_Document):
     """Views a robot reaches."""
 
-    T_world_camera: list[Matrix4] = Field(max_length=MOST_CANDIDATES)
+    T_world_camera: list[Matrix4] = Field(
+        max_length=MOST_CANDIDATES, description="Poses [m], OpenCV camera frame, world z up"
+    )
     path_length: list[Annotated[FiniteFloat, Field(ge=0.0)]] | None = Field(
         None, max_length=MOST_CANDIDATES, description="Way to each [m]; null = straight lines"
     )
@@ -128,23 +130,23 @@ class Candidates(_Document):
 class Gaze(_Document):
     """Where the head looks, against the platform [rad]."""
 
-    yaw: float
-    pitch: float
+    yaw: float = Field(description="To the left")
+    pitch: float = Field(description="Upwards")
 
 
 class NextAnswer(_Document):
     """Where to look next."""
 
     view: int = Field(description="Which it would be, 0 the first")
-    T_world_camera: list[list[float]]
+    T_world_camera: list[list[float]] = Field(description="Pose [m], OpenCV camera frame, world z up")
     candidate: int = Field(description="Which of the candidates it is")
     platform: list[float] | None = Field(description="x, y, yaw [m, rad]; null with candidates")
-    camera_height: float | None
-    gaze: Gaze | None
-    expected_gain: float
-    cost: float
-    score: float
-    why: str
+    camera_height: float | None = Field(description="Over the floor [m]; null with candidates")
+    gaze: Gaze | None = Field(description="How the head turns; null with candidates")
+    expected_gain: float = Field(description="Saliency s of eq. 3")
+    cost: float = Field(description="Cost h of the way, eq. 3")
+    score: float = Field(description="c = s − h, eq. 3")
+    why: str = Field(description="One sentence for a person to read")
     stop: str | None = Field(description="Why looking on may not pay, or null")
 
 

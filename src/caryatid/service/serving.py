@@ -61,6 +61,18 @@ def run_service(
 ) -> int:
     """Serve the sessions of a folder until Ctrl-C or SIGTERM; what has been asked by then is answered.
 
+    Args:
+        folder: Holds the sessions.
+        config: Settings of sessions that name none.
+        host: Address to listen at.
+        port: Port to listen at; 0 = any that is free.
+        token: What every request has to carry, or None.
+        open_sessions: How many are kept in memory at once.
+        waiting: How many requests may wait.
+        max_request: Largest request [bytes].
+        quiet: Say nothing.
+        json: Say where it listens as JSON.
+
     Raises:
         InputError: A token is missing, the address is taken, or the folder cannot be written.
     """

@@ -90,6 +90,13 @@ class Capture:
     ) -> Capture:
         """Read the files of one view.
 
+        Args:
+            depth: Depth image.
+            camera: JSON of the camera.
+            rgb: Colour image, or None.
+            labels: Label image, or None.
+            config: How large images may be.
+
         Raises:
             InputError: One is missing or too large, or the camera's is no such JSON.
         """
@@ -107,6 +114,12 @@ class Capture:
         cls, images: Mapping[str, bytes], document: Any, source: str | Path, name: str | Path
     ) -> Capture:
         """Put images together with what a camera's JSON says: K, T_world_camera, depth_scale.
+
+        Args:
+            images: Files by `depth`, `rgb` and `labels`.
+            document: What the camera's JSON holds.
+            source: What to call it in errors.
+            name: What to call the view.
 
         Raises:
             InputError: A key is missing or not valid.

@@ -28,6 +28,7 @@ from caryatid.settings import changed_settings
 
 FORMAT: Final = "caryatid/session"
 VERSION: Final = 1
+"""What a session's folder says it is."""
 
 
 class TakenError(InputError):

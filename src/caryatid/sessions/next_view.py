@@ -114,7 +114,15 @@ def candidates_from(document: Mapping[str, Any], source: str) -> tuple[Array, Ar
 
 
 def table_floor(scene: Scene, config: Config) -> FloorGrid:
-    """The floor around the table: under its top, and everything on it, nobody can stand."""
+    """The floor around the table: under its top, and everything on it, nobody can stand.
+
+    Args:
+        scene: What is known, of at least one view.
+        config: How the robot stands.
+
+    Raises:
+        PlanningError: No view is known yet.
+    """
     if scene.surface is None or scene.sphere is None:
         raise PlanningError("nothing has been seen yet; add a first view")
     shape = scene.surface.shape

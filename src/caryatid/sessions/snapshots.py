@@ -23,6 +23,7 @@ from caryatid.sessions.durable import PARTIAL
 from caryatid.sessions.scene_state import SceneWriter, read_scene
 
 FORMAT = "caryatid/session-state 1"
+"""What a snapshot says it is."""
 
 STEPS = (1, 8, 64)
 """Of snapshots the newest after a multiple of each of these many views is kept [1]."""

@@ -30,11 +30,17 @@ _SCREEN_DENSITY = 1200.0
 _SIDES: tuple[Side, ...] = ("+x", "+y", "-y")
 DOWN = np.array([[0.0, 0.0, -1.0]])
 AXES = np.eye(3)
+"""Straight down (1, 3), and the world's axes (3, 3)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Drop:
-    """A solid where it is let go; `stacked` if it is meant to stay on another one."""
+    """A solid where it is let go.
+
+    Attributes:
+        solid: The solid.
+        stacked: It is meant to stay on another one.
+    """
 
     solid: Solid
     stacked: bool = False
@@ -113,7 +119,12 @@ def generate_dense(
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """What stays put: the table's size [m] and where walls stand."""
+    """What stays put.
+
+    Attributes:
+        table: Size of the table's top along x and y [m].
+        walls: At which of its sides walls stand.
+    """
 
     table: tuple[float, float]
     walls: tuple[Side, ...]
@@ -132,6 +143,18 @@ def set_down(
 
     Solids that were there from the start must not be upset; where there were none, no earlier one must be.
     Where nothing can be set down any more, the last solid is taken up again too.
+
+    Args:
+        name: Of the scene.
+        solids: What is there from the start.
+        draws: Each draws a solid, given what is there already.
+        rng: For every random choice.
+        place: Table and walls.
+        habits: How often is tried again, and what counts as at rest.
+        physics: Settings of the simulation, or None for those that come with it.
+
+    Raises:
+        InputError: The solids cannot be set down within the tries there are.
     """
     physics = physics or PhysicsConfig()
     impatient = replace(physics, settle_time=habits.rest_time)
@@ -203,7 +226,14 @@ def _is_raised(scene: SimulatedScene, habits: GenerationConfig) -> bool:
 def let_go(
     shape: Box | Cylinder | Sphere, xy: Array, scene: SimulatedScene | None, habits: GenerationConfig
 ) -> Solid:
-    """Put a shape a little over whatever the boxes around objects say is below it."""
+    """Put a shape a little over whatever the boxes around objects say is below it.
+
+    Args:
+        shape: At the origin, turned as it is to be.
+        xy: Where (2,) [m].
+        scene: What is there already, or None.
+        habits: How far above.
+    """
     over = shape.moved(frames.rigid(np.eye(3), (*xy, 0.0)))
     tops = [TABLE_HEIGHT]
     if scene is not None:
@@ -225,7 +255,12 @@ def _over(shape: Box | Cylinder | Sphere, others: Sequence[Box | Cylinder | Sphe
 
 
 def upright(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
-    """Draw a shape at the origin with one axis vertical: a box on any face, a cylinder on an end or lying."""
+    """Draw a shape at the origin with one axis vertical: a box on any face, a cylinder on an end or lying.
+
+    Args:
+        rng: For every random choice.
+        habits: Kinds and sizes.
+    """
     yaw = frames.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
     R = yaw @ _ON_ITS_SIDE if rng.random() < habits.lying else yaw
     return _shape(rng, R, habits)
@@ -267,7 +302,17 @@ def _in_disc(rng: np.random.Generator, radius: float) -> Array:
 
 
 def check_request(name: str, size: int, seed: int, sizes: tuple[int, int]) -> None:
-    """Raise InputError where a scene of this size or seed cannot be set up."""
+    """Raise InputError where a scene of this size or seed cannot be set up.
+
+    Args:
+        name: Of the scene.
+        size: How many objects are asked for.
+        seed: Its seed.
+        sizes: Fewest and most objects there may be.
+
+    Raises:
+        InputError: The size is none of these, or the seed is negative.
+    """
     if not sizes[0] <= size <= sizes[1]:
         raise InputError(name, f"{size} objects cannot be set up", f"ask for {sizes[0]} to {sizes[1]}")
     if seed < 0:

@@ -76,7 +76,15 @@ def cylinder(
     turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
     density: float = 600.0,
 ) -> Solid:
-    """A cylinder [m], upright unless turned; the other arguments are as in `box`."""
+    """A cylinder [m], upright unless turned; the other arguments are as in `box`.
+
+    Args:
+        radius: Of its ends [m].
+        height: Along its axis [m].
+        at: As in `box`.
+        turn: As in `box`.
+        density: As in `box`.
+    """
     return Solid(Cylinder(_placed(at, turn), radius, height), density)
 
 

@@ -11,7 +11,7 @@ from caryatid.frames import Array
 
 
 def axial_sigma(depth: Array, config: NoiseConfig) -> Array:
-    """Standard deviation [m] of a reading at `depth` [m], any shape: σ(z) = a + b·(z − z0)²."""
+    """Standard deviation (...) [m] of readings at depths (...) [m]: σ(z) = a + b·(z − z0)²."""
     a, b, z0 = config.axial
     return a + b * (depth - z0) ** 2
 
@@ -53,7 +53,7 @@ def depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
 
 
 def misregister(T_world_camera: Array, config: NoiseConfig, rng: np.random.Generator) -> Array:
-    """Return the pose registration believes in: shifted, and turned about the camera's centre.
+    """Return the pose (4, 4) registration believes in: shifted, and turned about the camera's centre.
 
     The shift is Gaussian with σ = `config.translation` along each axis; the turn is about an axis drawn
     uniformly, by a Gaussian angle with σ = `config.rotation`.

@@ -24,7 +24,13 @@ _REMEDY = 'write {"vertices": […], "edges": [{"supporter", "supported", "kind"
 
 
 class TrueEdge(TypedDict):
-    """An edge of gt.json; `supporter` and `supported` are body names."""
+    """An edge of gt.json.
+
+    Attributes:
+        supporter: Name of the body that holds.
+        supported: Name of the body that is held.
+        kind: How.
+    """
 
     supporter: str
     supported: str
@@ -134,7 +140,13 @@ def displaced_without(
 
 
 def take_away(scene: SimulatedScene, data: Any, label: int) -> None:
-    """Lift an object of a simulation's state far above everything else, in place."""
+    """Lift an object of a simulation's state far above everything else, in place.
+
+    Args:
+        scene: Whose object it is.
+        data: State of the simulation, `mujoco.MjData`; changed.
+        label: Of the object.
+    """
     joint = int(scene.model.body_jntadr[scene.body_id(label)])
     address = int(scene.model.jnt_qposadr[joint])
     data.qpos[address + 2] += ASIDE
@@ -171,6 +183,10 @@ def read_truth(path: Path) -> GroundTruth:
 
 def write_truth(truth: GroundTruth, path: Path) -> None:
     """Write a gt.json.
+
+    Args:
+        truth: What is true.
+        path: The file.
 
     Raises:
         InputError: The file cannot be written.

@@ -38,7 +38,7 @@ class SimulatedScene:
         source: File or built-in name it came from, for messages.
         object_bodies: Body name of each object by its label 1…n, in the order of the bodies.
         table: Body name of the support surface.
-        geom_labels: Label of the object each geom belongs to (ngeom,), 0 for the table and everything else.
+        geom_labels: Label (G,) of the object each geom belongs to, 0 for the table and everything else.
         at_rest: Nothing moved any more when settling ended.
     """
 

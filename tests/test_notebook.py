@@ -1,0 +1,212 @@
+"""What scenes, steps, graphs and shapes show in a notebook."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from conftest import without_labels
+
+import caryatid as ct
+from caryatid.candidates import Candidates
+from caryatid.frames import look_at
+from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.manipulation.order import Order, TakeStep
+from caryatid.notebook import draw_cell
+from caryatid.pictured import Pictured
+from caryatid.planners import Decision
+from caryatid.report.colours import object_colour
+from caryatid.simulation import load_scene
+from caryatid.simulation.stage import set_stage
+from caryatid.views import Cloud, View
+
+HOSTILE = "<script>alert(1)</script> & \"quoted\" 'too'"
+
+
+@pytest.fixture(scope="module")
+def scene(views):
+    scene = ct.Scene()
+    for view in views:
+        scene.update(view)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def steps(scene_file, settings):
+    stage = set_stage(load_scene(scene_file), settings, noise="none", seed=0)
+    explored = ct.explore(stage.camera, stage.robot, config=settings, early_stop=False)
+    return [next(explored), next(explored)]
+
+
+@pytest.fixture(scope="module")
+def order():
+    first = TakeStep("o2", (), True, 0.0, "it supports nothing that is left")
+    return Order((first, TakeStep("o1", ("o3",), False, 0.25, "it disturbs o3")), "no safe order")
+
+
+@pytest.fixture(scope="module")
+def shown(scene, steps, views, order):
+    """One of each kind, and the ends of what they may be."""
+    pose = look_at(np.array([-1.0, 0.0, 1.5]), np.zeros(3))
+    bare = View(np.zeros((4, 6)), views[0].K)
+    empty = Cloud(np.empty((0, 3)), np.empty((0, 3)))
+    tilted = ct.Box(pose, np.array([0.1, 0.2, 0.0004]))
+    return {
+        "scene": scene,
+        "scene of nothing": ct.Scene(),
+        "first step": steps[0],
+        "last step": replace(steps[1], decision=None, candidates=None, stop="2 views were asked for"),
+        "graph": scene.graph,
+        "graph of nothing": ct.SupportGraph(),
+        "object": scene.graph["o1"],
+        "surface": scene.graph["o0"],
+        "box": tilted,
+        "cylinder": ct.Cylinder(pose, 0.04, 0.2),
+        "sphere": ct.Sphere(pose, 0.05),
+        "view": views[0],
+        "view of depth": without_labels([bare])[0],
+        "cloud": scene.cloud,
+        "cloud of nothing": empty,
+        "decision": steps[0].decision,
+        "decision without points": Decision(pose, 3, 0.5, 0.1, 0.4, "because"),
+        "order": order,
+        "order of nothing": Order(()),
+    }
+
+
+def parsed(html):
+    """The cell as a tree; it fails where a tag is not closed or a text not escaped."""
+    return ElementTree.fromstring(html.replace("<details open>", "<details>"))
+
+
+def words(html):
+    return " ".join("".join(part.itertext()) for part in parsed(html) if part.tag != "style")
+
+
+def test_every_kind_that_shows_itself_is_tried_here(shown):
+    # By name: a class with slots is made twice.
+    kinds = {kind.__qualname__ for kind in Pictured.__subclasses__()}
+    assert kinds == {type(thing).__qualname__ for thing in shown.values()}
+
+
+def test_each_is_one_piece_of_markup_that_loads_and_runs_nothing(shown):
+    for name, thing in shown.items():
+        html = thing._repr_html_()
+        assert parsed(html).tag == "div", name
+        assert not re.search(r"<script|javascript:|@import|url\(|\son\w+=|<link|<iframe", html), name
+        linked = re.findall(r'(?:href|src)="([^"]*)"', html)
+        assert all(link.startswith("data:image/") for link in linked), name
+        assert len(html) < 100_000, name
+
+
+def test_styles_reach_no_further_than_the_cell(scene):
+    style = re.search(r"<style>(.*?)</style>", scene._repr_html_(), re.S)[1]
+    rules = [rule.strip() for rule in re.split(r"}", style) if rule.strip()]
+    assert len(rules) > 20
+    for rule in rules:
+        assert all(
+            part.strip().startswith(".caryatid-cell")
+            for part in re.split(r",(?![^(]*\))", rule.split("{")[0])
+        )
+
+
+def test_text_takes_the_colour_of_the_page(scene):
+    """A colour of its own would be lost on a dark page, or on a light one."""
+    style = re.search(r"<style>(.*?)</style>", scene._repr_html_(), re.S)[1]
+    assert "background: #" not in style
+    assert not re.search(r"[{;]\s*color:(?!\s*inherit)", style)
+    assert "fill: currentColor" in style
+
+
+def test_the_same_is_shown_again_byte_by_byte(scene, steps):
+    assert scene._repr_html_() == scene._repr_html_()
+    assert steps[0]._repr_html_() == steps[0]._repr_html_()
+
+
+def test_names_from_outside_are_escaped(scene, steps, views):
+    o = replace(scene.graph["o1"], why=HOSTILE, doubt=HOSTILE)
+    support = replace(scene.graph.supports[0], why=HOSTILE)
+    graph = SupportGraph((scene.graph["o0"], o), (support,))
+    decision = replace(steps[0].decision, sphere_saliency=None, why=HOSTILE)
+    view = replace(views[0], name=HOSTILE)
+    step = replace(steps[0], graph=graph, view=view, decision=decision)
+    refused = Order((TakeStep("o1", (HOSTILE,), False, 1.0, HOSTILE),), HOSTILE)
+    for thing in (o, graph, decision, view, step, refused, replace(scene.cloud, name=HOSTILE)):
+        html = thing._repr_html_()
+        assert "<script" not in html
+        assert "alert(1)" in words(html), type(thing)
+
+
+def test_a_scene_says_what_it_knows(scene):
+    html = scene._repr_html_()
+    assert "3 views" in words(html)
+    assert "2 objects, 2 supports" in words(html)
+    for label in (1, 2):
+        assert object_colour(label) in html
+    assert html.count("<svg") == 2
+
+
+def test_a_step_says_what_comes_next_or_why_it_stops(shown, steps):
+    assert steps[0].decision.why in words(shown["first step"]._repr_html_())
+    assert "2 views were asked for" in words(shown["last step"]._repr_html_())
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("box", "100 × 200 × 0 mm"),
+        ("cylinder", "⌀ 80 mm, 200 mm long"),
+        ("sphere", "⌀ 100 mm"),
+        ("order", "not safe"),
+        ("order", "risk 25%"),
+        ("view", "160 × 120 px"),
+        ("view of depth", "pose not known"),
+        ("scene of nothing", "nothing has been seen yet"),
+    ],
+)
+def test_facts_are_told(shown, name, said):
+    assert said in words(shown[name]._repr_html_())
+
+
+def test_what_has_no_cell_is_an_error():
+    with pytest.raises(TypeError, match="int"):
+        draw_cell(3)
+
+
+def test_a_plain_line_says_what_it_is_without_its_arrays(shown, scene, steps):
+    things = [*shown.values(), scene.graph.supports[0], steps[0].candidates]
+    for thing in things:
+        assert "array(" not in repr(thing)
+        assert "\n" not in repr(thing)
+        assert len(repr(thing)) < 300
+        assert repr(thing).startswith(type(thing).__name__)
+
+
+def test_plain_lines_tell_one_from_another():
+    upright = np.eye(4)
+    assert (
+        repr(ct.Box(upright, np.array([0.1, 0.2, 0.3])))
+        == "Box(0.100 × 0.200 × 0.300 m at (0.000, 0.000, 0.000))"
+    )
+    assert (
+        repr(Support("o1", "o2", certain=False)) == "Support(o1 → o2, bottom-up, uncertain, found in 1 of 1)"
+    )
+    edges = tuple(Support("o1", f"o{k}") for k in range(2, 30))
+    many = repr(SupportGraph((SceneObject("o1", 1, ct.Sphere(upright, 0.1)),), edges))
+    assert many.startswith("SupportGraph(vertices=1, edges=28: o1 → o2, ")
+    assert many.endswith("…)")
+    candidates = Candidates(np.empty((0, 4, 4)), np.empty((0, 3)), np.empty(0), {"too low": 3})
+    assert repr(candidates) == "Candidates(0; refused: 3 too low)"
+
+
+def test_nothing_is_drawn_before_somebody_asks():
+    code = (
+        "import sys, numpy as np, caryatid as ct; box = ct.Box(np.eye(4), np.ones(3)); repr(box); ct.Scene;"
+        "assert not [m for m in sys.modules if m.startswith('caryatid.notebook') or m == 'jinja2']"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,0 +1,98 @@
+"""The notebooks of the documentation: they run, and show what they are stored with."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MOSD = ROOT.parent / "shared/data/mosd"
+NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
+NAMED = [path.stem for path in NOTEBOOKS]
+QUICK = {
+    "from-a-frame-to-a-graph": {"SCENE": "tower"},
+    "own-planner": {"SCENES": ("hidden_stack",), "VIEWS": 2, "SEEDS": (0,)},
+}
+"""Small work for each: as long as one exploration takes."""
+
+
+@pytest.fixture(scope="module")
+def executing():
+    spec = importlib.util.spec_from_file_location("execute", ROOT / "docs/notebooks/execute.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def outputs(notebook):
+    return [output for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
+
+
+def html(notebook):
+    return [o.data["text/html"] for o in outputs(notebook) if "text/html" in o.get("data", {})]
+
+
+def test_each_has_its_quick_way():
+    assert set(NAMED) == set(QUICK)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMED)
+def test_it_is_stored_with_what_it_shows(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    assert re.match(r"# \w", notebook.cells[0].source)
+    code = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    assert not [o for o in outputs(notebook) if o.output_type == "error" or o.get("name") == "stderr"]
+    assert sum(bool(cell.outputs) for cell in code) >= 3
+    assert path.stat().st_size < 500_000
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMED)
+def test_nothing_tells_where_or_when_it_was_run(path):
+    text = path.read_text()
+    assert not re.search(r"/(tmp|home|root|Users)/", text)
+    assert '"execution": {' not in text
+    assert set(nbformat.read(path, as_version=4).metadata) == {"kernelspec", "language_info"}
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMED)
+def test_links_lead_somewhere(path):
+    for cell in nbformat.read(path, as_version=4).cells:
+        for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", cell.source):
+            assert (path.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=NAMED)
+def test_it_runs(path, executing):
+    before = path.read_bytes()
+    notebook = executing.execute(path, QUICK[path.stem])
+    stored = nbformat.read(path, as_version=4)
+    kinds = [[o.output_type for o in cell.get("outputs", [])] for cell in notebook.cells]
+    assert kinds == [[o.output_type for o in cell.get("outputs", [])] for cell in stored.cells]
+    assert all("<svg" in shown or "<dl" in shown for shown in html(notebook))
+    assert path.read_bytes() == before
+
+
+@pytest.mark.skipif(not MOSD.is_dir(), reason="the recorded frames of ../shared are not here")
+def test_a_real_frame_goes_the_same_way(executing):
+    folder = sorted(path for path in MOSD.iterdir() if path.is_dir())[0]
+    path = ROOT / "docs/notebooks/from-a-frame-to-a-graph.ipynb"
+    notebook = executing.execute(path, QUICK[path.stem] | {"RECORDING": str(folder)})
+    assert folder.name in html(notebook)[0]
+    assert html(notebook)[1].count("<svg") == 2
+
+
+def test_a_failing_cell_is_not_stored(tmp_path, executing, monkeypatch):
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("1 / 0")])
+    path = tmp_path / "failing.ipynb"
+    nbformat.write(notebook, path)
+    before = path.read_bytes()
+    monkeypatch.setattr(executing, "FOLDER", tmp_path)
+    with pytest.raises(executing.CellExecutionError, match="ZeroDivisionError"):
+        executing.main()
+    assert path.read_bytes() == before
