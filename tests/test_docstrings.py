@@ -89,6 +89,7 @@ INSIDE = (
     "stability",
     "surfels",
     "uniting",
+    "viewer",
 )
 """Parts nobody calls but caryatid itself."""
 TOLD_BY_THEIR_PROTOCOL = frozenset({"capture", "candidates", "move_to", "plan"})

@@ -204,6 +204,26 @@ def test_plain_lines_tell_one_from_another():
     assert repr(candidates) == "Candidates(0; refused: 3 too low)"
 
 
+def test_a_scene_opens_the_viewer_in_the_page(views):
+    pytest.importorskip("viser")
+    scene = ct.Scene()
+    scene.update(views[0])
+    handle = scene.show()
+    try:
+        assert handle.url.startswith("http://127.0.0.1:")
+        assert f'<iframe src="{handle.url}"' in handle._repr_html_()
+        scene.update(views[1])
+        handle.update(scene)
+    finally:
+        handle.close()
+
+
+def test_without_the_viewer_the_error_names_the_extra(scene, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ct.InputError, match=re.escape('pip install "caryatid[view]"')):
+        scene.show()
+
+
 def test_nothing_is_drawn_before_somebody_asks():
     code = (
         "import sys, numpy as np, caryatid as ct; box = ct.Box(np.eye(4), np.ones(3)); repr(box); ct.Scene;"

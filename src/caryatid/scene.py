@@ -34,6 +34,8 @@ from caryatid.voxels import VoxelMap
 if TYPE_CHECKING:
     import networkx as nx
 
+    from caryatid.viewer import Shown
+
 
 class Scene(Pictured):
     """The scene model of section III, updated view by view.
@@ -110,6 +112,19 @@ class Scene(Pictured):
             InputError: There is no such object, or it is the support surface.
         """
         return predict_removal(self.graph, object_id, self.config.support)
+
+    def show(self) -> Shown:
+        """Open the viewer on what is known: a page in the browser, which a notebook shows in place.
+
+        Returns:
+            A handle with the page's `url`; `update(scene)` adds what is known by then, `close()` ends it.
+
+        Raises:
+            InputError: viser is not installed, which comes with the extra `view`; or no port is free.
+        """
+        from caryatid.viewer import show
+
+        return show(self)
 
     def copy(self) -> Scene:
         """Return a scene that knows the same; what one of the two learns, the other does not.
