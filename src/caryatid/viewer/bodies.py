@@ -30,6 +30,7 @@ DASH = 0.016
 UNDER_TABLE = 0.07
 """How far below a contact an arrow begins whose supporter is the table [m]."""
 ROBOT = (120, 130, 142)
+"""Colour of the robot."""
 
 
 def draw_shapes(graph: SupportGraph, chosen: str = "") -> Drawing:

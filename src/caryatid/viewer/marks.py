@@ -115,7 +115,12 @@ class Frustum:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Label:
-    """A short text at a place (3,) [m]."""
+    """A short text at a place.
+
+    Attributes:
+        position_world: The place (3,) [m].
+        text: What it says.
+    """
 
     position_world: Array
     text: str

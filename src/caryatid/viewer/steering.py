@@ -77,6 +77,12 @@ class SteeredRobot(OwnViews):
 def planned_anew(state: PlanningState, planner: Planner, robot: Robot, seed: int) -> Decision:
     """Choose with another planner from the same state, as the loop would have.
 
+    Args:
+        state: What the planner is given.
+        planner: The other planner.
+        robot: May refuse a view.
+        seed: Seed of its random choices.
+
     Raises:
         PlanningError: The robot can take none of the views.
     """

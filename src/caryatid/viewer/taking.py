@@ -51,6 +51,13 @@ def lifts_in_physics(
 ) -> Iterator[Picture]:
     """Take a scene apart in physics; the extracted shapes move as the bodies they stand for do.
 
+    Args:
+        scene: The scene in physics.
+        graph: What was extracted of it.
+        truth: What it really is.
+        steps: The order.
+        config: How lifts go.
+
     Yields:
         Several pictures of each lift, the last one `done`.
     """

@@ -16,6 +16,7 @@ from caryatid.report.rows import ObjectRow, object_rows, support_rows
 from caryatid.viewer.moments import Moment
 
 NOTHING_CHOSEN = "Click an object in the scene to see what is known of it."
+"""What stands where an object's figures will."""
 
 
 def in_page(content: str) -> str:
