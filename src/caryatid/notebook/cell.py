@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
+
+from caryatid.report.style import drawing_rules
 
 if TYPE_CHECKING:
     import jinja2
@@ -96,8 +99,9 @@ def _template() -> jinja2.Template:
 
 @cache
 def _style() -> str:
-    """The style sheet without the spaces that only people need."""
-    return "".join(line.strip() for line in _read("cell.css").splitlines())
+    """The cell's style sheet and that of the report's drawings, which reaches no further than the cell."""
+    drawings = re.sub(r"(^|, )svg\b", r"\1.caryatid-cell svg", drawing_rules(), flags=re.MULTILINE)
+    return "".join(line.strip() for line in (_read("cell.css") + drawings).splitlines())
 
 
 def _read(name: str) -> str:
