@@ -17,7 +17,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ScoreRow:
-    """How the graph after a view compares with the truth: vertices and edges together [1]."""
+    """How the graph after a view compares with the truth: vertices and edges together.
+
+    Attributes:
+        f1: Of precision and recall [1].
+        precision: Share of what was found that is true [1].
+        recall: Share of what is true that was found [1].
+    """
 
     f1: float
     precision: float

@@ -143,7 +143,7 @@ def tinted(image: NDArray[np.uint8], labels: NDArray[np.int32], width: float) ->
     """An image (H, W, 3) whose parts have their objects' colours, lit as they are in the image.
 
     Args:
-        image: The image.
+        image: The image (H, W, 3).
         labels: Object number of each pixel (H, W), 0 = nothing.
         width: Of what is shown of it [px]; stripes keep their size in what is shown.
     """

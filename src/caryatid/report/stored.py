@@ -14,6 +14,7 @@ from caryatid.report.contents import Report
 
 FORMAT: Final = "caryatid/report"
 VERSION: Final = 1
+"""What a stored report says it is."""
 
 
 def store_report(report: Report) -> str:
