@@ -110,13 +110,16 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     )
 
 
-def read_graph(path: Path) -> SupportGraph:
+def read_graph(path: str | Path) -> SupportGraph:
     """Read a graph.json.
+
+    Args:
+        path: The file.
 
     Raises:
         InputError: The file is missing, broken or no graph; see `graph_from_json`.
     """
-    return graph_from_json(read_json(path), path)
+    return graph_from_json(read_json(Path(path)), Path(path))
 
 
 def _object_to_json(o: SceneObject) -> dict[str, Any]:
