@@ -69,6 +69,7 @@ def benchmark_folder(workplace, views):
 
 def test_commands_run(workplace, benchmark_folder, capsys, monkeypatch):
     monkeypatch.setattr("caryatid.commands.benchmarking.run_all", lambda *arguments: None)
+    monkeypatch.setattr("caryatid.commands.benchmarking.ClusterExecutor.check", lambda executor: None)
     lines = [line for page in PAGES for block in blocks(page, "sh") for line in block.splitlines()]
     commands = [shlex.split(line)[1:] for line in lines if line.startswith("caryatid ")]
     named = {

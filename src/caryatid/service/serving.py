@@ -14,6 +14,7 @@ from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
 from caryatid.formats.staging import said_clearly
+from caryatid.interrupts import interruptible
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.service.app import make_app
 from caryatid.service.desk import Desk
@@ -46,6 +47,7 @@ def check_token(host: str, token: str | None) -> None:
         )
 
 
+@interruptible()
 def run_service(
     folder: Path,
     config: Config,
