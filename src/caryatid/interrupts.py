@@ -79,19 +79,11 @@ def made_in_time(make: Callable[[], T]) -> T | None:
 
     Returns:
         What was made, or None where it was left out.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C was heard before, and again.
     """
-    before = interrupted()
     try:
-        with _alarmed(_heard[0] + TIME_TO_MAKE if before else None):
+        with _alarmed(_heard[0] + TIME_TO_MAKE if interrupted() else None):
             return make()
-    except _AlarmError:
-        return None
-    except KeyboardInterrupt:
-        if before:
-            raise
+    except (_AlarmError, KeyboardInterrupt):
         return None
 
 
