@@ -2,17 +2,22 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test chromium check notebooks accuracy-gate bench bench-gate docs pictures gif format clean
+.PHONY: install demo test chromium check notebooks package accuracy-gate bench bench-gate docs pictures gif format clean
 
 install: $(VENV)/.installed
 
-$(VENV)/.installed: pyproject.toml constraints.txt
+# What users need; tests and tools, which take longer to install, come with the other targets.
+$(VENV)/.usable: pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[view]"
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.usable
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
 	touch $@
 
-demo: install
+demo: $(VENV)/.usable
 	$(BIN)/caryatid demo --out demo-run
 
 test: install
@@ -33,6 +38,10 @@ check: install
 
 notebooks: install
 	$(BIN)/python docs/notebooks/execute.py
+
+package: install
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt build twine
+	$(BIN)/python tools/package.py
 
 accuracy-gate: install
 	$(BIN)/python benchmarks/accuracy.py suite --gate

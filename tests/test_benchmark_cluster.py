@@ -179,7 +179,7 @@ def test_an_address_where_nobody_answers_says_what_to_do():
 
 def test_without_dask_the_remedy_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"needs dask\.distributed; pip install 'caryatid\[cluster\]'"):
+    with pytest.raises(InputError, match=r'needs dask\.distributed; pip install "caryatid\[cluster\]"'):
         list(ClusterExecutor("tcp://127.0.0.1:1").run([Episode("tower")]))
 
 

@@ -89,6 +89,6 @@ def test_same_records_same_bytes(records, tmp_path):
 
 def test_without_pyarrow_it_says_what_to_install(records, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(InputError, match=r"pip install 'caryatid\[benchmark\]'"):
+    with pytest.raises(InputError, match=r'pip install "caryatid\[benchmark\]"'):
         write_parquet(records, tmp_path / "rows.parquet")
     assert not (tmp_path / "rows.parquet").exists()

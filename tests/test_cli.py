@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import re
 import subprocess
 import sys
@@ -27,7 +26,6 @@ from caryatid.simulation.truth import ground_truth
 from caryatid.views import SUPPORT_LABEL
 
 ESCAPE = "\x1b"
-COLOUR = r"\x1b\[(?:\d+;)*3\d"
 
 
 def explored(source, out, *options):
@@ -376,20 +374,6 @@ def test_progress_names_new_objects_and_what_holds_them(tmp_path, scene_file, ca
     assert not any(ESCAPE in line for line in lines)
 
 
-@pytest.mark.parametrize(
-    "command", ["", "demo", "explore", "extract", "evaluate", "order", "dismantle", "config"]
-)
-def test_help_is_clean(command, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "100")
-    assert run_command(*command.split(), "--help") == 0
-    text = capsys.readouterr().out
-    assert "None" not in text
-    assert "default: False" not in text
-    assert "default: True" not in text
-    assert not re.search(r"default: .*default: [^│]*\)\s*│", text)
-    assert not re.search(r"\b(STR|INT|PATH)\b", text)
-
-
 def test_options_that_do_not_exist_are_usage_errors(tmp_path, capsys, scene_file, leftovers):
     for wrong in (
         ["--planner", "clever"],
@@ -433,11 +417,15 @@ def test_an_interrupt_keeps_a_whole_run_of_the_views_done(tmp_path, scene_file, 
         return work(self, *arguments)
 
     monkeypatch.setattr(owner, name, interrupted)
-    run = explored(scene_file, tmp_path / "run", "--no-early-stop")
+    words = ["explore", scene_file, "--out", tmp_path / "run", "--no-early-stop", *SMALL]
+    assert run_command(*words) == 130
+    run = read_run(tmp_path / "run")
+    assert run.record["interrupted"] is True
     assert len(run.views) == len(run.record["steps"]) == len(run.record["scores"]) == 1
     assert (tmp_path / "run/graph.json").read_bytes() == (tmp_path / "run/views/00/graph.json").read_bytes()
     assert (tmp_path / "run/report.html").is_file()
-    assert "interrupted: keeping the views done so far" in capsys.readouterr().err
+    told = capsys.readouterr().err.splitlines()[-1]
+    assert told == f"interrupted: 1 view is kept in {tmp_path / 'run'}, open its report.html"
 
 
 def test_an_interrupt_before_the_first_view_leaves_nothing(tmp_path, scene_file, monkeypatch, leftovers):
@@ -485,32 +473,3 @@ def test_the_command_runs_from_a_shell_without_escape_codes(tmp_path, scene_file
     assert said.stderr.count("\n") == 1
     assert "Traceback" not in said.stderr
     assert ESCAPE not in said.stdout + said.stderr
-
-
-def on_a_terminal(*arguments, **environment):
-    """What a command writes to stderr where that is a terminal."""
-    ours, theirs = pty.openpty()
-    with open(ours, "rb", buffering=0) as terminal:
-        subprocess.run(
-            [sys.executable, "-m", "caryatid", *map(str, arguments)],
-            stdout=subprocess.DEVNULL,
-            stderr=theirs,
-            timeout=60,
-            env=os.environ | {"TERM": "xterm"} | environment,
-            check=False,
-        )
-        os.write(theirs, b"\0")
-        os.close(theirs)
-        said = b""
-        while not said.endswith(b"\0"):
-            said += terminal.read(4096)
-    return said.decode()
-
-
-def test_no_color_is_respected_on_a_terminal(tmp_path):
-    coloured, plain = (
-        on_a_terminal("explore", "nowhere", "--out", tmp_path / "run", NO_COLOR=no) for no in ("", "1")
-    )
-    assert re.search(COLOUR, coloured)
-    assert not re.search(COLOUR, plain)
-    assert "error: nowhere" in plain

@@ -116,6 +116,7 @@ def workplace(prepared, tmp_path, monkeypatch):
     place = shutil.copytree(prepared, tmp_path / "here")
     monkeypatch.chdir(place)
     monkeypatch.setattr("caryatid.commands.benchmarking.run_all", lambda *arguments: None)
+    monkeypatch.setattr("caryatid.commands.benchmarking.ClusterExecutor.check", lambda executor: None)
     return place
 
 

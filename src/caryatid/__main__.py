@@ -1,7 +1,5 @@
 """`python -m caryatid`."""
 
-import sys
+from caryatid.cli import run_from_shell
 
-from caryatid.cli import main
-
-sys.exit(main())
+run_from_shell()

@@ -43,6 +43,14 @@ class ClusterExecutor:
         self._tell = tell
         self._patience = patience
 
+    def check(self) -> None:
+        """See whether the scheduler answers.
+
+        Raises:
+            InputError: dask.distributed is not installed, or no scheduler answers.
+        """
+        self._connected().close()
+
     def run(self, episodes: Sequence[Episode]) -> Generator[tuple[Episode, Outcome]]:
         """Yield each episode with its outcome as soon as it is done.
 
@@ -102,7 +110,7 @@ class ClusterExecutor:
             from distributed.comm import connect
         except ImportError:
             raise InputError(
-                "--scheduler", "needs dask.distributed", "pip install 'caryatid[cluster]'"
+                "--scheduler", "needs dask.distributed", 'pip install "caryatid[cluster]"'
             ) from None
 
         logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # what it says is said here
@@ -116,7 +124,7 @@ class ClusterExecutor:
             with ThreadPoolExecutor(1) as thread:
                 thread.submit(asyncio.run, greet()).result()
             return Client(self._address, timeout=self._patience, set_as_default=False)
-        except (OSError, ImportError, ValueError, TypeError, RuntimeError) as error:
+        except (OSError, ImportError, ValueError, TypeError, RuntimeError, MemoryError) as error:
             raise InputError(
                 f"--scheduler {self._address}",
                 f"no scheduler answers ({' '.join(str(error).split()) or 'it is silent'})",

@@ -54,7 +54,7 @@ def write_parquet(records: Sequence[Record], path: Path) -> None:
         import pyarrow
         from pyarrow import parquet
     except ImportError as error:
-        remedy = "pip install 'caryatid[benchmark]'"
+        remedy = 'pip install "caryatid[benchmark]"'
         raise InputError(path, "writing Parquet needs pyarrow", remedy) from error
     kinds = {str: pyarrow.string(), int: pyarrow.int64(), float: pyarrow.float64()}
     schema = pyarrow.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,10 +62,7 @@ def report_all(results: Sequence[Result], reference: str | None = None) -> list[
     Raises:
         InputError: No suite has such a method.
     """
-    there = {record.member.method: None for result in results for record in result.records}
-    if reference is not None and reference not in there:
-        names = ", ".join(there) or "none yet"
-        raise InputError(f"--reference {reference}", "there is no such method", f"choose one of {names}")
+    check_reference(reference, {r.member.method: None for result in results for r in result.records})
     reports = []
     for result in results:
         if not result.records:
@@ -79,6 +76,21 @@ def report_all(results: Sequence[Result], reference: str | None = None) -> list[
         what = "" if known is None else known.what
         reports.append(report_suite(result.name, what, summary, result.planned))
     return reports
+
+
+def check_reference(reference: str | None, methods: Collection[str]) -> None:
+    """Refuse to compare with a method that is not there.
+
+    Args:
+        reference: The method, or None for the suite's own.
+        methods: Those there are.
+
+    Raises:
+        InputError: It is none of them.
+    """
+    if reference is not None and reference not in methods:
+        names = ", ".join(methods) or "none yet"
+        raise InputError(f"--reference {reference}", "there is no such method", f"choose one of {names}")
 
 
 def write_tables(results: Sequence[Result], folder: Path) -> list[str]:

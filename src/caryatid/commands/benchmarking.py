@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -19,34 +20,45 @@ from caryatid.benchmark.scenes import find_scenes, short_name
 from caryatid.benchmark.sections import SuiteReport
 from caryatid.benchmark.store import ResultStore
 from caryatid.benchmark.suites import Suite, find_suite
-from caryatid.benchmark.telling import read_results, report_all, write_docs, write_page, write_tables
+from caryatid.benchmark.telling import (
+    check_reference,
+    read_results,
+    report_all,
+    write_docs,
+    write_page,
+    write_tables,
+)
 from caryatid.benchmark.variants import with_conditions, with_fusions, with_planners, with_settings
 from caryatid.commands.benchmark import CORES, Benchmark
+from caryatid.commands.consoles import news_console
 from caryatid.commands.episode_bar import EpisodeBar
 from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
+from caryatid.interrupts import Interrupted, interruptible
 from caryatid.kernels.compiling import compile_kernels
 
 RESULTS = "results.sqlite"
 """Name of the result store in the folder."""
 
 
+@interruptible()
 def run_benchmark(options: Benchmark) -> int:
-    """Run the episodes that are missing and write the figures."""
-    console = Console(
-        stderr=True, quiet=options.general.quiet or options.general.json, highlight=False, soft_wrap=True
-    )
+    """Run the episodes that are missing and write the figures; Ctrl-C ends it, and what is done is kept."""
+    console = news_console(options.general.quiet or options.general.json)
     suite = None if options.suite is None else _suite(options, options.suite)
+    executor = _executor(options, lambda text: console.print(text, markup=False))
     code = None if suite is None else fingerprint()
-    with ResultStore(options.out / RESULTS, code, collect_provenance().as_strings()) as store:
+    path = options.out / RESULTS
+    if suite is not None:
+        _check(options, suite, path, executor)
+    with ResultStore(path, code, collect_provenance().as_strings()) as store:
         try:
             if suite is not None:
                 with store.alone():
-                    _run(options, suite, store, console)
+                    _run(options, suite, store, console, executor)
             return _tell(options, store, console)
         except KeyboardInterrupt:
-            console.print("interrupted: what is done is kept, start again to go on")
-            return 130
+            raise Interrupted("what is done is kept, start again to go on") from None
 
 
 def _suite(options: Benchmark, name: str) -> Suite:
@@ -65,7 +77,22 @@ def _suite(options: Benchmark, name: str) -> Suite:
     return replace(suite, seeds=options.seeds or suite.seeds, views=options.views or suite.views)
 
 
-def _run(options: Benchmark, suite: Suite, store: ResultStore, console: Console) -> None:
+def _check(options: Benchmark, suite: Suite, path: Path, executor: Executor) -> None:
+    """Refuse before anything is written or run what would come to nothing.
+
+    Raises:
+        InputError: There is no such method to compare with, or nobody to run episodes.
+    """
+    methods = {member.method: None for member in suite.members()}
+    if path.is_file():
+        with ResultStore(path) as store:
+            methods |= {r.member.method: None for result in read_results(store) for r in result.records}
+    elif isinstance(executor, ClusterExecutor):
+        executor.check()
+    check_reference(options.reference, methods)
+
+
+def _run(options: Benchmark, suite: Suite, store: ResultStore, console: Console, executor: Executor) -> None:
     """Run what is not done, with a bar."""
     if options.retry:
         store.forget_failures()
@@ -81,15 +108,15 @@ def _run(options: Benchmark, suite: Suite, store: ResultStore, console: Console)
                 name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
                 bar.say(f"failed: {name}: {outcome.error}")
 
-        run_all(store, missing, _executor(options, bar), done)
+        run_all(store, missing, executor, done)
 
 
-def _executor(options: Benchmark, bar: EpisodeBar) -> Executor:
+def _executor(options: Benchmark, say: Callable[[str], None]) -> Executor:
     if options.scheduler is None:
         return LocalExecutor(options.jobs or CORES)
     if options.jobs is not None:
         raise InputError("--jobs", "a cluster has the workers it has", "leave --jobs or --scheduler out")
-    return ClusterExecutor(options.scheduler, bar.say)
+    return ClusterExecutor(options.scheduler, say)
 
 
 def _tell(options: Benchmark, store: ResultStore, console: Console) -> int:

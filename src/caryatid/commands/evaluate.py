@@ -28,10 +28,10 @@ class Evaluate:
 
     def __call__(self) -> int:
         """Run the command."""
-        from rich.console import Console
         from rich.table import Table
         from rich.text import Text
 
+        from caryatid.commands.consoles import result_console
         from caryatid.evaluation.truths import evaluate_run
         from caryatid.formats.json_files import json_text
 
@@ -46,5 +46,5 @@ class Evaluate:
             s = view.score
             figures = (s.precision, s.recall, s.f1, s.edge_precision, s.edge_recall, s.mean_iou)
             table.add_row(f"{view.view:02d}", *(f"{f:.3f}" for f in figures))
-        Console().print(table)
+        result_console().print(table)
         return 0

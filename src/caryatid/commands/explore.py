@@ -8,7 +8,16 @@ from typing import Annotated
 import tyro
 
 from caryatid.commands.names import PlannerName, RobotName
-from caryatid.commands.options import SAID, ModellingCommand, OutPath, Profile, Views, defaults_to, with_views
+from caryatid.commands.options import (
+    SAID,
+    ModellingCommand,
+    OutPath,
+    Profile,
+    Views,
+    defaults_to,
+    one_of,
+    with_views,
+)
 from caryatid.config import NoiseModel, SegmentationMethod
 
 
@@ -40,7 +49,7 @@ class Explore(ModellingCommand):
     """Who carries the simulated camera: arm:FILE.npz is an arm with a map of what it reaches, module:callable
     one of your own."""
     segmentation: Annotated[
-        SegmentationMethod | None, tyro.conf.DisallowNone, defaults_to("labels where the source has them")
+        SegmentationMethod | None, one_of(SegmentationMethod), defaults_to("labels where the source has them")
     ] = None
     """Where parts come from: the masks that are given, or automatic."""
     noise: NoiseModel = "none"

@@ -13,7 +13,7 @@ from caryatid.commands.dismantle import Dismantle
 from caryatid.commands.explore import Explore
 from caryatid.commands.profile import print_profile, profile_record
 from caryatid.commands.progress import Progress, summary
-from caryatid.commands.records import run_record, step_record, view_record
+from caryatid.commands.records import kept, run_record, step_record, view_record
 from caryatid.commands.sources import Source, open_source
 from caryatid.config import Config
 from caryatid.evaluation.oracle import planner_for
@@ -22,6 +22,7 @@ from caryatid.exploration import Step, explore
 from caryatid.formats.graph_json import graph_to_json
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
+from caryatid.interrupts import Interrupted, interrupted, interruptible, interrupts_held, made_in_time
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.report import Figure, ViewPage, compose_report, draw_view, render_html, store_report
 
@@ -42,6 +43,8 @@ class Exploration:
         pages: The views as the report shows them.
         steps: What run.json says of them.
         scores: Score after each view, where the truth is known.
+        interrupted: Ctrl-C ended it.
+        reported: It has a report.
     """
 
     source: Source
@@ -49,6 +52,8 @@ class Exploration:
     pages: list[ViewPage] = field(default_factory=list)
     steps: list[dict[str, Any]] = field(default_factory=list)
     scores: list[Score] = field(default_factory=list)
+    interrupted: bool = False
+    reported: bool = False
 
     @property
     def end(self) -> Step:
@@ -58,6 +63,7 @@ class Exploration:
         return self.last
 
 
+@interruptible()
 def run_exploration(options: Explore, config: Config) -> int:
     """Explore and write the run folder; Ctrl-C ends it with the views done so far."""
     progress = Progress(options.general.quiet or options.general.json)
@@ -70,6 +76,8 @@ def _explore_into(options: Explore, config: Config, progress: Progress, watcher:
     with RunWriter(options.out) as writer:
         done = look_around(options, config, progress, writer, report=not options.no_report, watcher=watcher)
         finish_run("explore", options, config, done, writer, report=not options.no_report)
+    if done.interrupted:
+        raise Interrupted(kept(len(done.steps), options.out, reported=done.reported))
     if options.general.json:
         document = {"run": str(options.out), "graph": graph_to_json(done.end.graph)}
         sys.stdout.write(json_text(document | (profile_record(done.steps) if options.profile else {})))
@@ -141,24 +149,25 @@ def look_around(
             if watcher is not None:
                 watcher.show(step, source, scored[-1].f1 if scored else None)
             page = [draw_view(step, config.report)] if report else []
-            if writer is not None:
-                writer.add_view(
-                    step.graph,
-                    step.labels,
-                    name=step.view.name,
-                    T_world_camera=step.view.T_world_camera,
-                    K=step.view.K,
-                    record=view_record(step),
-                )
-            before, done.last = done.last, step
-            done.steps.append(step_record(step))
-            done.pages += page
-            done.scores += scored
+            with interrupts_held():
+                if writer is not None:
+                    writer.add_view(
+                        step.graph,
+                        step.labels,
+                        name=step.view.name,
+                        T_world_camera=step.view.T_world_camera,
+                        K=step.view.K,
+                        record=view_record(step),
+                    )
+                before, done.last = done.last, step
+                done.steps.append(step_record(step))
+                done.pages += page
+                done.scores += scored
             progress.step(step, None if before is None else before.graph, done.scores)
     except KeyboardInterrupt:
         if done.last is None:
             raise
-        progress.say("interrupted: keeping the views done so far")
+        done.interrupted = True
     return done
 
 
@@ -196,16 +205,28 @@ def finish_run(
     html = stored = None
     if report:
         settings = {"source": options.source, "seed": seed} | told
-        said = compose_report(
-            done.pages,
-            title=f"caryatid: {done.source.name}",
-            settings=settings | {"fusion": config.fusion.method, "views": config.active.max_views},
-            scores=done.scores or None,
-            strip=strip,
-        )
-        html, stored = render_html(said), store_report(said)
+
+        def make() -> tuple[str, str]:
+            said = compose_report(
+                done.pages,
+                title=f"caryatid: {done.source.name}",
+                settings=settings | {"fusion": config.fusion.method, "views": config.active.max_views},
+                scores=done.scores or None,
+                strip=strip,
+            )
+            return render_html(said), store_report(said)
+
+        html, stored = made_in_time(make) or (None, None)
+    done.reported = html is not None
+    done.interrupted |= interrupted()
     record = run_record(command, options.source, seed, told, config, done.steps, done.scores)
-    writer.finish(done.end.graph, record | (more or {}), html, stored)
+    if done.interrupted:
+        record["interrupted"] = True
+    try:
+        with interrupts_held():
+            writer.finish(done.end.graph, record | (more or {}), html, stored)
+    except KeyboardInterrupt:
+        done.interrupted = True
 
 
 def _scored(step: Step, source: Source) -> list[Score]:

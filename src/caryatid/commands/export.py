@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from caryatid.commands.options import General, Settings, defaults_to
+from caryatid.commands.options import General, Settings, defaults_to, one_of
 from caryatid.config.choices import ExportFormat
 
 
@@ -26,9 +26,7 @@ class Export:
     """Run folder, as explore and extract write it, or a graph.json."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces one already there."""
-    format: Annotated[
-        ExportFormat | None, tyro.conf.DisallowNone, defaults_to("as FILE ends", metavar=None)
-    ] = None
+    format: Annotated[ExportFormat | None, one_of(ExportFormat), defaults_to("as FILE ends")] = None
     """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
     settings: tyro.conf.OmitArgPrefixes[Settings] = field(default_factory=Settings)
     general: tyro.conf.OmitArgPrefixes[General] = field(default_factory=General)
@@ -41,10 +39,12 @@ class Export:
         from caryatid.formats.graph_json import read_graph
         from caryatid.formats.json_files import json_text
         from caryatid.formats.runs import read_run
+        from caryatid.interrupts import interruptible
 
         format_ = self.format or format_of(self.out)
         graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
-        export_graph(graph, self.out, format_, config.export)
+        with interruptible():
+            export_graph(graph, self.out, format_, config.export)
         if self.general.json:
             sys.stdout.write(json_text({"file": str(self.out), "format": format_}))
         progress = Progress(self.general.quiet or self.general.json)

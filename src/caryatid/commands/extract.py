@@ -7,7 +7,15 @@ from typing import Annotated
 
 import tyro
 
-from caryatid.commands.options import SAID, ModellingCommand, OutPath, Profile, defaults_to, whole_number
+from caryatid.commands.options import (
+    SAID,
+    ModellingCommand,
+    OutPath,
+    Profile,
+    defaults_to,
+    one_of,
+    whole_number,
+)
 from caryatid.config import SegmentationMethod
 
 
@@ -25,7 +33,7 @@ class Extract(ModellingCommand):
     out: OutPath
     """Run folder to write; a run already there is replaced."""
     segmentation: Annotated[
-        SegmentationMethod | None, tyro.conf.DisallowNone, defaults_to("labels where the source has them")
+        SegmentationMethod | None, one_of(SegmentationMethod), defaults_to("labels where the source has them")
     ] = None
     """Where parts come from: the masks or labels that are given, or automatic."""
     label_divisor: Annotated[int, whole_number(1)] = 1

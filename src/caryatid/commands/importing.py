@@ -10,10 +10,12 @@ from caryatid.commands.import_recording import Import
 from caryatid.commands.progress import Progress
 from caryatid.config import Config
 from caryatid.formats.json_files import json_text
+from caryatid.interrupts import interruptible
 from caryatid.recordings.bag_footage import Topics
 from caryatid.recordings.importing import Imported, import_recording, reasons
 
 
+@interruptible()
 def run_import(options: Import, config: Config) -> int:
     """Import the recording and say what came of it."""
     if options.views is not None:

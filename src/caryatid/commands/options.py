@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_args
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
@@ -22,6 +22,23 @@ SAID = tyro.conf.arg(help_behavior_hint="")
 def defaults_to(value: object, metavar: str | None = None) -> object:
     """An option that is None where it is not given; the help names what counts then."""
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {value})")
+
+
+def one_of(choice: Any) -> PrimitiveConstructorSpec[str | None]:
+    """One of few words, or None where none is given; anything else is a usage error that lists them.
+
+    Args:
+        choice: A Literal of the words.
+    """
+    words: tuple[str, ...] = get_args(choice)
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="{" + ",".join(words) + "}",
+        instance_from_str=lambda given: given[0],
+        is_instance=lambda value: value is None or value in words,
+        str_from_instance=lambda value: [str(value)],
+        choices=words,
+    )
 
 
 def whole_number(least: int) -> PrimitiveConstructorSpec[int | None]:
@@ -84,7 +101,7 @@ class Settings:
 class Modelling(Settings):
     """How views become a scene model."""
 
-    fusion: Annotated[FusionMethod | None, tyro.conf.DisallowNone, defaults_to(DEFAULTS.fusion.method)] = None
+    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), defaults_to(DEFAULTS.fusion.method)] = None
     """What is fused over views: points, graphs, or both."""
     seed: Seed = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""

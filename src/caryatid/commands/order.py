@@ -37,6 +37,7 @@ class Order(ModellingCommand):
         from caryatid.commands.taking import print_order
         from caryatid.formats.json_files import json_text
         from caryatid.formats.runs import read_run
+        from caryatid.interrupts import interruptible
         from caryatid.manipulation.order import plan_order
         from caryatid.manipulation.telling import order_record
         from caryatid.threads import cores
@@ -44,12 +45,12 @@ class Order(ModellingCommand):
         progress = Progress(self.general.quiet or self.general.json)
         config = self.modelling.settings()
         graph = read_run(self.run).graph
-        with progress.working("rehearsing"):
+        with interruptible(), progress.working("rehearsing"):
             order = plan_order(
                 graph, config, goal=self.goal, hands=self.hands, seed=self.modelling.seed, threads=cores()
             )
         if self.general.json:
             sys.stdout.write(json_text(order_record(order)))
         else:
-            print_order(order, f"{self.run}")
+            print_order(order, f"{self.run}", self.goal)
         return 0

@@ -7,9 +7,9 @@ from dataclasses import asdict
 from typing import Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
+from caryatid.commands.consoles import result_console
 from caryatid.stopwatch import StageTime, by_stage
 
 WAITING = ("capture",)
@@ -45,7 +45,7 @@ def print_profile(steps: Sequence[Mapping[str, Any]]) -> None:
         laps = _laps(step)
         times = [laps.get(s.stage) for s in stages]
         views.add_row(f"{step['view']:02d}", *map(_milliseconds, [*times, _turn(laps)]))
-    console = Console()
+    console = result_console()
     console.print(table)
     console.print(views)
 

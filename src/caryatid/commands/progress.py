@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 
-from rich.console import Console
-
+from caryatid.commands.consoles import news_console
 from caryatid.evaluation.scores import Score
 from caryatid.exploration import Step
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph
@@ -21,12 +19,12 @@ class Progress:
     """
 
     def __init__(self, quiet: bool) -> None:
-        self._console = Console(stderr=True, quiet=quiet, highlight=False, emoji=False, soft_wrap=True)
+        self._console = news_console(quiet)
 
     @contextmanager
     def working(self, what: str) -> Iterator[None]:
         """Show a spinner while something takes its time, on a terminal."""
-        with self._console.status(what) if sys.stderr.isatty() else nullcontext():
+        with self._console.status(what) if self._console.is_interactive else nullcontext():
             yield
 
     def say(self, text: str) -> None:

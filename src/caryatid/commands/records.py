@@ -6,6 +6,7 @@ import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -96,3 +97,9 @@ def view_record(step: Step) -> dict[str, Any]:
             quartiles = np.quantile(d.candidate_saliency, (0.0, 0.25, 0.5, 0.75, 1.0))
             record["next"]["candidate_saliency_quartiles"] = quartiles
     return record
+
+
+def kept(views: int, folder: Path, *, reported: bool) -> str:
+    """What is kept of an interrupted run, and where."""
+    count = "1 view is" if views == 1 else f"{views} views are"
+    return f"{count} kept in {folder}, " + ("open its report.html" if reported else "without a report")

@@ -36,11 +36,11 @@ class Serve:
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """Folder of the sessions; made if missing."""
-    host: str = "127.0.0.1"
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen at."""
     port: Port = 8765
     """Port to listen at; 0 = any that is free."""
-    token: Annotated[str | None, tyro.conf.DisallowNone, SAID] = None
+    token: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="TOKEN"), SAID] = None
     """What requests have to bear; better given as CARYATID_TOKEN, where no process list shows it."""
     open_sessions: Count = 4
     """Sessions kept open; others are opened from disk when they are asked for, in a tenth of a second."""

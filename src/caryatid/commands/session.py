@@ -9,11 +9,11 @@ from typing import Annotated
 import tyro
 
 from caryatid.commands.names import PlannerName, RobotName
-from caryatid.commands.options import SAID, General, Modelling, defaults_to
+from caryatid.commands.options import SAID, General, Modelling, defaults_to, one_of
 from caryatid.config import SegmentationMethod
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-File = Annotated[Path | None, tyro.conf.DisallowNone, SAID]
+File = Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE"), SAID]
 GENERAL = General()
 MODELLING = Modelling()
 
@@ -31,7 +31,9 @@ class New:
     folder: Folder
     """Folder of the session; new or empty."""
     segmentation: Annotated[
-        SegmentationMethod | None, tyro.conf.DisallowNone, defaults_to("labels where the first view has them")
+        SegmentationMethod | None,
+        one_of(SegmentationMethod),
+        defaults_to("labels where the first view has them"),
     ] = None
     """Where parts come from: label images that are given, or automatic."""
     planner: PlannerName = "support"

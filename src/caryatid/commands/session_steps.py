@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from caryatid.commands.options import General
@@ -11,11 +13,23 @@ from caryatid.commands.session import Add, Graph, New, Next, Undo
 from caryatid.config import Config
 from caryatid.formats.graph_json import graph_text, graph_to_json
 from caryatid.formats.json_files import json_text, read_json
+from caryatid.interrupts import Interrupted, interruptible
 from caryatid.robots import located
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.next_view import candidates_from
 
 
+@contextmanager
+def _whole_views() -> Iterator[None]:
+    """Let Ctrl-C leave a session as it was, or as the command has made it."""
+    try:
+        with interruptible():
+            yield
+    except KeyboardInterrupt:
+        raise Interrupted("the session keeps every view that is in it") from None
+
+
+@interruptible()
 def begin_session(options: New, config: Config) -> int:
     """Begin a session."""
     seed = options.modelling.seed
@@ -27,6 +41,7 @@ def begin_session(options: New, config: Config) -> int:
     return 0
 
 
+@_whole_views()
 def add_view(options: Add) -> int:
     """Take in a view."""
     with Session.open(options.folder) as session:
@@ -40,6 +55,7 @@ def add_view(options: Add) -> int:
     return 0
 
 
+@interruptible()
 def tell_next(options: Next) -> int:
     """Say where to look next."""
     with Session.open(options.folder, read_only=True) as session:
@@ -50,6 +66,7 @@ def tell_next(options: Next) -> int:
     return 0
 
 
+@interruptible()
 def tell_graph(options: Graph) -> int:
     """Write the graph."""
     with Session.open(options.folder, read_only=True) as session:
@@ -57,6 +74,7 @@ def tell_graph(options: Graph) -> int:
     return 0
 
 
+@_whole_views()
 def undo_view(options: Undo) -> int:
     """Take the last view back."""
     with Session.open(options.folder) as session:

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from caryatid.commands.consoles import result_console
 from caryatid.manipulation.dismantling import Taken
 from caryatid.manipulation.order import Order
 from caryatid.manipulation.telling import succeeded
 
 
-def print_order(order: Order, title: str) -> None:
-    """Print an order as a table, and why it is not safe where it is not."""
-    table = _table(f"{title}: {'a safe order' if order.safe else 'no safe order'}", "take", "hold", "why")
+def print_order(order: Order, title: str, goal: str | None) -> None:
+    """Print an order as a table, and why it is not safe where it is not.
+
+    Args:
+        order: The order.
+        title: Of what.
+        goal: The object it is to get at, or None where everything goes.
+    """
+    what = "a safe order" if order.safe else "no safe order"
+    table = _table(f"{title}: {what}" + (f" to get at {goal}" if goal else ""), "take", "hold", "why")
     for number, step in enumerate(order.steps, start=1):
         mark = "" if step.safe else "! "
         table.add_row(str(number), step.object_id, ", ".join(step.hold), Text(mark + step.why))
-    console = Console()
+    console = result_console()
     console.print(table)
     if order.refusal:
         console.print(Text(order.refusal))
@@ -47,7 +54,7 @@ def print_dismantling(order: Order, taken: Sequence[Taken], left: Sequence[str],
             ", ".join(t.disturbed) or "–",
             Text(t.step.why),
         )
-    console = Console()
+    console = result_console()
     console.print(table)
     if order.refusal:
         console.print(Text(order.refusal))

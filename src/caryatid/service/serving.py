@@ -14,6 +14,7 @@ from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.formats.json_files import json_text
 from caryatid.formats.staging import said_clearly
+from caryatid.interrupts import interruptible
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.service.app import make_app
 from caryatid.service.desk import Desk
@@ -46,6 +47,7 @@ def check_token(host: str, token: str | None) -> None:
         )
 
 
+@interruptible()
 def run_service(
     folder: Path,
     config: Config,
@@ -97,14 +99,18 @@ def run_service(
     )
     shown = f"[{host}]" if ":" in host else host
     address = f"http://{shown}:{listener.getsockname()[1]}"
-    if json:
-        sys.stdout.write(json_text({"address": address, "folder": str(folder)}))
-        sys.stdout.flush()
-    elif not quiet:
-        _say(f"serving {folder} at {address}, its pages at {address}/docs; Ctrl-C stops")
-    # The server hands a signal on once it has stopped; stopping when told to is no failure.
-    before = {number: signal.signal(number, _ignore) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def stop(number: int, frame: object) -> None:
+        server.should_exit = True
+
+    # The server hears signals itself as soon as it runs, and hands them on once it has stopped.
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
+        if json:
+            sys.stdout.write(json_text({"address": address, "folder": str(folder)}))
+            sys.stdout.flush()
+        elif not quiet:
+            _say(f"serving {folder} at {address}, its pages at {address}/docs; Ctrl-C stops")
         server.run(sockets=[listener])
     finally:
         for number, handler in before.items():
@@ -126,7 +132,3 @@ def _listen(host: str, port: int) -> socket.socket:
 def _say(line: str) -> None:
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
-
-
-def _ignore(number: int, frame: object) -> None:
-    """Do nothing."""

@@ -1,0 +1,231 @@
+"""Ctrl-C at many moments: the command ends with 130, and what was done so far is a whole run."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from contextlib import suppress
+
+import pytest
+from conftest import SMALL, run_command
+
+from caryatid import interrupts
+from caryatid.formats import read_run
+from caryatid.interrupts import interrupted, interruptible, made_in_time
+
+
+@pytest.fixture
+def heard(monkeypatch):
+    """Ctrl-C pressed in this process, as often as asked for."""
+    monkeypatch.setattr(interrupts, "_heard", [])
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def press():
+        with suppress(KeyboardInterrupt), interruptible():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(60.0)
+
+    yield press
+    signal.signal(signal.SIGINT, before)
+
+
+# What there is time for
+
+
+def test_what_can_be_left_out_is_made_where_nobody_waits(heard):
+    assert made_in_time(lambda: "report") == "report"
+    assert not interrupted()
+
+
+def test_after_an_interrupt_it_is_made_while_there_is_time(heard, monkeypatch):
+    heard()
+    assert interrupted()
+    monkeypatch.setattr(interrupts, "TIME_TO_MAKE", 60.0)
+    assert made_in_time(lambda: "report") == "report"
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.05])
+def test_after_an_interrupt_it_is_left_out_when_time_is_up(heard, monkeypatch, seconds):
+    heard()
+    interrupts._heard[0] = time.monotonic()
+    monkeypatch.setattr(interrupts, "TIME_TO_MAKE", seconds)
+    assert made_in_time(lambda: time.sleep(60.0)) is None
+
+
+def test_an_interrupt_meanwhile_leaves_it_out(heard, monkeypatch):
+    def pressed():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(60.0)
+
+    monkeypatch.setattr(interrupts, "TIME_TO_MAKE", 60.0)
+    with interruptible():
+        assert made_in_time(pressed) is None
+        assert made_in_time(pressed) is None
+
+
+def test_an_interrupt_that_a_library_took_for_a_failure_is_one(heard, monkeypatch, capsys, tmp_path):
+    def failing(*_, **__):
+        with interruptible():
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(60.0)
+            except KeyboardInterrupt:
+                raise ImportError("initialization failed") from None
+
+    monkeypatch.setattr("caryatid.commands.options.read_settings", failing)
+    assert run_command("config") == 130
+    assert capsys.readouterr().err == "interrupted: nothing was written\n"
+
+
+# Processes
+
+
+class Command:
+    """A command in a process of its own, in which Ctrl-C is what it is in a shell."""
+
+    def __init__(self, *words):
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "caryatid", *map(str, words)],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )  # fmt: skip
+
+    def wait_for(self, text):
+        """Read what it says until some text comes."""
+        for line in self._process.stderr:
+            if text in line:
+                return
+        pytest.fail(f"it ended without saying {text!r}")
+
+    def interrupt(self):
+        """Press Ctrl-C; status, stdout and the last line of stderr."""
+        os.killpg(self._process.pid, signal.SIGINT)
+        out, err = self._process.communicate(timeout=60)
+        assert "Traceback" not in err
+        return self._process.returncode, out, (err.splitlines() or [""])[-1]
+
+
+def whole(folder, views):
+    """The run that was kept, with nothing half-written beside it."""
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    run = read_run(folder)
+    assert run.record["interrupted"] is True
+    assert views <= len(run.views) == len(run.record["steps"])
+    assert (folder / "graph.json").read_bytes() == (
+        folder / f"views/{len(run.views) - 1:02d}/graph.json"
+    ).read_bytes()
+    assert all(view.load_labels().any() for view in run.views)
+    return run
+
+
+@pytest.mark.parametrize("moment", ["view 00", "next view", "view 02"])
+def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
+    folder = tmp_path / "runs" / "run"
+    folder.parent.mkdir()
+    words = ["explore", scene_file, "--out", folder, "--views", 50, "--no-early-stop", *SMALL]
+    command = Command(*words)
+    command.wait_for(moment)
+    status, out, told = command.interrupt()
+    assert (status, out) == (130, "")
+    run = whole(folder, 3 if moment == "view 02" else 1)
+    count = "1 view is" if len(run.views) == 1 else f"{len(run.views)} views are"
+    report = "open its report.html" if (folder / "report.html").exists() else "without a report"
+    assert told == f"interrupted: {count} kept in {folder}, {report}"
+    assert len(run.record["scores"]) == len(run.views)
+
+
+def test_an_older_run_gives_way_to_what_was_kept(tmp_path, scene_file):
+    folder = tmp_path / "runs" / "run"
+    words = ["explore", scene_file, "--out", folder, "--no-early-stop", *SMALL]
+    assert run_command(*words, "--views", 1, "--quiet") == 0
+    command = Command(*words, "--views", 50)
+    command.wait_for("view 01")
+    assert command.interrupt()[0] == 130
+    whole(folder, 2)
+
+
+def test_an_extraction_keeps_its_views(tmp_path, recording):
+    frames = json.loads((recording / "scene_camera.json").read_text())
+    masks = json.loads((recording / "scene_gt.json").read_text())
+    for number in range(3, 40):
+        for kind in ("depth", "rgb"):
+            (first,) = (recording / kind).glob(f"{number % 3:06d}.*")
+            (recording / kind / f"{number:06d}{first.suffix}").hardlink_to(first)
+        for mask in (recording / "mask_visib").glob(f"{number % 3:06d}_*"):
+            mask.with_name(mask.name.replace(f"{number % 3:06d}_", f"{number:06d}_", 1)).hardlink_to(mask)
+        frames[str(number)], masks[str(number)] = frames[str(number % 3)], masks[str(number % 3)]
+    (recording / "scene_camera.json").write_text(json.dumps(frames))
+    (recording / "scene_gt.json").write_text(json.dumps(masks))
+    folder = tmp_path / "runs" / "run"
+    folder.parent.mkdir()
+    command = Command("extract", recording, "--out", folder)
+    command.wait_for("view 01")
+    assert command.interrupt()[:2] == (130, "")
+    assert len(whole(folder, 2).views) < 40
+
+
+@pytest.mark.parametrize("moment", ["view 01", "  done: ", "o"])
+def test_a_dismantling_keeps_its_views_and_lifts(tmp_path, moment):
+    folder = tmp_path / "runs" / "run"
+    folder.parent.mkdir()
+    command = Command("dismantle", "tower", "--out", folder, "--views", 2, "--no-early-stop", *SMALL)
+    command.wait_for("view 01")
+    if moment != "view 01":
+        command.wait_for("done: ")
+    if moment == "o":
+        command.wait_for("o")
+    status, out, told = command.interrupt()
+    assert (status, out) == (130, "")
+    assert "views are kept in" in told
+    record = whole(folder, 2).record["dismantling"]
+    assert len(record["steps"]) >= (moment == "o")
+    assert record["left"]
+
+
+def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):
+    assert run_command("explore", scene_file, "--out", tmp_path / "run", "--views", 1, *SMALL, "--quiet") == 0
+    before = sorted(tmp_path.rglob("*"))
+    command = Command("order", tmp_path / "run", "--set", "rehearsal.draws=5000")
+    with pytest.raises(subprocess.TimeoutExpired):
+        command._process.wait(3.0)
+    assert command.interrupt() == (130, "", "interrupted: nothing was written")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize("option", ["--json", "--port=0"])
+def test_a_service_stops_as_soon_as_it_has_said_where_it_is(tmp_path, option):
+    command = Command("serve", tmp_path / "s", "--port", 0, option)
+    said = "".join(iter(command._process.stdout.readline, "}\n")) + "}" if option == "--json" else ""
+    if said:
+        assert json.loads(said)["address"].startswith("http://127.0.0.1:")
+    else:
+        assert command._process.stdout.readline().startswith("serving ")
+    assert command.interrupt() == (0, "", "")
+
+
+def test_two_interrupts_end_it_too(tmp_path, scene_file):
+    words = ["explore", scene_file, "--out", tmp_path / "run", "--views", 50, "--no-early-stop", *SMALL]
+    command = Command(*words)
+    command.wait_for("view 01")
+    os.killpg(command._process.pid, signal.SIGINT)
+    assert command.interrupt()[0] == 130
+    assert [path.name for path in tmp_path.iterdir() if path.name != "run"] == []
+
+
+def test_a_command_in_the_background_goes_on(tmp_path, scene_file):
+    """A shell that starts it with & lets it ignore Ctrl-C, which is meant for another."""
+    words = ["explore", scene_file, "--out", tmp_path / "run", "--views", 2, "--no-early-stop", *SMALL]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "caryatid", *map(str, words)], stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )  # fmt: skip
+    assert process.stderr.readline().startswith("view 00")
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert len(read_run(tmp_path / "run").views) == 2

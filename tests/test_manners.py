@@ -1,0 +1,289 @@
+"""Manners all commands share: help with examples, one document with --json, no colour where nobody looks."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import pty
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from bag_files import write_tum
+from benchmark_records import make_suite
+from conftest import SMALL, run_command
+
+from caryatid import __version__, cli
+from caryatid.benchmark.store import ResultStore
+from caryatid.commands import session
+from caryatid.commands.benchmarking import RESULTS
+from caryatid.commands.reading import read_command
+from caryatid.formats.images import png
+
+ESCAPE = "\x1b"
+QUICK = ["--set", "rehearsal.draws=2"]
+STEPS = ("new", "add", "next", "graph", "undo")
+COMMANDS = [name for name in cli.commands() if name != "session"] + [f"session {step}" for step in STEPS]
+
+
+def documented(command):
+    """The docstring of a command."""
+    name, _, step = command.partition(" ")
+    return inspect.getdoc(getattr(session, step.capitalize()) if step else cli.commands()[name])
+
+
+def examples(command):
+    """What the help says one may try, without what the shell does with the result."""
+    _, _, block = documented(command).partition("To try:\n")
+    return [line.strip() for line in block.splitlines() if line.strip()]
+
+
+# Help
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_every_command_has_examples_that_are_commands(command, capsys):
+    tried = examples(command)
+    assert tried
+    for example in tried:
+        words = shlex.split(re.sub(r"\$\([^)]*\)|.*<\((.*)\)", r"\1", example), comments=True)
+        words = words[words.index("caryatid") + 1 :]
+        ends = [words.index(sign) for sign in (">", "|", "&&") if sign in words]
+        words = words[: min(ends, default=len(words))]
+        assert words[: len(command.split())] == command.split()
+        assert read_command(cli.commands(), words).general is not None
+    assert run_command(*command.split(), "--help") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert all(" ".join(example.split()) in shown for example in tried)
+
+
+def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "160")
+    assert run_command("--help") == 0
+    lines = capsys.readouterr().out.splitlines()
+    begin = lines.index("To begin:")
+    assert lines[begin + 1].split()[:2] == ["caryatid", "demo"]
+    for name, kind in cli.commands().items():
+        (line,) = (line for line in lines if f"• {name} " in line)
+        assert inspect.getdoc(kind).splitlines()[0][:60] in line
+    assert "To try:" not in lines
+
+
+@pytest.mark.parametrize("command", ["", "session", *COMMANDS])
+def test_help_is_clean(command, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run_command(*command.split(), "--help") == 0
+    text = capsys.readouterr().out
+    assert "None" not in text
+    assert "default: False" not in text
+    assert "default: True" not in text
+    assert not re.search(r"default: .*default: [^│]*\)\s*│", text)
+    assert not re.search(r"\b(STR|INT|PATH)\b", text)
+
+
+@pytest.mark.parametrize("words", ["explore", "extract", "session", "explore tower", "session add"])
+def test_a_usage_error_is_no_wall_of_text(words, capsys):
+    assert run_command(*words.split()) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert len(said.err.splitlines()) < 20
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("explore tower --out x --fusion k", "('pc', 'sg', 'pc+sg')"),
+        ("explore tower --out x --segmentation k", "('labels', 'auto')"),
+        ("extract x --out x --segmentation k", "('labels', 'auto')"),
+        ("session new x --segmentation k", "('labels', 'auto')"),
+        ("export x --out x --format k", "('mjcf', 'urdf', 'gltf', 'graphml', 'dot')"),
+        ("config --fusion k", "('pc', 'sg', 'pc+sg')"),
+    ],
+)
+def test_a_word_that_is_none_of_few_is_answered_with_those_there_are(words, said, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert run_command(*words.split()) == 2
+    assert f"Expected one of {said}" in capsys.readouterr().err
+
+
+def test_the_version_is_told(capsys):
+    assert run_command("--version") == 0
+    assert capsys.readouterr().out == f"caryatid {__version__}\n"
+
+
+# --json
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory, scene_file, views):
+    """A run, a recording to import, results of a benchmark and a session, to be read."""
+    folder = tmp_path_factory.mktemp("kept")
+    words = ["explore", scene_file, "--out", folder / "run", "--views", 1, *SMALL, "--quiet"]
+    assert run_command(*words) == 0
+    write_tum(folder / "tum", views)
+    camera = {"fx": views[0].K[0, 0], "fy": views[0].K[1, 1], "cx": views[0].K[0, 2], "cy": views[0].K[1, 2]}
+    (folder / "tum.json").write_text(json.dumps(camera))
+    suite = make_suite(["support", "random"], scenes=2, seeds=1, views=2)
+    with ResultStore(folder / "bench" / RESULTS, "code") as store:
+        store.plan("own", [record.member for record in suite])
+        for record in suite:
+            store.add(record.member.episode, record.outcome)
+    (folder / "depth.png").write_bytes(png(np.round(1e4 * views[0].depth).astype(np.uint16)))
+    (folder / "labels.png").write_bytes(png(views[0].labels.astype(np.uint8)))
+    camera = {"K": views[0].K.tolist(), "T_world_camera": views[0].pose.tolist(), "depth_scale": 0.1}
+    (folder / "camera.json").write_text(json.dumps(camera))
+    add = ["--depth", folder / "depth.png", "--labels", folder / "labels.png", "--camera"]
+    assert run_command("session", "new", folder / "session", "--quiet") == 0
+    assert run_command("session", "add", folder / "session", *add, folder / "camera.json", "--quiet") == 0
+    return folder
+
+
+WORDS = {
+    "demo": "--scene tower --views 1 --out {out} {small}",
+    "explore": "{scene} --views 1 --out {out} {small}",
+    "extract": "{recording} --out {out}",
+    "evaluate": "{run} {scenes}",
+    "order": "{run} {quick}",
+    "dismantle": "{scene} --views 1 --out {out} {small} {quick}",
+    "import": "{kept}/tum --camera {kept}/tum.json --out {out}",
+    "report": "{run}",
+    "export": "{run} --out {out}.xml",
+    "benchmark": "--out {bench}",
+    "session new": "{out}",
+    "session add": "{session} --depth {kept}/depth.png {labels} --camera {kept}/camera.json",
+    "session next": "{session}",
+    "session graph": "{session}",
+    "session undo": "{session}",
+    "config": "",
+    "completion": "bash",
+}
+"""Of each command words that make it work; `serve` and `view` go on until they are stopped."""
+
+KEYS = {
+    "demo": {"run", "graph"},
+    "explore": {"run", "graph"},
+    "extract": {"run", "graph"},
+    "evaluate": {"views"},
+    "order": {"steps", "safe", "refusal"},
+    "dismantle": {"success", "steps", "left"},
+    "import": {"recording", "views", "frames"},
+    "export": {"file", "format"},
+    "benchmark": {"results", "suites"},
+    "session new": {"session", "views"},
+    "session add": {"view", "changed", "graph"},
+    "session next": {"T_world_camera", "why"},
+    "session graph": {"objects", "supports"},
+    "session undo": {"views", "graph"},
+    "config": {"fit", "fusion"},
+    "completion": {"shell", "script"},
+}
+"""What the documents hold, among other things."""
+
+
+def test_all_commands_are_asked_for_a_document():
+    assert set(COMMANDS) - {"serve", "view"} <= set(WORDS)
+
+
+@pytest.fixture
+def words(tmp_path, kept, scene_file, recording):
+    """The words that make a command work, in a folder of its own."""
+
+    def spelled(command):
+        for name in ("session", "bench"):
+            shutil.copytree(kept / name, tmp_path / name)
+        places = {
+            "out": tmp_path / "out", "kept": kept, "run": kept / "run", "scene": scene_file,
+            "scenes": scene_file.parent, "recording": recording, "session": tmp_path / "session",
+            "bench": tmp_path / "bench", "small": shlex.join(SMALL), "quick": shlex.join(QUICK),
+            "labels": f"--labels {kept / 'labels.png'}",
+        }  # fmt: skip
+        return [*command.split(), *shlex.split(WORDS[command].format(**places))]
+
+    return spelled
+
+
+@pytest.mark.parametrize("command", [command for command in WORDS if command in COMMANDS])
+def test_with_json_stdout_is_one_document_and_stderr_is_empty(command, words, capfd):
+    capfd.readouterr()
+    assert run_command(*words(command), "--json") == 0
+    said = capfd.readouterr()
+    assert said.err == ""
+    assert json.loads(said.out).keys() >= KEYS.get(command, set())
+    assert said.out.endswith("\n")
+
+
+@pytest.mark.parametrize("command", ["explore", "extract", "evaluate", "order", "import", "session add"])
+def test_with_json_an_error_is_one_line_and_no_document(command, words, capfd):
+    spelled = words(command)
+    spelled[len(command.split())] += "-not-there"
+    assert run_command(*spelled, "--json") == 1
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("error: ")
+    assert said.err.count("\n") == 1
+
+
+# Colours, and what moves
+
+
+def said_on(words, *, out, err, **environment):
+    """What a command writes to stdout and stderr where these are terminals, or not."""
+    environment = {k: v for k, v in os.environ.items() if k not in {"NO_COLOR", "FORCE_COLOR"}} | {
+        "TERM": "xterm-256color", **environment,
+    }  # fmt: skip
+    masters, slaves = zip(*(pty.openpty() if terminal else os.pipe() for terminal in (out, err)), strict=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "caryatid", *map(str, words)], stdin=subprocess.DEVNULL,
+        stdout=slaves[0], stderr=slaves[1], env=environment,
+    )  # fmt: skip
+    said = [b"", b""]
+    for k, (master, slave) in enumerate(zip(masters, slaves, strict=True)):
+        os.close(slave)
+        while True:
+            try:
+                chunk = os.read(master, 65536)
+            except OSError:  # Linux says so where the other end of a terminal is closed.
+                break
+            if not chunk:
+                break
+            said[k] += chunk
+        os.close(master)
+    process.wait()
+    return said[0].decode(), said[1].decode()
+
+
+COLOUR = re.compile(r"\x1b\[(?:\d+;)*[349]\d")
+
+
+@pytest.mark.parametrize(
+    "words", ["explore nowhere --out run", "explore tower --out run --fusion k", "juggle"]
+)
+def test_errors_are_coloured_for_a_person_who_has_not_said_no(words):
+    assert COLOUR.search(said_on(words.split(), out=True, err=True)[1]) or "nowhere" in words
+    for quiet in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
+        assert not COLOUR.search(said_on(words.split(), out=True, err=True, **quiet)[1])
+    assert ESCAPE not in said_on(words.split(), out=True, err=False)[1]
+    assert ESCAPE not in said_on(words.split(), out=False, err=False)[1]
+
+
+def test_help_and_tables_are_plain_in_a_pipe(kept):
+    for words in (["--help"], ["order", "--help"], ["order", kept / "run", *QUICK]):
+        assert ESCAPE in "".join(said_on(words, out=True, err=True))
+        out, err = said_on(words, out=False, err=False)
+        assert out
+        assert ESCAPE not in out + err
+        assert not COLOUR.search("".join(said_on(words, out=True, err=True, NO_COLOR="1")))
+
+
+def test_a_spinner_turns_on_a_terminal_only(kept):
+    words = ["order", kept / "run", *QUICK]
+    assert "rehearsing" in said_on(words, out=False, err=True)[1]
+    assert said_on(words, out=True, err=False)[1] == ""
+    assert said_on(words, out=True, err=False, FORCE_COLOR="1")[1] == ""
+    assert said_on(words, out=False, err=True, TERM="dumb")[1] == ""
+    assert said_on([*words, "--quiet"], out=False, err=True)[1] == ""

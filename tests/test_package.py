@@ -1,0 +1,172 @@
+"""What is published: wheel and sdist hold what they should, and extras are needed only where asked for."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tarfile
+import tomllib
+import zipfile
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+from bag_files import write_bag
+from conftest import SMALL, run_command
+
+import caryatid
+from caryatid import cli
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+NOT_SOURCE = {"__pycache__", ".git", ".venv", "dist", "build", "_build"}
+
+
+def sources(folder):
+    """Files of a folder of the repository, without what tools leave behind."""
+    found = {p.relative_to(ROOT) for p in (ROOT / folder).rglob("*") if p.is_file()}
+    return {p.as_posix() for p in found if not NOT_SOURCE & set(p.parts) and p.suffix != ".pyc"}
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Wheel and sdist, built without a network."""
+    folder = tmp_path_factory.mktemp("dist")
+    done = subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-d", str(folder)],
+        cwd=ROOT, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
+    return zipfile.ZipFile(wheel), tarfile.open(sdist)
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(built):
+    names = set(built[0].namelist())
+    assert {name for name in names if name.startswith("caryatid/")} == {
+        name.removeprefix("src/") for name in sources("src/caryatid")
+    }
+    assert {"caryatid/py.typed", "caryatid/report/page.html.jinja"} <= names
+    assert {name.split("/")[0] for name in names} == {
+        "caryatid",
+        f"caryatid-{caryatid.__version__}.dist-info",
+    }
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert sum(info.file_size for info in built[0].infolist()) < 5_000_000
+
+
+def test_the_sdist_holds_tests_docs_and_what_the_tests_read(built):
+    names = {name.partition("/")[2] for name in built[1].getnames()}
+    for folder in ("src", "tests", "examples", "benchmarks", "tools"):
+        assert sources(folder) <= names
+    files = ("README.md", "CHANGELOG.md", "CITATION.cff", "LICENSE", "Makefile", "constraints.txt")
+    assert {*files, "docs/method.md", "pyproject.toml"} <= names
+    assert not any(NOT_SOURCE & set(name.split("/")) or name.endswith((".nbi", ".nbc")) for name in names)
+
+
+def test_what_an_index_is_told(built):
+    (path,) = (name for name in built[0].namelist() if name.endswith(".dist-info/METADATA"))
+    told = Parser().parsestr(built[0].read(path).decode())
+    assert told["Version"] == caryatid.__version__
+    assert told["License-Expression"] == "BSD-3-Clause"
+    assert told["Description-Content-Type"] == "text/markdown"
+    assert told.get_payload() == (ROOT / "README.md").read_text()
+    extras = {"view", "serve", "ros", "pdf", "benchmark", "cluster", "bench", "docs", "dev", "all"}
+    assert set(told.get_all("Provides-Extra")) == extras
+    (scripts,) = (name for name in built[0].namelist() if name.endswith("entry_points.txt"))
+    assert "caryatid = caryatid.cli:run_from_shell" in built[0].read(scripts).decode()
+
+
+def test_the_version_is_written_in_one_place_and_cited():
+    assert PROJECT["dynamic"] == ["version"]
+    cited = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text(), re.M)
+    assert cited[1] == caryatid.__version__
+    assert f"## {caryatid.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_all_that_is_needed_is_pinned():
+    """A clone installs the same packages wherever it is set up."""
+    pins = re.findall(r"^([A-Za-z0-9._-]+)==\S+$", (ROOT / "constraints.txt").read_text(), re.M)
+    pinned = {normal(name) for name in pins}
+    extras = PROJECT["optional-dependencies"]
+    wanted = [*PROJECT["dependencies"], *(line for extra in extras.values() for line in extra)]
+    names = {normal(re.match(r"[A-Za-z0-9._-]+", line)[0]) for line in wanted}
+    assert names - {"caryatid"} <= pinned
+
+
+def normal(name):
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+# Extras
+
+MODULES = {
+    "view": ["viser"],
+    "serve": ["fastapi", "starlette", "pydantic", "uvicorn"],
+    "ros": ["rosbags"],
+    "pdf": ["typst"],
+    "benchmark": ["pyarrow"],
+    "cluster": ["distributed", "dask"],
+}
+
+BLOCKED = """
+import json, sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in blocked:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+blocked = json.loads(sys.argv[1])
+sys.meta_path.insert(0, Missing())
+import caryatid
+assert all(getattr(caryatid, name) is not None for name in caryatid.__all__)
+from caryatid.cli import main
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+def without(modules, *words):
+    """Run a command where some modules are not installed."""
+    return subprocess.run(
+        [sys.executable, "-c", BLOCKED, json.dumps(modules), *map(str, words)],
+        capture_output=True, text=True, timeout=120, env=os.environ, check=False,
+    )  # fmt: skip
+
+
+def test_every_extra_of_users_is_in_all_and_tried_here():
+    (line,) = PROJECT["optional-dependencies"]["all"]
+    assert set(line.partition("[")[2].rstrip("]").split(",")) == set(MODULES)
+
+
+def test_the_core_needs_no_extra(tmp_path, scene_file):
+    modules = [name for names in MODULES.values() for name in names]
+    done = without(modules, "explore", scene_file, "--views", 1, "--out", tmp_path / "run", *SMALL)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "run/report.html").is_file()
+
+
+WORDS = {
+    "view": "view {run}",
+    "serve": "serve {folder}/sessions",
+    "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
+    "pdf": "report {run} --pdf {folder}/report.pdf",
+    "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",
+}
+
+
+@pytest.mark.parametrize("extra", [e for e, words in WORDS.items() if words.split()[0] in cli.commands()])
+def test_where_an_extra_is_missing_its_name_is_told(tmp_path, scene_file, views, extra):
+    write_bag(tmp_path / "pour.bag", views)
+    run = tmp_path / "run"
+    assert run_command("explore", scene_file, "--views", 1, "--out", run, *SMALL, "--quiet") == 0
+    before = sorted(tmp_path.rglob("*"))
+    done = without(MODULES[extra], *WORDS[extra].format(folder=tmp_path, run=run).split())
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: ")
+    assert done.stderr.count("\n") == 1
+    assert f'pip install "caryatid[{extra}]"' in done.stderr
+    assert sorted(tmp_path.rglob("*")) == before

@@ -1,0 +1,103 @@
+"""Whether an installed caryatid works without extras: run by its Python, in an empty folder."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import sysconfig
+import time
+from importlib.metadata import version
+from pathlib import Path
+
+EXTRAS = {
+    "serve": ["serve", "sessions"],
+    "ros": ["import", "pour.bag", "--depth", "/d", "--info", "/i", "--out", "pour"],
+    "cluster": ["benchmark", "--suite", "smoke", "--scheduler", "tcp://127.0.0.1:1", "--out", "bench"],
+    "view": ["view", "run"],
+    "pdf": ["report", "run", "--pdf", "report.pdf"],
+}
+"""Extra → a command that needs it; commands this version does not have are left out."""
+
+CLOUD = """
+import numpy as np
+from caryatid import frames
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.scenes import load_scene
+
+T_world_camera = frames.look_at(np.array([-1.2, 0.0, 1.5]), np.array([0.0, 0.0, 0.8]))
+view = SimulatedCamera(load_scene("tower")).capture(T_world_camera)
+points = view.points_camera[view.valid]
+header = "ply\\nformat ascii 1.0\\nelement vertex %d\\n" % len(points)
+header += "".join(f"property float {axis}\\n" for axis in "xyz") + "end_header"
+np.savetxt("table.ply", points, "%.5f", header=header, comments="")
+"""
+"""Writes what a depth camera sees of a tower as `table.ply`."""
+
+
+def caryatid(*words: str, status: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run the command that was installed, as a shell would."""
+    command = Path(sysconfig.get_path("scripts")) / "caryatid"
+    done = subprocess.run([command, *words], capture_output=True, text=True, check=False)
+    if done.returncode != status or "Traceback" in done.stderr:
+        sys.exit(f"caryatid {' '.join(words)}: status {done.returncode}\n{done.stdout}\n{done.stderr}")
+    return done
+
+
+def check(true: bool, what: str) -> None:
+    """End with what is wrong."""
+    if not true:
+        sys.exit(what)
+
+
+def main() -> None:
+    """Try everything, and write how long it took as JSON."""
+    begun = time.monotonic()
+    import caryatid as package
+
+    home = Path(package.__file__).parent
+    check(home.is_relative_to(Path(sys.prefix).resolve()), f"caryatid of {home} was imported")
+    check(package.__version__ == version("caryatid"), "the package and its metadata have different versions")
+    check(all(getattr(package, name) is not None for name in package.__all__), "a name is missing")
+    check((home / "py.typed").exists(), "py.typed is missing")
+
+    told = caryatid("--version").stdout
+    check(told == f"caryatid {version('caryatid')}\n", f"--version says {told}")
+    commands = caryatid("--help").stdout
+    Path("pour.bag").touch()
+    missing = []
+    for extra, words in EXTRAS.items():
+        if f"• {words[0]} " in commands and words[0] not in ("view", "report"):
+            said = caryatid(*words, status=1).stderr
+            check(f'pip install "caryatid[{extra}]"' in said, f"{words[0]} does not name its extra: {said}")
+            missing.append(extra)
+    times = {"start": time.monotonic() - begun}
+
+    begun = time.monotonic()
+    caryatid("demo", "--scene", "tower", "--views", "2", "--out", "run")
+    check(len(Path("run/report.html").read_text()) > 10_000, "the report is empty")
+    times["demo"] = time.monotonic() - begun
+    for extra in ("view", "pdf"):
+        if f"• {EXTRAS[extra][0]} " in commands:
+            said = caryatid(*EXTRAS[extra], status=1).stderr
+            check(f'pip install "caryatid[{extra}]"' in said, f"{extra} is not named: {said}")
+            missing.append(extra)
+
+    begun = time.monotonic()
+    subprocess.run([sys.executable, "-c", CLOUD], check=True)
+    graph = json.loads(caryatid("extract", "table.ply", "--out", "cloud", "--json").stdout)["graph"]
+    check(len(graph["objects"]) > 3 and len(graph["supports"]) > 2, "too little was found in a cloud")
+    times["extract"] = time.monotonic() - begun
+    order = json.loads(caryatid("order", "run", "--set", "rehearsal.draws=2", "--json").stdout)
+    check(len(order["steps"]) > 0, "there is no order")
+    for file in ("scene.xml", "scene.urdf", "scene.glb", "scene.graphml", "scene.dot"):
+        caryatid("export", "run", "--out", file)
+        check(Path(file).stat().st_size > 100, f"{file} is empty")
+    caryatid("session", "new", "table")
+    check("complete" in caryatid("completion", "bash").stdout, "there is no completion")
+    python = sys.version.split()[0]
+    print(json.dumps({"python": python, "seconds": times, "extras named": missing}))
+
+
+if __name__ == "__main__":
+    main()
