@@ -6,8 +6,8 @@ The first is measured in a headless Chromium, from the call that adds a view to 
 points, with clouds of 300,000 and of a million points. The second compares turns of the loop on a scene whose
 cloud grows to some 300,000 points, with a page that another process receives, and without. A machine without
 a graphics card draws in software, where a picture of so many points takes longer than all else, and takes the
-cores the loop wants: so views are also handed over with their layer hidden, and what receives the page while
-the loop is measured does not draw it.
+cores the loop wants: so views are also handed over to a page that has nothing to draw, and what receives the
+page while the loop is measured does not draw it.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from caryatid.exploration import Step, explore
 from caryatid.frames import Array
 from caryatid.settings import changed_settings
 from caryatid.viewer.apart import PageApart
+from caryatid.viewer.drawing import LAYERS
 from caryatid.viewer.loop import Loop, standing_of
 from caryatid.viewer.moments import Dots, Moment, moment_of_step
 from caryatid.viewer.page import Page
@@ -87,7 +88,8 @@ def latency(size: int, runs: int, *, drawn: bool) -> list[float]:
     Args:
         size: Points of each view.
         runs: Views.
-        drawn: The cloud is shown; else its layer is hidden, and drawing in software holds nothing up.
+        drawn: It is shown too; else all is hidden and the picture tiny, so that drawing, which the page takes
+            turns with, takes as little as on a graphics card.
     """
     config, rng = Config(), np.random.default_rng(0)
     seen = moments(config, 3)
@@ -95,9 +97,10 @@ def latency(size: int, runs: int, *, drawn: bool) -> list[float]:
     page.add(seen[0])
     found = []
     with TemporaryDirectory() as folder, browser(Path(folder), (640, 480)) as tab:
-        tab.open(page.url)
+        tab.open(page.url, resolution=0.5 if drawn else 0.05)
         tab.page.evaluate(SEEN)
-        page.canvas.show_layer("cloud", drawn)
+        for layer in LAYERS:
+            page.canvas.show_layer(layer, drawn)
         for run in range(runs):
             moment = replace(with_points(seen[run % 3], size, rng), index=run + 1)
             tab.page.wait_for_timeout(1000)

@@ -327,6 +327,29 @@ def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatc
     assert pages[0] in capsys.readouterr().err
 
 
+def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_file, tmp_path, monkeypatch):
+    from caryatid.commands.watching import Watcher
+
+    shown, waited = [], []
+    monkeypatch.setattr("webbrowser.open", lambda url: None)
+    _waiting(monkeypatch, lambda: waited.append(True))
+    show = Watcher.show
+
+    def interrupted(self, step, source, score):
+        show(self, step, source, score)
+        shown.append(step.index)
+        if step.index == 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Watcher, "show", interrupted)
+    out = tmp_path / "run"
+    options = ("--no-early-stop", "--view", "--no-report", "--quiet", *SMALL)
+    assert run_command("explore", scene_file, "--out", out, *options) == 0
+    assert shown == [0, 1]
+    assert not waited
+    assert len(read_run(out).views) == 1
+
+
 def test_moments_come_through_a_pipe_as_they_were(loop):
     stream = io.BytesIO()
     writer = MomentWriter(stream)

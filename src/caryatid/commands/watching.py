@@ -23,20 +23,25 @@ class Watcher:
     Args:
         page: Where.
         config: All settings.
+
+    Attributes:
+        ended: The exploration came to its end by itself.
     """
 
     def __init__(self, page: PageApart, config: Config) -> None:
         self._page, self._config = page, config
+        self.ended = False
 
     def show(self, step: Step, source: Source, score: float | None) -> None:
         """Show a step; F1 is shown where it is known."""
+        self.ended = step.stop is not None
         standing = standing_of(source.robot, self._config)
         self._page.add(moment_of_step(step, robot=standing, score=score))
 
 
 @contextmanager
 def watched(name: str, config: Config, progress: Progress, wait: Callable[[], None]) -> Iterator[Watcher]:
-    """Open a page for an exploration, and keep it open after its end until Ctrl-C.
+    """Open a page for an exploration; where that came to its end by itself, keep it open until Ctrl-C.
 
     Args:
         name: What is explored.
@@ -48,8 +53,10 @@ def watched(name: str, config: Config, progress: Progress, wait: Callable[[], No
     progress.say(f"{name} at {page.url}")
     page.open_browser()
     try:
-        yield Watcher(page, config)
-        progress.say(f"the page stays at {page.url}; Ctrl-C ends")
-        wait()
+        watcher = Watcher(page, config)
+        yield watcher
+        if watcher.ended:
+            progress.say(f"the page stays at {page.url}; Ctrl-C ends")
+            wait()
     finally:
         page.close()
