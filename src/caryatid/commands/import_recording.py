@@ -40,7 +40,7 @@ class Import:
     """Frame to be the world, level with z up, such as map or base_link. Without: one frame, no pose."""
     camera: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.json"), SAID] = None
     """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. Without: as published, by the folder's name."""
-    level: bool = False
+    level: Annotated[bool, SAID] = False
     """Turn the world so that the table, which most views must show, is level: for poses whose z does not
     point up."""
     views: Annotated[Views, defaults_to(DEFAULTS.recording.max_views)] = None

@@ -14,12 +14,14 @@ DESCRIPTION = """Look around a cluttered table until it is known what holds up w
 
 To begin:
   caryatid demo                                     a built-in table, explored in simulation
+  caryatid view clutter                             the same in the browser, view by view
   caryatid explore tower --noise carmine --out run  another, or a scene or recording of your own
   caryatid extract table.pcd --out run              one cloud, or all views of a recording
   caryatid order run                                a safe order to take away what was found
   caryatid COMMAND --help                           what a command does, its options, and more to try
   caryatid --version                                which caryatid this is
 """
+"""What the help of the whole begins with."""
 
 MARKERS = (tyro.conf.FlagCreatePairsOff, tyro.conf.HelptextFromCommentsOff)
 """How options look."""

@@ -33,7 +33,7 @@ class View(ModellingCommand):
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Run, scene or recording."""
-    host: str = "127.0.0.1"
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen at; at any other than this one others can come, and nobody asks them who they are."""
     port: Port = 8770
     """Port to listen at, or the next one that is free; 0 = any that is free."""
