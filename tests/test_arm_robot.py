@@ -375,7 +375,7 @@ class Rig:
 
 
 def test_the_hardware_of_the_page_on_robots_goes_around_the_table():
-    (code,) = (block for block in blocks(PAGE, "python") if "class RealArm" in block)
+    (code,) = (text for _, _, text in blocks(PAGE) if "class RealArm" in text)
     page = {}
     exec(code, page)
     assert len(code.splitlines()) < 40

@@ -344,7 +344,7 @@ def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_fi
     monkeypatch.setattr(Watcher, "show", interrupted)
     out = tmp_path / "run"
     options = ("--no-early-stop", "--view", "--no-report", "--quiet", *SMALL)
-    assert run_command("explore", scene_file, "--out", out, *options) == 0
+    assert run_command("explore", scene_file, "--out", out, *options) == 130
     assert shown == [0, 1]
     assert not waited
     assert len(read_run(out).views) == 1

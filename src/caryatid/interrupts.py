@@ -61,6 +61,15 @@ def interruptible() -> Iterator[None]:
         yield
 
 
+def note_interrupts() -> None:
+    """From here to the end of what is `interruptible` Ctrl-C raises nothing; `interrupted` tells of it.
+
+    For what comes between two parts that may be interrupted, and must not get lost.
+    """
+    if current_thread() is main_thread() and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _note)
+
+
 def interrupted() -> bool:
     """Whether Ctrl-C was heard since the command began."""
     return bool(_heard)
@@ -81,7 +90,7 @@ def made_in_time(make: Callable[[], T]) -> T | None:
         What was made, or None where it was left out.
     """
     try:
-        with _alarmed(_heard[0] + TIME_TO_MAKE if interrupted() else None):
+        with interruptible(), _alarmed(_heard[0] + TIME_TO_MAKE if interrupted() else None):
             return make()
     except (_AlarmError, KeyboardInterrupt):
         return None
@@ -150,6 +159,10 @@ def _leave(number: int, frame: FrameType | None) -> None:
     os._exit(STATUS)
 
 
-def _raise(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
+def _note(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
     _heard.append(time.monotonic())
+
+
+def _raise(number: int = signal.SIGINT, frame: FrameType | None = None) -> None:
+    _note()
     raise KeyboardInterrupt

@@ -16,7 +16,7 @@ from caryatid.errors import InputError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
-from caryatid.interrupts import NOTHING, Interrupted, interruptible
+from caryatid.interrupts import NOTHING, Interrupted, interrupted, interruptible
 from caryatid.manipulation.dismantling import Taken, bodies_of, dismantle
 from caryatid.manipulation.order import Order, plan_order
 from caryatid.manipulation.telling import dismantling_record
@@ -47,19 +47,24 @@ def run_dismantling(options: Dismantle, config: Config) -> int:
         taken: list[Taken] = []
         strip: tuple[Figure, ...] = ()
         try:
-            if done.interrupted:
-                raise KeyboardInterrupt
-            with progress.working("rehearsing"):
-                order = plan_order(
-                    done.end.graph, config, hands=options.hands, seed=options.modelling.seed, threads=cores()
-                )
-            for t in dismantle(scene, order.steps, bodies_of(done.end.graph, truth), config):
-                taken.append(t)
-                ill = ", ".join(t.disturbed)
-                progress.say(f"{t.step.object_id}: " + (f"{ill} disturbed" if ill else "ok"))
-            if writer is not None:
-                T_world_camera = done.end.sphere.poses(done.end.visited[:1])[0]
-                strip = draw_lifts(scene, taken, done.end.graph, T_world_camera, config)
+            with interruptible():
+                if done.interrupted or interrupted():
+                    raise KeyboardInterrupt
+                with progress.working("rehearsing"):
+                    order = plan_order(
+                        done.end.graph,
+                        config,
+                        hands=options.hands,
+                        seed=options.modelling.seed,
+                        threads=cores(),
+                    )
+                for t in dismantle(scene, order.steps, bodies_of(done.end.graph, truth), config):
+                    taken.append(t)
+                    ill = ", ".join(t.disturbed)
+                    progress.say(f"{t.step.object_id}: " + (f"{ill} disturbed" if ill else "ok"))
+                if writer is not None:
+                    T_world_camera = done.end.sphere.poses(done.end.visited[:1])[0]
+                    strip = draw_lifts(scene, taken, done.end.graph, T_world_camera, config)
         except KeyboardInterrupt:
             done.interrupted = True
         names = {t.body for t in taken}

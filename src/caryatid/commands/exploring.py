@@ -22,7 +22,14 @@ from caryatid.exploration import Step, explore
 from caryatid.formats.graph_json import graph_to_json
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import RunWriter
-from caryatid.interrupts import Interrupted, interrupted, interruptible, interrupts_held, made_in_time
+from caryatid.interrupts import (
+    Interrupted,
+    interrupted,
+    interruptible,
+    interrupts_held,
+    made_in_time,
+    note_interrupts,
+)
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.report import Figure, ViewPage, compose_report, draw_view, render_html, store_report
 
@@ -117,7 +124,8 @@ def look_around(
         watcher: Shows the views, or None.
 
     Raises:
-        KeyboardInterrupt: Before the first view; later an interrupt ends the exploration.
+        KeyboardInterrupt: Before the first view; later an interrupt ends the exploration, and after it
+            interrupts are only noted.
     """
     seed = options.modelling.seed
     with progress.working("opening"):
@@ -164,9 +172,11 @@ def look_around(
                 done.pages += page
                 done.scores += scored
             progress.step(step, None if before is None else before.graph, done.scores)
+        note_interrupts()
     except KeyboardInterrupt:
         if done.last is None:
             raise
+        note_interrupts()
         done.interrupted = True
     return done
 

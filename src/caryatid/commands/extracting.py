@@ -23,7 +23,14 @@ from caryatid.formats.json_files import json_text
 from caryatid.formats.point_clouds import read_stored_cloud
 from caryatid.formats.runs import RunWriter
 from caryatid.graph import SupportGraph
-from caryatid.interrupts import Interrupted, interrupted, interruptible, interrupts_held, made_in_time
+from caryatid.interrupts import (
+    Interrupted,
+    interrupted,
+    interruptible,
+    interrupts_held,
+    made_in_time,
+    note_interrupts,
+)
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.perception import level_cloud
 from caryatid.report import ViewPage, compose_report, draw_model, render_html, store_report
@@ -120,9 +127,11 @@ def _extract_recording(options: Extract, config: Config, writer: RunWriter, prog
         for frame in recording.frames:
             _take_in(frame.load(), scene, done, options, config, writer)
             progress.say(f"view {len(done.steps) - 1:02d}: {summary(done.graph)}")
+        note_interrupts()
     except KeyboardInterrupt:
         if not done.steps:
             raise
+        note_interrupts()
         done.interrupted = True
     return done
 

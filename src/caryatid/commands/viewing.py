@@ -16,6 +16,7 @@ from caryatid.config import Config
 from caryatid.errors import CaryatidError
 from caryatid.formats.json_files import json_text
 from caryatid.formats.runs import Run, is_run, read_run
+from caryatid.interrupts import interruptible
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.viewer.controls import Controls
 from caryatid.viewer.loop import Loop
@@ -49,7 +50,8 @@ def run_viewer(options: View, config: Config) -> int:
 def wait_for_interrupt() -> None:
     """Return at Ctrl-C."""
     try:
-        Event().wait()
+        with interruptible():
+            Event().wait()
     except KeyboardInterrupt:
         return
 
