@@ -12,6 +12,7 @@ from caryatid.exploration import Step
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
 from caryatid.interest import PointOfInterest
 from caryatid.planners import Decision
+from caryatid.report import compose_report, render_html
 from caryatid.report.wireframes import Projection
 from caryatid.shapes import Box, Cylinder, Sphere, fibonacci_sphere
 from caryatid.view_sphere import ViewSphere
@@ -98,3 +99,8 @@ def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
 
 def good(f1: float) -> Score:
     return Score(f1 + 0.02, f1 - 0.02, f1, f1, f1, f1, f1, 0.8)
+
+
+def render_report(pages, **said) -> str:
+    """The HTML of a report of these pages."""
+    return render_html(compose_report(pages, **said))

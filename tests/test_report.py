@@ -9,12 +9,12 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from report_steps import SMALL, K, at, good, make_cloud, make_graph, make_step, make_view
+from report_steps import SMALL, K, at, good, make_cloud, make_graph, make_step, make_view, render_report
 
 from caryatid import frames
 from caryatid.candidates import Candidates
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.report import draw_model, draw_view, render_report
+from caryatid.report import draw_model, draw_view
 from caryatid.report.charts import Line, bar_chart, line_chart
 from caryatid.report.colours import PALETTE, object_colour
 from caryatid.report.graphs import draw_graph

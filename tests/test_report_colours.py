@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from report_steps import SMALL, good, make_cloud, make_graph, make_step, make_view
+from report_steps import SMALL, good, make_cloud, make_graph, make_step, make_view, render_report
 
-from caryatid.report import draw_view, render_report
+from caryatid.report import draw_view
 from caryatid.report.charts import Line, line_chart
 from caryatid.report.colours import (
     PALETTE,

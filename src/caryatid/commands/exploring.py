@@ -14,6 +14,7 @@ from caryatid.commands.explore import Explore
 from caryatid.commands.profile import print_profile, profile_record
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import kept, run_record, step_record, view_record
+from caryatid.commands.report_texts import report_in_time
 from caryatid.commands.sources import Source, open_source
 from caryatid.config import Config
 from caryatid.evaluation.oracle import planner_for
@@ -27,11 +28,10 @@ from caryatid.interrupts import (
     interrupted,
     interruptible,
     interrupts_held,
-    made_in_time,
     note_interrupts,
 )
 from caryatid.kernels.compiling import compile_kernels
-from caryatid.report import Figure, ViewPage, compose_report, draw_view, render_html, store_report
+from caryatid.report import Figure, ViewPage, draw_view
 
 if TYPE_CHECKING:
     from caryatid.commands.watching import Watcher
@@ -215,18 +215,10 @@ def finish_run(
     html = stored = None
     if report:
         settings = {"source": options.source, "seed": seed} | told
-
-        def make() -> tuple[str, str]:
-            said = compose_report(
-                done.pages,
-                title=f"caryatid: {done.source.name}",
-                settings=settings | {"fusion": config.fusion.method, "views": config.active.max_views},
-                scores=done.scores or None,
-                strip=strip,
-            )
-            return render_html(said), store_report(said)
-
-        html, stored = made_in_time(make) or (None, None)
+        settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
+        html, stored = report_in_time(
+            done.pages, done.source.name, settings, scores=done.scores or None, strip=strip
+        )
     done.reported = html is not None
     done.interrupted |= interrupted()
     record = run_record(command, options.source, seed, told, config, done.steps, done.scores)

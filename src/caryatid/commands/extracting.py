@@ -15,6 +15,7 @@ from caryatid.commands.extract import Extract
 from caryatid.commands.profile import print_profile, profile_record
 from caryatid.commands.progress import Progress, summary
 from caryatid.commands.records import kept, run_record
+from caryatid.commands.report_texts import report_in_time
 from caryatid.commands.sources import CLOUD_SUFFIXES, check_segments, open_recording
 from caryatid.config import Config
 from caryatid.errors import InputError
@@ -28,12 +29,11 @@ from caryatid.interrupts import (
     interrupted,
     interruptible,
     interrupts_held,
-    made_in_time,
     note_interrupts,
 )
 from caryatid.kernels.compiling import compile_kernels
 from caryatid.perception import level_cloud
-from caryatid.report import ViewPage, compose_report, draw_model, render_html, store_report
+from caryatid.report import ViewPage, draw_model
 from caryatid.scene import Scene
 from caryatid.views import View
 
@@ -70,12 +70,7 @@ def run_extraction(options: Extract, config: Config) -> int:
         html = stored = None
         if not options.no_report:
             settings = {"source": options.source, "seed": seed} | told | {"fusion": config.fusion.method}
-
-            def make() -> tuple[str, str]:
-                said = compose_report(done.pages, title=f"caryatid: {name}", settings=settings)
-                return render_html(said), store_report(said)
-
-            html, stored = made_in_time(make) or (None, None)
+            html, stored = report_in_time(done.pages, name, settings)
         done.interrupted |= interrupted()
         record = run_record("extract", options.source, seed, told, config, done.steps, [])
         if done.interrupted:

@@ -58,6 +58,7 @@ def import_recording(
     camera_file: Path | None = None,
     level: bool = False,
     config: Config | None = None,
+    seed: int = 0,
 ) -> Imported:
     """Choose sharp frames from different viewpoints and write them as a BOP scene folder.
 
@@ -68,6 +69,7 @@ def import_recording(
         camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
         level: Turn the world so that the table is level: for poses whose z axis does not point up.
         config: What is sharp, what is different, and how many views there may be; and how a table is found.
+        seed: Seed of how the table is found.
 
     Raises:
         InputError: The recording is damaged or does not fit the options, no frame of it can become a view,
@@ -88,7 +90,7 @@ def import_recording(
         T_level_world = np.eye(4)
         if level and poses:
             T_level_world = level_rotation(
-                footage.path, footage.load(chosen), settings, np.random.default_rng(0)
+                footage.path, footage.load(chosen), settings, np.random.default_rng(seed)
             )
         for view in footage.load(chosen):
             T = view.T_world_camera

@@ -6,7 +6,7 @@ clouds need not be kept; `draw_model` draws a model without planning. `compose_r
 """
 
 from caryatid.report.contents import Report, compose_report
-from caryatid.report.html import render_html, render_report
+from caryatid.report.html import render_html
 from caryatid.report.page import Figure, ViewPage, draw_model, draw_view
 from caryatid.report.pdf import render_pdf
 from caryatid.report.stored import read_report, store_report
@@ -21,6 +21,5 @@ __all__ = [
     "read_report",
     "render_html",
     "render_pdf",
-    "render_report",
     "store_report",
 ]

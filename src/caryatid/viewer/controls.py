@@ -90,7 +90,7 @@ class Controls:
             self._dismantle = self._button("dismantle", self.dismantle, hint, 7)
         self._pause.disabled = True
         self._planner.on_update(lambda _: self._do("planning anew", self._replan))
-        self._fusion.on_update(lambda _: self._do("taking the same views again", self._refuse))
+        self._fusion.on_update(lambda _: self._do("taking the same views again", self._fuse_anew))
         self._by_hand.on_update(lambda _: self._listen(self._by_hand.value))
 
     def _button(self, label: str, press: Callable[[], None], hint: str, order: int) -> Any:
@@ -157,7 +157,7 @@ class Controls:
         self._page.add(moment)
         return f"{self._loop.planner} chose the next view"
 
-    def _refuse(self) -> str | None:
+    def _fuse_anew(self) -> str | None:
         if self._fusion.value == self._loop.fusion:
             return None
         self._page.stage(None)
