@@ -15,7 +15,7 @@ from conftest import SMALL, run_command
 
 from caryatid import interrupts
 from caryatid.formats import read_run
-from caryatid.interrupts import interrupted, interruptible, made_in_time
+from caryatid.interrupts import TIME_TO_MAKE, interrupted, interruptible, made_in_time
 
 
 @pytest.fixture
@@ -229,3 +229,22 @@ def test_a_command_in_the_background_goes_on(tmp_path, scene_file):
     process.communicate(timeout=60)
     assert process.returncode == 0
     assert len(read_run(tmp_path / "run").views) == 2
+
+
+def test_an_alarm_that_is_lost_rings_again_and_says_nothing(monkeypatch, capsys):
+    class Ending:
+        def __del__(self):
+            end = time.monotonic() + 0.3
+            while time.monotonic() < end:
+                pass
+
+    def make():
+        Ending()
+        time.sleep(5.0)
+        return "made"
+
+    monkeypatch.setattr("caryatid.interrupts._heard", [time.monotonic() - TIME_TO_MAKE + 0.1])
+    began = time.monotonic()
+    assert made_in_time(make) is None
+    assert time.monotonic() - began < 3.0
+    assert capsys.readouterr().err == ""

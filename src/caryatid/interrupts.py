@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,6 +19,9 @@ STATUS = 130
 
 TIME_TO_MAKE = 0.7
 """How long after Ctrl-C what can be left out may be made [s]; the process is to end within a second."""
+
+TIME_TO_RING_AGAIN = 0.05
+"""After which an alarm that was lost rings again [s]."""
 
 NOTHING = "nothing was written"
 """What was kept, where a command does not say."""
@@ -132,13 +136,20 @@ def _alarmed(end: float | None) -> Iterator[None]:
     def ring(number: int, frame: FrameType | None) -> None:
         raise _AlarmError
 
+    def pass_over(lost: sys.UnraisableHookArgs) -> None:
+        if not isinstance(lost.exc_value, _AlarmError):
+            report_lost(lost)
+
+    # Where Python can pass no exception on, as in what is called at an object's end, the alarm is lost.
+    report_lost, sys.unraisablehook = sys.unraisablehook, pass_over
     before = signal.signal(signal.SIGALRM, ring)
-    signal.setitimer(signal.ITIMER_REAL, left)
+    signal.setitimer(signal.ITIMER_REAL, left, TIME_TO_RING_AGAIN)
     try:
         yield
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
+        sys.unraisablehook = report_lost
 
 
 @contextmanager
