@@ -12,10 +12,8 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
-from pkgutil import iter_modules
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
@@ -44,13 +42,13 @@ def rehearse() -> None:
     from caryatid.evaluation.scores import score
     from caryatid.evaluation.truths import true_scene_from_simulation
     from caryatid.exploration import explore, next_best_view
-    from caryatid.formats import read_recording, write_recording
-    from caryatid.planners import BUILT_IN
+    from caryatid.io import read_recording, write_recording
+    from caryatid.planning.planners import BUILT_IN
     from caryatid.scene import Scene
+    from caryatid.sensing.views import SUPPORT_LABEL, Cloud
     from caryatid.simulation.scenes import load_scene
     from caryatid.simulation.stage import set_stage
     from caryatid.simulation.truth import ground_truth
-    from caryatid.views import SUPPORT_LABEL, Cloud
 
     config = Config()
     fast = replace(config, active=replace(config.active, sphere_points=4000, max_views=3))
@@ -85,12 +83,11 @@ def kernels() -> Iterator[tuple[str, Any]]:
     """All that numba compiles, `module.name` and the kernel."""
     from numba.core.dispatcher import Dispatcher
 
-    import caryatid.kernels as package
-
-    for module in iter_modules(package.__path__):
-        for name, kernel in vars(import_module(f"{package.__name__}.{module.name}")).items():
-            if isinstance(kernel, Dispatcher) and kernel.py_func.__module__.endswith(f".{module.name}"):
-                yield f"{module.name}.{name}", kernel
+    for module, content in sorted(sys.modules.items()):
+        if module.startswith("caryatid."):
+            for name, kernel in vars(content).items():
+                if isinstance(kernel, Dispatcher) and kernel.py_func.__module__ == module:
+                    yield f"{module.removeprefix('caryatid.')}.{name}", kernel
 
 
 def calls() -> Calls:
@@ -106,7 +103,7 @@ def spelt(arguments: tuple[Any, ...]) -> str:
     Raises:
         ValueError: A type has no spelling here.
     """
-    from caryatid.kernels.compiling import argument_types
+    from caryatid.runtime.compiling import argument_types
 
     text = f"({', '.join(map(_spelt, arguments))},)"
     if argument_types(text) != arguments:
@@ -128,7 +125,8 @@ def _spelt(kind: Any) -> str:
         case types.Array(ndim=n, layout=layout):
             return f"Array({_spelt(kind.dtype)}, {n}, '{layout}', readonly=True)"
         case types.BaseNamedTuple():
-            name = f"{kind.instance_class.__module__.rpartition('.')[2]}.{kind.instance_class.__name__}"
+            module = kind.instance_class.__module__.removeprefix("caryatid.")
+            name = f"{module}.{kind.instance_class.__name__}"
             return f"Named('{name}', ({', '.join(map(_spelt, kind))},))"
         case types.FunctionType():
             signature: Any = kind.signature
@@ -145,7 +143,7 @@ def seconds(calls: Calls) -> dict[str, float]:
     """Time each kernel takes to compile, one after the other [s]; what several call counts for the first."""
     from numba import njit
 
-    from caryatid.kernels.compiling import argument_types
+    from caryatid.runtime.compiling import argument_types
 
     njit(_warm)(1.0)
     listed = dict(kernels())
@@ -165,7 +163,7 @@ def _warm(x: float) -> float:
 def side_by_side() -> float:
     """Time until all are compiled, as after installation [s]."""
     start = time.perf_counter()
-    from caryatid.kernels.compiling import compile_kernels
+    from caryatid.runtime.compiling import compile_kernels
 
     compile_kernels()
     return time.perf_counter() - start
@@ -195,7 +193,7 @@ def run(args: Compiling) -> int:
         called = apart(Path(folder) / "a", calls)
         taken = apart(Path(folder) / "b", seconds, called)
         if args.write:
-            from caryatid.kernels.compiling import SIGNATURES
+            from caryatid.runtime.compiling import SIGNATURES
 
             longest = {name: called[name] for name in sorted(called, key=lambda n: -taken[n])}
             SIGNATURES.write_text(json.dumps(longest, indent=1) + "\n", encoding="utf-8")

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.scores import Score, score, score_masks
-from caryatid.settings import read_settings
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Set to 1 in the processes, unless set already: the jobs share the cores."""
@@ -92,8 +92,8 @@ class Episode:
 
     def run(self) -> list[Row]:
         """Explore and score every view."""
-        from caryatid.commands.sources import open_source
         from caryatid.exploration import explore
+        from caryatid.sources import open_source
 
         config = read_settings(None, self.settings)
         config = replace(
@@ -156,7 +156,7 @@ class Extraction:
             return self._extract(recording, config)
 
     def _extract(self, folder: Path, config: Config) -> list[Row]:
-        from caryatid.formats.bop import read_recording
+        from caryatid.io.bop import read_recording
         from caryatid.scene import Scene
         from caryatid.simulation.truth import read_truth
 
@@ -187,7 +187,7 @@ def record_frame(scene: str, folder: Path, config: Config, seed: int) -> None:
         config: Sensor, noise and robot.
         seed: Seed of the noise.
     """
-    from caryatid.formats import write_recording
+    from caryatid.io import write_recording
     from caryatid.simulation.scenes import load_scene
     from caryatid.simulation.stage import set_stage
     from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, write_truth

@@ -32,12 +32,12 @@ from rich.console import Console
 from rich.table import Table
 from scipy.spatial import cKDTree
 
-from caryatid import frames
 from caryatid.config import FitConfig
-from caryatid.frames import Array
-from caryatid.merging import axes_rotation
-from caryatid.primitives import Fit, fit
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.fitting.primitives import Fit, fit
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.objects.sightings import axes_rotation
 
 BASELINE = Path(__file__).with_name("fits_baseline.json")
 """The committed figures."""
@@ -99,7 +99,7 @@ class Trial:
 
 def random_shape(kind: str, rng: np.random.Generator) -> Box | Cylinder | Sphere:
     """A shape of table-top size in any pose."""
-    T = frames.rigid(frames.random_rotation(rng), rng.uniform(-0.3, 0.3, 3))
+    T = transforms.rigid(transforms.random_rotation(rng), rng.uniform(-0.3, 0.3, 3))
     if kind == "box":
         return Box(T, rng.uniform(0.04, 0.25, 3))
     if kind == "cylinder":
@@ -111,7 +111,7 @@ def half_view(
     shape: Box | Cylinder | Sphere, count: int, sigma: float, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
     """Points (N, 3) [m] and normals (N, 3) of a view along a random direction, and that direction (3,)."""
-    view = frames.random_rotation(rng)[:, 2]
+    view = transforms.random_rotation(rng)[:, 2]
     dense, outward = dense_surface(shape, 40 * count, rng)
     cosine = outward @ view
     weight = np.where(cosine > np.cos(STEEPEST), cosine, 0.0)
@@ -128,7 +128,7 @@ def dense_surface(
 ) -> tuple[Array, Array]:
     """Points (N, 3) [m] drawn evenly over the whole surface, and outward normals (N, 3)."""
     if isinstance(shape, Sphere):
-        outward = frames.unit(rng.normal(size=(count, 3)))
+        outward = transforms.unit(rng.normal(size=(count, 3)))
         local = shape.radius * outward
     elif isinstance(shape, Box):
         e = shape.extents
@@ -147,7 +147,7 @@ def dense_surface(
         reach = shape.radius * np.where(side == 0, 1.0, np.sqrt(rng.uniform(size=count)))
         outward = np.where((side == 0)[:, None], ring, np.array([0.0, 0.0, 1.0]) * np.sign(z)[:, None])
         local = reach[:, None] * ring + np.array([0.0, 0.0, 1.0]) * z[:, None]
-    return frames.transform(shape.T_world_object, local), frames.rotate(shape.T_world_object, outward)
+    return transforms.transform(shape.T_world_object, local), transforms.rotate(shape.T_world_object, outward)
 
 
 def run_trial(task: tuple[str, int, float, int]) -> Trial:

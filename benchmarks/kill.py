@@ -21,9 +21,9 @@ from tempfile import TemporaryDirectory
 
 from sessions import Starter, depth_png, graphs_of, labels_png, views_around, write_files
 
-from caryatid.formats.graph_json import graph_text
+from caryatid.io.graph_json import graph_text
+from caryatid.sensing.views import View
 from caryatid.sessions import Session
-from caryatid.views import View
 
 from robot_client import RobotClient  # isort: skip
 

@@ -21,9 +21,9 @@ from tempfile import TemporaryDirectory
 import psutil
 from sessions import depth_png, labels_png, views_around
 
-from caryatid.formats.graph_json import graph_to_json
+from caryatid.io.graph_json import graph_to_json
 from caryatid.scene import Scene
-from caryatid.views import View
+from caryatid.sensing.views import View
 
 from robot_client import RobotClient  # isort: skip
 

@@ -32,10 +32,10 @@ from rich.table import Table
 from suites import BUILT_IN
 
 from caryatid.config import Config, NoiseModel
+from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.overlaps import assign, mask_ious
-from caryatid.settings import read_settings
-from caryatid.views import View
+from caryatid.sensing.views import View
 
 BASELINE = Path(__file__).with_name("segmentation_baseline.json")
 LEAST_PIXELS = 200
@@ -87,9 +87,9 @@ class Row:
 
 def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
     """The views of a source, with true labels."""
-    from caryatid.commands.sources import is_recording, open_source
-    from caryatid.formats.bop import read_recording
-    from caryatid.view_sphere import ViewSphere
+    from caryatid.io.bop import read_recording
+    from caryatid.sensing.view_sphere import ViewSphere
+    from caryatid.sources import is_recording, open_source
 
     if is_recording(source):
         yield from read_recording(source)
@@ -142,8 +142,8 @@ def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> tuple[int, i
 
 def measure(task: tuple[str, Args]) -> list[Row]:
     """Segment the views of one source."""
-    from caryatid.perception import perceive
-    from caryatid.segmentation import segment
+    from caryatid.segmentation.perception import perceive
+    from caryatid.segmentation.segments import segment
 
     source, args = task
     config = read_settings(None, args.set)

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from caryatid import frames
 from caryatid.config import SensorConfig
-from caryatid.formats.graph_json import graph_text
-from caryatid.formats.images import png
+from caryatid.geometry import transforms
+from caryatid.io.graph_json import graph_text
+from caryatid.io.images import png
 from caryatid.scene import Scene
+from caryatid.sensing.views import View
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
-from caryatid.views import View
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
 
@@ -30,7 +30,7 @@ SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 
 FORKING = """
 import os, sys, json
-import caryatid.cli, caryatid.commands.session_steps, caryatid.service.serving
+import caryatid.cli, caryatid.cli.session_steps, caryatid.service.serving
 for line in sys.stdin:
     child = os.fork()
     if child == 0:
@@ -65,7 +65,7 @@ def views_around(scene: str, count: int, seed: int = 0) -> list[View]:
     for azimuth in 2.0 * np.pi * rng.random(count):
         elevation = np.radians(rng.uniform(25.0, 60.0))
         out = np.cos(elevation) * np.array([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)])
-        view = camera.capture(frames.look_at(centre_world + 1.2 * out, centre_world))
+        view = camera.capture(transforms.look_at(centre_world + 1.2 * out, centre_world))
         depth = np.round(1e3 * view.depth).astype(np.uint16)
         depth_m = (depth.astype(np.float64) * (1.0 / 1000.0)).astype(np.float32)
         found.append(replace(view, depth=depth_m, rgb=None, normals_camera=None))

@@ -29,11 +29,11 @@ from typing import Any
 import numpy as np
 from browser import browser
 
-from caryatid.commands.sources import open_source
 from caryatid.config import Config
+from caryatid.config.settings import changed_settings
 from caryatid.exploration import Step, explore
-from caryatid.frames import Array
-from caryatid.settings import changed_settings
+from caryatid.geometry.transforms import Array
+from caryatid.sources import open_source
 from caryatid.viewer.apart import PageApart
 from caryatid.viewer.drawing import LAYERS
 from caryatid.viewer.loop import Loop, standing_of

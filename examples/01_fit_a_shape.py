@@ -3,14 +3,14 @@
 import numpy as np
 
 import caryatid as ct
-from caryatid import frames
-from caryatid.primitives import FitFailure
+from caryatid.fitting.primitives import FitFailure
+from caryatid.geometry import transforms
 
 NOISE = 0.001
 """σ of a reading [m]."""
 
 
-def half_of(shape: ct.Cylinder, eye_world: frames.Array) -> tuple[frames.Array, frames.Array]:
+def half_of(shape: ct.Cylinder, eye_world: transforms.Array) -> tuple[transforms.Array, transforms.Array]:
     """Oriented points of the side of a shape that can be seen from a place, with noise."""
     points_world, normals_world = shape.surface(spacing=0.004)
     seen = np.sum((eye_world - points_world) * normals_world, axis=1) > 0.0
@@ -21,7 +21,7 @@ def half_of(shape: ct.Cylinder, eye_world: frames.Array) -> tuple[frames.Array, 
 def main() -> None:
     """Fit half a can and compare it with the whole one."""
     # A can that stands upright on a table 0.7 m high, seen from one side and from above.
-    can = ct.Cylinder(frames.rigid(np.eye(3), (0.1, 0.2, 0.76)), radius=0.035, height=0.12)
+    can = ct.Cylinder(transforms.rigid(np.eye(3), (0.1, 0.2, 0.76)), radius=0.035, height=0.12)
     points_world, normals_world = half_of(can, eye_world=np.array([-1.0, 0.0, 1.6]))
 
     fit = ct.fit(points_world, normals_world, config=ct.Config().fit, rng=np.random.default_rng(0))

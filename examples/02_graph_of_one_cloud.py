@@ -3,14 +3,14 @@
 import numpy as np
 
 import caryatid as ct
-from caryatid import frames
+from caryatid.geometry import transforms
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
-def upright(x: float, y: float, z: float) -> frames.Array:
+def upright(x: float, y: float, z: float) -> transforms.Array:
     """Pose of something that stands upright with its centre at (x, y, z) [m]."""
-    return frames.rigid(np.eye(3), (x, y, z))
+    return transforms.rigid(np.eye(3), (x, y, z))
 
 
 def main() -> None:

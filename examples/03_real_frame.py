@@ -7,7 +7,7 @@ from tempfile import TemporaryDirectory
 
 import caryatid as ct
 from caryatid.evaluation import Score, score_masks
-from caryatid.formats import read_recording, write_recording
+from caryatid.io import read_recording, write_recording
 from caryatid.simulation import ground_truth, load_scene, read_truth
 from caryatid.simulation.stage import set_stage
 

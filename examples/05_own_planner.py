@@ -2,7 +2,7 @@
 
 To use it on the command line as `--planner opposite`, a package offers it as an entry point:
 
-    [project.entry-points."caryatid.planners"]
+    [project.entry-points."caryatid.planning.planners"]
     opposite = "my_package:OppositePlanner"
 
 `planner_package/` beside this file is such a package.
@@ -11,9 +11,9 @@ To use it on the command line as `--planner opposite`, a package offers it as an
 import numpy as np
 
 import caryatid as ct
-from caryatid import frames
-from caryatid.planners import Decision, PlanningState
-from caryatid.planners.decision import check_candidates, path_cost
+from caryatid.geometry import transforms
+from caryatid.planning.decision import check_candidates, path_cost
+from caryatid.planning.planners import Decision, PlanningState
 from caryatid.simulation import load_scene
 from caryatid.simulation.stage import set_stage
 
@@ -24,7 +24,9 @@ class OppositePlanner:
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Take the candidate whose nearest earlier view is farthest away."""
         check_candidates(state)
-        angle = frames.angle_between(state.candidates.directions[:, None], state.visited[None]).min(axis=1)
+        angle = transforms.angle_between(state.candidates.directions[:, None], state.visited[None]).min(
+            axis=1
+        )
         best = int(np.argmax(angle))
         cost = path_cost(state)[best]
         return Decision(

@@ -6,11 +6,11 @@ On the command line, with the map in a file: `caryatid explore clutter --robot a
 import numpy as np
 
 import caryatid as ct
-from caryatid.arm_robot import ArmRobot
 from caryatid.evaluation import score, true_scene_from_simulation
-from caryatid.frames import Array
-from caryatid.reachability import sample_reachability
-from caryatid.robots import Surroundings
+from caryatid.geometry.transforms import Array
+from caryatid.robots.arm import ArmRobot
+from caryatid.robots.reachability import sample_reachability
+from caryatid.robots.registry import Surroundings
 from caryatid.simulation import ground_truth, load_scene
 from caryatid.simulation.stage import set_stage
 

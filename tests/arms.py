@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 
 LOW, HIGH = np.array([0.2, -0.2, 0.1]), np.array([0.6, 0.2, 0.4])
 """Where the gantry's camera can be [m]."""
@@ -44,4 +44,4 @@ def sideways_only(T_base_camera: Array) -> np.ndarray:
 
 
 def base_at(x: float, y: float, z: float, yaw_deg: float = 0.0) -> Array:
-    return frames.rigid(frames.rotation_from_vector((0.0, 0.0, np.deg2rad(yaw_deg))), (x, y, z))
+    return transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, np.deg2rad(yaw_deg))), (x, y, z))

@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
-from caryatid import frames
+from caryatid.geometry import transforms
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
@@ -112,7 +112,7 @@ class BagFile:
         return self.type("tf2_msgs/msg/TFMessage")(transforms=[item])
 
 
-T_BASE_LENS = frames.rigid(frames.rotation_from_vector((-1.2, 0.9, -0.4)), (0.1, -0.02, 0.3))
+T_BASE_LENS = transforms.rigid(transforms.rotation_from_vector((-1.2, 0.9, -0.4)), (0.1, -0.02, 0.3))
 """Where the camera sits on the robot."""
 
 
@@ -124,15 +124,15 @@ def write_bag(path, views, storage="sqlite3", *, slash="", without_pose=(), with
         bag.write("/chatter", bag.type("std_msgs/msg/String")(data="hello"), START)
         for index, view in enumerate(views):
             time = START + index * SECOND
-            T_world_base = view.T_world_camera @ frames.invert(T_BASE_LENS)
+            T_world_base = view.T_world_camera @ transforms.invert(T_BASE_LENS)
             size = view.depth.shape[::-1]
             if index not in without_pose:
                 # The base goes straight and turns evenly from 10 ms before the image to 30 ms after it.
-                turn = frames.rotation_from_vector((0.01, -0.02, 0.03))
-                back = frames.rotation_from_vector((-0.01 / 3, 0.02 / 3, -0.01))
+                turn = transforms.rotation_from_vector((0.01, -0.02, 0.03))
+                back = transforms.rotation_from_vector((-0.01 / 3, 0.02 / 3, -0.01))
                 step = np.array([0.003, -0.006, 0.009])
                 for late, R, t in ((-10, back, -step / 3), (30, turn, step)):
-                    T = frames.rigid(T_world_base[:3, :3] @ R, T_world_base[:3, 3] + t)
+                    T = transforms.rigid(T_world_base[:3, :3] @ R, T_world_base[:3, 3] + t)
                     when = time + late * SECOND // 1000
                     bag.write("/tf", bag.transform(when, slash + WORLD, slash + BASE, T), when)
             bag.write(INFO, bag.camera(time, view.K, size, lens), time)

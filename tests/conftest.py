@@ -11,10 +11,11 @@ import numba
 import numpy as np
 import pytest
 
-from caryatid import cli, frames
+from caryatid import cli
 from caryatid.config import Config, SensorConfig
-from caryatid.formats import write_recording
-from caryatid.kernels.compiling import compile_kernels
+from caryatid.geometry import transforms
+from caryatid.io import write_recording
+from caryatid.runtime.compiling import compile_kernels
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth, write_truth
@@ -60,7 +61,7 @@ def capture(scene_file: Path, azimuths_deg: tuple[float, ...]):
     for azimuth in np.radians(azimuths_deg):
         up, out = np.sin(np.radians(40.0)), np.cos(np.radians(40.0))
         eye_world = centre_world + 1.2 * np.array([out * np.cos(azimuth), out * np.sin(azimuth), up])
-        view = camera.capture(frames.look_at(eye_world, centre_world))
+        view = camera.capture(transforms.look_at(eye_world, centre_world))
         views.append(replace(view, normals_camera=None))
     return views
 

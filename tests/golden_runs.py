@@ -112,7 +112,9 @@ def _call(*words: object) -> bytes:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("hashes", type=Path, nargs="?", help="file of hashes to compare with")
     parser.add_argument("--renew", action="store_true", help="write the hashes, or the golden graphs")
     parser.add_argument("--only", nargs="*", help="names of runs")

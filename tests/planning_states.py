@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.candidates import Candidates
 from caryatid.config import ActiveVisionConfig, RobotConfig, VoxelConfig
-from caryatid.floor import FloorGrid
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.planners import PlanningState
-from caryatid.robot import HumanoidRobot
-from caryatid.shapes import Box
-from caryatid.view_sphere import ViewSphere, direction
-from caryatid.voxels import VoxelMap
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import PlanningState
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot
+from caryatid.sensing.view_sphere import ViewSphere, direction
+from caryatid.sensing.voxel_map import VoxelMap
 
 CONFIG = ActiveVisionConfig()
 SPHERE = ViewSphere.around((0.0, 0.0, 0.75), CONFIG)
@@ -23,7 +23,7 @@ HOME = direction(np.pi, np.deg2rad(35.0))
 
 
 def box(label: int, centre: tuple[float, float, float], extents: tuple[float, float, float]) -> SceneObject:
-    shape = Box(frames.rigid(np.eye(3), centre), np.array(extents))
+    shape = Box(transforms.rigid(np.eye(3), centre), np.array(extents))
     return SceneObject(f"o{label}", label, shape, "object" if label else "support_surface")
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.frames import Array
-from caryatid.views import View
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import View
 
 K = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
 TABLE = 0.75
@@ -27,7 +27,7 @@ def table_scene(
     """
     v, u = np.mgrid[0:480, 0:640].astype(np.float64)
     rays_camera = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    rays = frames.rotate(T_world_camera, rays_camera)
+    rays = transforms.rotate(T_world_camera, rays_camera)
     eye = T_world_camera[:3, 3]
     depth, labels = np.full(u.shape, np.inf), np.zeros(u.shape, dtype=np.int32)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -58,4 +58,4 @@ def from_the_side(azimuth: float = 20.0, elevation: float = 40.0, distance: floa
     a, e = np.radians([azimuth, elevation])
     centre = np.array([0.0, 0.0, TABLE])
     offset = distance * np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-    return frames.look_at(centre + offset, centre)
+    return transforms.look_at(centre + offset, centre)

@@ -9,13 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from caryatid import frames, refine
-from caryatid.frames import Array
-from caryatid.kernels.fitting import levenberg_marquardt
-from caryatid.kernels.ransac import BATCH
-from caryatid.kernels.rims import likeliest_end
-from caryatid.primitives import HOPEFUL, PROMISING
-from caryatid.refine import (
+from caryatid.fitting import least_squares as refine
+from caryatid.fitting.edge_likelihood import likeliest_end
+from caryatid.fitting.least_squares import (
     CODES,
     CONVERGED,
     NOISE_FLOOR,
@@ -27,9 +23,14 @@ from caryatid.refine import (
     linearise,
     refine_reference,
 )
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.uncertainty import estimate
-from caryatid.voxels import FREE
+from caryatid.fitting.primitives import HOPEFUL, PROMISING
+from caryatid.fitting.ransac import BATCH
+from caryatid.fitting.uncertainty import estimate
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.signed_distance import levenberg_marquardt
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.voxel_map import FREE
 
 COLUMNS = {"box": (0, 1, 2, 3, 4, 5, 6, 7, 8), "cylinder": (0, 1, 2, 3, 4, 5, 6, 8), "sphere": range(7)}
 """Where the derivatives of `linearise` stand in the normal equations."""
@@ -100,7 +101,7 @@ def hypotheses(kind, samples, points, normals, config) -> Hypotheses:
     if kind == "box":
         across = n2 - np.sum(n1 * n2, axis=1, keepdims=True) * n1
         valid = np.linalg.norm(across, axis=1) > LEAST_SINE[kind]
-        y = frames.unit(np.where(valid[:, None], across, frames.perpendicular(n1)))
+        y = transforms.unit(np.where(valid[:, None], across, transforms.perpendicular(n1)))
         R = np.stack([np.cross(y, n1), y, n1], axis=-1)
         low, high = ordered_ends(np.einsum("ni,bij->nbj", points, R), config.trim)
         extents = np.maximum(high - low, 1e-4)
@@ -108,7 +109,7 @@ def hypotheses(kind, samples, points, normals, config) -> Hypotheses:
         return Hypotheses(R, centre, extents / 2.0, valid & (extents.max(axis=1) <= config.max_extent))
     cross = np.cross(n1, n2)
     valid = np.linalg.norm(cross, axis=1) > LEAST_SINE[kind]
-    axis = frames.unit(np.where(valid[:, None], cross, frames.perpendicular(n1)))
+    axis = transforms.unit(np.where(valid[:, None], cross, transforms.perpendicular(n1)))
     gap, turn = p2 - p1, n1 - n2
     gap = gap - np.sum(gap * axis, axis=1, keepdims=True) * axis
     radius = np.sum(gap * -turn, axis=1) / np.maximum(np.sum(turn * turn, axis=1), 1e-12)
@@ -158,7 +159,7 @@ def main_normal(normals):
     cosine = normals @ normals.T
     agree = cosine > np.cos(np.radians(25.0))
     on_face = agree[int(np.argmax(agree.sum(axis=0)))]
-    return frames.unit(normals[on_face].mean(axis=0)), on_face
+    return transforms.unit(normals[on_face].mean(axis=0)), on_face
 
 
 def of_one_face(kind, points, normals, config, ends=ordered_ends):
@@ -176,7 +177,7 @@ def of_one_face(kind, points, normals, config, ends=ordered_ends):
     low, high = (np.array(end) for end in ends(points @ R, config.trim))
     high[2] = np.median((points @ axis)[on_face])
     low[2] = min(low[2], high[2] - config.min_extent)
-    T = frames.rigid(R, R @ ((low + high) / 2.0))
+    T = transforms.rigid(R, R @ ((low + high) / 2.0))
     if kind == "box":
         return Box(T, high - low) if (high - low).max() <= config.max_extent else None
     radius, height = float(np.mean(high[:2] - low[:2]) / 2.0), float(high[2] - low[2])
@@ -190,7 +191,7 @@ def _across(points, axis):
     offsets = points - points.mean(axis=0)
     offsets = offsets - (offsets @ axis)[:, None] * axis
     reach = np.linalg.norm(offsets, axis=1)
-    return frames.unit(offsets[int(np.argmax(reach > 0.5 * reach.max()))])
+    return transforms.unit(offsets[int(np.argmax(reach > 0.5 * reach.max()))])
 
 
 # Judgement
@@ -213,7 +214,7 @@ def draw_in(shape, points, normals, config):
     if isinstance(shape, Sphere):
         return shape, tuple(seen)
     T = shape.T_world_object
-    local = frames.transform(frames.invert(T), points[near] if near.any() else points)
+    local = transforms.transform(transforms.invert(T), points[near] if near.any() else points)
     low, high = -shape.extents / 2.0, shape.extents / 2.0
     for axis in (2,) if isinstance(shape, Cylinder) else (0, 1, 2):
         start, end = np.quantile(local[:, axis], (config.trim, 1.0 - config.trim))
@@ -293,7 +294,7 @@ def candidates(points, normals, config, rng):
             best = min(best, judged(best[1], points, CONVERGED), key=lambda j: j[0])
         price, shape, seen = best
         if shape.extents.max() <= config.max_extent:
-            found[kind] = price, shape.moved(frames.rigid(np.eye(3), origin)), seen
+            found[kind] = price, shape.moved(transforms.rigid(np.eye(3), origin)), seen
     return found
 
 
@@ -350,9 +351,9 @@ def _opened(shape, seen, config):
 
 
 def _closed(opened, shape, seen, points, sigma, config):
-    T_object_world = frames.invert(opened.T_world_object)
-    local = frames.transform(T_object_world, points)
-    before = frames.transform(T_object_world, shape.T_world_object[:3, 3])
+    T_object_world = transforms.invert(opened.T_world_object)
+    local = transforms.transform(T_object_world, points)
+    before = transforms.transform(T_object_world, shape.T_world_object[:3, 3])
     ends = np.stack([-opened.extents, opened.extents], axis=1) / 2.0
     hidden = np.full(6, config.max_extent / np.sqrt(12.0))
     margin = config.face_width * sigma
@@ -397,9 +398,9 @@ def _between(shape, low, high):
     """The shape between these sides (3,) [m] in its own frame; a cylinder keeps its radius."""
     T = shape.T_world_object
     if isinstance(shape, Cylinder):
-        middle = frames.transform(T, np.array([0.0, 0.0, (low[2] + high[2]) / 2.0]))
-        return Cylinder(frames.rigid(T[:3, :3], middle), shape.radius, float(high[2] - low[2]))
-    return Box(frames.rigid(T[:3, :3], frames.transform(T, (low + high) / 2.0)), high - low)
+        middle = transforms.transform(T, np.array([0.0, 0.0, (low[2] + high[2]) / 2.0]))
+        return Cylinder(transforms.rigid(T[:3, :3], middle), shape.radius, float(high[2] - low[2]))
+    return Box(transforms.rigid(T[:3, :3], transforms.transform(T, (low + high) / 2.0)), high - low)
 
 
 # Explanations
@@ -422,5 +423,5 @@ def free_inside(shape, voxels, inset):
     local = np.stack([g.ravel() for g in np.meshgrid(*ticks, indexing="ij")], axis=-1)
     round_in = {"box": 0, "cylinder": 2, "sphere": 3}[shape.kind]
     local = local[np.linalg.norm(local[:, :round_in], axis=1) <= half[0]]
-    states = voxels.state_at(frames.transform(shape.T_world_object, local))
+    states = voxels.state_at(transforms.transform(shape.T_world_object, local))
     return len(states), int((states == FREE).sum())

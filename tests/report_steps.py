@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.candidates import Candidates
 from caryatid.config import ReportConfig
 from caryatid.evaluation.scores import Score
 from caryatid.exploration import Step
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
-from caryatid.interest import PointOfInterest
-from caryatid.planners import Decision
-from caryatid.report import compose_report, render_html
-from caryatid.report.wireframes import Projection
-from caryatid.shapes import Box, Cylinder, Sphere, fibonacci_sphere
-from caryatid.view_sphere import ViewSphere
-from caryatid.views import SUPPORT_LABEL, Cloud, View
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import Decision
+from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.viz import compose_report, render_html
+from caryatid.viz.wireframes import Projection
 
 SMALL = ReportConfig(cloud_width=240, sphere_width=80)
 K = np.array([[200.0, 0.0, 79.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
@@ -24,7 +24,7 @@ TOP = 0.7
 
 
 def at(x: float, y: float, z: float) -> np.ndarray:
-    return frames.rigid(np.eye(3), (x, y, z))
+    return transforms.rigid(np.eye(3), (x, y, z))
 
 
 def make_graph() -> SupportGraph:
@@ -44,7 +44,7 @@ def make_graph() -> SupportGraph:
 
 def make_view(graph: SupportGraph, rgb: bool = True) -> View:
     """A view in which every surface point of every shape is a pixel, the nearest wins."""
-    T_world_camera = frames.look_at((1.0, 0.2, TOP + 0.6), (0.0, 0.0, TOP + 0.05))
+    T_world_camera = transforms.look_at((1.0, 0.2, TOP + 0.6), (0.0, 0.0, TOP + 0.05))
     depth = np.zeros((120, 160), dtype=np.float32)
     labels = np.zeros((120, 160), dtype=np.int32)
     projection = Projection(T_world_camera, K, depth)
@@ -87,7 +87,7 @@ def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
         graph=graph,
         cloud=make_cloud(graph),
         sphere=sphere,
-        visited=frames.unit(np.array([[0.8, 0.1, 0.5], [0.0, 0.8, 0.5]]))[: index + 1],
+        visited=transforms.unit(np.array([[0.8, 0.1, 0.5], [0.0, 0.8, 0.5]]))[: index + 1],
         candidates=candidates if decide else None,
         decision=decision if decide else None,
         timings={"capture": 0.04, "fit": 0.2},

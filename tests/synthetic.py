@@ -7,17 +7,17 @@ from functools import cache
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.clouds import oriented_points
 from caryatid.config import Config, FusionMethod, SensorConfig
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph
 from caryatid.scene import Scene
-from caryatid.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
+from caryatid.sensing.clouds import oriented_points
+from caryatid.sensing.view_sphere import direction
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
-from caryatid.view_sphere import direction
-from caryatid.views import SUPPORT_LABEL, Cloud, View
 
 SENSOR = SensorConfig(width=240, height=180, focal=197.0)
 """The Carmine's field of view with a seventh of its pixels: 8 mm between points at 1.5 m."""
@@ -33,17 +33,17 @@ DIRECTIONS = fibonacci_sphere(400)
 
 def box(centre, extents, turn_deg: float = 0.0) -> Box:
     """A box turned about the vertical."""
-    R = frames.rotation_from_vector((0.0, 0.0, np.radians(turn_deg)))
-    return Box(frames.rigid(R, centre), np.array(extents, dtype=np.float64))
+    R = transforms.rotation_from_vector((0.0, 0.0, np.radians(turn_deg)))
+    return Box(transforms.rigid(R, centre), np.array(extents, dtype=np.float64))
 
 
 def cylinder(centre, radius: float, height: float) -> Cylinder:
     """An upright cylinder."""
-    return Cylinder(frames.rigid(np.eye(3), centre), radius, height)
+    return Cylinder(transforms.rigid(np.eye(3), centre), radius, height)
 
 
 def sphere(centre, radius: float) -> Sphere:
-    return Sphere(frames.rigid(np.eye(3), centre), radius)
+    return Sphere(transforms.rigid(np.eye(3), centre), radius)
 
 
 def thing(label: int, shape: Shape, **fields) -> SceneObject:
@@ -58,18 +58,18 @@ def table_object(top: float = TABLE_TOP) -> SceneObject:
 
 def random_motion(rng: np.random.Generator, reach: float = 1.0) -> Array:
     """Any rotation, and a translation of up to `reach` [m] along each axis."""
-    return frames.rigid(frames.random_rotation(rng), rng.uniform(-reach, reach, 3))
+    return transforms.rigid(transforms.random_rotation(rng), rng.uniform(-reach, reach, 3))
 
 
 def motion_about_vertical(rng: np.random.Generator, reach: float = 1.0) -> Array:
     """A rotation about the vertical, and a translation of up to `reach` [m] along each axis."""
-    R = frames.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
-    return frames.rigid(R, rng.uniform(-reach, reach, 3))
+    R = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    return transforms.rigid(R, rng.uniform(-reach, reach, 3))
 
 
 def moved(cloud: Cloud, T: Array) -> Cloud:
-    points, normals = frames.transform(T, cloud.points_world), frames.rotate(T, cloud.normals_world)
-    eye = None if cloud.viewpoint_world is None else frames.transform(T, cloud.viewpoint_world)
+    points, normals = transforms.transform(T, cloud.points_world), transforms.rotate(T, cloud.normals_world)
+    eye = None if cloud.viewpoint_world is None else transforms.transform(T, cloud.viewpoint_world)
     return replace(cloud, points_world=points, normals_world=normals, viewpoint_world=eye)
 
 
@@ -87,7 +87,7 @@ def surface_points(
     """
     points, normals = shape.surface(spacing)
     if eye is not None:
-        towards = frames.unit(np.asarray(eye) - points)
+        towards = transforms.unit(np.asarray(eye) - points)
         facing = np.sum(towards * normals, axis=1) > np.cos(np.radians(80.0))
         points, normals = points[facing], normals[facing]
     return points + sigma * rng.normal(size=(len(points), 1)) * normals, normals
@@ -116,7 +116,7 @@ def look_from(azimuth_deg: float, elevation_deg: float = 38.0, distance: float =
     """`T_world_camera` of a camera that looks at the middle of the table top."""
     centre = np.array([0.0, 0.0, TABLE_TOP])
     offset = distance * direction(np.radians(azimuth_deg), np.radians(elevation_deg))
-    return frames.look_at(centre + offset, centre)
+    return transforms.look_at(centre + offset, centre)
 
 
 @cache

@@ -9,19 +9,19 @@ from arms import LIMITS, base_at, gantry, sideways_only, within_arms_length
 from synthetic import SENSOR
 from test_docs import ROOT, blocks
 
-from caryatid import frames
-from caryatid.arm_robot import REASONS, UNCONFIRMED, ArmRobot
 from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import explore, next_best_view
-from caryatid.floor import FloorGrid
-from caryatid.reachability import sample_reachability
-from caryatid.robot import HumanoidRobot, Posture, Unreachable, home_view, view_sphere_of
+from caryatid.geometry import transforms
+from caryatid.robots.arm import REASONS, UNCONFIRMED, ArmRobot
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot, Posture, Unreachable, home_view, view_sphere_of
+from caryatid.robots.reachability import sample_reachability
 from caryatid.scene import Scene
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import load_scene
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.stage import set_stage
-from caryatid.view_sphere import ViewSphere
 
 PAGE = ROOT / "docs/how-to-own-robot.md"
 
@@ -96,14 +96,14 @@ class TestCandidates:
         sphere = robot.view_sphere(PROPOSED)
         found = robot.candidates(sphere)
         assert len(found) > 50
-        assert within_arms_length(frames.invert(BASE) @ found.T_world_camera).all()
+        assert within_arms_length(transforms.invert(BASE) @ found.T_world_camera).all()
         np.testing.assert_allclose(roll_of(found.T_world_camera), 0.0, atol=1e-9)
         assert found.T_world_camera[:, 2, 3].min() >= TOP[2] + CONFIG.clearance
         np.testing.assert_array_equal(found.directions, sphere.directions[found.indices])
         others = np.setdiff1d(np.arange(len(sphere.directions)), found.indices)
         poses = sphere.poses(sphere.directions[others])
         high = poses[:, 2, 3] >= TOP[2] + CONFIG.clearance
-        assert not within_arms_length((frames.invert(BASE) @ poses)[high]).any()
+        assert not within_arms_length((transforms.invert(BASE) @ poses)[high]).any()
 
     def test_every_view_is_a_candidate_or_counted_with_its_reason(self):
         wall = FloorGrid.from_boxes([[0.0, 0.4, 1.0]], [[0.6, 0.02, 1.0]], [np.eye(3)], RobotConfig())
@@ -122,7 +122,7 @@ class TestCandidates:
         sphere = robot.view_sphere(PROPOSED)
         found = robot.candidates(sphere)
         assert len(found) > 50
-        assert sideways_only(frames.invert(BASE) @ found.T_world_camera).all()
+        assert sideways_only(transforms.invert(BASE) @ found.T_world_camera).all()
         level = sphere.poses(found.directions)
         np.testing.assert_allclose(found.T_world_camera[:, :3, 2:], level[:, :3, 2:], atol=1e-12)
         assert roll_of(found.T_world_camera).min() > 30.0
@@ -135,7 +135,7 @@ class TestCandidates:
         assert not start.path_length.any()
         assert robot.move_to(start.T_world_camera[0]) == 0.0
         found = robot.candidates(sphere)
-        angle = frames.angle_between(found.directions[0], found.directions)
+        angle = transforms.angle_between(found.directions[0], found.directions)
         np.testing.assert_allclose(found.path_length, 2.0 * sphere.radius * np.sin(angle / 2.0), atol=1e-9)
         assert robot.move_to(found.T_world_camera[7]) == pytest.approx(found.path_length[7])
         np.testing.assert_array_equal(robot.T_world_camera, found.T_world_camera[7])
@@ -144,7 +144,7 @@ class TestCandidates:
     def test_base_and_table_moved_together_change_nothing(self, seed):
         rng = np.random.default_rng(seed)
         T = base_at(*rng.uniform(-3.0, 3.0, 3), float(rng.uniform(-180.0, 180.0)))
-        there = replace(PROPOSED, centre_world=frames.transform(T, PROPOSED.centre_world))
+        there = replace(PROPOSED, centre_world=transforms.transform(T, PROPOSED.centre_world))
         reach = sample_reachability(gantry, LIMITS, 20_000, rng, CONFIG)
         for reachable in (within_arms_length, sideways_only, reach):
             robot, moved = arm(reachable), arm(reachable, T @ BASE)
@@ -160,7 +160,7 @@ class TestCandidates:
         robot = arm(reach, base_at(-0.4, 0.0, 0.9))
         found = robot.candidates(robot.view_sphere(PROPOSED))
         assert len(found) > 20
-        assert reach(frames.invert(robot.T_world_base) @ found.T_world_camera).all()
+        assert reach(transforms.invert(robot.T_world_base) @ found.T_world_camera).all()
 
 
 class TestSolve:
@@ -190,17 +190,17 @@ class TestSolve:
         ],
     )
     def test_it_says_why_not(self, reachable, eye, target, reason):
-        answer = arm(reachable).solve(frames.look_at(eye, TOP), target)
+        answer = arm(reachable).solve(transforms.look_at(eye, TOP), target)
         assert isinstance(answer, Unreachable)
         assert reason in answer.reason
         with pytest.raises(PlanningError, match="cannot go to this view"):
-            arm(never).move_to(frames.look_at(eye, TOP))
+            arm(never).move_to(transforms.look_at(eye, TOP))
 
     def test_a_refused_move_leaves_it_where_it_is(self):
-        here = frames.look_at((-0.3, 0.0, 1.2), TOP)
+        here = transforms.look_at((-0.3, 0.0, 1.2), TOP)
         robot = arm(T_world_camera=here)
         with pytest.raises(PlanningError):
-            robot.move_to(frames.look_at((5.0, 0.0, 1.2), TOP))
+            robot.move_to(transforms.look_at((5.0, 0.0, 1.2), TOP))
         np.testing.assert_array_equal(robot.T_world_camera, here)
 
     def test_where_it_is_is_taken_as_it_is(self):
@@ -208,7 +208,7 @@ class TestSolve:
             def move_to(self, T_world_camera):
                 raise AssertionError("moved")
 
-        here = frames.look_at((5.0, 0.0, 1.2), TOP)
+        here = transforms.look_at((5.0, 0.0, 1.2), TOP)
         np.testing.assert_array_equal(Real(never, BASE, T_world_camera=here).T_world_camera, here)
         with pytest.raises(InputError, match="T_world_camera"):
             Real(never, BASE, T_world_camera=np.ones((4, 4)))
@@ -354,7 +354,9 @@ class Rig:
     def __init__(self, camera, T_hand_camera):
         self.camera, self.K, self.T_hand_camera = camera, camera.K, T_hand_camera
         self.T_hand = (
-            frames.invert(BASE) @ frames.look_at((-0.4, 0.1, 1.3), TOP) @ frames.invert(T_hand_camera)
+            transforms.invert(BASE)
+            @ transforms.look_at((-0.4, 0.1, 1.3), TOP)
+            @ transforms.invert(T_hand_camera)
         )
         self.planned, self.gone = 0, 0
 

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from test_planners import CONFIG, CUBE, HOME, OPEN, SPHERE, TABLE, box, known, state
 
-from caryatid import frames
+from caryatid.geometry import transforms
 from caryatid.graph import Support, SupportGraph
-from caryatid.planners import make_planner
-from caryatid.planners.hidden import surface_samples, visibility
-from caryatid.view_sphere import direction
+from caryatid.planning.hidden_surface import surface_samples, visibility
+from caryatid.planning.planners import make_planner
+from caryatid.sensing.view_sphere import direction
 
 GOLDEN = Path(__file__).parent / "golden" / "paper.json"
 
@@ -138,7 +138,7 @@ def test_a_view_no_point_reaches_is_not_said_to_be_about_one():
     """A relation found in all views is worth nothing with λ_s = ½: the robot stays where it is."""
     settings = {"saliency_weight": 0.5, "inhibition": 0.0, "path_cost": "angle"}
     alone = decision("attention", [CUBE], (Support("o0", "o1"),), propagation=False, **settings)
-    assert frames.angle_between(HOME, OPEN.directions[alone.index]) < 0.02
+    assert transforms.angle_between(HOME, OPEN.directions[alone.index]) < 0.02
     assert "no point of interest" in alone.why
 
 

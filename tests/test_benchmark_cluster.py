@@ -21,7 +21,6 @@ from test_benchmark_suites import QUICK, without_times
 import caryatid
 from caryatid.benchmark.cluster import ClusterExecutor, run_on_worker
 from caryatid.benchmark.episodes import run_episode
-from caryatid.benchmark.fingerprint import fingerprint
 from caryatid.benchmark.records import Episode, Outcome
 from caryatid.benchmark.running import run_all
 from caryatid.benchmark.scenes import content_of
@@ -29,6 +28,7 @@ from caryatid.benchmark.store import ResultStore
 from caryatid.benchmark.suites import find_suite
 from caryatid.benchmark.variants import with_planners
 from caryatid.errors import CaryatidError, InputError
+from caryatid.runtime.fingerprint import fingerprint
 
 LOCAL = ["--host", "127.0.0.1", "--no-dashboard"]
 

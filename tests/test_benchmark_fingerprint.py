@@ -7,9 +7,10 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from caryatid import planners
-from caryatid.benchmark.fingerprint import fingerprint, plugin_of
-from caryatid.planners import BUILT_IN, ORACLE
+from caryatid.benchmark.plugins import plugin_of
+from caryatid.planning import planners
+from caryatid.planning.planners import BUILT_IN, ORACLE
+from caryatid.runtime.fingerprint import fingerprint
 
 
 def test_the_code_has_one_fingerprint():

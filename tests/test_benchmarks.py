@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from caryatid import frames
-from caryatid.shapes import Box, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Sphere
 from caryatid.simulation.truth import GroundTruth, TrueEdge, write_truth
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -84,8 +84,8 @@ def test_a_recording_is_scored_frame_by_frame(recording):
 
 
 def test_solids_are_drawn_where_they_are_and_hide_what_is_behind():
-    ball = Sphere(frames.rigid(np.eye(3), (0.0, 0.0, 0.1)), 0.05)
-    behind = Box(frames.rigid(np.eye(3), (-0.3, 0.0, 0.1)), np.full(3, 0.04))
+    ball = Sphere(transforms.rigid(np.eye(3), (0.0, 0.0, 0.1)), 0.05)
+    behind = Box(transforms.rigid(np.eye(3), (-0.3, 0.0, 0.1)), np.full(3, 0.04))
     eye = solids.Eye.towards(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0]), 0.1, 60, 60)
     image, seen = solids.draw_solids([ball, behind], [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0)], 0.0, eye)
     assert image.shape == (60, 60, 3)

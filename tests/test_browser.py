@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caryatid import frames
-from caryatid.commands.sources import open_source
+from caryatid.geometry import transforms
+from caryatid.sources import open_source
 from caryatid.viewer.controls import Controls
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.page import Page
@@ -63,7 +63,7 @@ def pixel_of(page, point_world, tab):
         ]
     )
     T_world_camera[:3, 3] = client.camera.position
-    seen = frames.transform(frames.invert(T_world_camera), point_world[None])[0]
+    seen = transforms.transform(transforms.invert(T_world_camera), point_world[None])[0]
     box = tab.page.locator("canvas").first.bounding_box()
     focal = box["height"] / 2.0 / np.tan(client.camera.fov / 2.0)
     u = box["x"] + box["width"] / 2.0 + focal * seen[0] / seen[2]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from planning_states import CONFIG, HOME, OPEN, SPHERE, candidates
 
-from caryatid import frames
-from caryatid.candidates import looks_among
 from caryatid.config import RobotConfig
-from caryatid.floor import FloorGrid
-from caryatid.robot import HumanoidRobot
-from caryatid.view_sphere import ViewSphere, direction
+from caryatid.geometry import transforms
+from caryatid.planning.candidates import looks_among
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot
+from caryatid.sensing.view_sphere import ViewSphere, direction
 
 COUNT = CONFIG.look_directions
 
@@ -24,7 +24,7 @@ def test_looks_are_evenly_spread_and_every_view_has_one_near():
     chosen = OPEN.directions[looks.chosen]
     nearest = np.argmax(OPEN.directions @ chosen.T, axis=1)
     np.testing.assert_array_equal(looks.nearest, nearest)
-    assert frames.angle_between(OPEN.directions, chosen[looks.nearest]).max() < 1.2 * apart
+    assert transforms.angle_between(OPEN.directions, chosen[looks.nearest]).max() < 1.2 * apart
 
 
 def test_of_few_views_all_are_looks():

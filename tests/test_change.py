@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from synthetic import box, cylinder, sphere, table_object, thing
 
-from caryatid import frames
-from caryatid.change import changed, reshaped
 from caryatid.config import FusionConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
 from caryatid.graph import Support, SupportGraph
-from caryatid.shapes import Box
+from caryatid.objects.change import changed, reshaped
 
 CONFIG = FusionConfig()
 CRATE = thing(1, box((0.0, 0.0, 0.8), (0.1, 0.2, 0.3)))
@@ -24,7 +24,7 @@ def with_crate(crate):
 
 
 def shifted(o, by):
-    return replace(o, shape=o.shape.moved(frames.rigid(np.eye(3), (by, 0.0, 0.0))))
+    return replace(o, shape=o.shape.moved(transforms.rigid(np.eye(3), (by, 0.0, 0.0))))
 
 
 def grown(o, by):
@@ -34,7 +34,9 @@ def grown(o, by):
 def turned(o, by):
     """Turned so that the ends of the longest edge move by this much."""
     angle = by / (o.shape.extents.max() / 2.0)
-    T = o.shape.T_world_object @ frames.rigid(frames.rotation_from_vector((angle, 0.0, 0.0)), np.zeros(3))
+    T = o.shape.T_world_object @ transforms.rigid(
+        transforms.rotation_from_vector((angle, 0.0, 0.0)), np.zeros(3)
+    )
     return replace(o, shape=replace(o.shape, T_world_object=T))
 
 
@@ -56,7 +58,7 @@ def test_another_kind_of_shape_is_a_change():
 
 def test_other_names_for_the_axes_are_no_change():
     x, y, z = np.eye(3)
-    T = CRATE.shape.T_world_object @ frames.rigid(np.stack([y, z, x], axis=1), np.zeros(3))
+    T = CRATE.shape.T_world_object @ transforms.rigid(np.stack([y, z, x], axis=1), np.zeros(3))
     renamed = Box(T, CRATE.shape.extents[[1, 2, 0]])
     assert not changed(BEFORE, with_crate(replace(CRATE, shape=renamed)), CONFIG)
 

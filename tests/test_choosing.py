@@ -7,16 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 
-from caryatid import frames
 from caryatid.config import RecordingConfig
-from caryatid.recordings import choose_views
-from caryatid.recordings.choosing import apart, sharpness_of_colour
+from caryatid.geometry import transforms
+from caryatid.io.recordings import choose_views
+from caryatid.io.recordings.frame_filter import apart, sharpness_of_colour
 
 CONFIG = RecordingConfig()
 
 
 def along_a_line(positions):
-    return np.stack([frames.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions])
+    return np.stack([transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions])
 
 
 def test_a_camera_at_rest_gives_one_view_the_sharpest():
@@ -45,7 +45,9 @@ def test_a_dull_part_of_a_recording_is_not_taken_for_a_blurred_one():
 
 def test_a_turn_without_a_step_is_another_view_and_coming_back_is_not():
     turns = np.radians([0.0, 4.0, 12.0, 4.0, 0.0])
-    poses = np.stack([frames.rigid(frames.rotation_from_vector((0.0, a, 0.0)), np.zeros(3)) for a in turns])
+    poses = np.stack(
+        [transforms.rigid(transforms.rotation_from_vector((0.0, a, 0.0)), np.zeros(3)) for a in turns]
+    )
     choice = choose_views(np.arange(5) * 1.0, np.ones(5), poses, CONFIG)
     assert choice.kept == (0, 2)
 
@@ -68,7 +70,7 @@ def test_views_are_few_apart_and_every_frame_is_accounted_for(seed, count, most)
     rng = np.random.default_rng(seed)
     times = np.sort(rng.uniform(0.0, 10.0, count))
     walk = np.cumsum(rng.normal(0.0, 0.05, (count, 3)), axis=0)
-    poses = np.array([frames.rigid(frames.random_rotation(rng), p) for p in walk]).reshape(-1, 4, 4)
+    poses = np.array([transforms.rigid(transforms.random_rotation(rng), p) for p in walk]).reshape(-1, 4, 4)
     if seed % 2:
         poses[:, :3, :3] = np.eye(3)
     config = RecordingConfig(max_views=most)

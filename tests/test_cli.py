@@ -17,13 +17,13 @@ from conftest import SMALL, SMALL_SENSOR, run_command
 from PIL import Image
 
 from caryatid.config import Config
-from caryatid.formats import read_run
-from caryatid.formats.bop import read_recording
-from caryatid.planners import BUILT_IN, SupportPlanner
+from caryatid.io import read_run
+from caryatid.io.bop import read_recording
+from caryatid.planning.planners import BUILT_IN, SupportPlanner
+from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth
-from caryatid.views import SUPPORT_LABEL
 
 ESCAPE = "\x1b"
 

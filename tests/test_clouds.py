@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from raycast import K, from_the_side, table_scene
 
-from caryatid import frames
-from caryatid.clouds import estimate_normals, oriented_points, thin
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
-from caryatid.kernels.local_planes import local_surface, local_surface_reference
-from caryatid.views import View
+from caryatid.geometry import transforms
+from caryatid.sensing.clouds import estimate_normals, oriented_points, thin
+from caryatid.sensing.local_planes import local_surface, local_surface_reference
+from caryatid.sensing.views import View
 
 CONFIG = CloudConfig()
 SPHERE = (np.array([0.0, 0.0, 0.87]), 0.12)
 
 
 def angles(a, b):
-    return np.degrees(frames.angle_between(a, b))
+    return np.degrees(transforms.angle_between(a, b))
 
 
 def test_normals_of_a_plane_are_its_normal():
@@ -88,10 +88,10 @@ def test_oriented_planes_lie_on_the_pixels_rays_in_the_world():
     row, column = np.divmod(pixels, depth.shape[1])
     in_image = points @ K.T
     np.testing.assert_allclose(in_image[:, :2] / in_image[:, 2:], np.stack([column, row], axis=-1), atol=1e-9)
-    T = frames.rigid(frames.random_rotation(np.random.default_rng(0)), (0.3, -0.2, 0.5))
+    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (0.3, -0.2, 0.5))
     moved, turned = surface.oriented(pixels, K, T)
-    np.testing.assert_allclose(moved, frames.transform(T, points), atol=1e-12)
-    np.testing.assert_allclose(turned, frames.rotate(T, normals), atol=1e-12)
+    np.testing.assert_allclose(moved, transforms.transform(T, points), atol=1e-12)
+    np.testing.assert_allclose(turned, transforms.rotate(T, normals), atol=1e-12)
 
 
 def roof(sigma):
@@ -118,7 +118,7 @@ def test_smoothing_takes_noise_off_and_leaves_a_ridge_sharp():
 def test_smoothed_points_lie_nearer_to_the_surface_than_the_readings():
     view = table_scene(from_the_side(distance=1.2), half_table=(5.0, 5.0), sigma=0.004)
     points, _, pixels = oriented_points(view, CONFIG)
-    readings = frames.transform(view.pose, view.points_camera.reshape(-1, 3)[pixels])
+    readings = transforms.transform(view.pose, view.points_camera.reshape(-1, 3)[pixels])
     table = np.median(points[:, 2])
     assert np.std(points[:, 2] - table) < np.std(readings[:, 2] - table) / 3.0
 
@@ -157,15 +157,15 @@ def test_readings_left_out_are_no_points_and_bear_on_none():
 
 def test_normals_of_a_cloud_follow_rigid_motion_and_face_the_viewpoint():
     rng = np.random.default_rng(0)
-    directions = frames.unit(rng.normal(size=(2000, 3)))
+    directions = transforms.unit(rng.normal(size=(2000, 3)))
     points, viewpoint = 0.1 * directions, np.array([0.0, 0.0, 3.0])
     normals = estimate_normals(points, viewpoint, 12)
     upper = directions[:, 2] > 0.3
     assert angles(normals[upper], directions[upper]).max() < 12.0
     assert (np.einsum("ij,ij->i", normals, viewpoint - points) >= 0.0).all()
-    T = frames.rigid(frames.random_rotation(rng), (0.3, -0.2, 0.5))
-    moved = estimate_normals(frames.transform(T, points), frames.transform(T, viewpoint), 12)
-    np.testing.assert_allclose(moved, frames.rotate(T, normals), atol=1e-6)
+    T = transforms.rigid(transforms.random_rotation(rng), (0.3, -0.2, 0.5))
+    moved = estimate_normals(transforms.transform(T, points), transforms.transform(T, viewpoint), 12)
+    np.testing.assert_allclose(moved, transforms.rotate(T, normals), atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])

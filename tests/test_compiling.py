@@ -16,8 +16,8 @@ import numba
 import pytest
 from conftest import SMALL, run_command
 
-from caryatid.kernels import compiling
-from caryatid.kernels.compiling import compile_kernels, compile_share, listed
+from caryatid.runtime import compiling
+from caryatid.runtime.compiling import compile_kernels, compile_share, listed
 from caryatid.scene import Scene
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
@@ -25,7 +25,7 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 AFTERWARDS = """
 import json, sys
 from numba.core import event
-from caryatid.kernels.compiling import compile_kernels
+from caryatid.runtime.compiling import compile_kernels
 
 said, late = [], []
 compile_kernels(said.append)

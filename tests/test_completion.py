@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from synthetic import TABLE_TOP, box, cylinder, hausdorff, sphere, thing
 
-from caryatid import frames
-from caryatid.completion import complete
 from caryatid.config import CompletionConfig, VoxelConfig
-from caryatid.shapes import Box, Cylinder
-from caryatid.surface import SupportSurface
-from caryatid.voxels import VoxelMap
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder
+from caryatid.objects.hidden_extents import complete
+from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.sensing.voxel_map import VoxelMap
 
 CONFIG = CompletionConfig()
 SIDES_AND_TOP = (True, True, True, True, False, True)
@@ -47,7 +47,7 @@ def highest(shape):
 
 def upside_down(shape):
     """The same solid with its z axis downwards."""
-    T = shape.T_world_object @ frames.rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+    T = shape.T_world_object @ transforms.rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
     return Box(T, shape.extents) if isinstance(shape, Box) else Cylinder(T, shape.radius, shape.height)
 
 
@@ -138,8 +138,8 @@ def test_a_ball_is_known_whole_from_any_side():
 
 @pytest.mark.parametrize(("tilt_deg", "extended"), [(15.0, True), (45.0, False)])
 def test_only_a_side_that_faces_down_is_one_to_rest_on(tilt_deg, extended):
-    R = frames.rotation_from_vector((np.radians(tilt_deg), 0.0, 0.0))
-    tilted = cylinder((0.0, 0.0, 0.0), 0.02, 0.06).moved(frames.rigid(R, (0.0, 0.0, TABLE_TOP + 0.1)))
+    R = transforms.rotation_from_vector((np.radians(tilt_deg), 0.0, 0.0))
+    tilted = cylinder((0.0, 0.0, 0.0), 0.02, 0.06).moved(transforms.rigid(R, (0.0, 0.0, TABLE_TOP + 0.1)))
     (done,) = completed(thing(1, tilted, seen=SIDES_AND_TOP))
     assert (done.shape.height > tilted.height) == extended
     # The face is tested at points, not on all of its rim.
@@ -180,7 +180,7 @@ def test_among_many_objects_it_reaches_down_to_the_first_one_in_its_way():
         done = completed(thing(1, plate, seen=SIDES_AND_TOP), *crowd)[0].shape
         ticks = np.linspace(-0.5, 0.5, 21)
         face = np.stack(np.meshgrid(ticks, ticks, [-0.5]), axis=-1).reshape(-1, 3) * done.extents
-        face = frames.transform(done.T_world_object, face)
+        face = transforms.transform(done.T_world_object, face)
         gap = min(o.shape.signed_distance(face).min() for o in crowd)
         assert gap > -CONFIG.overlap - 0.001
         if lowest(done) < TABLE_TOP + 1e-9:

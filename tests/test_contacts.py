@@ -6,16 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
-from caryatid import frames
-from caryatid.contacts import find_contacts, find_gap, local_frames
 from caryatid.errors import InputError
-from caryatid.frames import Array, rigid
-from caryatid.shape_arrays import shape_arrays
-from caryatid.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.geometry.transforms import Array, rigid
+from caryatid.support.contacts import find_contacts, find_gap, local_frames
 
 
 def at(x: float, y: float, z: float, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
-    return rigid(frames.rotation_from_vector(np.radians(turn)), (x, y, z))
+    return rigid(transforms.rotation_from_vector(np.radians(turn)), (x, y, z))
 
 
 def cube(x: float, y: float, z: float, side: float = 0.1) -> Box:
@@ -25,7 +25,7 @@ def cube(x: float, y: float, z: float, side: float = 0.1) -> Box:
 def random_shapes(count: int, rng: np.random.Generator, side: float) -> list[Shape]:
     shapes: list[Shape] = []
     for k in range(count):
-        T = rigid(frames.random_rotation(rng), rng.uniform(-side, side, 3))
+        T = rigid(transforms.random_rotation(rng), rng.uniform(-side, side, 3))
         a, b, c = rng.uniform(0.04, 0.15, 3)
         shapes.append([Box(T, np.array([a, b, c])), Cylinder(T, a / 2.0, b), Sphere(T, a / 2.0)][k % 3])
     return shapes
@@ -117,7 +117,7 @@ def test_deep_overlap_of_noisy_fits_keeps_the_plane() -> None:
     ):
         (contact,) = find_contacts([base, upper], 0.005)
         assert contact.distance < -0.01
-        assert np.degrees(frames.angle_between(contact.normal_world, (0, 0, 1))) < 5.0
+        assert np.degrees(transforms.angle_between(contact.normal_world, (0, 0, 1))) < 5.0
 
 
 def test_distance_and_points_agree_with_signed_distance() -> None:
@@ -176,10 +176,12 @@ def test_contacts_in_the_frames_of_both_shapes() -> None:
     )
     for k, contact in enumerate(contacts):
         for side, (index, sign) in enumerate(((contact.a, 1.0), (contact.b, -1.0))):
-            T = frames.invert(shapes[index].T_world_object)
-            np.testing.assert_allclose(points[k, side], frames.transform(T, contact.point_world), atol=1e-12)
+            T = transforms.invert(shapes[index].T_world_object)
             np.testing.assert_allclose(
-                outward[k, side], sign * frames.rotate(T, contact.normal_world), atol=1e-12
+                points[k, side], transforms.transform(T, contact.point_world), atol=1e-12
+            )
+            np.testing.assert_allclose(
+                outward[k, side], sign * transforms.rotate(T, contact.normal_world), atol=1e-12
             )
 
 
@@ -193,7 +195,7 @@ def test_rigid_motion_moves_contacts_along() -> None:
     rng = np.random.default_rng(5)
     for _ in range(10):
         shapes = random_shapes(9, rng, 0.15)
-        T = rigid(frames.random_rotation(rng), rng.uniform(-1, 1, 3))
+        T = rigid(transforms.random_rotation(rng), rng.uniform(-1, 1, 3))
         still, moved = find_contacts(shapes, 0.01), find_contacts([s.moved(T) for s in shapes], 0.01)
         assert [(c.a, c.b) for c in moved] == [(c.a, c.b) for c in still]
         for one, other in zip(still, moved, strict=True):

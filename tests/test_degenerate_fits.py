@@ -9,8 +9,8 @@ import pytest
 from synthetic import surface_points
 from test_primitives import CONFIG, SHAPES, fits_of, heap, same
 
-from caryatid import frames
-from caryatid.primitives import Fit, FitFailure, Oriented, fit
+from caryatid.fitting.primitives import Fit, FitFailure, Oriented, fit
+from caryatid.geometry import transforms
 
 COUNT = 60
 UP = np.tile((0.0, 0.0, 1.0), (COUNT, 1))
@@ -38,7 +38,7 @@ POINTS = {
 }
 NORMALS = {
     "up": UP,
-    "any way": frames.unit(np.random.default_rng(1).normal(size=(COUNT, 3))),
+    "any way": transforms.unit(np.random.default_rng(1).normal(size=(COUNT, 3))),
     "up and down": np.where(NUMBER % 2 == 1, UP, -UP),
     "no direction": 0.0 * UP,
     "half no numbers": np.where(NUMBER % 2 == 1, UP, np.nan),

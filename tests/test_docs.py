@@ -24,10 +24,10 @@ from conftest import SMALL, run_command, without_labels
 
 import caryatid as ct
 from caryatid import config
-from caryatid.formats.images import png
-from caryatid.formats.reachability_npz import write_reachability
-from caryatid.reachability import sample_reachability
-from caryatid.settings import write_settings
+from caryatid.config.settings import write_settings
+from caryatid.io.images import png
+from caryatid.robots.reachability import sample_reachability
+from caryatid.robots.reachability_files import write_reachability
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -115,8 +115,8 @@ def workplace(prepared, tmp_path, monkeypatch):
     """A copy of these files, in the current folder."""
     place = shutil.copytree(prepared, tmp_path / "here")
     monkeypatch.chdir(place)
-    monkeypatch.setattr("caryatid.commands.benchmarking.run_all", lambda *arguments: None)
-    monkeypatch.setattr("caryatid.commands.benchmarking.ClusterExecutor.check", lambda executor: None)
+    monkeypatch.setattr("caryatid.cli.benchmarking.run_all", lambda *arguments: None)
+    monkeypatch.setattr("caryatid.cli.benchmarking.ClusterExecutor.check", lambda executor: None)
     return place
 
 

@@ -8,7 +8,7 @@ import re
 import pytest
 from rich.console import Console
 
-from caryatid.commands.episode_bar import EpisodeBar, pace
+from caryatid.cli.episode_bar import EpisodeBar, pace
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ import reference_fits as reference
 from synthetic import box, cylinder, random_motion, sphere, surface_points
 from test_degenerate_fits import POINTS, UP
 
-from caryatid import frames
 from caryatid.config import ExplanationConfig, FitConfig, SplitConfig, VoxelConfig
-from caryatid.explanation import (
+from caryatid.geometry import transforms
+from caryatid.objects.description_length import (
     Evidence,
     around,
     border_cost,
@@ -25,9 +25,9 @@ from caryatid.explanation import (
     point_costs,
     price,
 )
-from caryatid.splitting import split
-from caryatid.views import Cloud
-from caryatid.voxels import VoxelMap
+from caryatid.objects.model_split import split
+from caryatid.sensing.views import Cloud
+from caryatid.sensing.voxel_map import VoxelMap
 
 COSTS, FIT = ExplanationConfig(), FitConfig()
 EYE = (-1.2, -0.6, 1.0)
@@ -43,7 +43,7 @@ each = pytest.mark.parametrize("shape", SHAPES, ids=lambda s: s.kind)
 def evidence_of(shape, seed=0, sigma=0.002, turned=0.2, voxels=None) -> Evidence:
     rng = np.random.default_rng(seed)
     points, normals = surface_points(shape, rng, eye=EYE, sigma=sigma)
-    normals = frames.unit(normals + turned * rng.normal(size=normals.shape))
+    normals = transforms.unit(normals + turned * rng.normal(size=normals.shape))
     return gather(Cloud(points, normals), 0.003, voxels, COSTS)
 
 
@@ -51,7 +51,7 @@ def evidence_of(shape, seed=0, sigma=0.002, turned=0.2, voxels=None) -> Evidence
 def test_the_costs_of_points_are_those_of_the_reference(shape):
     moved = shape.moved(random_motion(np.random.default_rng(1), 0.3))
     points, normals = surface_points(moved, np.random.default_rng(0), sigma=0.008)
-    normals = frames.unit(normals + 0.5 * np.random.default_rng(2).normal(size=normals.shape))
+    normals = transforms.unit(normals + 0.5 * np.random.default_rng(2).normal(size=normals.shape))
     evidence = Evidence(points, normals, np.ones(len(points)), 0.004, None)
     found = point_costs(moved, evidence, COSTS)
     expected = reference.point_costs(moved, points, normals, 0.004, COSTS)
@@ -92,7 +92,11 @@ def test_points_are_explained_by_the_shape_they_were_taken_from(shape):
 def test_points_of_no_shape_are_left_without_one():
     rng = np.random.default_rng(0)
     crumpled = Evidence(
-        rng.uniform(-0.1, 0.1, (400, 3)), frames.unit(rng.normal(size=(400, 3))), np.ones(400), 0.003, None
+        rng.uniform(-0.1, 0.1, (400, 3)),
+        transforms.unit(rng.normal(size=(400, 3))),
+        np.ones(400),
+        0.003,
+        None,
     )
     few = crumpled.select(np.arange(FIT.min_points - 1))
     for evidence, best in zip((crumpled, few), explain([crumpled, few], COSTS, FIT, [rng, rng]), strict=True):

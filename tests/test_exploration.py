@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from synthetic import SENSOR, model_of, simulated_scene, simulated_views
 
-from caryatid import frames
 from caryatid.config import ActiveVisionConfig, Config
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import Step, explore, next_best_view
-from caryatid.formats.graph_json import graph_text
-from caryatid.planners import RandomPlanner
-from caryatid.recording_robot import RecordingRobot
+from caryatid.geometry import transforms
+from caryatid.io.graph_json import graph_text
+from caryatid.planning.planners import RandomPlanner
+from caryatid.robots.recording import RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.stage import set_stage
 
@@ -68,7 +68,7 @@ def test_the_way_travelled_is_counted(steps):
     angle = 0.0
     for before, after in itertools.pairwise(steps):
         np.testing.assert_array_equal(after.visited[:-1], before.visited)
-        angle += frames.angle_between(after.visited[-2], after.visited[-1])
+        angle += transforms.angle_between(after.visited[-2], after.visited[-1])
         assert after.angle_travelled == pytest.approx(angle)
         straight = np.linalg.norm(after.view.pose[:2, 3] - before.view.pose[:2, 3])
         # The platform stands up to 0.1 m from its camera, and on a grid of 5 cm.
@@ -99,7 +99,7 @@ def test_the_reason_of_a_choice_is_told(steps):
 def test_every_planner_goes_by_its_name(planner):
     steps = exploration(planner=planner, early_stop=False)
     assert len(steps) == 3
-    assert frames.angle_between(steps[0].visited[-1], steps[1].visited[-1]) > 0.05
+    assert transforms.angle_between(steps[0].visited[-1], steps[1].visited[-1]) > 0.05
 
 
 def test_a_planner_that_does_not_exist_is_refused_with_those_that_do():
@@ -133,7 +133,7 @@ def test_the_same_seed_gives_the_same_graphs_byte_for_byte(noise):
 
 def test_another_seed_sends_a_random_planner_elsewhere():
     first, other = (exploration(planner="random", seed=s, early_stop=False)[1].visited[1] for s in (0, 1))
-    assert frames.angle_between(first, other) > 0.01
+    assert transforms.angle_between(first, other) > 0.01
 
 
 class Playback:

@@ -14,18 +14,18 @@ import trimesh
 import yourdfpy
 from conftest import run_command
 
-from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.exports import export_graph
-from caryatid.formats import graph_text, read_run
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.report.colours import object_colour
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.io import graph_text, read_run
 from caryatid.simulation.scenes import load_scene
+from caryatid.viz.colours import object_colour
 
 
 def at(x, y, z, turn=(0.0, 0.0, 0.0)):
-    return frames.rigid(frames.rotation_from_vector(turn), (x, y, z))
+    return transforms.rigid(transforms.rotation_from_vector(turn), (x, y, z))
 
 
 def make_graph():

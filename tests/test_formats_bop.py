@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from caryatid import frames
 from caryatid.errors import InputError
-from caryatid.formats import read_recording, write_recording
-from caryatid.views import View
+from caryatid.geometry import transforms
+from caryatid.io import read_recording, write_recording
+from caryatid.sensing.views import View
 
 SHARED = Path(__file__).parents[2] / "shared"
 K = np.array([[60.0, 0.0, 31.5], [0.0, 60.0, 23.5], [0.0, 0.0, 1.0]])
@@ -34,7 +34,9 @@ def make_views(count=3, poses=True):
                 K=K,
                 labels=labels,
                 rgb=rng.integers(0, 256, (48, 64, 3), dtype=np.uint8),
-                T_world_camera=frames.look_at(rng.normal(5.0, 1.0, 3), rng.normal(size=3)) if poses else None,
+                T_world_camera=transforms.look_at(rng.normal(5.0, 1.0, 3), rng.normal(size=3))
+                if poses
+                else None,
             )
         )
     return views
@@ -321,6 +323,6 @@ def test_a_real_recording_with_poses_is_read():
     assert len(recording) == 21
     assert recording.has_poses
     first, second = recording[0], recording[1]
-    points = [frames.transform(v.pose, v.points_camera[v.valid]) for v in (first, second)]
+    points = [transforms.transform(v.pose, v.points_camera[v.valid]) for v in (first, second)]
     heights = [np.histogram(p[:, 2], bins=200, range=(-1.5, 1.0))[0] for p in points]
     assert np.corrcoef(heights[0], heights[1])[0, 1] > 0.9

@@ -11,13 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caryatid import frames
 from caryatid.errors import InputError
-from caryatid.formats import graph_from_json, graph_text, graph_to_json, read_graph
-from caryatid.formats.json_files import json_text, read_json
+from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.uncertainty import Uncertainty
+from caryatid.io import graph_from_json, graph_text, graph_to_json, read_graph
+from caryatid.io.json_files import json_text, read_json
 
 
 def random_graph(seed, count=5):
@@ -26,12 +26,12 @@ def random_graph(seed, count=5):
         SceneObject(
             "o0",
             65535,
-            Box(frames.rigid(np.eye(3), (0.0, 0.0, 0.7)), np.array([1.0, 0.8, 0.04])),
+            Box(transforms.rigid(np.eye(3), (0.0, 0.0, 0.7)), np.array([1.0, 0.8, 0.04])),
             role="support_surface",
         )
     ]
     for label in range(1, count + 1):
-        T = frames.rigid(frames.random_rotation(rng), rng.normal(size=3))
+        T = transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3))
         shape = [
             Box(T, rng.uniform(0.02, 0.3, 3)),
             Cylinder(T, rng.uniform(0.02, 0.1), rng.uniform(0.02, 0.3)),
@@ -64,7 +64,7 @@ def random_graph(seed, count=5):
             int(rng.integers(1, 4)),
             4,
             rng.normal(size=3) if rng.integers(2) else None,
-            frames.unit(rng.normal(size=3)) if rng.integers(2) else None,
+            transforms.unit(rng.normal(size=3)) if rng.integers(2) else None,
             "contact",
         )
         for a, b in pairs
@@ -112,7 +112,7 @@ def test_what_is_written_is_read_back(seed):
 
 
 def test_the_document_is_as_documented():
-    T = frames.rigid(np.eye(3), (0.0, 0.0, 0.8))
+    T = transforms.rigid(np.eye(3), (0.0, 0.0, 0.8))
     graph = SupportGraph(
         (SceneObject("o1", 1, Sphere(T, 0.05)), SceneObject("o3", 3, Cylinder(T, 0.04, 0.12), occurrences=4)),
         (Support("o1", "o3", "bottom-up", True, 3, 4),),
@@ -137,7 +137,9 @@ def test_the_document_is_as_documented():
 
 def test_noise_below_a_nanometre_and_negative_zero_change_no_byte():
     def graph(offset):
-        return SupportGraph((SceneObject("o1", 1, Sphere(frames.rigid(np.eye(3), (offset, 0, 1)), 0.05)),))
+        return SupportGraph(
+            (SceneObject("o1", 1, Sphere(transforms.rigid(np.eye(3), (offset, 0, 1)), 0.05)),)
+        )
 
     assert graph_text(graph(0.0)) == graph_text(graph(-1e-12))
     assert graph_text(graph(0.0)) != graph_text(graph(1e-6))

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
-from caryatid.formats import read_cloud, read_recording, read_stored_cloud
+from caryatid.io import read_cloud, read_recording, read_stored_cloud
 
 SHARED = Path(__file__).parents[2] / "shared"
 DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgba", "<u4"), ("label", "<u4")])

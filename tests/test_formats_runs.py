@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caryatid import frames
 from caryatid.errors import CaryatidError, InputError
-from caryatid.formats import RunWriter, read_run
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Sphere
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.shapes import Sphere
+from caryatid.io import RunWriter, read_run
 
-T = frames.rigid(np.eye(3), (0.1, 0.2, 1.5))
+T = transforms.rigid(np.eye(3), (0.1, 0.2, 1.5))
 K = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
 
 
 def graph(count=1):
-    shapes = [Sphere(frames.rigid(np.eye(3), (0.1 * k, 0, 0)), 0.05) for k in range(1, count + 1)]
+    shapes = [Sphere(transforms.rigid(np.eye(3), (0.1 * k, 0, 0)), 0.05) for k in range(1, count + 1)]
     return SupportGraph(tuple(SceneObject(f"o{k}", k, shape) for k, shape in enumerate(shapes, start=1)))
 
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from caryatid import frames
 from caryatid.errors import InputError
+from caryatid.geometry import transforms
 
 
 @pytest.fixture
@@ -15,11 +15,11 @@ def rng():
 
 @pytest.fixture
 def T_a_b(rng):
-    return frames.rigid(frames.random_rotation(rng), rng.normal(size=3))
+    return transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3))
 
 
 def test_a_rigid_transform_is_taken_as_it_is_also_from_lists(T_a_b):
-    taken = frames.as_rigid(T_a_b.tolist())
+    taken = transforms.as_rigid(T_a_b.tolist())
     assert taken.dtype == np.float64
     np.testing.assert_array_equal(taken, T_a_b)
 
@@ -44,62 +44,62 @@ def broken(change):
 )
 def test_what_is_no_rigid_transform_is_refused_by_name_and_reason(T, reason):
     with pytest.raises(InputError, match=reason) as caught:
-        frames.as_rigid(T, "frame 7")
+        transforms.as_rigid(T, "frame 7")
     assert str(caught.value).startswith("frame 7: ")
     assert caught.value.remedy
 
 
 def test_rounding_of_a_text_file_is_no_reason_to_refuse(T_a_b):
-    frames.as_rigid(np.round(T_a_b, 6))
+    transforms.as_rigid(np.round(T_a_b, 6))
 
 
 def test_inverting_a_transform_undoes_it_also_for_many_at_once(rng):
-    many = np.array([frames.rigid(frames.random_rotation(rng), rng.normal(size=3)) for _ in range(5)])
-    np.testing.assert_allclose(frames.invert(many) @ many, np.tile(np.eye(4), (5, 1, 1)), atol=1e-14)
-    np.testing.assert_array_equal(frames.invert(many[2]), frames.invert(many)[2])
+    many = np.array([transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3)) for _ in range(5)])
+    np.testing.assert_allclose(transforms.invert(many) @ many, np.tile(np.eye(4), (5, 1, 1)), atol=1e-14)
+    np.testing.assert_array_equal(transforms.invert(many[2]), transforms.invert(many)[2])
 
 
 def test_points_are_moved_and_vectors_only_turned(T_a_b, rng):
     points = rng.normal(size=(4, 5, 3))
     by_matrix = np.concatenate([points, np.ones((4, 5, 1))], axis=-1) @ T_a_b.T
-    np.testing.assert_allclose(frames.transform(T_a_b, points), by_matrix[..., :3], atol=1e-14)
-    difference = frames.transform(T_a_b, points) - frames.transform(T_a_b, np.zeros(3))
-    np.testing.assert_allclose(frames.rotate(T_a_b, points), difference, atol=1e-14)
+    np.testing.assert_allclose(transforms.transform(T_a_b, points), by_matrix[..., :3], atol=1e-14)
+    difference = transforms.transform(T_a_b, points) - transforms.transform(T_a_b, np.zeros(3))
+    np.testing.assert_allclose(transforms.rotate(T_a_b, points), difference, atol=1e-14)
 
 
 def test_units_have_length_one_and_zero_stays_zero():
-    vectors = frames.unit([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0]])
+    vectors = transforms.unit([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0]])
     np.testing.assert_allclose(vectors, [[0.6, 0.0, 0.8], [0.0, 0.0, 0.0]])
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, np.pi / 2, np.pi - 1e-9, np.pi])
 def test_angles_are_exact_where_the_arc_cosine_is_not(angle):
     turned = [np.cos(angle), np.sin(angle), 0.0]
-    assert frames.angle_between([2.0, 0.0, 0.0], turned) == pytest.approx(angle, rel=1e-6, abs=1e-15)
+    assert transforms.angle_between([2.0, 0.0, 0.0], turned) == pytest.approx(angle, rel=1e-6, abs=1e-15)
 
 
 def test_perpendicular_vectors_are_perpendicular_units_for_every_axis(rng):
     axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(20, 3))])
-    across = frames.perpendicular(axes)
+    across = transforms.perpendicular(axes)
     np.testing.assert_allclose(np.sum(across * axes, axis=1), 0.0, atol=1e-14)
     np.testing.assert_allclose(np.linalg.norm(across, axis=1), 1.0)
 
 
 @pytest.mark.parametrize("length", [0.0, 1e-15, 1e-7, 5e-4, 0.3, 3.0])
 def test_rotation_vectors_follow_rodrigues(length, rng):
-    vector = length * frames.unit(rng.normal(size=3))
+    vector = length * transforms.unit(rng.normal(size=3))
     expected = Rotation.from_rotvec(vector).as_matrix()
-    np.testing.assert_allclose(frames.rotation_from_vector(vector), expected, atol=1e-14)
+    np.testing.assert_allclose(transforms.rotation_from_vector(vector), expected, atol=1e-14)
 
 
 def test_the_cross_product_matrix_crosses(rng):
     a, b = rng.normal(size=(2, 3))
-    np.testing.assert_allclose(frames.skew(a) @ b, np.cross(a, b))
+    np.testing.assert_allclose(transforms.skew(a) @ b, np.cross(a, b))
 
 
 def test_random_rotations_are_rotations_spread_over_all_of_them():
     rng = np.random.default_rng(0)
-    many = np.array([frames.random_rotation(rng) for _ in range(3000)])
+    many = np.array([transforms.random_rotation(rng) for _ in range(3000)])
     np.testing.assert_allclose(np.swapaxes(many, 1, 2) @ many, np.tile(np.eye(3), (3000, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(many), 1.0)
     # Uniform over SO(3): every entry has mean 0 and variance 1/3.
@@ -110,50 +110,50 @@ def test_random_rotations_are_rotations_spread_over_all_of_them():
 def test_looking_at_a_point_puts_it_on_the_axis_with_up_upwards(rng):
     for _ in range(20):
         eye, target = rng.normal(size=(2, 3))
-        T_world_camera = frames.as_rigid(frames.look_at(eye, target))
-        target_camera = frames.transform(frames.invert(T_world_camera), target)
+        T_world_camera = transforms.as_rigid(transforms.look_at(eye, target))
+        target_camera = transforms.transform(transforms.invert(T_world_camera), target)
         np.testing.assert_allclose(target_camera, [0.0, 0.0, np.linalg.norm(target - eye)], atol=1e-12)
         np.testing.assert_allclose(T_world_camera[:3, 3], eye)
-        up_camera = frames.rotate(frames.invert(T_world_camera), np.array([0.0, 0.0, 1.0]))
+        up_camera = transforms.rotate(transforms.invert(T_world_camera), np.array([0.0, 0.0, 1.0]))
         assert abs(up_camera[0]) < 1e-12
         assert up_camera[1] < 0.0
 
 
 @pytest.mark.parametrize("target", [(0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
 def test_looking_straight_down_or_up_has_a_roll_all_the_same(target):
-    T_world_camera = frames.as_rigid(frames.look_at((0.0, 0.0, 0.0), target))
+    T_world_camera = transforms.as_rigid(transforms.look_at((0.0, 0.0, 0.0), target))
     np.testing.assert_allclose(T_world_camera[:3, 2], target)
     np.testing.assert_allclose(-T_world_camera[:3, 1], (1.0, 0.0, 0.0), atol=1e-12)
 
 
 def test_looking_along_a_given_up_works_too():
-    T_world_camera = frames.as_rigid(
-        frames.look_at((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), up_world=(1.0, 0.0, 0.0))
+    T_world_camera = transforms.as_rigid(
+        transforms.look_at((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), up_world=(1.0, 0.0, 0.0))
     )
     np.testing.assert_allclose(T_world_camera[:3, 2], (1.0, 0.0, 0.0))
 
 
 def test_nothing_is_seen_of_where_one_stands():
     with pytest.raises(InputError, match="same point"):
-        frames.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
+        transforms.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
 
 
 def test_a_level_world_has_the_plane_at_zero_below_the_camera(rng):
-    truth = frames.look_at((0.4, -1.0, 1.2), (0.1, 0.2, 0.0))
-    T_camera_world = frames.invert(truth)
-    normal = frames.rotate(T_camera_world, np.array([0.0, 0.0, 1.0]))
-    on_plane = frames.transform(T_camera_world, np.array([[0.3, 0.7, 0.0], [-2.0, 0.1, 0.0]]))
-    T_world_camera = frames.as_rigid(frames.level_world(normal, on_plane[0]))
-    np.testing.assert_allclose(frames.transform(T_world_camera, on_plane)[:, 2], 0.0, atol=1e-12)
+    truth = transforms.look_at((0.4, -1.0, 1.2), (0.1, 0.2, 0.0))
+    T_camera_world = transforms.invert(truth)
+    normal = transforms.rotate(T_camera_world, np.array([0.0, 0.0, 1.0]))
+    on_plane = transforms.transform(T_camera_world, np.array([[0.3, 0.7, 0.0], [-2.0, 0.1, 0.0]]))
+    T_world_camera = transforms.as_rigid(transforms.level_world(normal, on_plane[0]))
+    np.testing.assert_allclose(transforms.transform(T_world_camera, on_plane)[:, 2], 0.0, atol=1e-12)
     np.testing.assert_allclose(T_world_camera[:3, 3], (0.0, 0.0, 1.2), atol=1e-12)
-    np.testing.assert_allclose(frames.rotate(T_world_camera, normal), (0.0, 0.0, 1.0), atol=1e-12)
+    np.testing.assert_allclose(transforms.rotate(T_world_camera, normal), (0.0, 0.0, 1.0), atol=1e-12)
     forward = T_world_camera[:3, 2]
     assert forward[0] > 0.0
     assert abs(forward[1]) < 1e-12
     # Whichever point of the plane is given.
-    np.testing.assert_allclose(frames.level_world(normal, on_plane[1]), T_world_camera, atol=1e-12)
+    np.testing.assert_allclose(transforms.level_world(normal, on_plane[1]), T_world_camera, atol=1e-12)
 
 
 def test_a_camera_that_looks_straight_down_gets_a_level_world_too():
-    T_world_camera = frames.as_rigid(frames.level_world((0.0, 0.0, -1.0), (0.0, 0.0, 2.0)))
+    T_world_camera = transforms.as_rigid(transforms.level_world((0.0, 0.0, -1.0), (0.0, 0.0, 2.0)))
     np.testing.assert_allclose(T_world_camera[:3, 3], (0.0, 0.0, 2.0))

@@ -7,9 +7,9 @@ import pytest
 from synthetic import box, cylinder, edges, hausdorff, sphere, table_object, thing, vertices
 
 from caryatid.config import FusionConfig
-from caryatid.fusion import Evidence, absorbed, fuse, fused_graph, match
+from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.graph import Support, SupportGraph
-from caryatid.uncertainty import Uncertainty
+from caryatid.objects.fusion import Evidence, absorbed, fuse, fused_graph, match
 
 SG, PC, BOTH = (FusionConfig(method=m) for m in ("sg", "pc", "pc+sg"))
 CRATE = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1))

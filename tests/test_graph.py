@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from synthetic import box, cylinder, random_motion, table_object, thing
 
-from caryatid import frames
+from caryatid.geometry import transforms
 from caryatid.graph import SUPPORT_SURFACE_ID, Stability, Support, SupportGraph, object_id
 
 CONTACT = np.array([0.01, 0.02, 0.85])
@@ -49,9 +49,9 @@ def test_a_moved_graph_is_the_same_graph_elsewhere():
     there = GRAPH.moved(T)
     assert [o.id for o in there.objects] == [o.id for o in GRAPH.objects]
     for before, after in zip(GRAPH.objects, there.objects, strict=True):
-        np.testing.assert_allclose(after.centre_world, frames.transform(T, before.centre_world))
+        np.testing.assert_allclose(after.centre_world, transforms.transform(T, before.centre_world))
     edge = there.support("o1", "o2")
-    np.testing.assert_allclose(edge.contact_world, frames.transform(T, CONTACT))
+    np.testing.assert_allclose(edge.contact_world, transforms.transform(T, CONTACT))
     np.testing.assert_allclose(edge.normal_world, T[:3, 2])
     assert there.support("o0", "o1").contact_world is None
     assert there.stability == GRAPH.stability

@@ -29,8 +29,8 @@ from conftest import run_command, without_labels
 from PIL import Image
 from rosbags.typesys import get_types_from_msg
 
-from caryatid import frames
-from caryatid.formats import read_recording, write_recording
+from caryatid.geometry import transforms
+from caryatid.io import read_recording, write_recording
 from caryatid.scene import Scene
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)
@@ -546,7 +546,7 @@ def test_poses_of_a_folder_are_interpolated(tmp_path, views):
     ]
     (folder / "groundtruth.txt").write_text("\n".join(rows))
     (view,) = imported(tmp_path, folder, "--camera", camera_file(tmp_path, views[0].K))
-    moved = frames.invert(views[0].T_world_camera) @ view.T_world_camera
+    moved = transforms.invert(views[0].T_world_camera) @ view.T_world_camera
     assert np.allclose(
         views[0].T_world_camera[:3, 3] + (0.005, 0.0, 0.0), view.T_world_camera[:3, 3], atol=1e-6
     )
@@ -603,14 +603,14 @@ def test_colour_of_another_size(tmp_path, views, capsys):
 
 def lying(views):
     """The same pictures in a world that lies on its side."""
-    T = frames.rigid(frames.rotation_from_vector((1.4, 0.5, 0.0)), (0.3, -0.2, 1.0))
+    T = transforms.rigid(transforms.rotation_from_vector((1.4, 0.5, 0.0)), (0.3, -0.2, 1.0))
     return [replace(view, T_world_camera=T @ view.pose) for view in views]
 
 
 def up_from(view, upright):
     """Angle [deg] between up in a view and up in the same view of an upright world."""
     up, right = view.pose[2, :3], upright.pose[2, :3]
-    return np.rad2deg(frames.angle_between(up, right))
+    return np.rad2deg(transforms.angle_between(up, right))
 
 
 def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views, capsys):
@@ -619,7 +619,7 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     levelled = list(imported(tmp_path, folder, *options))
     assert "so that the table is level" in capsys.readouterr().err
     assert max(up_from(view, upright) for view, upright in zip(levelled, views, strict=True)) < 0.5
-    before, after = (frames.invert(a.pose) @ b.pose for a, b in (views[:2], levelled[:2]))
+    before, after = (transforms.invert(a.pose) @ b.pose for a, b in (views[:2], levelled[:2]))
     assert np.allclose(before, after, atol=1e-5)
     scenes = []
     for those in (views, levelled):
@@ -638,7 +638,8 @@ def test_a_level_world_is_hardly_turned(tmp_path, views):
 
 def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, capsys):
     turns = [
-        frames.rigid(frames.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0)) for n in range(3)
+        transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
+        for n in range(3)
     ]
     folder = tum_folder(
         tmp_path, [replace(v, T_world_camera=T @ v.pose) for v, T in zip(views, turns, strict=True)]

@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caryatid import frames
 from caryatid.config import ActiveVisionConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.interest import (
+from caryatid.planning.points_of_interest import (
     inhibition_of_return,
     largest_arc,
     painted,
@@ -17,8 +18,7 @@ from caryatid.interest import (
     relation_saliency,
     surface_point,
 )
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.view_sphere import ViewSphere, direction
+from caryatid.sensing.view_sphere import ViewSphere, direction
 
 CONFIG = ActiveVisionConfig(sphere_points=500)
 PAPER = replace(CONFIG, saliency="paper", edge_point="midpoint")
@@ -27,7 +27,7 @@ HOME = direction(np.pi, np.deg2rad(35.0))[None]
 
 
 def box(label: int, centre: tuple[float, float, float], extents: tuple[float, float, float]) -> SceneObject:
-    shape = Box(frames.rigid(np.eye(3), centre), np.array(extents))
+    shape = Box(transforms.rigid(np.eye(3), centre), np.array(extents))
     return SceneObject(f"o{label}", label, shape, "object" if label else "support_surface")
 
 
@@ -85,11 +85,11 @@ def test_equation_2_decreasing_falls_to_two_lambda_minus_one():
     "shape",
     [
         Box(
-            frames.rigid(frames.rotation_from_vector((0.3, 0.2, 0.9)), (0.1, 0.0, 0.8)),
+            transforms.rigid(transforms.rotation_from_vector((0.3, 0.2, 0.9)), (0.1, 0.0, 0.8)),
             np.array([0.1, 0.2, 0.05]),
         ),
-        Cylinder(frames.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.04, 0.12),
-        Sphere(frames.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.05),
+        Cylinder(transforms.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.04, 0.12),
+        Sphere(transforms.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.05),
     ],
 )
 def test_surface_point_is_on_the_surface_and_on_the_line(shape: Box | Cylinder | Sphere):
@@ -97,7 +97,7 @@ def test_surface_point_is_on_the_surface_and_on_the_line(shape: Box | Cylinder |
     point = surface_point(shape, target)
     centre = shape.T_world_object[:3, 3]
     assert shape.signed_distance(point[None])[0] == pytest.approx(0.0, abs=1e-6)
-    assert frames.angle_between(point - centre, target - centre) == pytest.approx(0.0, abs=1e-6)
+    assert transforms.angle_between(point - centre, target - centre) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_every_relation_and_every_unsupported_object_gives_one_point():
@@ -132,7 +132,7 @@ def test_a_relations_point_is_the_midpoint_or_the_contact():
     np.testing.assert_allclose(contact[1].position_world, [0.1, 0.13, 0.85])
     np.testing.assert_allclose(contact[0].position_world, middle[0].position_world)
     for p in middle[:2]:
-        np.testing.assert_allclose(p.direction, frames.unit(p.position_world - SPHERE.centre_world))
+        np.testing.assert_allclose(p.direction, transforms.unit(p.position_world - SPHERE.centre_world))
 
 
 def test_a_relations_saliency_follows_equation_2():

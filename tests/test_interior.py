@@ -8,10 +8,10 @@ import reference_fits as reference
 from synthetic import box, cylinder, random_motion, sphere, surface_points
 
 from caryatid.config import FitConfig, VoxelConfig
-from caryatid.interior import free_inside, free_share
-from caryatid.primitives import Oriented, candidates, fit
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.voxels import VoxelMap
+from caryatid.fitting.free_space import free_inside, free_share
+from caryatid.fitting.primitives import Oriented, candidates, fit
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.sensing.voxel_map import VoxelMap
 
 INSET = 0.012
 

@@ -13,9 +13,9 @@ from contextlib import suppress
 import pytest
 from conftest import SMALL, run_command
 
-from caryatid import interrupts
-from caryatid.formats import read_run
-from caryatid.interrupts import TIME_TO_MAKE, interrupted, interruptible, made_in_time
+from caryatid.io import read_run
+from caryatid.runtime import interrupts
+from caryatid.runtime.interrupts import TIME_TO_MAKE, interrupted, interruptible, made_in_time
 
 
 @pytest.fixture
@@ -77,7 +77,7 @@ def test_an_interrupt_that_a_library_took_for_a_failure_is_one(heard, monkeypatc
             except KeyboardInterrupt:
                 raise ImportError("initialization failed") from None
 
-    monkeypatch.setattr("caryatid.commands.options.read_settings", failing)
+    monkeypatch.setattr("caryatid.cli.options.read_settings", failing)
     assert run_command("config") == 130
     assert capsys.readouterr().err == "interrupted: nothing was written\n"
 
@@ -243,7 +243,7 @@ def test_an_alarm_that_is_lost_rings_again_and_says_nothing(monkeypatch, capsys)
         time.sleep(5.0)
         return "made"
 
-    monkeypatch.setattr("caryatid.interrupts._heard", [time.monotonic() - TIME_TO_MAKE + 0.1])
+    monkeypatch.setattr("caryatid.runtime.interrupts._heard", [time.monotonic() - TIME_TO_MAKE + 0.1])
     began = time.monotonic()
     assert made_in_time(make) is None
     assert time.monotonic() - began < 3.0

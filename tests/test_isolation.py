@@ -17,7 +17,7 @@ from caryatid.config import ActiveVisionConfig, Config
 from caryatid.evaluation.oracle import OraclePlanner
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
-from caryatid.planners import BUILT_IN, make_planner
+from caryatid.planning.planners import BUILT_IN, make_planner
 from caryatid.simulation.stage import set_stage
 from caryatid.simulation.truth import ground_truth
 
@@ -43,7 +43,7 @@ class Refuse:
 
 sys.meta_path.insert(0, Refuse())
 import numpy as np
-from caryatid.planners import BUILT_IN, make_planner
+from caryatid.planning.planners import BUILT_IN, make_planner
 planners = {name: make_planner(name) for name in BUILT_IN}
 del sys.modules["mujoco"]
 

@@ -10,11 +10,11 @@ import reference_fits as reference
 from scipy.spatial import cKDTree
 from synthetic import box, cylinder, hausdorff, random_motion, sphere, surface_points
 
-from caryatid import frames
 from caryatid.config import FitConfig
-from caryatid.kernels import judging
-from caryatid.refine import arrays, from_arrays
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.fitting import scoring as judging
+from caryatid.fitting.least_squares import arrays, from_arrays
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 
 CONFIG = FitConfig()
 EYE = (-1.1, 0.35, 0.95)
@@ -60,13 +60,15 @@ def part_of(shape, seed, sigma=0.003):
     points, normals = surface_points(shape, rng, eye=rng.uniform(-1.0, 1.0, 3), sigma=sigma)
     cut = points @ rng.normal(size=3)
     kept = cut > np.quantile(cut, 1.0 / 3.0)
-    return points[kept], frames.unit(normals + 0.4 * rng.normal(size=normals.shape))[kept]
+    return points[kept], transforms.unit(normals + 0.4 * rng.normal(size=normals.shape))[kept]
 
 
 def disturbed(shape, seed):
     """The shape moved by some millimetres, turned by some degrees and up to 4 cm larger."""
     rng = np.random.default_rng(seed)
-    motion = frames.rigid(frames.rotation_from_vector(0.05 * rng.normal(size=3)), 0.003 * rng.normal(size=3))
+    motion = transforms.rigid(
+        transforms.rotation_from_vector(0.05 * rng.normal(size=3)), 0.003 * rng.normal(size=3)
+    )
     pose = shape.T_world_object @ motion
     if isinstance(shape, Box):
         return Box(pose, shape.extents + rng.uniform(0.0, 0.04, 3))
@@ -158,7 +160,7 @@ def test_distance_and_normals_are_weighed_by_themselves():
     ball = sphere((0.0, 0.0, 0.0), 0.05)
     points, normals = surface_points(ball, np.random.default_rng(0), sigma=0.0)
     assert misfit(ball, points, normals) == pytest.approx((0.0, 0.0, 1.0), abs=1e-9)
-    across = frames.perpendicular(normals)
+    across = transforms.perpendicular(normals)
     assert misfit(ball, points, across) == pytest.approx((0.0, 1.0, 1.0), abs=1e-9)
     assert misfit(ball, points, -normals) == pytest.approx((0.0, 1.0, 1.0), abs=1e-9)
     assert misfit(sphere((0.0, 0.0, 0.0), 0.054), points, normals) == pytest.approx(
@@ -216,7 +218,7 @@ def test_the_bare_share_is_what_a_search_tree_finds(shape, seed):
         judging._samples(kind, half, k // 2, 2 * (k % 2) - 1, CONFIG.bare_spacing)
         for k in np.flatnonzero(seen)
     ]
-    gap, _ = cKDTree(frames.transform(frames.invert(shape.T_world_object), points)).query(
+    gap, _ = cKDTree(transforms.transform(transforms.invert(shape.T_world_object), points)).query(
         np.concatenate(samples)
     )
     expected = (gap > 2.0 * CONFIG.bare_spacing).mean()

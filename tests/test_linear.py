@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caryatid.kernels.linear import solve_positive
+from caryatid.geometry.linear import solve_positive
 
 
 @pytest.mark.parametrize("size", [7, 8, 9])

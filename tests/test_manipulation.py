@@ -9,16 +9,16 @@ from synthetic import box, sphere, table_object, thing
 from caryatid.config import Config, LiftConfig, RehearsalConfig, SupportConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.graph import Support, SupportGraph
 from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses_of
-from caryatid.manipulation.effects import predict_removal
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.manipulation.rehearsal import Rehearsal
 from caryatid.simulation.mjcf import TABLE_HEIGHT, Solid, build_spec
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import scene_from_spec
-from caryatid.support import infer
-from caryatid.uncertainty import Uncertainty
+from caryatid.support.relations import infer
+from caryatid.support.removal import predict_removal
 
 CONFIG = replace(Config(), rehearsal=RehearsalConfig(draws=2), lift=LiftConfig(watch=1.0))
 TOP = TABLE_HEIGHT

@@ -20,10 +20,10 @@ from conftest import SMALL, run_command
 
 from caryatid import __version__, cli
 from caryatid.benchmark.store import ResultStore
-from caryatid.commands import session
-from caryatid.commands.benchmarking import RESULTS
-from caryatid.commands.reading import read_command
-from caryatid.formats.images import png
+from caryatid.cli import session
+from caryatid.cli.benchmarking import RESULTS
+from caryatid.cli.reading import read_command
+from caryatid.io.images import png
 
 ESCAPE = "\x1b"
 QUICK = ["--set", "rehearsal.draws=2"]

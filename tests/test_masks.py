@@ -5,7 +5,7 @@ import pytest
 
 from caryatid.config import MaskConfig
 from caryatid.errors import InputError
-from caryatid.masks import labels_from_masks
+from caryatid.segmentation.masks import labels_from_masks
 
 
 def square(first, last, size=60):

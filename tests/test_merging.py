@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from synthetic import box, cylinder, hausdorff, random_motion, sphere, surface_points, thing
 
-from caryatid import frames
 from caryatid.config import FitConfig, FusionConfig
+from caryatid.fitting.primitives import Fit, fit
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder
 from caryatid.graph import SceneObject
-from caryatid.merging import axes_rotation, merge
-from caryatid.primitives import Fit, fit
-from caryatid.shapes import Box, Cylinder
+from caryatid.objects.sightings import axes_rotation, merge
 
 ALL = (True,) * 6
 NONE = (False,) * 6
@@ -25,7 +25,7 @@ def merged_of(sightings):
 
 def renamed(shape, turn):
     """The same solid, its axes named otherwise by a rotation (3, 3) of the cube."""
-    T = shape.T_world_object @ frames.rigid(turn, np.zeros(3))
+    T = shape.T_world_object @ transforms.rigid(turn, np.zeros(3))
     return Box(T, np.abs(turn.T @ shape.extents))
 
 
@@ -98,8 +98,8 @@ def test_noise_of_many_sightings_averages_out():
     truth = cylinder((0.0, 0.1, 0.2), 0.04, 0.1)
     sightings = []
     for _ in range(25):
-        tilt = frames.rotation_from_vector(0.04 * rng.normal(size=3))
-        T = frames.rigid(tilt, truth.T_world_object[:3, 3] + 0.004 * rng.normal(size=3))
+        tilt = transforms.rotation_from_vector(0.04 * rng.normal(size=3))
+        T = transforms.rigid(tilt, truth.T_world_object[:3, 3] + 0.004 * rng.normal(size=3))
         sightings.append(thing(1, Cylinder(T, 0.04 + 0.003 * rng.normal(), 0.1 + 0.005 * rng.normal())))
     errors = [hausdorff(o.shape, truth) for o in sightings]
     assert hausdorff(merged_of(sightings).shape, truth) < 0.4 * np.mean(errors)
@@ -127,7 +127,10 @@ def test_the_order_of_sightings_makes_no_difference_but_for_rounding():
     truth = box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1))
     sightings = [
         thing(
-            1, truth.moved(frames.rigid(np.eye(3), 0.004 * rng.normal(size=3))), residual=0.001 * k, seen=seen
+            1,
+            truth.moved(transforms.rigid(np.eye(3), 0.004 * rng.normal(size=3))),
+            residual=0.001 * k,
+            seen=seen,
         )
         for k, seen in enumerate([ALL, (True, False) * 3, (False, True) * 3], start=1)
     ]
@@ -155,16 +158,18 @@ def test_the_angle_between_boxes_is_the_least_their_symmetry_allows(degrees):
         turn, angle = axes_rotation(turned, reference)
         assert np.degrees(angle) == pytest.approx(degrees, abs=1e-5)
         aligned = turned.T_world_object[:3, :3] @ turn
-        assert np.degrees(frames.angle_between(aligned.T, np.eye(3))).max() <= degrees + 1e-5
+        assert np.degrees(transforms.angle_between(aligned.T, np.eye(3))).max() <= degrees + 1e-5
 
 
 def test_a_cylinder_has_an_axis_and_no_ends_to_tell_apart():
     upright = cylinder((0.0, 0.0, 0.0), 0.03, 0.1)
-    over = upright.moved(frames.rigid(frames.rotation_from_vector((np.pi - 0.2, 0.0, 0.0)), np.zeros(3)))
+    over = upright.moved(
+        transforms.rigid(transforms.rotation_from_vector((np.pi - 0.2, 0.0, 0.0)), np.zeros(3))
+    )
     turn, angle = axes_rotation(over, upright)
     assert angle == pytest.approx(0.2)
     assert (over.T_world_object[:3, :3] @ turn)[2, 2] > 0.9
-    spun = upright.moved(frames.rigid(frames.rotation_from_vector((0.0, 0.0, 1.0)), np.zeros(3)))
+    spun = upright.moved(transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, 1.0)), np.zeros(3)))
     assert axes_rotation(spun, upright)[1] == pytest.approx(0.0)
 
 

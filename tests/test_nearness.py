@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from synthetic import box, cylinder, sphere, surface_points
 
-from caryatid.kernels.nearness import KnownObjects, gaps_to_objects, gaps_to_objects_reference
+from caryatid.objects.object_distance import KnownObjects, gaps_to_objects, gaps_to_objects_reference
 
 SHAPES = [box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1), 30.0), cylinder((0.12, 0.0, 0.8), 0.04, 0.1), None]
 SHAPES += [sphere((0.0, 0.12, 0.79), 0.04)]

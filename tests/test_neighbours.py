@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from caryatid.kernels.neighbours import SHARE, nearest_neighbours
+from caryatid.geometry.neighbours import SHARE, nearest_neighbours
 
 
 @pytest.mark.parametrize(("size", "count"), [(1, 1), (5, 5), (SHARE, 4), (SHARE + 1, 9), (700, 12)])

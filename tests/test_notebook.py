@@ -13,17 +13,17 @@ import pytest
 from conftest import without_labels
 
 import caryatid as ct
-from caryatid.candidates import Candidates
-from caryatid.frames import look_at
+from caryatid.geometry.transforms import look_at
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.manipulation.order import Order, TakeStep
-from caryatid.notebook import draw_cell
-from caryatid.pictured import Pictured
-from caryatid.planners import Decision
-from caryatid.report.colours import object_colour
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import Decision
+from caryatid.runtime.display import Pictured
+from caryatid.sensing.views import Cloud, View
 from caryatid.simulation import load_scene
 from caryatid.simulation.stage import set_stage
-from caryatid.views import Cloud, View
+from caryatid.viz.colours import object_colour
+from caryatid.viz.notebook import draw_cell
 
 HOSTILE = "<script>alert(1)</script> & \"quoted\" 'too'"
 
@@ -227,6 +227,6 @@ def test_without_the_viewer_the_error_names_the_extra(scene, monkeypatch):
 def test_nothing_is_drawn_before_somebody_asks():
     code = (
         "import sys, numpy as np, caryatid as ct; box = ct.Box(np.eye(4), np.ones(3)); repr(box); ct.Scene;"
-        "assert not [m for m in sys.modules if m.startswith('caryatid.notebook') or m == 'jinja2']"
+        "assert not [m for m in sys.modules if m.startswith('caryatid.viz.notebook') or m == 'jinja2']"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

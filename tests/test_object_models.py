@@ -9,9 +9,9 @@ import pytest
 from synthetic import box, cylinder, surface_points
 
 from caryatid.config import Config
-from caryatid.object_models import ObjectModels
-from caryatid.perception import Percept
-from caryatid.views import Cloud
+from caryatid.objects.models import ObjectModels
+from caryatid.segmentation.perception import Percept
+from caryatid.sensing.views import Cloud
 
 CRATE, CAN = box((0.0, 0.0, 0.8), (0.16, 0.12, 0.1)), cylinder((0.0, 0.0, 0.91), 0.03, 0.12)
 
@@ -71,7 +71,7 @@ def test_the_newest_view_alone_is_fitted_on_demand(models):
 
 def test_an_object_that_could_not_be_divided_is_left_alone_until_it_has_grown(models, monkeypatch):
     tried = []
-    monkeypatch.setattr("caryatid.object_models.split", lambda *a, **k: tried.append(len(a[0].points)))
+    monkeypatch.setattr("caryatid.objects.models.split", lambda *a, **k: tried.append(len(a[0].points)))
     models.fit_all(models.add(percept_of((1,), (CRATE,)), 0))
     assert models.divide({1}) == set()
     assert models.divide({1}) == set()
@@ -89,7 +89,7 @@ def test_a_pair_is_looked_at_again_when_one_of_them_has_been_divided(models, mon
         apart[1, 2] = 10**6
 
     with monkeypatch.context() as patched:
-        patched.setattr("caryatid.object_models.united", all_are_two)
+        patched.setattr("caryatid.objects.models.united", all_are_two)
         assert models.unite({1, 2}) == {}
     assert models.unite({1, 2}) == {}
     models.unite(models.divide({1}))

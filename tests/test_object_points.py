@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.object_points import ObjectPoints, joined
-from caryatid.views import SUPPORT_LABEL, Cloud
+from caryatid.geometry import transforms
+from caryatid.objects.points import ObjectPoints, joined
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
 
 def cloud(count, label, at=0.0):
@@ -63,14 +63,16 @@ def test_a_move_moves_the_points_of_its_views_only():
     points.add(9, cloud(3, 9, 7.0), 2)
     before = {k: points.of(k) for k in (1, 3, 9)}
     copied = points.copy()
-    T = frames.rigid(frames.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
+    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
     assert points.move({1: T}) == {1, 3, SUPPORT_LABEL}
     assert points.move({}) == set()
     for label, count in ((1, 4), (3, 6)):
         old, new = before[label], points.of(label)
         np.testing.assert_array_equal(new.points_world[:count], old.points_world[:count])
-        np.testing.assert_allclose(new.points_world[count:], frames.transform(T, old.points_world[count:]))
-        np.testing.assert_allclose(new.normals_world[count:], frames.rotate(T, old.normals_world[count:]))
+        np.testing.assert_allclose(
+            new.points_world[count:], transforms.transform(T, old.points_world[count:])
+        )
+        np.testing.assert_allclose(new.normals_world[count:], transforms.rotate(T, old.normals_world[count:]))
         np.testing.assert_array_equal(copied.of(label).points_world, old.points_world)
     np.testing.assert_array_equal(points.of(9).points_world, before[9].points_world)
 
@@ -78,7 +80,7 @@ def test_a_move_moves_the_points_of_its_views_only():
 def test_a_divided_objects_points_still_move_with_their_views():
     points = two_views()
     names = points.divide(3, np.arange(12) % 2)
-    T = frames.rigid(np.eye(3), (0.0, 0.0, 5.0))
+    T = transforms.rigid(np.eye(3), (0.0, 0.0, 5.0))
     heights = [points.of(k).points_world[:, 2] for k in names]
     points.move({1: T})
     for label, height in zip(names, heights, strict=True):
@@ -93,7 +95,7 @@ def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
         assert len(points.of(1)) == (20 * (view + 1) if view < 8 else 80)
     left = np.unique(np.round(points.of(1).points_world[:, 0] % 1.0, 9))
     np.testing.assert_array_equal(left, [0.05, 0.06, 0.07, 0.08])
-    points.move({8: frames.rigid(np.eye(3), (0.2, 0.0, 0.0))})
+    points.move({8: transforms.rigid(np.eye(3), (0.2, 0.0, 0.0))})
     assert (points.of(1).points_world[:, 0] % 1.0 > 0.2).sum() == 20
 
 

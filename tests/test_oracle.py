@@ -10,16 +10,16 @@ import pytest
 from conftest import run_command
 from synthetic import SENSOR, simulated_scene
 
-from caryatid import frames
 from caryatid.config import ActiveVisionConfig, Config, OracleConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.oracle import OraclePlanner, planner_for, spread_out
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
-from caryatid.formats.graph_json import graph_text
-from caryatid.planners import make_planner
-from caryatid.shapes import fibonacci_sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import fibonacci_sphere
+from caryatid.io.graph_json import graph_text
+from caryatid.planning.planners import make_planner
 from caryatid.simulation.stage import set_stage
 from caryatid.simulation.truth import ground_truth
 
@@ -114,7 +114,7 @@ def test_of_equal_views_it_takes_the_one_that_shows_most_unseen_surface():
     steps = list(explore(oracle.camera, stage.robot, planner=oracle, config=config, segmentation="labels"))
     first = steps[0]
     assert first.decision.saliency == 1.0
-    assert frames.angle_between(first.visited[0], steps[1].visited[1]) > np.pi / 3.0
+    assert transforms.angle_between(first.visited[0], steps[1].visited[1]) > np.pi / 3.0
 
 
 def test_views_to_try_are_spread_over_all_there_are():
@@ -122,10 +122,10 @@ def test_views_to_try_are_spread_over_all_there_are():
     visited = directions[:1]
     picked = spread_out(directions, visited, 32)
     assert len(set(picked)) == 32
-    apart = frames.angle_between(directions[picked][:, None], directions[picked][None])
+    apart = transforms.angle_between(directions[picked][:, None], directions[picked][None])
     assert apart[~np.eye(32, dtype=bool)].min() > np.deg2rad(25.0)
-    assert frames.angle_between(directions[picked], visited).min() > np.deg2rad(25.0)
-    covered = frames.angle_between(directions[:, None], directions[picked][None]).min(axis=1)
+    assert transforms.angle_between(directions[picked], visited).min() > np.deg2rad(25.0)
+    covered = transforms.angle_between(directions[:, None], directions[picked][None]).min(axis=1)
     assert covered.max() < np.deg2rad(35.0)
     assert sorted(spread_out(directions[:5], visited, 32)) == [0, 1, 2, 3, 4]
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caryatid.kernels.ordering import quantile, select
+from caryatid.geometry.ranks import quantile, select
 
 
 @pytest.mark.parametrize("values", [2, 30, 10_000])

@@ -11,7 +11,7 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.kernels.parallel import for_each
+from caryatid.runtime.parallel import for_each
 
 Data = tuple[NDArray[np.float64], float, NDArray[np.float64]]
 """Numbers, a factor, and where results go; of no type of this file, which what is kept on disk would name."""
@@ -52,7 +52,7 @@ import numpy as np
 from numba import njit
 sys.path.insert(0, sys.argv[1])
 import kinds
-from caryatid.kernels.parallel import for_each
+from caryatid.runtime.parallel import for_each
 
 @njit
 def count(index, data):
@@ -99,8 +99,8 @@ import numba
 import numpy as np
 from test_primitives import CONFIG, fits_of, heap
 from caryatid.config import ExplanationConfig
-from caryatid.explanation import Evidence, explain
-from caryatid.primitives import Fit
+from caryatid.objects.description_length import Evidence, explain
+from caryatid.fitting.primitives import Fit
 objects = heap()
 said = hashlib.sha256()
 for result in fits_of(objects, range(len(objects))):

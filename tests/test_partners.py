@@ -6,11 +6,11 @@ import numba
 import numpy as np
 import pytest
 
-from caryatid import frames
-from caryatid.kernels.descent import normal_equations, step_down
-from caryatid.kernels.parallel import for_each
-from caryatid.kernels.partners import CHUNK, Search, find_partners, index_patches
-from caryatid.registration import twist_transform
+from caryatid.geometry import transforms
+from caryatid.runtime.parallel import for_each
+from caryatid.sensing.correspondences import CHUNK, Search, find_partners, index_patches
+from caryatid.sensing.gauss_newton import normal_equations, step_down
+from caryatid.sensing.registration import twist_transform
 
 EDGE, MIN_COSINE, NORMAL_REACH, NOISE = 0.05, 0.9, 0.05, 0.001
 PIVOT = np.array([0.02, -0.01, 0.03])
@@ -29,7 +29,7 @@ def patches(seed, count=700):
     normals = 0.1 * rng.normal(size=(count, 3))
     normals[np.arange(count), axis] += sign
     return np.column_stack(
-        [points, frames.unit(normals), rng.uniform(1e-7, 1e-6, count), rng.integers(1, 4, count)]
+        [points, transforms.unit(normals), rng.uniform(1e-7, 1e-6, count), rng.integers(1, 4, count)]
     )
 
 
@@ -73,15 +73,15 @@ def found_reference(reach, pairs=((0, 2), (1, 2), (0, 1)), stride=1):
     for still, moving in pairs:
         T, S = twist_transform(TWISTS[moving], PIVOT), twist_transform(TWISTS[still], PIVOT)
         others = patches(still)
-        q, m = frames.transform(S, others[:, :3]), frames.rotate(S, others[:, 3:6])
+        q, m = transforms.transform(S, others[:, :3]), transforms.rotate(S, others[:, 3:6])
         for sample in patches(moving)[:130:stride]:
-            p, n = frames.transform(T, sample[:3]), frames.rotate(T, sample[3:6])
+            p, n = transforms.transform(T, sample[:3]), transforms.rotate(T, sample[3:6])
             apart, cosine = np.linalg.norm(q - p, axis=1), m @ n
             cost = apart**2 + 2.0 * NORMAL_REACH**2 * (1.0 - cosine)
             cost[(apart >= reach) | (cosine <= MIN_COSINE) | (others[:, 7] != sample[7])] = np.inf
             k = int(np.argmin(cost))
             if np.isfinite(cost[k]):
-                between, middle = frames.unit(n + m[k]), 0.5 * (p + q[k]) - PIVOT
+                between, middle = transforms.unit(n + m[k]), 0.5 * (p + q[k]) - PIVOT
                 variance = sample[6] + others[k, 6] + NOISE**2
                 rows.append([*between, *np.cross(middle, between), np.dot(p - q[k], between), 1.0 / variance])
     return np.array(rows)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from caryatid import frames
-from caryatid.kernels.patches import fit_planes, gather_patches
+from caryatid.geometry import transforms
+from caryatid.sensing.surfel_kernels import fit_planes, gather_patches
 
 NEAR, FAR, LABEL_FAR = 0.01, 0.03, 9
 
@@ -15,7 +15,7 @@ def readings(seed=0, count=4000):
     """Points of several labels around the origin, in clumps of a few a voxel; label 0 is among them."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.06, 0.06, (count, 3))
-    normals = frames.unit(rng.normal(size=(count, 3)) + np.array([0.0, 0.0, 1.5]))
+    normals = transforms.unit(rng.normal(size=(count, 3)) + np.array([0.0, 0.0, 1.5]))
     return points, normals, rng.choice([0, 1, 2, LABEL_FAR], count).astype(np.int32)
 
 
@@ -107,7 +107,7 @@ def test_planes_are_those_of_least_spread():
     rng = np.random.default_rng(0)
     side = rng.integers(0, 6, 600)
     flat_points = rng.normal(size=(600, 3)) * (0.05, 0.02, 0.001)
-    turns = np.stack([frames.random_rotation(rng) for _ in range(6)])
+    turns = np.stack([transforms.random_rotation(rng) for _ in range(6)])
     points = np.einsum("nij,nj->ni", turns[side], flat_points) + rng.normal(size=(6, 3))[side]
     points[::9] += 0.02 * rng.normal(size=points[::9].shape)
     normals, widths, heights = fit_planes(points, side, 6, 0.002, 4)

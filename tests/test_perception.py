@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from synthetic import TABLE_TOP, motion_about_vertical, moved, random_motion, simulated_cloud, simulated_views
 
-from caryatid import frames
 from caryatid.config import Config
 from caryatid.errors import InputError, PerceptionError
-from caryatid.perception import label_image, level_cloud, perceive
-from caryatid.views import SUPPORT_LABEL, Cloud, View
+from caryatid.geometry import transforms
+from caryatid.segmentation.perception import label_image, level_cloud, perceive
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 CONFIG = Config()
 VIEW = simulated_views("tower")[0]
@@ -84,7 +84,7 @@ def test_a_view_of_nothing_but_the_floor_keeps_the_known_table():
 
 def test_points_are_where_their_pixels_see_them():
     percept = percept_of(VIEW)
-    expected = frames.transform(VIEW.pose, VIEW.points_camera.reshape(-1, 3)[percept.pixels])
+    expected = transforms.transform(VIEW.pose, VIEW.points_camera.reshape(-1, 3)[percept.pixels])
     np.testing.assert_allclose(percept.cloud.points_world, expected)
     np.testing.assert_array_equal(percept.cloud.rgb, VIEW.rgb.reshape(-1, 3)[percept.pixels])
     np.testing.assert_array_equal(percept.cloud.viewpoint_world, VIEW.pose[:3, 3])
@@ -94,8 +94,8 @@ def test_a_view_without_a_pose_gets_a_level_world_on_the_table():
     percept = percept_of(without_pose(VIEW))
     T_world_camera = percept.view.pose
     on_objects = VIEW.labels > 0
-    heights = frames.transform(T_world_camera, VIEW.points_camera)[on_objects][:, 2]
-    true = frames.transform(VIEW.pose, VIEW.points_camera)[on_objects][:, 2] - TABLE_TOP
+    heights = transforms.transform(T_world_camera, VIEW.points_camera)[on_objects][:, 2]
+    true = transforms.transform(VIEW.pose, VIEW.points_camera)[on_objects][:, 2] - TABLE_TOP
     np.testing.assert_allclose(heights, true, atol=0.002)
     np.testing.assert_allclose(T_world_camera[:2, 3], 0.0, atol=1e-12)
     assert percept.surface.point_world[2] == pytest.approx(0.0, abs=0.001)
@@ -149,7 +149,7 @@ def test_a_view_of_a_wall_has_no_support_surface():
     wall = View(
         np.full((120, 160), 1.0), np.array([[131.0, 0, 79.5], [0, 131.0, 59.5], [0, 0, 1]]), name="wall"
     )
-    level = frames.look_at((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
+    level = transforms.look_at((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
     with pytest.raises(PerceptionError, match="wall: no support surface"):
         percept_of(wall.with_pose(level))
 
@@ -183,7 +183,7 @@ def test_a_moved_percept_is_moved_in_all_its_parts():
     T = motion_about_vertical(np.random.default_rng(0))
     there = percept.moved(T)
     np.testing.assert_allclose(
-        there.cloud.points_world, frames.transform(T, percept.cloud.points_world), atol=1e-12
+        there.cloud.points_world, transforms.transform(T, percept.cloud.points_world), atol=1e-12
     )
     np.testing.assert_allclose(there.view.pose, T @ percept.view.pose)
     np.testing.assert_allclose(
@@ -208,7 +208,7 @@ def test_the_label_image_holds_each_label_at_its_pixel():
 
 def test_a_cloud_in_its_sensors_frame_is_levelled():
     percept = percept_of(VIEW, "labels")
-    T_camera_world = frames.invert(VIEW.pose)
+    T_camera_world = transforms.invert(VIEW.pose)
     world = replace(percept.cloud, labels=VIEW.labels.ravel()[percept.pixels])
     stored = moved(world, T_camera_world)
     level = level_cloud(stored, CONFIG, segmentation=None, rng=np.random.default_rng(0))
@@ -221,6 +221,6 @@ def test_a_cloud_in_its_sensors_frame_is_levelled():
 
 def test_levelling_finds_no_table_where_there_is_none():
     rng = np.random.default_rng(0)
-    noise = Cloud(rng.normal(size=(500, 3)), frames.unit(rng.normal(size=(500, 3))), name="noise")
+    noise = Cloud(rng.normal(size=(500, 3)), transforms.unit(rng.normal(size=(500, 3))), name="noise")
     with pytest.raises(PerceptionError, match="noise: "):
         level_cloud(moved(noise, random_motion(rng)), CONFIG, segmentation=None, rng=rng)

@@ -17,9 +17,9 @@ from raycast import from_the_side, table_scene
 from rich.console import Console
 
 import caryatid as ct
-from caryatid import frames
 from caryatid.benchmark.provenance import Provenance
-from caryatid.interest import points_of_interest
+from caryatid.geometry import transforms
+from caryatid.planning.points_of_interest import points_of_interest
 from caryatid.simulation.mjcf import TABLE_HEIGHT
 from caryatid.simulation.solids import bounds
 
@@ -191,7 +191,7 @@ def test_errors_do_not_depend_on_which_way_an_axis_points():
     shape = draw(Setting("cylinder", 1000, "all around"), 0).shape
     exact = fitting.estimate_of(shape)
     assert fitting.errors(exact, shape) == pytest.approx({"axis": 0.0, "radius": 0.0}, abs=1e-5)
-    tilt = frames.rotation_from_vector(np.radians(3.0) * frames.perpendicular(exact.axis))
+    tilt = transforms.rotation_from_vector(np.radians(3.0) * transforms.perpendicular(exact.axis))
     other = peers.Estimate(-tilt @ exact.axis, exact.radius + 0.002)
     assert fitting.errors(other, shape) == pytest.approx({"axis": 3.0, "radius": 2.0})
     assert np.isnan(list(fitting.errors(peers.Estimate(), shape).values())).all()

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 
 from caryatid.config import SegmentationConfig
-from caryatid.plain_colours import cut_by_colour, two_colours
+from caryatid.segmentation.colour_cut import cut_by_colour, two_colours
 
 CONFIG = SegmentationConfig()
 RED, BLUE = np.array([200, 30, 30], np.uint8), np.array([30, 30, 200], np.uint8)

@@ -14,8 +14,8 @@ import pytest
 from conftest import SMALL
 from test_planners import CUBE, HOME, OPEN, state
 
-from caryatid import frames
-from caryatid.planners import ENTRY_POINTS
+from caryatid.geometry import transforms
+from caryatid.planning.planners import ENTRY_POINTS
 
 PACKAGE = Path(__file__).parents[1] / "examples" / "planner_package"
 PROJECT = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
@@ -56,7 +56,7 @@ def test_the_command_line_explores_with_it(environment, tmp_path):
 
 def test_it_is_made_by_its_name_and_listed_with_the_others(environment):
     code = (
-        "from caryatid.planners import make_planner\n"
+        "from caryatid.planning.planners import make_planner\n"
         f"print(type(make_planner('{NAME}')).__name__)\n"
         "make_planner('no-such')"
     )
@@ -73,8 +73,8 @@ def test_it_looks_from_above_and_then_all_around(planner):
         np.testing.assert_array_equal(decision.T_world_camera, OPEN.T_world_camera[decision.index])
         visited = np.vstack([visited, chosen])
     assert visited[1, 2] == OPEN.directions[:, 2].max()
-    flat = frames.unit(np.delete(visited, 1, axis=0) * (1.0, 1.0, 0.0))
-    apart = np.rad2deg(frames.angle_between(flat[:, None], flat[None]))
+    flat = transforms.unit(np.delete(visited, 1, axis=0) * (1.0, 1.0, 0.0))
+    apart = np.rad2deg(transforms.angle_between(flat[:, None], flat[None]))
     assert apart[~np.eye(len(flat), dtype=bool)].min() > 80.0
 
 

@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 from planning_states import CONFIG, CUBE, HOME, ON_TABLE, OPEN, SPHERE, TABLE, box, candidates, known, state
 
-from caryatid import frames, planners
-from caryatid.candidates import Candidates
 from caryatid.config import VoxelConfig
 from caryatid.errors import InputError, PlanningError
+from caryatid.geometry import transforms
 from caryatid.graph import Support, SupportGraph
-from caryatid.planners import BUILT_IN, make_planner
-from caryatid.planners.hidden import SPACE, space_samples, surface_samples, unseen_shares, visibility
-from caryatid.recording_robot import RecordingRobot
-from caryatid.view_sphere import direction
-from caryatid.voxels import VoxelMap
+from caryatid.planning import planners
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.hidden_surface import SPACE, space_samples, surface_samples, unseen_shares, visibility
+from caryatid.planning.planners import BUILT_IN, make_planner
+from caryatid.robots.recording import RecordingRobot
+from caryatid.sensing.view_sphere import direction
+from caryatid.sensing.voxel_map import VoxelMap
 
 CORNERS = ((0.12, 0.12), (0.12, -0.12), (-0.12, 0.12), (-0.12, -0.12))
 """Where four objects stand around the middle of the table [m]."""
@@ -72,7 +73,7 @@ def test_an_unknown_planner_lists_those_there_are():
 
 
 def test_other_packages_offer_planners_by_entry_point(monkeypatch: pytest.MonkeyPatch):
-    offer = EntryPoint("mine", "caryatid.planners.random:RandomPlanner", planners.ENTRY_POINTS)
+    offer = EntryPoint("mine", "caryatid.planning.planners.random:RandomPlanner", planners.ENTRY_POINTS)
     monkeypatch.setattr(planners, "entry_points", lambda group: [offer] if group == offer.group else [])
     assert isinstance(make_planner("mine"), planners.RandomPlanner)
     with pytest.raises(InputError, match=f"{', '.join(BUILT_IN)}, mine"):
@@ -91,12 +92,12 @@ class TestPaper:
     def test_its_score_is_the_papers_formula(self):
         decision = make_planner("paper").plan(state([CUBE], (ON_TABLE,)), np.random.default_rng(0))
         chosen = OPEN.directions[decision.index]
-        alpha = frames.angle_between(HOME, chosen)
+        alpha = transforms.angle_between(HOME, chosen)
         midpoint = (TABLE.centre_world + CUBE.centre_world) / 2.0 - SPHERE.centre_world
         sigma = np.deg2rad(CONFIG.spread)
 
         def bump(top: np.ndarray) -> float:
-            return float(np.exp(-0.5 * (frames.angle_between(top, chosen) / sigma) ** 2))
+            return float(np.exp(-0.5 * (transforms.angle_between(top, chosen) / sigma) ** 2))
 
         assert decision.cost == pytest.approx(np.sin(alpha / 2.0))
         assert decision.score == pytest.approx(decision.saliency - decision.cost)
@@ -156,7 +157,7 @@ class TestSupport:
         for _ in range(4):
             decision = make_planner("support").plan(state([CUBE], (ON_TABLE,), visited=visited), rng)
             chosen = OPEN.directions[decision.index]
-            assert np.rad2deg(frames.angle_between(visited, chosen)).min() > 15.0
+            assert np.rad2deg(transforms.angle_between(visited, chosen)).min() > 15.0
             visited = np.vstack([visited, chosen])
 
     def test_what_cannot_be_reached_is_not_wanted(self):

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from planning_states import CONFIG, CUBE, HOME, OPEN, candidates, state
 
-from caryatid import frames
-from caryatid.candidates import Candidates
-from caryatid.planners import make_planner
+from caryatid.geometry import transforms
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import make_planner
 
 
 def tour(name: str, views: int, offered: Candidates = OPEN, **settings: object) -> np.ndarray:
@@ -43,16 +43,18 @@ def test_a_stop_that_cannot_be_reached_is_replaced_by_the_nearest_view():
     offered = candidates(wall)
     visited = tour("ring", 3, offered, ring_views=4)
     opposite = -HOME * (1.0, 1.0, -1.0)
-    nearest = frames.angle_between(offered.directions, opposite).min()
+    nearest = transforms.angle_between(offered.directions, opposite).min()
     assert nearest > np.deg2rad(10.0), "the wall leaves the stop open"
-    assert frames.angle_between(visited[2], opposite) == pytest.approx(nearest)
+    assert transforms.angle_between(visited[2], opposite) == pytest.approx(nearest)
 
 
 def test_farthest_is_farthest():
     visited = tour("farthest", 6)
     for n in range(1, len(visited)):
-        smallest = np.array([frames.angle_between(visited[:n], d).min() for d in OPEN.directions])
-        assert frames.angle_between(visited[:n], visited[n]).min() == pytest.approx(smallest.max(), abs=1e-6)
+        smallest = np.array([transforms.angle_between(visited[:n], d).min() for d in OPEN.directions])
+        assert transforms.angle_between(visited[:n], visited[n]).min() == pytest.approx(
+            smallest.max(), abs=1e-6
+        )
 
 
 def test_of_equally_far_candidates_the_first_is_taken():

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from planning_states import CONFIG, CUBE, HOME, ON_TABLE, OPEN, TABLE, box, candidates, known, state
 
-from caryatid import frames
 from caryatid.config import VoxelConfig
-from caryatid.kernels.information import gather, gather_reference
-from caryatid.planners import PlanningState, make_planner
-from caryatid.planners.hidden import space_above
-from caryatid.planners.volumetric import FORMULATIONS, image_rays, layers, ray_information
-from caryatid.voxels import FREE, OCCUPIED, UNKNOWN, VoxelMap
+from caryatid.geometry import transforms
+from caryatid.planning.hidden_surface import space_above
+from caryatid.planning.information import gather, gather_reference
+from caryatid.planning.planners import PlanningState, make_planner
+from caryatid.planning.planners.volumetric import FORMULATIONS, image_rays, layers, ray_information
+from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
 SIZE = 0.01
 STRAIGHT = np.array([[0.0, 0.0, 1.0]])
@@ -43,7 +43,7 @@ def line(*states: int) -> VoxelMap:
 def along(voxels: VoxelMap, proximity: float = 0.1, backwards: bool = False) -> dict[str, float]:
     """What a single ray along +x, or −x, through the row of voxels gathers."""
     eye, target = (-0.5, 0.005, 0.005), (1.0, 0.005, 0.005)
-    T_world_camera = frames.look_at(target, eye) if backwards else frames.look_at(eye, target)
+    T_world_camera = transforms.look_at(target, eye) if backwards else transforms.look_at(eye, target)
     gathered = gather(
         voxels.states, layers(voxels, proximity), T_world_camera[None], STRAIGHT, np.zeros(3), SIZE
     )
@@ -94,7 +94,7 @@ class TestFormulas:
         states[16:] = UNKNOWN
         voxels = map_of(states)
         middle = np.full(3, 0.15)
-        poses = np.stack([frames.look_at(middle + (x, 0.0, 0.0), middle) for x in (-1.0, 1.0)])
+        poses = np.stack([transforms.look_at(middle + (x, 0.0, 0.0), middle) for x in (-1.0, 1.0)])
         found = gather(voxels.states, layers(voxels, 0.1), poses, image_rays(CONFIG), np.zeros(3), SIZE)
         for name in SHOWN:
             front, back = found[:, FORMULATIONS.index(name)]
@@ -116,8 +116,8 @@ def test_the_kernel_agrees_with_its_reference():
         assert {UNKNOWN, FREE, OCCUPIED} == set(np.unique(voxels.states))
         eyes = rng.uniform(-1.5, 1.5, (4, 3))
         eyes[0] = (0.01, 0.02, 0.03)
-        poses = np.stack([frames.look_at(eye, rng.uniform(-0.2, 0.2, 3)) for eye in eyes])
-        rays_camera = frames.unit(rng.normal(size=(150, 3)) * (0.3, 0.3, 0.0) + (0.0, 0.0, 1.0))
+        poses = np.stack([transforms.look_at(eye, rng.uniform(-0.2, 0.2, 3)) for eye in eyes])
+        rays_camera = transforms.unit(rng.normal(size=(150, 3)) * (0.3, 0.3, 0.0) + (0.0, 0.0, 1.0))
         args = (voxels.states, layers(voxels, 0.2), poses, rays_camera, voxels.origin_world, 0.05)
         compiled, reference = gather(*args), gather_reference(*args)
         assert (reference > 1.0).all()
@@ -129,8 +129,8 @@ import sys
 import numpy as np
 import numba
 from planning_states import CUBE, OPEN, SPHERE, state
-from caryatid.planners.volumetric import ray_information
-from caryatid.voxels import VoxelMap
+from caryatid.planning.planners.volumetric import ray_information
+from caryatid.sensing.voxel_map import VoxelMap
 from dataclasses import replace
 situation = state([CUBE])
 rng = np.random.default_rng(0)
@@ -195,24 +195,24 @@ class TestPlanner:
     def test_its_score_is_the_utility(self, name: str):
         situation = beside_screen(1.0, cost_weight=0.7, path_cost="angle")
         decision = make_planner(name).plan(situation, np.random.default_rng(0))
-        alpha = frames.angle_between(HOME, OPEN.directions[decision.index])
+        alpha = transforms.angle_between(HOME, OPEN.directions[decision.index])
         assert decision.score == pytest.approx(decision.saliency - decision.cost)
         double = make_planner(name).plan(
             beside_screen(1.0, cost_weight=1.4, path_cost="angle"), np.random.default_rng(0)
         )
-        other = frames.angle_between(HOME, OPEN.directions[double.index])
+        other = transforms.angle_between(HOME, OPEN.directions[double.index])
         ratio = np.sin(other / 2.0) / np.sin(alpha / 2.0)
         assert double.cost == pytest.approx(2.0 * ratio * decision.cost)
 
     def test_dear_ways_are_not_gone(self, name: str):
         situation = beside_screen(1.0, cost_weight=1000.0)
         decision = make_planner(name).plan(situation, np.random.default_rng(0))
-        assert np.rad2deg(frames.angle_between(HOME, OPEN.directions[decision.index])) < 15.0
+        assert np.rad2deg(transforms.angle_between(HOME, OPEN.directions[decision.index])) < 15.0
 
     def test_it_does_not_stay_where_it_is(self, name: str):
         situation = beside_screen(-1.0)
         decision = make_planner(name).plan(situation, np.random.default_rng(0))
-        assert np.rad2deg(frames.angle_between(HOME, OPEN.directions[decision.index])) > 5.0
+        assert np.rad2deg(transforms.angle_between(HOME, OPEN.directions[decision.index])) > 5.0
 
     def test_what_cannot_be_reached_is_not_wanted(self, name: str):
         offered = candidates(((0.62, 0.0, 1.0), (0.03, 1.6, 1.0)))

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from synthetic import motion_about_vertical
 
-from caryatid import frames
 from caryatid.config import PlausibilityConfig
-from caryatid.contacts import find_contacts, find_gap
+from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject
-from caryatid.plausibility import closing, reconcile
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.uncertainty import Uncertainty
+from caryatid.support.contacts import find_contacts, find_gap
+from caryatid.support.plausibility import closing, reconcile
 
 CONFIG = PlausibilityConfig()
 TABLE = SceneObject(
-    "o0", 0, Box(frames.rigid(np.eye(3), (0, 0, -0.02)), np.array([1.0, 1.0, 0.04])), "support_surface"
+    "o0", 0, Box(transforms.rigid(np.eye(3), (0, 0, -0.02)), np.array([1.0, 1.0, 0.04])), "support_surface"
 )
 
 
@@ -31,7 +31,7 @@ def unsure(sigma: float = 0.001, turn: float = 0.001, **sides: float) -> Uncerta
 
 def block(label: int, centre, size, known: Uncertainty | None) -> SceneObject:
     return SceneObject(
-        f"o{label}", label, Box(frames.rigid(np.eye(3), centre), np.array(size)), uncertainty=known
+        f"o{label}", label, Box(transforms.rigid(np.eye(3), centre), np.array(size)), uncertainty=known
     )
 
 
@@ -67,7 +67,7 @@ def test_an_overlap_is_taken_from_the_side_nobody_saw():
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
 def test_what_hovers_is_let_down_onto_what_carries_it(kind):
-    T = frames.rigid(np.eye(3), (0.0, 0.0, 0.055))
+    T = transforms.rigid(np.eye(3), (0.0, 0.0, 0.055))
     shape = {"box": Box(T, np.full(3, 0.1)), "cylinder": Cylinder(T, 0.03, 0.1), "sphere": Sphere(T, 0.05)}[
         kind
     ]

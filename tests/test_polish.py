@@ -8,12 +8,12 @@ import reference_fits as reference
 from scipy.special import ndtr
 from synthetic import box, cylinder, hausdorff, random_motion, sphere
 
-from caryatid import frames
 from caryatid.config import FitConfig
-from caryatid.kernels.rims import likeliest_end
-from caryatid.polish import Polish, polish
-from caryatid.refine import distances
-from caryatid.shapes import Box, Cylinder
+from caryatid.fitting.edge_likelihood import likeliest_end
+from caryatid.fitting.hidden_faces import Polish, polish
+from caryatid.fitting.least_squares import distances
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder
 
 INDEPENDENT = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
 """Every point has an error of its own."""
@@ -33,7 +33,7 @@ def face_points(shape, axis, sign, count, rng, sigma):
     """Points drawn evenly over one face of a box, with noise in space."""
     local = rng.uniform(-0.5, 0.5, (count, 3)) * shape.extents
     local[:, axis] = sign * shape.extents[axis] / 2.0
-    return frames.transform(shape.T_world_object, local) + sigma * rng.normal(size=(count, 3))
+    return transforms.transform(shape.T_world_object, local) + sigma * rng.normal(size=(count, 3))
 
 
 def two_faces(seed, sigma=0.002, shape=BOX):
@@ -45,7 +45,7 @@ def mantle_points(shape, count, rng, sigma):
     """Points drawn evenly over the front half of a cylinder's mantle."""
     angle, z = rng.uniform(0.0, np.pi, count), rng.uniform(-0.5, 0.5, count) * shape.height
     local = np.stack([shape.radius * np.cos(angle), shape.radius * np.sin(angle), z], axis=1)
-    return frames.transform(shape.T_world_object, local) + sigma * rng.normal(size=(count, 3))
+    return transforms.transform(shape.T_world_object, local) + sigma * rng.normal(size=(count, 3))
 
 
 def end_reference(coordinates, start, sigma, window, growing, stray):
@@ -137,7 +137,7 @@ def test_the_radius_of_a_disc_is_where_it_ends():
 def test_a_ball_is_told_by_any_part_of_it():
     ball = sphere((0.0, 0.0, 0.0), 0.04)
     rng = np.random.default_rng(0)
-    normals = frames.unit(rng.normal(size=(3000, 3)))
+    normals = transforms.unit(rng.normal(size=(3000, 3)))
     points = ball.radius * normals[normals[:, 0] > 0.0]
     points = points + 0.002 * rng.normal(size=points.shape)
     found, uncertainty = polished(ball, np.arange(6) == 1, points)
@@ -199,7 +199,7 @@ def half_view(shape, seed, count=700, sigma=0.002):
         end = np.stack(
             [reach * np.cos(angle), reach * np.sin(angle), np.full(count, shape.height / 2.0)], axis=1
         )
-        end = frames.transform(shape.T_world_object, end) + sigma * rng.normal(size=end.shape)
+        end = transforms.transform(shape.T_world_object, end) + sigma * rng.normal(size=end.shape)
         points = [mantle_points(shape, count, rng, sigma), end]
     stray = rng.uniform(-0.1, 0.1, (20, 3)) + shape.T_world_object[:3, 3]
     return np.concatenate([*points, stray])
@@ -230,7 +230,7 @@ def test_polished_shapes_are_those_of_the_reference_whatever_was_seen(kind, seed
     pose = random_motion(rng, 0.3)
     shape = Box(pose, np.array([0.08, 0.12, 0.1])) if kind == "box" else Cylinder(pose, 0.045, 0.11)
     points = half_view(shape, seed)
-    start = shape.moved(frames.rigid(np.eye(3), 0.002 * rng.normal(size=3)))
+    start = shape.moved(transforms.rigid(np.eye(3), 0.002 * rng.normal(size=3)))
     seen = rng.random(6) < 0.5
     if kind == "cylinder" and seed < 4:
         seen[:4] = False
@@ -240,7 +240,7 @@ def test_polished_shapes_are_those_of_the_reference_whatever_was_seen(kind, seed
 
 def test_a_polished_ball_is_that_of_the_reference():
     rng = np.random.default_rng(0)
-    normals = frames.unit(rng.normal(size=(2000, 3)))
+    normals = transforms.unit(rng.normal(size=(2000, 3)))
     points = 0.04 * normals[normals[:, 0] > 0.0] + 0.002 * rng.normal(size=(np.sum(normals[:, 0] > 0.0), 3))
     start = sphere((0.002, 0.001, 0.0), 0.043)
     assert_polished_as_the_reference(start, np.arange(6) == 1, points, FitConfig())
@@ -296,7 +296,7 @@ def test_shapes_polished_together_are_as_polished_alone():
     found = [
         Polish(BOX, tuple(TWO_FACES), two_faces(0)),
         Polish(CAN, (True, True, False, True, False, False), mantle_points(CAN, 400, rng, 0.002)),
-        Polish(sphere((0.0, 0.0, 0.0), 0.04), (False, True) * 3, 0.04 * frames.unit(ball) + 0.001 * ball),
+        Polish(sphere((0.0, 0.0, 0.0), 0.04), (False, True) * 3, 0.04 * transforms.unit(ball) + 0.001 * ball),
     ]
     together = polish(found, FitConfig())
     for order in ((0, 1, 2), (2, 0, 1)):

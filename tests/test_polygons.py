@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import shapely
 
-from caryatid import frames
-from caryatid.kernels.polygons import area, cap, hull, intersection, nearest_on_border
+from caryatid.geometry import transforms
+from caryatid.geometry.polygons import area, cap, hull, intersection, nearest_on_border
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
@@ -98,8 +98,8 @@ def test_the_nearest_point_of_the_border_is_the_one_of_shapely(seed):
 def test_the_cap_is_what_lies_near_the_outermost_point(seed):
     """Against the hull of all segments between corners, cut off by the plane."""
     rng = np.random.default_rng(seed)
-    corners = (CUBE * rng.uniform(0.02, 0.2, 3)) @ frames.random_rotation(rng).T + rng.normal(size=3)
-    direction = frames.unit(rng.normal(size=3))
+    corners = (CUBE * rng.uniform(0.02, 0.2, 3)) @ transforms.random_rotation(rng).T + rng.normal(size=3)
+    direction = transforms.unit(rng.normal(size=3))
     depth = rng.uniform(0.001, 0.2)
     reach = corners @ direction
     kept = [corners[reach >= reach.max() - depth]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid.pose_graph import Ties
+from caryatid.sensing.pose_graph import Ties
 
 STILL, MOVING = np.array([0, 0, 1, 2]), np.array([1, 2, 2, 3])
 

@@ -7,10 +7,10 @@ import pytest
 import reference_fits as reference
 from synthetic import box, cylinder, hausdorff, random_motion, sphere, surface_points
 
-from caryatid import frames
 from caryatid.config import FitConfig
-from caryatid.primitives import Fit, FitFailure, Oriented, candidates, fit, fit_many
-from caryatid.shapes import Box, Cylinder
+from caryatid.fitting.primitives import Fit, FitFailure, Oriented, candidates, fit, fit_many
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder
 
 CONFIG = FitConfig()
 EYE = (-1.1, 0.35, 0.95)
@@ -39,7 +39,7 @@ def candidates_of(points, normals, config=CONFIG, seed=0):
 
 
 def noisy_normals(normals, rng, degrees=5.0):
-    return frames.unit(normals + np.radians(degrees) * rng.normal(size=normals.shape))
+    return transforms.unit(normals + np.radians(degrees) * rng.normal(size=normals.shape))
 
 
 @each
@@ -72,7 +72,7 @@ def test_hundreds_of_points_do_not_hide_an_outlier_or_two(shape):
     count = len(points) // 20
     stray = rng.uniform(-0.12, 0.12, (count, 3))
     points = np.concatenate([points, stray])
-    normals = np.concatenate([normals, frames.unit(rng.normal(size=(count, 3)))])
+    normals = np.concatenate([normals, transforms.unit(rng.normal(size=(count, 3)))])
     assert fit_of(points, normals).shape.kind == shape.kind
 
 
@@ -343,8 +343,8 @@ def test_a_kilometre_away_it_is_the_same_shape(shape):
     rng = np.random.default_rng(0)
     points, normals = surface_points(shape, rng, eye=EYE, sigma=0.002)
     normals = noisy_normals(normals, rng)
-    far = frames.rigid(np.eye(3), (1000.0, -1000.0, 1000.0))
-    here, there = fit_of(points, normals).shape, fit_of(frames.transform(far, points), normals).shape
+    far = transforms.rigid(np.eye(3), (1000.0, -1000.0, 1000.0))
+    here, there = fit_of(points, normals).shape, fit_of(transforms.transform(far, points), normals).shape
     assert there.kind == here.kind
     assert hausdorff(there, here.moved(far)) < 1e-6
 

@@ -29,15 +29,15 @@ from synthetic import (
     vertices,
 )
 
-from caryatid import frames
 from caryatid.config import FitConfig, SupportConfig
-from caryatid.contacts import find_contacts
 from caryatid.evaluation.scores import as_scene, score, score_scenes
 from caryatid.evaluation.truths import true_scene_from_simulation
-from caryatid.formats.graph_json import graph_text
-from caryatid.primitives import Fit, Oriented, fit, fit_many
+from caryatid.fitting.primitives import Fit, Oriented, fit, fit_many
+from caryatid.geometry import transforms
+from caryatid.io.graph_json import graph_text
 from caryatid.simulation.truth import ground_truth
-from caryatid.support import infer
+from caryatid.support.contacts import find_contacts
+from caryatid.support.relations import infer
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.sampled_from(["box", "cylinder", "sphere"])
@@ -65,7 +65,7 @@ def half_view(kind, seed, sigma):
     points, normals = surface_points(
         random_shape(kind, rng), rng, eye=(0.0, 0.0, 1.5), spacing=0.007, sigma=sigma
     )
-    return points, frames.unit(normals + np.radians(2.0) * rng.normal(size=normals.shape))
+    return points, transforms.unit(normals + np.radians(2.0) * rng.normal(size=normals.shape))
 
 
 def fit_of(points, normals, seed=0):
@@ -81,7 +81,7 @@ def test_a_fit_moves_with_its_points_under_any_motion(kind, seed, sigma):
     points, normals = half_view(kind, seed, sigma)
     T = random_motion(np.random.default_rng(seed), 2.0)
     here = fit_of(points, normals)
-    there = fit_of(frames.transform(T, points), frames.rotate(T, normals))
+    there = fit_of(transforms.transform(T, points), transforms.rotate(T, normals))
     assert isinstance(here, Fit)
     assert there.shape.kind == here.shape.kind
     assert hausdorff(there.shape, here.shape.moved(T)) < 1e-5
@@ -95,7 +95,7 @@ def test_a_fit_moves_with_its_points_to_the_last_digits():
     for seed in range(60):
         points, normals = half_view(("box", "cylinder", "sphere")[seed % 3], seed, 0.002)
         T = random_motion(np.random.default_rng(seed), 2.0)
-        there = fit_of(frames.transform(T, points), frames.rotate(T, normals))
+        there = fit_of(transforms.transform(T, points), transforms.rotate(T, normals))
         off.append(hausdorff(there.shape, fit_of(points, normals).shape.moved(T)))
     assert sorted(off)[-2] < 1e-9
     assert max(off) < 1e-5
@@ -169,7 +169,7 @@ def test_contacts_move_with_the_shapes_about_the_vertical(seed):
     assert len(here) >= 4
     for before, after in zip(here, there, strict=True):
         assert after.distance == pytest.approx(before.distance, abs=1e-6)
-        assert frames.angle_between(after.normal_world, frames.rotate(T, before.normal_world)) < 1e-3
+        assert transforms.angle_between(after.normal_world, transforms.rotate(T, before.normal_world)) < 1e-3
 
 
 @few(20)

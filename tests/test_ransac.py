@@ -9,11 +9,11 @@ import pytest
 import reference_fits as reference
 from synthetic import random_motion, sphere, surface_points
 
-from caryatid import frames
 from caryatid.config import FitConfig
-from caryatid.kernels.ransac import BATCH, hypothesis, msac, search, trimmed_range
-from caryatid.refine import CODES, arrays
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.fitting.least_squares import CODES, arrays
+from caryatid.fitting.ransac import BATCH, hypothesis, msac, search, trimmed_range
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 
 CONFIG = FitConfig()
 KINDS = sorted(CODES)
@@ -38,7 +38,7 @@ def oriented(kind, seed, clutter=0.2, sigma=0.002):
     stray = rng.uniform(-0.08, 0.08, (int(clutter * len(points)), 3))
     points = np.concatenate([points, stray])
     normals = np.concatenate([normals, rng.normal(size=stray.shape)])
-    normals = frames.unit(normals + 0.05 * rng.normal(size=normals.shape))
+    normals = transforms.unit(normals + 0.05 * rng.normal(size=normals.shape))
     order = rng.permutation(len(points))[:200]
     return points[order] - points[order].mean(axis=0), normals[order]
 
@@ -59,7 +59,7 @@ def ball_amid_clutter(inliers, outliers, sigma=0.0, seed=0):
     """Points of one ball, the first ones, amid points of no shape."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.15, 0.15, (inliers + outliers, 3))
-    normals = frames.unit(rng.normal(size=points.shape))
+    normals = transforms.unit(rng.normal(size=points.shape))
     reach = BALL.radius + sigma * rng.normal(size=(inliers, 1))
     points[:inliers] = BALL.T_world_object[:3, 3] + reach * normals[:inliers]
     return points, normals
@@ -166,7 +166,7 @@ def test_scoring_ends_once_the_cost_exceeds_the_limit():
 
 def test_of_two_shapes_with_as_many_inliers_the_nearer_one_is_preferred():
     rng = np.random.default_rng(0)
-    normals = frames.unit(rng.normal(size=(30, 3)))
+    normals = transforms.unit(rng.normal(size=(30, 3)))
     points = np.where(np.arange(30)[:, None] < 24, 0.05, 0.059) * normals
     _, _, half, cost = found("sphere", points, normals, pairs(points, 100, 0))
     assert half[0, 0] == pytest.approx(0.05)
@@ -270,7 +270,7 @@ def test_it_stops_where_the_reference_does(inliers):
 def test_the_trimmed_range_leaves_out_as_many_points_at_either_end(trim):
     rng = np.random.default_rng(1)
     points = rng.normal(size=(61, 3))
-    for direction in frames.unit(rng.normal(size=(4, 3))):
+    for direction in transforms.unit(rng.normal(size=(4, 3))):
         low, high = reference.ordered_ends(points @ direction, trim)
         np.testing.assert_allclose(trimmed_range(points, *direction, trim), (low, high))
 

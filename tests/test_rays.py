@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caryatid.kernels.rays import room, traverse, traversed_reference
+from caryatid.geometry.rays import room, traverse, traversed_reference
 
 SHAPE = (13, 17, 11)
 

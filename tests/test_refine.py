@@ -8,8 +8,7 @@ import pytest
 from reference_fits import refined
 from synthetic import hausdorff, random_motion, surface_points
 
-from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
-from caryatid.refine import (
+from caryatid.fitting.least_squares import (
     NOISE_FLOOR,
     ROBUST_WIDTH,
     distances,
@@ -17,7 +16,8 @@ from caryatid.refine import (
     refine_reference,
     stepped,
 )
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.signed_distance import BOX, CYLINDER, SPHERE, normal_equations, signed_distances
 
 T = random_motion(np.random.default_rng(1))
 SHAPES = [Box(T, np.array([0.06, 0.1, 0.14])), Cylinder(T, 0.04, 0.11), Sphere(T, 0.05)]

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from synthetic import TABLE_TOP, box, cylinder, direction, moved, sphere, surface_points
 
-from caryatid import frames
 from caryatid.config import RegistrationConfig
-from caryatid.frames import Array
-from caryatid.joint_registration import ViewRegistration
-from caryatid.registration import twist_transform
-from caryatid.surfels import even_sample, surfels_of
-from caryatid.views import SUPPORT_LABEL, Cloud
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.joint_registration import ViewRegistration
+from caryatid.sensing.registration import twist_transform
+from caryatid.sensing.surfels import even_sample, surfels_of
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
 CONFIG = RegistrationConfig()
 PIVOT = np.array([0.0, 0.0, TABLE_TOP])
@@ -63,14 +63,14 @@ def drawn_error(rng, sigma_mm=10.0, sigma_deg=1.0) -> Array:
 
 def put_right(cloud: Cloud, error: Array) -> Cloud:
     shifted = moved(cloud, error)
-    return replace(shifted, viewpoint_world=frames.transform(error, cloud.viewpoint_world))
+    return replace(shifted, viewpoint_world=transforms.transform(error, cloud.viewpoint_world))
 
 
 def left(registration: ViewRegistration, view: int, error: Array) -> float:
     """How far a point 20 cm from the pivot is from where it belongs, at the worst [m]."""
     corners = PIVOT + 0.2 * np.array([(1, 0, 0), (0, 1, 0), (0, 0, 1), (-1, 0, 0), (0, -1, 0)])
     T = twist_transform(registration.placements[view].twist, PIVOT) @ error
-    return float(np.linalg.norm(frames.transform(T, corners) - corners, axis=1).max())
+    return float(np.linalg.norm(transforms.transform(T, corners) - corners, axis=1).max())
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -254,17 +254,17 @@ def test_the_same_views_give_the_same_bytes():
 
 def test_a_twist_turns_about_its_pivot():
     T = twist_transform(np.array([0.01, 0.02, 0.03, 0.0, 0.0, 0.5]), PIVOT)
-    np.testing.assert_allclose(frames.transform(T, PIVOT), PIVOT + (0.01, 0.02, 0.03))
-    np.testing.assert_allclose(T[:3, :3], frames.rotation_from_vector((0.0, 0.0, 0.5)))
+    np.testing.assert_allclose(transforms.transform(T, PIVOT), PIVOT + (0.01, 0.02, 0.03))
+    np.testing.assert_allclose(T[:3, :3], transforms.rotation_from_vector((0.0, 0.0, 0.5)))
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-5, 0.3, 3.0])
 def test_many_twists_at_once_turn_like_each_of_them(angle):
     rng = np.random.default_rng(0)
     twists = rng.normal(size=(2, 3, 6))
-    twists[..., 3:] = angle * frames.unit(twists[..., 3:])
+    twists[..., 3:] = angle * transforms.unit(twists[..., 3:])
     for found, twist in zip(
         twist_transform(twists, PIVOT).reshape(-1, 4, 4), twists.reshape(-1, 6), strict=True
     ):
-        R = frames.rotation_from_vector(twist[3:])
-        np.testing.assert_allclose(found, frames.rigid(R, PIVOT - R @ PIVOT + twist[:3]), atol=1e-14)
+        R = transforms.rotation_from_vector(twist[3:])
+        np.testing.assert_allclose(found, transforms.rigid(R, PIVOT - R @ PIVOT + twist[:3]), atol=1e-14)

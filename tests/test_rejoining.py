@@ -7,11 +7,11 @@ import pytest
 from raycast import TABLE, K, from_the_side, table_scene
 from test_segmentation import UP, found, surface_of
 
-from caryatid import frames
 from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
-from caryatid.kernels.concavity import hollowness
-from caryatid.kernels.gaps import hidden_gaps, hidden_gaps_reference
-from caryatid.segmentation import segment
+from caryatid.geometry import transforms
+from caryatid.segmentation.concavity import hollowness
+from caryatid.segmentation.occlusion_gaps import hidden_gaps, hidden_gaps_reference
+from caryatid.segmentation.segments import segment
 
 POST = (np.array([0.15, 0.0, TABLE + 0.13]), np.array([0.05, 0.08, 0.26]))
 LONG = (np.array([0.0, 0.0, TABLE + 0.05]), np.array([0.06, 0.3, 0.1]))
@@ -70,7 +70,7 @@ def bowl(T_world_camera, radius=0.09, rim=0.07):
     """A bowl, thin as a shell, upside up on the table: part of a sphere below its rim."""
     view = table_scene(T_world_camera)
     v, u = np.mgrid[0:480, 0:640].astype(np.float64)
-    rays = frames.rotate(
+    rays = transforms.rotate(
         T_world_camera, np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
     )
     eye = T_world_camera[:3, 3]
@@ -96,7 +96,7 @@ def test_the_inside_of_a_bowl_belongs_to_the_bowl():
 
 def test_hollowness_knows_inside_from_outside():
     around = np.random.default_rng(0).normal(size=(500, 3)) * (1.0, 1.0, 0.3) + (0.0, 0.0, 2.0)
-    outward = frames.unit(around)
+    outward = transforms.unit(around)
     assert hollowness(np.hstack([0.1 * outward, -outward])) > 0.2
     assert hollowness(np.hstack([0.1 * outward, outward])) < -0.2
     assert abs(hollowness(np.hstack([around * (1.0, 1.0, 0.0), np.tile(UP, (500, 1))]))) < 1e-9

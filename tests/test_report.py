@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 from report_steps import SMALL, K, at, good, make_cloud, make_graph, make_step, make_view, render_report
 
-from caryatid import frames
-from caryatid.candidates import Candidates
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.report import draw_model, draw_view
-from caryatid.report.charts import Line, bar_chart, line_chart
-from caryatid.report.colours import PALETTE, object_colour
-from caryatid.report.graphs import draw_graph
-from caryatid.report.images import draw_image
-from caryatid.report.layout import arrange, layers
-from caryatid.report.svg import keep_apart
-from caryatid.report.wireframes import Projection, wireframe
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.views import SUPPORT_LABEL, Cloud, View
+from caryatid.planning.candidates import Candidates
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.viz import draw_model, draw_view
+from caryatid.viz.charts import Line, bar_chart, line_chart
+from caryatid.viz.colours import PALETTE, object_colour
+from caryatid.viz.graphs import draw_graph
+from caryatid.viz.images import draw_image
+from caryatid.viz.layout import arrange, layers
+from caryatid.viz.svg import keep_apart
+from caryatid.viz.wireframes import Projection, wireframe
 
 VOID = {"meta", "input", "br", "link", "img", "hr"}
 
@@ -326,7 +326,7 @@ def test_wireframes_lie_on_the_surface(shape: Box | Cylinder | Sphere) -> None:
 @pytest.mark.parametrize("shape", [Cylinder(at(0, 0, 0.1), 0.05, 0.2), Sphere(at(0, 0, 0.1), 0.07)])
 def test_round_shapes_are_outlined_by_their_silhouette(shape: Cylinder | Sphere) -> None:
     eye = np.array([0.9, 0.3, 0.6])
-    T_world_camera = frames.look_at(eye, (0.0, 0.0, 0.1))
+    T_world_camera = transforms.look_at(eye, (0.0, 0.0, 0.1))
     projection = Projection(T_world_camera, K, np.zeros((1, 1), dtype=np.float32))
     drawn, _ = projection.project(np.concatenate(wireframe(shape, eye)))
     solid, _ = projection.project(shape.surface(0.001)[0])
@@ -336,7 +336,7 @@ def test_round_shapes_are_outlined_by_their_silhouette(shape: Cylinder | Sphere)
 
 def test_projection_agrees_with_the_view() -> None:
     view = make_view(make_graph())
-    points_world = frames.transform(view.pose, view.points_camera.reshape(-1, 3))
+    points_world = transforms.transform(view.pose, view.points_camera.reshape(-1, 3))
     valid = view.valid.ravel()
     pixels, z = Projection(view.pose, view.K, view.depth).project(points_world[valid])
     v, u = np.nonzero(view.valid)

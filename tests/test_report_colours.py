@@ -12,9 +12,10 @@ import pytest
 from PIL import Image
 from report_steps import SMALL, good, make_cloud, make_graph, make_step, make_view, render_report
 
-from caryatid.report import draw_view
-from caryatid.report.charts import Line, line_chart
-from caryatid.report.colours import (
+from caryatid.sensing.views import SUPPORT_LABEL
+from caryatid.viz import draw_view
+from caryatid.viz.charts import Line, line_chart
+from caryatid.viz.colours import (
     PALETTE,
     PLAIN,
     SALIENCY_STOPS,
@@ -25,11 +26,10 @@ from caryatid.report.colours import (
     rgb,
     striped_colours,
 )
-from caryatid.report.graphs import draw_graph
-from caryatid.report.images import draw_image
-from caryatid.report.layout import arrange
-from caryatid.report.rows import object_rows, support_rows
-from caryatid.views import SUPPORT_LABEL
+from caryatid.viz.graphs import draw_graph
+from caryatid.viz.images import draw_image
+from caryatid.viz.layout import arrange
+from caryatid.viz.rows import object_rows, support_rows
 
 VISIONS = {
     "full": np.eye(3),

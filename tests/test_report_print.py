@@ -14,7 +14,7 @@ from pypdf import PdfReader
 from report_steps import SMALL, good, make_cloud, make_graph, make_step
 
 from caryatid.errors import InputError
-from caryatid.report import (
+from caryatid.viz import (
     compose_report,
     draw_model,
     draw_view,
@@ -23,8 +23,8 @@ from caryatid.report import (
     render_pdf,
     store_report,
 )
-from caryatid.report.contents import ScoreRow
-from caryatid.report.style import alone
+from caryatid.viz.contents import ScoreRow
+from caryatid.viz.style import alone
 
 A4 = (595.3, 841.9)
 """Width and height of a page [pt]."""
@@ -243,5 +243,5 @@ def test_without_typst_the_extra_is_named(run, tmp_path, capsys, monkeypatch):
 
 
 def test_reports_are_made_without_typst_being_imported():
-    code = "import sys, caryatid.report; sys.exit('typst' in sys.modules)"
+    code = "import sys, caryatid.viz; sys.exit('typst' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

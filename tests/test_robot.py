@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from caryatid import frames
 from caryatid.config import ActiveVisionConfig, RobotConfig
 from caryatid.errors import InputError, PlanningError
-from caryatid.floor import FloorGrid
-from caryatid.recording_robot import RecordingRobot
-from caryatid.robot import HumanoidRobot, Posture, Unreachable, home_view
-from caryatid.view_sphere import ViewSphere, direction
+from caryatid.geometry import transforms
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot, Posture, Unreachable, home_view
+from caryatid.robots.recording import RecordingRobot
+from caryatid.sensing.view_sphere import ViewSphere, direction
 
 CONFIG = RobotConfig()
 SPHERE = ViewSphere.around((0.0, 0.0, 0.75), ActiveVisionConfig())
@@ -45,7 +45,7 @@ class TestFloorGrid:
 
     def test_a_turned_box_blocks_as_it_lies(self):
         half = np.array([[1.0, 0.05, 0.5]])
-        R = frames.rotation_from_vector((0.0, 0.0, np.deg2rad(45.0)))
+        R = transforms.rotation_from_vector((0.0, 0.0, np.deg2rad(45.0)))
         grid = FloorGrid.from_boxes(np.array([[0.0, 0.0, 0.5]]), half, R[None], CONFIG)
         cells, _ = grid.cells(np.array([[0.6, 0.6], [0.6, -0.6]]))
         assert grid.free.ravel()[cells].tolist() == [False, True]
@@ -123,14 +123,17 @@ class TestHumanoidRobot:
     @pytest.mark.parametrize(
         ("T_world_camera", "reason"),
         [
-            (frames.look_at((-1.5, 0.0, 1.0), (0.0, 0.0, 0.75)), "too low: 1.00 m, it reaches 1.30…1.90 m"),
-            (frames.look_at((-1.5, 0.0, 2.0), (0.0, 0.0, 0.75)), "too high"),
-            (frames.look_at((-1.0, 0.0, 1.8), (-0.9, 0.0, 0.75)), "pitch is beyond its limits: -85°"),
-            (frames.look_at((-1.5, 0.0, 1.5), (0.0, 0.0, 2.9)), "pitch is beyond its limits: 43°"),
-            (frames.look_at((-1.5, 0.0, 1.5), (0.0, 0.0, 1.0), (0.0, 0.2, 1.0)), "rolled"),
-            (frames.look_at((-1.5, 0.0, 1.5), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), "rolled"),
-            (frames.look_at((-0.3, 0.0, 1.5), (0.0, 0.0, 1.4)), "in an obstacle"),
-            (frames.look_at((-3.5, 0.0, 1.5), (0.0, 0.0, 1.4)), "outside the floor"),
+            (
+                transforms.look_at((-1.5, 0.0, 1.0), (0.0, 0.0, 0.75)),
+                "too low: 1.00 m, it reaches 1.30…1.90 m",
+            ),
+            (transforms.look_at((-1.5, 0.0, 2.0), (0.0, 0.0, 0.75)), "too high"),
+            (transforms.look_at((-1.0, 0.0, 1.8), (-0.9, 0.0, 0.75)), "pitch is beyond its limits: -85°"),
+            (transforms.look_at((-1.5, 0.0, 1.5), (0.0, 0.0, 2.9)), "pitch is beyond its limits: 43°"),
+            (transforms.look_at((-1.5, 0.0, 1.5), (0.0, 0.0, 1.0), (0.0, 0.2, 1.0)), "rolled"),
+            (transforms.look_at((-1.5, 0.0, 1.5), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0)), "rolled"),
+            (transforms.look_at((-0.3, 0.0, 1.5), (0.0, 0.0, 1.4)), "in an obstacle"),
+            (transforms.look_at((-3.5, 0.0, 1.5), (0.0, 0.0, 1.4)), "outside the floor"),
         ],
     )
     def test_it_says_why_not(self, T_world_camera: np.ndarray, reason: str):
@@ -154,7 +157,7 @@ class TestHumanoidRobot:
     def test_a_turned_head_helps_to_stand_clear(self):
         straight = replace(CONFIG, head_yaws=1, yaw=(0.0, 0.0))
         grid = floor(TABLE, ((-1.84, 0.0, 1.0), (0.05, 2.0, 1.0)))
-        T = frames.look_at((-1.37, 0.0, 1.6), (0.0, 0.0, 0.75))
+        T = transforms.look_at((-1.37, 0.0, 1.6), (0.0, 0.0, 0.75))
         assert isinstance(HumanoidRobot(grid, straight).solve(T), Unreachable)
         posture = HumanoidRobot(grid, CONFIG).solve(T)
         assert isinstance(posture, Posture)
@@ -215,12 +218,12 @@ class TestHumanoidRobot:
     def test_home_is_the_reachable_view_nearest_to_the_minus_x_side(self):
         robot = HumanoidRobot(floor(TABLE), CONFIG)
         home = SPHERE.direction_of(home_view(robot, SPHERE, CONFIG))
-        assert np.rad2deg(frames.angle_between(home, pose_direction(180.0, 35.0))) < 1.5
+        assert np.rad2deg(transforms.angle_between(home, pose_direction(180.0, 35.0))) < 1.5
         walled = HumanoidRobot(floor(TABLE, ((-0.62, 0.0, 1.0), (0.03, 1.6, 1.0))), CONFIG)
         home = SPHERE.direction_of(home_view(walled, SPHERE, CONFIG))
         others = walled.candidates(SPHERE).directions
         wanted = pose_direction(180.0, 35.0)
-        assert frames.angle_between(home, wanted) == frames.angle_between(others, wanted).min()
+        assert transforms.angle_between(home, wanted) == transforms.angle_between(others, wanted).min()
 
     def test_no_home_is_an_error_with_the_reasons(self):
         robot = HumanoidRobot(floor(((0.0, 0.0, 1.0), (3.0, 3.0, 1.0))), CONFIG)

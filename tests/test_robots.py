@@ -10,20 +10,20 @@ import pytest
 from arms import SLIDES, gantry, within_arms_length
 from conftest import SMALL, run_command
 
-from caryatid import robots
-from caryatid.arm_robot import ArmRobot
 from caryatid.config import ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError
-from caryatid.floor import FloorGrid
-from caryatid.formats.reachability_npz import write_reachability
-from caryatid.reachability import sample_reachability
-from caryatid.robot import HumanoidRobot, Posture
-from caryatid.robots import Surroundings, find_robot
+from caryatid.robots.arm import ArmRobot
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot, Posture
+from caryatid.robots.reachability import sample_reachability
+from caryatid.robots.reachability_files import write_reachability
+from caryatid.robots.registry import Surroundings, find_robot
+from caryatid.robots.registry import registry as robots
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sessions import Session
 from caryatid.sessions.next_view import table_floor
 from caryatid.simulation import load_scene
 from caryatid.simulation.stage import set_stage
-from caryatid.view_sphere import ViewSphere
 
 QUICK = [*SMALL, "--views=2", "--no-report", "--quiet"]
 

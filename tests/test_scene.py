@@ -19,16 +19,16 @@ from synthetic import (
     vertices,
 )
 
-from caryatid import frames
 from caryatid.config import Config, RegistrationConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
-from caryatid.formats.graph_json import graph_text
+from caryatid.geometry import transforms
+from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
+from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.truth import ground_truth
-from caryatid.views import SUPPORT_LABEL
 
 METHODS = ("pc", "sg", "pc+sg")
 
@@ -163,7 +163,7 @@ def test_registration_brings_views_nearer_to_where_they_were_taken():
         for reported, true in zip(noisy, exact, strict=True):
             scene.update(reported)
             points = reported.points_camera[reported.labels > 0]
-            gap = frames.transform(scene.T_world_camera, points) - frames.transform(true.pose, points)
+            gap = transforms.transform(scene.T_world_camera, points) - transforms.transform(true.pose, points)
             found.append(np.linalg.norm(gap, axis=1).mean())
         return np.array(found)
 

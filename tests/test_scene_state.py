@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from conftest import SMALL_SENSOR
 
-from caryatid import frames
 from caryatid.config import Config
+from caryatid.geometry import transforms
 from caryatid.scene import Scene
 from caryatid.sessions.scene_state import MODELS, SceneWriter, read_scene
 from caryatid.simulation.camera import SimulatedCamera
@@ -29,7 +29,7 @@ def noisy_views():
     for azimuth, up in ((180, 40), (100, 60), (30, 35), (-40, 50), (-110, 30), (150, 55)):
         a, e = np.radians((azimuth, up))
         out = np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
-        views.append(camera.capture(frames.look_at(centre_world + 1.2 * out, centre_world)))
+        views.append(camera.capture(transforms.look_at(centre_world + 1.2 * out, centre_world)))
     return [replace(view, normals_camera=None) for view in views]
 
 

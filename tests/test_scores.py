@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from caryatid import frames
 from caryatid.errors import InputError
 from caryatid.evaluation import (
     as_scene,
@@ -22,17 +21,18 @@ from caryatid.evaluation import (
 )
 from caryatid.evaluation.overlaps import TrueObject, assign, mask_ious, volume_ious
 from caryatid.evaluation.scores import TrueScene, score_matches, top_height
-from caryatid.formats import RunWriter, read_recording, write_recording
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.io import RunWriter, read_recording, write_recording
+from caryatid.sensing.views import SUPPORT_LABEL, View
 from caryatid.simulation.truth import read_truth
-from caryatid.views import SUPPORT_LABEL, View
 
 SHARED = Path(__file__).parents[2] / "shared"
 
 
 def at(x=0.0, y=0.0, z=0.0):
-    return frames.rigid(np.eye(3), (x, y, z))
+    return transforms.rigid(np.eye(3), (x, y, z))
 
 
 def table(height=0.75):
@@ -54,7 +54,7 @@ def random_scene(seed):
     rng = np.random.default_rng(seed)
     objects = [table()]
     for label in range(1, int(rng.integers(1, 8)) + 1):
-        T = frames.rigid(frames.random_rotation(rng), rng.uniform((-0.2, -0.2, 0.7), (0.2, 0.2, 1.1)))
+        T = transforms.rigid(transforms.random_rotation(rng), rng.uniform((-0.2, -0.2, 0.7), (0.2, 0.2, 1.1)))
         shape = [
             Box(T, rng.uniform(0.03, 0.2, 3)),
             Cylinder(T, rng.uniform(0.02, 0.08), rng.uniform(0.03, 0.2)),
@@ -203,12 +203,12 @@ def test_assignment_is_one_to_one_and_drops_poor_pairs():
 
 
 def test_the_top_of_a_tilted_table_is_measured_in_its_middle():
-    tilt = frames.rotation_from_vector((np.deg2rad(2.0), 0, 0))
-    box = Box(frames.rigid(tilt, (0, 0, 0.7)), np.array([1.0, 1.0, 0.04]))
+    tilt = transforms.rotation_from_vector((np.deg2rad(2.0), 0, 0))
+    box = Box(transforms.rigid(tilt, (0, 0, 0.7)), np.array([1.0, 1.0, 0.04]))
     assert top_height(box) == pytest.approx(0.72, abs=1e-4)
     assert top_height(Sphere(at(z=1.0), 0.1)) == pytest.approx(1.1)
-    lying = frames.rotation_from_vector((0, np.deg2rad(90.0), 0))
-    assert top_height(Box(frames.rigid(lying, (0, 0, 0.7)), np.array([0.04, 1.0, 1.0]))) == pytest.approx(
+    lying = transforms.rotation_from_vector((0, np.deg2rad(90.0), 0))
+    assert top_height(Box(transforms.rigid(lying, (0, 0, 0.7)), np.array([0.04, 1.0, 1.0]))) == pytest.approx(
         0.72
     )
 
@@ -341,7 +341,7 @@ def test_a_run_is_scored_view_by_view_against_its_scene(tmp_path, scene_folder):
 
 
 def record(folder, count):
-    poses = [frames.look_at((1.0, 0.2 * k, 1.0), (0, 0, 0)) for k in range(count)]
+    poses = [transforms.look_at((1.0, 0.2 * k, 1.0), (0, 0, 0)) for k in range(count)]
     K = np.array([[20.0, 0, 9.5], [0, 20.0, 9.5], [0, 0, 1]])
     depth = np.ones((20, 20), np.float32)
     write_recording(

@@ -9,14 +9,14 @@ from PIL import Image
 from raycast import TABLE, K, from_the_side, table_scene
 from scipy.optimize import linear_sum_assignment
 
-from caryatid import frames
-from caryatid.clouds import oriented_points, thin
 from caryatid.config import CloudConfig, SegmentationConfig, SurfaceConfig
-from caryatid.convexity import convex_parts, number_by_appearance
 from caryatid.errors import PerceptionError
-from caryatid.kernels.clusters import OneBody, cluster_by_mean
-from caryatid.segmentation import find_support_surface, on_surface, segment, segment_cloud
-from caryatid.views import Cloud, View
+from caryatid.geometry import transforms
+from caryatid.segmentation.clusters import OneBody, cluster_by_mean
+from caryatid.segmentation.lccp import convex_parts, number_by_appearance
+from caryatid.segmentation.segments import find_support_surface, on_surface, segment, segment_cloud
+from caryatid.sensing.clouds import oriented_points, thin
+from caryatid.sensing.views import Cloud, View
 
 UP = np.array([0.0, 0.0, 1.0])
 MOSD = Path(__file__).parents[2] / "shared" / "data" / "mosd"
@@ -47,7 +47,7 @@ def found(labels, truth):
 def test_the_table_is_found_not_the_floor(sigma):
     surface = surface_of(table_scene(from_the_side(distance=1.6), STACK, [BALL], sigma))
     assert abs(surface.point_world[2] - TABLE) < 0.003
-    assert np.degrees(frames.angle_between(surface.normal_world, UP)) < 0.5
+    assert np.degrees(transforms.angle_between(surface.normal_world, UP)) < 0.5
     np.testing.assert_allclose(sorted(surface.shape.extents), [0.04, 0.6, 0.9], atol=0.03)
 
 
@@ -81,8 +81,8 @@ def test_without_a_pose_the_table_is_found_in_the_camera_frame():
     T = from_the_side(distance=1.0)
     view = replace(table_scene(T, STACK, [BALL], sigma=0.001), T_world_camera=None)
     surface = surface_of(view, up=None)
-    assert np.degrees(frames.angle_between(frames.rotate(T, surface.normal_world), UP)) < 0.5
-    assert abs(frames.transform(T, surface.point_world)[2] - TABLE) < 0.003
+    assert np.degrees(transforms.angle_between(transforms.rotate(T, surface.normal_world), UP)) < 0.5
+    assert abs(transforms.transform(T, surface.point_world)[2] - TABLE) < 0.003
 
 
 def test_same_seed_same_surface():
@@ -95,7 +95,7 @@ def test_same_seed_same_surface():
 @pytest.mark.parametrize("up", [UP, None])
 def test_no_surface_is_an_error_that_says_so(up):
     rng = np.random.default_rng(0)
-    points, normals = rng.uniform(-1, 1, size=(3000, 3)), frames.unit(rng.normal(size=(3000, 3)))
+    points, normals = rng.uniform(-1, 1, size=(3000, 3)), transforms.unit(rng.normal(size=(3000, 3)))
     config = SurfaceConfig(min_points=400)
     with pytest.raises(PerceptionError, match="no support surface"):
         find_support_surface(points, normals, up, config, rng)
@@ -191,8 +191,8 @@ def test_sheets_part_where_they_are_concave(angle, parts):
     assert len(np.unique(labels)) == parts
     assert labels.min() == 1
     assert len(np.unique(labels[: len(labels) // 2])) == 1
-    T = frames.rigid(frames.random_rotation(np.random.default_rng(1)), (0.2, 0.1, 0.4))
-    moved = convex_parts(frames.transform(T, points), frames.rotate(T, normals), edges, config)
+    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(1)), (0.2, 0.1, 0.4))
+    moved = convex_parts(transforms.transform(T, points), transforms.rotate(T, normals), edges, config)
     assert len(np.unique(moved)) == parts
 
 

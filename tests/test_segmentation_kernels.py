@@ -11,22 +11,22 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from caryatid import frames
-from caryatid.clouds import oriented_points
 from caryatid.config import CloudConfig, SegmentationConfig, SurfaceConfig
-from caryatid.kernels.clusters import OneBody, cluster_by_mean, cluster_by_mean_reference
-from caryatid.kernels.concavity import convex, hollowness
-from caryatid.kernels.graphs import (
+from caryatid.geometry import transforms
+from caryatid.segmentation.clusters import OneBody, cluster_by_mean, cluster_by_mean_reference
+from caryatid.segmentation.concavity import convex, hollowness
+from caryatid.segmentation.plane_fits import Window, tangent_planes, tangent_planes_reference
+from caryatid.segmentation.sample_graph import (
     bent_lengths,
     count_borders,
     count_borders_reference,
     nearest_seeds,
     nearest_seeds_reference,
 )
-from caryatid.kernels.grids import TOUCHING, colour_patches, grid_edges, spread_labels, wide_parts
-from caryatid.kernels.planes import Window, tangent_planes, tangent_planes_reference
-from caryatid.samples import find_foreground
-from caryatid.segmentation import find_support_surface, on_surface
+from caryatid.segmentation.sample_grid import TOUCHING, colour_patches, grid_edges, spread_labels, wide_parts
+from caryatid.segmentation.samples import find_foreground
+from caryatid.segmentation.segments import find_support_surface, on_surface
+from caryatid.sensing.clouds import oriented_points
 
 UP = np.array([0.0, 0.0, 1.0])
 BOXES = [(np.array([0.1 * k, 0.22 * k, TABLE + 0.05]), np.array([0.1, 0.2, 0.1])) for k in (-2, 0, 2)]
@@ -42,7 +42,7 @@ def test_the_foreground_is_what_stands_on_the_surface(posed):
     config, clouds = SegmentationConfig(), CloudConfig(min_depth=0.9, max_depth=1.3)
     found = find_foreground(view, surface, config, clouds)
     T = view.T_world_camera if posed else np.eye(4)
-    points = frames.transform(T, view.points_camera)
+    points = transforms.transform(T, view.points_camera)
     in_range = (view.depth >= 0.9) & (view.depth <= 1.3)
     expected = np.zeros_like(in_range)
     expected[in_range] = on_surface(points[in_range], surface, config)
@@ -95,7 +95,7 @@ def bumpy(shape=(14, 17), seed=0):
     v, u = np.argwhere(places).T
     z = 1.0 + 0.02 * np.round(rng.random(len(v)) * 1.5) + 0.003 * rng.standard_normal(len(v))
     points = np.stack([0.004 * u * z, 0.004 * v * z, z], axis=-1)
-    return places, points, frames.unit(rng.normal(size=(len(v), 3)) * 0.3 + (0.0, 0.0, -1.0))
+    return places, points, transforms.unit(rng.normal(size=(len(v), 3)) * 0.3 + (0.0, 0.0, -1.0))
 
 
 def test_grid_edges_are_those_of_the_reference():
@@ -250,7 +250,10 @@ def concave_share_reference(first, second, rise, bend):
 
 def random_patches(rng, count):
     return np.concatenate(
-        [rng.normal(size=(count, 3)) * (0.1, 0.1, 0.02), frames.unit(rng.normal(size=(count, 3)) + 2.0 * UP)],
+        [
+            rng.normal(size=(count, 3)) * (0.1, 0.1, 0.02),
+            transforms.unit(rng.normal(size=(count, 3)) + 2.0 * UP),
+        ],
         axis=1,
     )
 

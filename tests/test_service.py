@@ -17,8 +17,8 @@ from conftest import run_command
 
 from caryatid.config import Config
 from caryatid.errors import InputError
-from caryatid.formats.graph_json import graph_to_json
-from caryatid.formats.images import png
+from caryatid.io.graph_json import graph_to_json
+from caryatid.io.images import png
 from caryatid.scene import Scene
 from caryatid.service.app import make_app
 from caryatid.service.desk import Desk

@@ -9,8 +9,8 @@ import pytest
 from conftest import run_command
 
 from caryatid.config import Config
-from caryatid.formats.graph_json import graph_text
-from caryatid.formats.images import png
+from caryatid.io.graph_json import graph_text
+from caryatid.io.images import png
 from caryatid.scene import Scene
 from caryatid.sessions import Capture, Session
 

@@ -13,15 +13,15 @@ import pytest
 from conftest import run_command
 from PIL import Image
 
-from caryatid import frames
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, InputError, PerceptionError, PlanningError
-from caryatid.formats.graph_json import graph_text
+from caryatid.geometry import transforms
+from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
+from caryatid.sensing.views import View
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.lock import SessionBusyError
 from caryatid.sessions.session import WrongNumberError
-from caryatid.views import View
 
 
 @pytest.fixture
@@ -97,7 +97,7 @@ def test_the_next_view_is_where_the_robot_can_be(begun):
         told = session.next().to_json()
     robot = Config().robot
     assert told["view"] == 2
-    frames.as_rigid(told["T_world_camera"])
+    transforms.as_rigid(told["T_world_camera"])
     assert robot.camera_height[0] <= told["camera_height"] <= robot.camera_height[1]
     assert told["camera_height"] == told["T_world_camera"][2][3]
     yaw = told["platform"][2] + told["gaze"]["yaw"]
@@ -113,7 +113,7 @@ def test_the_next_view_is_where_the_robot_can_be(begun):
 def test_a_robot_may_say_itself_what_it_reaches(begun, views):
     centre = np.array([0.0, 0.0, 0.7])
     poses = [
-        frames.look_at(centre + at, centre) for at in ((1.0, 0.0, 0.5), (0.0, -0.8, 0.9), (0.0, 0.8, 0.9))
+        transforms.look_at(centre + at, centre) for at in ((1.0, 0.0, 0.5), (0.0, -0.8, 0.9), (0.0, 0.8, 0.9))
     ]
     with Session.open(begun, read_only=True) as session:
         told = session.next(poses, [1.0, 2.0, 0.5]).to_json()
@@ -379,7 +379,7 @@ def posed(change):
 
 
 def shifted(x, y, z):
-    return posed(lambda T: frames.rigid(T[:3, :3], T[:3, 3] + (x, y, z)))
+    return posed(lambda T: transforms.rigid(T[:3, :3], T[:3, 3] + (x, y, z)))
 
 
 UNUSABLE = {
@@ -392,11 +392,11 @@ UNUSABLE = {
     ),
     "no pose": (lambda v: replace(v, T_world_camera=None), "has no camera pose"),
     "no labels": (lambda v: replace(v, labels=None), "has no labels"),
-    "millimetres": (posed(lambda T: frames.rigid(T[:3, :3], 1e3 * T[:3, 3])), "the camera would be"),
+    "millimetres": (posed(lambda T: transforms.rigid(T[:3, :3], 1e3 * T[:3, 3])), "the camera would be"),
     "far away": (shifted(9.0, 0.0, 0.0), "too far to see it"),
     "astronomical": (shifted(1e9, 0.0, 0.0), "from the world's origin"),
     "below the table": (shifted(0.0, 0.0, -1.2), "below the table top"),
-    "the inverse": (posed(frames.invert), "its pose cannot be right"),
+    "the inverse": (posed(transforms.invert), "its pose cannot be right"),
     "0.4 m too high": (shifted(0.0, 0.0, 0.4), "of what it shows is where earlier views saw anything"),
     "looking away": (posed(lambda T: T @ np.diag((-1.0, 1.0, -1.0, 1.0))), "its pose cannot be right"),
     "depth in millimetres": (lambda v: replace(v, depth=1e6 * v.depth), "give depth in metres"),
@@ -440,8 +440,8 @@ def test_labels_come_with_all_views_or_with_none(folder, views):
 
 @pytest.mark.parametrize("degrees", [0.0, 3.0])
 def test_a_pose_that_is_a_little_off_is_no_jump(begun, views, degrees):
-    turn = frames.rotation_from_vector(np.radians([0.0, 0.0, degrees]))
-    T = views[2].pose @ frames.rigid(turn, (0.02, -0.02, 0.03))
+    turn = transforms.rotation_from_vector(np.radians([0.0, 0.0, degrees]))
+    T = views[2].pose @ transforms.rigid(turn, (0.02, -0.02, 0.03))
     with Session.open(begun) as session:
         assert session.add(views[2].with_pose(T)).number == 2
 

@@ -15,8 +15,8 @@ from caryatid.config import (
     VoxelConfig,
 )
 from caryatid.config.ranges import Stage, kinds, out_of_range
+from caryatid.config.settings import read_settings, write_settings
 from caryatid.errors import InputError
-from caryatid.settings import read_settings, write_settings
 
 
 @pytest.fixture

@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 from synthetic import random_motion
 
-from caryatid.kernels.fitting import BOX, CYLINDER, SPHERE
-from caryatid.shape_arrays import boxes_around, shape_arrays
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shape_arrays import boxes_around, shape_arrays
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.signed_distance import BOX, CYLINDER, SPHERE
 
 
 def some_shapes():

@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial import ConvexHull, cKDTree
 from synthetic import random_motion
 
-from caryatid import frames
 from caryatid.errors import InputError
-from caryatid.shapes import Box, Cylinder, Sphere, fibonacci_sphere, from_size
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere, from_size
 
 T = random_motion(np.random.default_rng(1))
 SHAPES = [Box(T, np.array([0.06, 0.1, 0.14])), Cylinder(T, 0.04, 0.11), Sphere(T, 0.05)]
@@ -87,7 +87,7 @@ def test_a_moved_shape_is_the_same_shape_elsewhere(shape):
     there = shape.moved(motion)
     assert there.size == shape.size
     np.testing.assert_allclose(
-        there.signed_distance(frames.transform(motion, points)), shape.signed_distance(points), atol=1e-12
+        there.signed_distance(transforms.transform(motion, points)), shape.signed_distance(points), atol=1e-12
     )
 
 

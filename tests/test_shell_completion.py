@@ -10,7 +10,7 @@ import pytest
 from conftest import run_command
 
 from caryatid import cli
-from caryatid.planners import BUILT_IN
+from caryatid.planning.planners import BUILT_IN
 
 SHELLS = ("bash", "zsh", "fish", "tcsh")
 
@@ -30,7 +30,7 @@ def script(tmp_path_factory):
     def write(shell):
         path = folder / shell
         if not path.exists():
-            from caryatid.commands.completing import completion_script
+            from caryatid.cli.completing import completion_script
 
             path.write_text(completion_script(shell))
         return path

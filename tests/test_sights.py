@@ -4,21 +4,21 @@ import numpy as np
 import shapely
 from synthetic import box, cylinder, sphere
 
-from caryatid import frames
-from caryatid.kernels.sights import shown, shown_reference
-from caryatid.kernels.spaces import unseen_space, unseen_space_reference
-from caryatid.kernels.surfaces import sample_surfaces
-from caryatid.shape_arrays import shape_arrays
+from caryatid.geometry import transforms
+from caryatid.geometry.sampling import sample_surfaces
+from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.planning.unseen_space import unseen_space, unseen_space_reference
+from caryatid.sensing.visibility import shown, shown_reference
 
 
 def sights(rng: np.random.Generator, points: int, cameras: int) -> tuple[np.ndarray, ...]:
     """Random arguments of `shown`: points without a side, worth nothing, seen before are among them."""
-    normals = frames.unit(rng.normal(size=(points, 3)))
+    normals = transforms.unit(rng.normal(size=(points, 3)))
     normals[::3] = 0.0
     before = np.where(rng.random(points) < 0.5, 0.0, rng.random(points))
     weights = np.where(rng.random(points) < 0.2, 0.0, rng.random(points))
     eyes = rng.uniform(-1.0, 1.0, (cameras, 3))
-    axes = frames.unit(rng.uniform(-0.3, 0.3, (cameras, 3)) - eyes)
+    axes = transforms.unit(rng.uniform(-0.3, 0.3, (cameras, 3)) - eyes)
     solid = (rng.random((13, 17, 11)) < 0.02).astype(np.uint8)
     return (
         solid, np.array([-0.3, -0.4, -0.2]), 0.05, rng.uniform(-0.6, 0.6, (points, 3)), normals, before,
@@ -48,7 +48,7 @@ def test_without_anything_solid_nothing_is_hidden():
 def test_points_on_many_surfaces_are_those_of_each():
     rng = np.random.default_rng(2)
     shapes = [
-        shape.moved(frames.rigid(frames.random_rotation(rng), rng.normal(size=3)))
+        shape.moved(transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3)))
         for size in rng.uniform(0.02, 0.2, (6, 3))
         for shape in (box((0, 0, 0), size), cylinder((0, 0, 0), *size[:2]), sphere((0, 0, 0), size[0]))
     ]
@@ -63,7 +63,7 @@ def test_points_on_many_surfaces_are_those_of_each():
 
 def test_the_unseen_space_over_a_table_agrees_with_its_reference():
     rng = np.random.default_rng(3)
-    T_world_table = frames.rigid(frames.rotation_from_vector((0.02, -0.03, 0.6)), (0.02, -0.03, 0.0))
+    T_world_table = transforms.rigid(transforms.rotation_from_vector((0.02, -0.03, 0.6)), (0.02, -0.03, 0.0))
     x, y, z = np.arange(-0.5, 0.5, 0.04), np.arange(-0.4, 0.6, 0.04), np.arange(0.03, 0.3, 0.04)
     corners = rng.uniform(-0.3, 0.3, (12, 2))
     states = rng.choice(np.array([0, 1, 2], dtype=np.int8), (13, 17, 5), p=(0.3, 0.5, 0.2))

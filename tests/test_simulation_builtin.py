@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from caryatid.errors import InputError
-from caryatid.shapes import Box
+from caryatid.geometry.shapes import Box
 from caryatid.simulation import (
     SimulatedScene,
     bounds,

@@ -4,15 +4,15 @@ import mujoco
 import numpy as np
 import pytest
 
-from caryatid import frames
 from caryatid.config import NoiseConfig, SensorConfig
 from caryatid.errors import InputError
+from caryatid.geometry import transforms
 from caryatid.simulation import SimulatedCamera, load_scene, true_shapes
 from caryatid.simulation.camera import render
 from caryatid.simulation.noise import add_depth_noise, axial_sigma, depth_edges, misregister
 from caryatid.simulation.world import SimulatedScene, scene_from_spec
 
-FROM_THE_ROBOT = frames.look_at((-1.2, 0.1, 1.6), (0.0, 0.0, 0.8))
+FROM_THE_ROBOT = transforms.look_at((-1.2, 0.1, 1.6), (0.0, 0.0, 0.8))
 SMALL = SensorConfig(width=160, height=120, focal=131.0)
 
 
@@ -44,8 +44,8 @@ def test_points_lie_on_the_shapes_their_labels_name(clutter: SimulatedScene):
     view = SimulatedCamera(clutter, sensor=SMALL).capture(FROM_THE_ROBOT)
     assert view.labels is not None
     assert view.normals_camera is not None
-    points_world = frames.transform(view.pose, view.points_camera)
-    normals_world = frames.rotate(view.pose, view.normals_camera.astype(np.float64))
+    points_world = transforms.transform(view.pose, view.points_camera)
+    normals_world = transforms.rotate(view.pose, view.normals_camera.astype(np.float64))
     seen = 0
     for label, shape in true_shapes(clutter).items():
         mask = view.labels == label
@@ -60,9 +60,9 @@ def test_points_lie_on_the_shapes_their_labels_name(clutter: SimulatedScene):
 
 
 def test_straight_down_the_table_is_at_its_depth():
-    T = frames.look_at((0.2, 0.3, 1.75), (0.2, 0.3, 0.75))
+    T = transforms.look_at((0.2, 0.3, 1.75), (0.2, 0.3, 0.75))
     view = SimulatedCamera(table_scene(""), sensor=SMALL).capture(T)
-    on_table = np.abs(frames.transform(T, view.points_camera)[..., 2] - 0.75) < 1e-6
+    on_table = np.abs(transforms.transform(T, view.points_camera)[..., 2] - 0.75) < 1e-6
     assert on_table.sum() > 1000
     np.testing.assert_allclose(view.depth[on_table], 1.0, atol=1e-6)
     assert view.labels is not None
@@ -71,7 +71,7 @@ def test_straight_down_the_table_is_at_its_depth():
 
 def test_group_3_is_not_seen_and_nothing_is_nothing():
     cover = '<geom type="box" size="0.3 0.3 0.3" pos="0 0 1.1" group="{}" contype="0" conaffinity="0"/>'
-    T = frames.look_at((-1.2, 0.0, 1.3), (0.0, 0.0, 0.8))
+    T = transforms.look_at((-1.2, 0.0, 1.3), (0.0, 0.0, 0.8))
     hidden = SimulatedCamera(table_scene(cover.format(3)), sensor=SMALL).capture(T)
     shown = SimulatedCamera(table_scene(cover.format(0)), sensor=SMALL).capture(T)
     plain = SimulatedCamera(table_scene(""), sensor=SMALL).capture(T)
@@ -115,7 +115,7 @@ def test_captures_depend_on_seed_and_number_alone(clutter: SimulatedScene):
 
 
 def test_noise_of_a_capture_does_not_depend_on_what_was_seen_before(clutter: SimulatedScene):
-    elsewhere = frames.look_at((0.0, 1.2, 1.6), (0.0, 0.0, 0.8))
+    elsewhere = transforms.look_at((0.0, 1.2, 1.6), (0.0, 0.0, 0.8))
     seconds = []
     for first in (FROM_THE_ROBOT, elsewhere):
         camera = SimulatedCamera(clutter, "carmine", rng=rng(3), sensor=SMALL)
@@ -147,7 +147,7 @@ def test_misregistration_has_the_configured_size():
     rms = np.sqrt(np.mean(np.rad2deg(np.arccos(traces)) ** 2))
     assert rms == pytest.approx(config.rotation, rel=0.06)
     for T in draws[:20]:
-        frames.as_rigid(T)
+        transforms.as_rigid(T)
 
 
 def test_axial_noise_has_the_published_size_and_depths_are_quantised():

@@ -6,10 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from caryatid import frames
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.simulation import (
     bounds,
     contains,
@@ -149,7 +149,7 @@ def test_static_boxes_and_table_top():
     np.testing.assert_allclose(boxes[0].extents, [0.6, 0.9, 0.04])
     np.testing.assert_allclose(boxes[1].extents, [0.04, 0.04, 0.7])
     np.testing.assert_allclose(boxes[2].extents, [0.06, 2.0, 2.0])
-    expected = frames.rotation_from_vector((0.0, 0.0, np.deg2rad(30.0)))
+    expected = transforms.rotation_from_vector((0.0, 0.0, np.deg2rad(30.0)))
     np.testing.assert_allclose(boxes[2].T_world_object[:3, :3], expected, atol=1e-9)
     top = table_top(scene)
     assert top.height == pytest.approx(0.75)

@@ -9,11 +9,11 @@ import pytest
 from scipy.spatial import cKDTree
 from synthetic import box, cylinder, motion_about_vertical, sphere, surface_points
 
-from caryatid import frames
 from caryatid.config import ExplanationConfig, FitConfig, SplitConfig
-from caryatid.explanation import explain, gather
-from caryatid.splitting import split
-from caryatid.views import Cloud
+from caryatid.geometry import transforms
+from caryatid.objects.description_length import explain, gather
+from caryatid.objects.model_split import split
+from caryatid.sensing.views import Cloud
 
 UP = np.array([0.0, 0.0, 1.0])
 COSTS = ExplanationConfig()
@@ -118,6 +118,6 @@ def test_a_view_that_is_off_leaves_a_layer_and_no_second_object():
 def test_the_division_turns_with_the_scene():
     points, normals, truth = points_of(STACKED)
     T = motion_about_vertical(np.random.default_rng(5))
-    groups = divided(frames.transform(T, points), frames.rotate(T, normals))
+    groups = divided(transforms.transform(T, points), transforms.rotate(T, normals))
     assert groups is not None
     assert agreement(groups, truth) > 0.9

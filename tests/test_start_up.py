@@ -13,9 +13,9 @@ import pytest
 
 import caryatid
 import caryatid.exports
-import caryatid.planners
-import caryatid.recordings
-from caryatid.kernels.information import FORMULATIONS
+import caryatid.io.recordings
+import caryatid.planning.planners
+from caryatid.planning.information import FORMULATIONS
 
 HEAVY = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx", "matplotlib", "trimesh", "PIL", "jinja2")
 
@@ -90,7 +90,9 @@ def declared(package):
     return {alias.name: node.module for node in imports for alias in node.names}
 
 
-@pytest.mark.parametrize("package", [caryatid, caryatid.planners, caryatid.recordings, caryatid.exports])
+@pytest.mark.parametrize(
+    "package", [caryatid, caryatid.planning.planners, caryatid.io.recordings, caryatid.exports]
+)
 def test_names_come_from_where_type_checkers_are_told(package):
     names = declared(package)
     assert names
@@ -101,22 +103,20 @@ def test_names_come_from_where_type_checkers_are_told(package):
 
 
 def test_a_package_has_its_modules_and_nothing_else():
-    done = python(
-        "import caryatid; caryatid.frames.look_at; caryatid.planners.ring.RingPlanner; caryatid.frame"
-    )
+    done = python("import caryatid; caryatid.planning.planners.ring.RingPlanner; caryatid.frame")
     assert done.returncode == 1
     assert "AttributeError: module 'caryatid' has no attribute 'frame'" in done.stderr
 
 
 def test_what_is_missing_in_a_module_of_ours_is_said_as_it_is():
     """A module that cannot be imported is not taken for a name that does not exist."""
-    done = python("import sys; sys.modules['numpy'] = None; import caryatid; caryatid.frames")
+    done = python("import sys; sys.modules['numpy'] = None; import caryatid; caryatid.geometry.transforms")
     assert done.returncode == 1
     assert "ModuleNotFoundError: import of numpy halted" in done.stderr
 
 
 def test_the_volumetric_planners_are_those_there_are_formulations_of():
-    assert caryatid.planners.VOLUMETRIC == FORMULATIONS
+    assert caryatid.planning.planners.VOLUMETRIC == FORMULATIONS
 
 
 INTERRUPTED = """

@@ -9,10 +9,10 @@ import pytest
 import reference_fits as reference
 from synthetic import hausdorff, random_motion
 
-from caryatid import frames
 from caryatid.config import FitConfig
-from caryatid.kernels.starts import main_normal, of_one_face
-from caryatid.refine import CODES, from_arrays
+from caryatid.fitting.least_squares import CODES, from_arrays
+from caryatid.fitting.single_face import main_normal, of_one_face
+from caryatid.geometry import transforms
 
 CONFIG = FitConfig()
 FLAT = ("box", "cylinder")
@@ -32,7 +32,7 @@ def start(kind, points, normals, config=CONFIG):
 def face(seed, count=400, sides=(0.1, 0.14), turn_deg=30.0, sigma=0.001, others=0.0):
     """Points all over a rectangle in any attitude, and some of faces beside it, about their middle."""
     rng = np.random.default_rng(seed)
-    R = frames.rotation_from_vector((0.0, 0.0, np.radians(turn_deg)))
+    R = transforms.rotation_from_vector((0.0, 0.0, np.radians(turn_deg)))
     points = rng.uniform(-0.5, 0.5, (count, 3)) * (*sides, 0.0)
     points[:, 2] = sigma * rng.normal(size=count)
     normals = np.tile((0.0, 0.0, 1.0), (count, 1)) + 0.1 * rng.normal(size=(count, 3))
@@ -40,15 +40,15 @@ def face(seed, count=400, sides=(0.1, 0.14), turn_deg=30.0, sigma=0.001, others=
     points[beside, 0] = sides[0] / 2.0
     points[beside, 2] = -rng.uniform(0.0, 0.05, len(beside))
     normals[beside] = (1.0, 0.0, 0.0)
-    T = random_motion(rng, 0.0) @ frames.rigid(R, np.zeros(3))
-    points, normals = frames.transform(T, points), frames.rotate(T, frames.unit(normals))
+    T = random_motion(rng, 0.0) @ transforms.rigid(R, np.zeros(3))
+    points, normals = transforms.transform(T, points), transforms.rotate(T, transforms.unit(normals))
     return points - points.mean(axis=0), normals
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_the_main_normal_is_that_of_the_reference(seed):
     rng = np.random.default_rng(seed)
-    normals = frames.unit(rng.normal(size=(70, 3)) + rng.integers(0, 2, (70, 1)) * (0.0, 1.5, 0.0))
+    normals = transforms.unit(rng.normal(size=(70, 3)) + rng.integers(0, 2, (70, 1)) * (0.0, 1.5, 0.0))
     axis, on_face = main_normal(normals)
     expected, agree = reference.main_normal(normals)
     assert 3 < agree.sum() < 70
@@ -100,7 +100,7 @@ def test_a_start_moves_with_its_points(kind):
     points, normals = face(0, others=0.2)
     T = random_motion(np.random.default_rng(9), 0.0)
     here = start(kind, points, normals)
-    there = start(kind, frames.transform(T, points), frames.rotate(T, normals))
+    there = start(kind, transforms.transform(T, points), transforms.rotate(T, normals))
     assert hausdorff(there, here.moved(T)) < 1e-9
 
 

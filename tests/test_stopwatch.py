@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from caryatid import stopwatch
-from caryatid.stopwatch import StageTime, Stopwatch, by_stage
+from caryatid.runtime import stopwatch
+from caryatid.runtime.stopwatch import StageTime, Stopwatch, by_stage
 
 
 def test_each_stage_gets_the_time_since_the_one_before(monkeypatch):

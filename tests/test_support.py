@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 import shapely
 
-from caryatid import frames
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
-from caryatid.frames import Array, rigid
+from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry import transforms
+from caryatid.geometry.polygons import area, hull
+from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array, rigid
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.kernels.polygons import area, hull
-from caryatid.shape_arrays import shape_arrays
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.stability import (
+from caryatid.support.relations import explain, infer
+from caryatid.support.stability import (
     assess,
     beneath,
     centroid,
@@ -25,8 +27,6 @@ from caryatid.stability import (
     ground_outline,
     support_polygon,
 )
-from caryatid.support import explain, infer
-from caryatid.uncertainty import Uncertainty
 
 CONFIG = SupportConfig()
 PAPER = replace(CONFIG, top_down="paper")
@@ -34,7 +34,7 @@ TABLE = Box(rigid(np.eye(3), (0.0, 0.0, -0.02)), np.array([1.0, 1.0, 0.04]))
 
 
 def at(x: float, y: float, z: float, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
-    return rigid(frames.rotation_from_vector(np.radians(turn)), (x, y, z))
+    return rigid(transforms.rotation_from_vector(np.radians(turn)), (x, y, z))
 
 
 def block(
@@ -249,7 +249,7 @@ def test_a_rigid_motion_about_the_vertical_changes_nothing(make) -> None:  # typ
     graph = infer(objects, CONFIG)
     rng = np.random.default_rng(7)
     for _ in range(8):
-        T = rigid(frames.rotation_from_vector((0, 0, rng.uniform(-np.pi, np.pi))), rng.uniform(-1, 1, 3))
+        T = rigid(transforms.rotation_from_vector((0, 0, rng.uniform(-np.pi, np.pi))), rng.uniform(-1, 1, 3))
         moved = infer([replace(o, shape=o.shape.moved(T)) for o in objects], CONFIG)
         assert [(s.pair, s.kind, s.certain) for s in moved.supports] == [
             (s.pair, s.kind, s.certain) for s in graph.supports
@@ -260,7 +260,7 @@ def test_a_rigid_motion_about_the_vertical_changes_nothing(make) -> None:  # typ
         for one, other in zip(graph.supports, moved.supports, strict=True):
             assert one.normal_world is not None
             assert other.normal_world is not None
-            np.testing.assert_allclose(other.normal_world, frames.rotate(T, one.normal_world), atol=0.02)
+            np.testing.assert_allclose(other.normal_world, transforms.rotate(T, one.normal_world), atol=0.02)
 
 
 def test_random_heaps_do_not_change_under_motions_about_the_vertical() -> None:
@@ -268,11 +268,11 @@ def test_random_heaps_do_not_change_under_motions_about_the_vertical() -> None:
     for _ in range(20):
         shapes: list[Box | Cylinder | Sphere] = []
         for k in range(7):
-            T = rigid(frames.random_rotation(rng), (*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.02, 0.15)))
+            T = rigid(transforms.random_rotation(rng), (*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.02, 0.15)))
             a, b, c = rng.uniform(0.04, 0.1, 3)
             shapes.append((Box(T, np.array([a, b, c])), Cylinder(T, a / 2, b), Sphere(T, a / 2))[k % 3])
         objects = scene(*shapes)
-        T = rigid(frames.rotation_from_vector((0, 0, rng.uniform(-np.pi, np.pi))), rng.uniform(-1, 1, 3))
+        T = rigid(transforms.rotation_from_vector((0, 0, rng.uniform(-np.pi, np.pi))), rng.uniform(-1, 1, 3))
         moved = infer([replace(o, shape=o.shape.moved(T)) for o in objects], CONFIG)
         assert edges(moved) == edges(infer(objects, CONFIG))
 
@@ -360,7 +360,7 @@ def test_what_a_falling_shape_meets_lies_beneath_it() -> None:
     for _ in range(10):
         shapes = [
             (Box, Cylinder, Sphere)[k % 3](
-                rigid(frames.random_rotation(rng), rng.uniform(-0.15, 0.15, 3)),
+                rigid(transforms.random_rotation(rng), rng.uniform(-0.15, 0.15, 3)),
                 *((rng.uniform(0.03, 0.1, 3),), (0.03, 0.08), (0.04,))[k % 3],
             )
             for k in range(8)

@@ -7,20 +7,20 @@ import numpy as np
 import pytest
 from raycast import TABLE, from_the_side, table_scene
 
-from caryatid import frames
-from caryatid.clouds import oriented_points
 from caryatid.config import CloudConfig, SurfaceConfig
-from caryatid.kernels.outlines import (
+from caryatid.geometry import transforms
+from caryatid.segmentation.outlines import (
     within_prism,
     within_prism_reference,
 )
-from caryatid.kernels.surface import (
+from caryatid.segmentation.support_plane import find_support_surface
+from caryatid.segmentation.support_plane_kernels import (
     plane_gains,
     plane_gains_reference,
     plane_inliers,
     plane_inliers_reference,
 )
-from caryatid.surface import find_support_surface
+from caryatid.sensing.clouds import oriented_points
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -29,13 +29,13 @@ UP = np.array([0.0, 0.0, 1.0])
 def cloud():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, size=(3000, 3)) * (1.0, 1.0, 0.03)
-    return points, frames.unit(UP + rng.normal(0.0, 0.3, size=(3000, 3)))
+    return points, transforms.unit(UP + rng.normal(0.0, 0.3, size=(3000, 3)))
 
 
 @pytest.mark.parametrize("penalty", [0.0, 1.0])
 def test_planes_score_as_by_numpy(cloud, penalty):
     rng = np.random.default_rng(1)
-    planes = frames.unit(UP + rng.normal(0.0, 0.03, size=(77, 3))), rng.uniform(-0.02, 0.02, size=77)
+    planes = transforms.unit(UP + rng.normal(0.0, 0.03, size=(77, 3))), rng.uniform(-0.02, 0.02, size=77)
     gains = plane_gains(*cloud, *planes, 0.01, 0.95, penalty)
     np.testing.assert_allclose(gains, plane_gains_reference(*cloud, *planes, 0.01, 0.95, penalty), atol=1e-9)
     assert gains.max() > 100.0
@@ -45,7 +45,7 @@ def test_planes_score_as_by_numpy(cloud, penalty):
 def test_inliers_of_a_plane_are_those_of_numpy(cloud):
     among = np.arange(3000) % 3 > 0
     for offset in (0.002, 3.0):
-        plane = frames.unit((0.01, -0.02, 1.0)), offset
+        plane = transforms.unit((0.01, -0.02, 1.0)), offset
         found = plane_inliers(*cloud, among, plane, 0.004, 0.95)
         for ours, theirs in zip(
             found, plane_inliers_reference(*cloud, among, plane, 0.004, 0.95), strict=True
@@ -56,7 +56,7 @@ def test_inliers_of_a_plane_are_those_of_numpy(cloud):
 
 def test_what_is_over_an_outline_is_as_by_numpy(cloud):
     corners = np.array([[-0.3, -0.2], [0.3, -0.25], [0.35, 0.2], [-0.1, 0.3]])
-    edges = frames.unit(np.roll(corners, -1, axis=0) - corners)
+    edges = transforms.unit(np.roll(corners, -1, axis=0) - corners)
     outward = np.stack([edges[:, 1], -edges[:, 0]], axis=-1)
     sides = np.column_stack([outward, np.sum(outward * corners, axis=1)])
     prism = cloud[0], np.array([0.01, 0.0, 0.001]), np.eye(3), sides, -0.005, 0.01, 0.02

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from synthetic import box, cylinder, random_motion, sphere
 
-from caryatid.kernels.sweeps import way_to_shapes
-from caryatid.shape_arrays import shape_arrays
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.objects.sweeps import way_to_shapes
 
 DOWN = np.array([0.0, 0.0, -1.0])
 OVERLAP, LEAST = 0.004, 0.0005

@@ -10,8 +10,8 @@ from conftest import SMALL, run_command
 
 from caryatid.benchmark.episodes import run_episode
 from caryatid.benchmark.records import ORDERS, Episode
-from caryatid.formats.runs import read_run
-from caryatid.report.colours import object_colour
+from caryatid.io.runs import read_run
+from caryatid.viz.colours import object_colour
 
 QUICK = ["--set=rehearsal.draws=2", "--set=lift.watch=1.0"]
 BRIEF = (

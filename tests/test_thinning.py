@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caryatid.kernels.voxels import last_in_voxels, most_central, most_central_reference
+from caryatid.geometry.thinning import last_in_voxels, most_central, most_central_reference
 
 EDGES = np.array([0.0, 0.02, 0.05])
 

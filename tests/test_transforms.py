@@ -8,16 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from caryatid import frames
-from caryatid.recordings import TransformTree
-from caryatid.recordings.transforms import SECOND, MissingTransform, is_pose
+from caryatid.geometry import transforms
+from caryatid.io.recordings import TransformTree
+from caryatid.io.recordings.transform_tree import SECOND, MissingTransform, is_pose
 
 NOW = 1_700_000_000 * SECOND
 """Large enough that a float would lose the nanoseconds."""
 
 
 def random_pose(rng):
-    return frames.rigid(frames.random_rotation(rng), rng.normal(size=3))
+    return transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3))
 
 
 def tree_with(*links, gap=1.0):
@@ -50,11 +50,11 @@ def test_chains_up_and_down_the_tree_multiply(seed):
 def test_between_two_poses_the_path_is_straight_and_the_turn_even(seed, share):
     rng = np.random.default_rng(seed)
     start = random_pose(rng)
-    axis, angle, way = frames.unit(rng.normal(size=3)), rng.uniform(0.0, 3.0), rng.normal(size=3)
+    axis, angle, way = transforms.unit(rng.normal(size=3)), rng.uniform(0.0, 3.0), rng.normal(size=3)
 
     def after(part):
-        R = start[:3, :3] @ frames.rotation_from_vector(part * angle * axis)
-        return frames.rigid(R, start[:3, 3] + part * way)
+        R = start[:3, :3] @ transforms.rotation_from_vector(part * angle * axis)
+        return transforms.rigid(R, start[:3, 3] + part * way)
 
     tree = tree_with(("map", "eye", NOW, start), ("map", "eye", NOW + SECOND // 2, after(1.0)))
     nanoseconds = round(share * (SECOND // 2))
@@ -116,4 +116,6 @@ def test_a_quaternion_need_not_have_length_one():
     tree = TransformTree(1.0)
     tree.add("map", "eye", NOW, (1.0, 1.0, 1.0, 0.0, 0.0, 2.0, 2.0))
     T = tree.between("map", "eye", NOW)
-    assert np.allclose(T, frames.rigid(frames.rotation_from_vector((0.0, 0.0, np.pi / 2)), np.ones(3)))
+    assert np.allclose(
+        T, transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, np.pi / 2)), np.ones(3))
+    )

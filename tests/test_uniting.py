@@ -8,10 +8,10 @@ import numpy as np
 from synthetic import box, cylinder, surface_points
 
 from caryatid.config import ExplanationConfig, FitConfig, VoxelConfig
-from caryatid.explanation import explain, gather
-from caryatid.uniting import united
-from caryatid.views import Cloud
-from caryatid.voxels import VoxelMap
+from caryatid.objects.description_length import explain, gather
+from caryatid.objects.model_merge import united
+from caryatid.sensing.views import Cloud
+from caryatid.sensing.voxel_map import VoxelMap
 
 COSTS, FIT = ExplanationConfig(), FitConfig()
 EYE = (-1.2, -0.6, 1.0)

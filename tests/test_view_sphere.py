@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid import frames
 from caryatid.config import ActiveVisionConfig
-from caryatid.view_sphere import ViewSphere, direction, spread
+from caryatid.geometry import transforms
+from caryatid.sensing.view_sphere import ViewSphere, direction, spread
 
 SPHERE = ViewSphere.around((0.1, -0.2, 0.75), ActiveVisionConfig(sphere_points=2000))
 
@@ -25,7 +25,7 @@ def test_views_lie_on_the_sphere_and_are_spread_evenly():
 def test_poses_look_at_the_centre_like_look_at_does():
     directions = np.vstack([SPHERE.directions[::50], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
     for T, d in zip(SPHERE.poses(directions), directions, strict=True):
-        expected = frames.look_at(SPHERE.centre_world + 1.5 * d, SPHERE.centre_world)
+        expected = transforms.look_at(SPHERE.centre_world + 1.5 * d, SPHERE.centre_world)
         np.testing.assert_allclose(T, expected, atol=1e-9)
 
 

@@ -12,14 +12,13 @@ import pytest
 from conftest import SMALL, run_command
 
 from caryatid import InputError, Scene
-from caryatid.commands.sources import open_recording, open_source
 from caryatid.exploration import explore
-from caryatid.formats.graph_json import graph_text
-from caryatid.formats.runs import read_run
 from caryatid.graph import Support, SupportGraph
-from caryatid.manipulation.effects import Effect, predict_removal
+from caryatid.io.graph_json import graph_text
+from caryatid.io.runs import read_run
 from caryatid.manipulation.order import TakeStep
-from caryatid.report.colours import object_colour, rgb
+from caryatid.sources import open_recording, open_source
+from caryatid.support.removal import Effect, predict_removal
 from caryatid.viewer import words
 from caryatid.viewer.apart import PageApart
 from caryatid.viewer.canvas import same
@@ -27,11 +26,12 @@ from caryatid.viewer.drawing import BY_HAND, LAYERS, draw_dots, draw_moment
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.marks import Copies, Frustum, Mesh, Points
 from caryatid.viewer.moments import Dots, moment_of_scene
+from caryatid.viewer.removal import Picture, lifts_told, pictured
 from caryatid.viewer.replay import replayed
 from caryatid.viewer.runs import config_of_run, moments_of_run
 from caryatid.viewer.steering import candidate_under
-from caryatid.viewer.taking import Picture, lifts_told, pictured
 from caryatid.viewer.wire import MomentReader, MomentWriter
+from caryatid.viz.colours import object_colour, rgb
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +288,7 @@ def test_an_extracted_recording_is_computed_again(recording, tmp_path):
 
 def _waiting(monkeypatch, meanwhile):
     """Have the command, where it would wait for Ctrl-C, do something else."""
-    monkeypatch.setattr("caryatid.commands.viewing.wait_for_interrupt", meanwhile)
+    monkeypatch.setattr("caryatid.cli.viewing.wait_for_interrupt", meanwhile)
 
 
 def test_view_serves_a_page_to_this_machine_until_it_is_stopped(run_folder, monkeypatch, capsys):
@@ -328,7 +328,7 @@ def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatc
 
 
 def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_file, tmp_path, monkeypatch):
-    from caryatid.commands.watching import Watcher
+    from caryatid.cli.watching import Watcher
 
     shown, waited = [], []
     monkeypatch.setattr("webbrowser.open", lambda url: None)

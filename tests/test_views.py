@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caryatid import frames
 from caryatid.errors import InputError
-from caryatid.views import SUPPORT_LABEL, Cloud, View, check_intrinsics
+from caryatid.geometry import transforms
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View, check_intrinsics
 
 K = np.array([[500.0, 0.0, 2.0], [0.0, 400.0, 1.0], [0.0, 0.0, 1.0]])
 DEPTH = np.linspace(0.5, 1.5, 20).reshape(4, 5)
@@ -39,7 +39,7 @@ def test_points_project_back_to_their_pixels_at_their_depth():
 
 def test_a_view_from_another_pose_is_the_same_view():
     view = View(DEPTH, K, np.eye(4), name="first")
-    T = frames.rigid(frames.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
+    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
     there = view.with_pose(T)
     np.testing.assert_array_equal(there.pose, T)
     np.testing.assert_array_equal(view.pose, np.eye(4))
@@ -87,7 +87,7 @@ def test_a_pose_that_is_not_known_is_asked_for_by_name():
 
 def test_a_view_from_another_pose_is_a_new_view():
     view = View(DEPTH, K, labels=np.ones((4, 5), dtype=np.int32))
-    T = frames.rigid(np.eye(3), (1.0, 2.0, 3.0))
+    T = transforms.rigid(np.eye(3), (1.0, 2.0, 3.0))
     posed = view.with_pose(T)
     assert view.T_world_camera is None
     np.testing.assert_array_equal(posed.pose, T)
@@ -104,7 +104,7 @@ def test_points_are_picked_with_all_that_belongs_to_them():
     rng = np.random.default_rng(0)
     cloud = Cloud(
         rng.normal(size=(6, 3)),
-        frames.unit(rng.normal(size=(6, 3))),
+        transforms.unit(rng.normal(size=(6, 3))),
         np.arange(6, dtype=np.int32),
         rng.integers(0, 255, (6, 3), dtype=np.uint8),
         np.array([0.0, 0.0, 1.0]),

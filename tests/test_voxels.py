@@ -8,10 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caryatid import frames
 from caryatid.config import VoxelConfig
-from caryatid.kernels.solids import filled_reference
-from caryatid.kernels.voxel_maps import (
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.sensing.solids import filled_reference
+from caryatid.sensing.views import View
+from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
+from caryatid.sensing.voxel_map_kernels import (
     enter_view,
     enter_view_reference,
     states_of,
@@ -19,9 +22,6 @@ from caryatid.kernels.voxel_maps import (
     voxels_at,
     voxels_at_reference,
 )
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.views import View
-from caryatid.voxels import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
 K = np.array([[100.0, 0.0, 79.5], [0.0, 100.0, 59.5], [0.0, 0.0, 1.0]])
 CONFIG = VoxelConfig(size=0.02, extent=(0.8, 0.8, 0.6), below=0.2, stride=1, margin=0.02)
@@ -29,7 +29,7 @@ CONFIG = VoxelConfig(size=0.02, extent=(0.8, 0.8, 0.6), below=0.2, stride=1, mar
 
 def wall_view(distance: float = 1.0, noise: np.ndarray | float = 0.0) -> View:
     """A camera 1 m from the origin on the -x side that sees a plane across its axis."""
-    T_world_camera = frames.look_at((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    T_world_camera = transforms.look_at((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     depth = (np.full((120, 160), distance) + noise).astype(np.float32)
     return View(depth, K, T_world_camera)
 
@@ -45,7 +45,7 @@ def a_view(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     depth = rng.uniform(0.2, 2.0, (23, 31)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0.0
     K = np.array([[30.0, 0.0, 15.2], [0.0, 28.0, 11.1], [0.0, 0.0, 1.0]])
-    return depth, K, frames.look_at(rng.uniform(-0.8, 0.8, 3), rng.uniform(-0.2, 0.2, 3))
+    return depth, K, transforms.look_at(rng.uniform(-0.8, 0.8, 3), rng.uniform(-0.2, 0.2, 3))
 
 
 @pytest.mark.parametrize("stride", [1, 2, 3])
@@ -86,10 +86,10 @@ def test_the_voxels_of_points_agree_with_their_reference():
 
 def shapes_about(rng: np.random.Generator) -> list:
     """Shapes in and about the map of `random_counts`, turned; one far away."""
-    T = [frames.rigid(frames.random_rotation(rng), rng.uniform(-0.4, 0.5, 3)) for _ in range(6)]
+    T = [transforms.rigid(transforms.random_rotation(rng), rng.uniform(-0.4, 0.5, 3)) for _ in range(6)]
     boxes = [Box(t, rng.uniform(0.05, 0.5, 3)) for t in T[:2]]
     cylinders = [Cylinder(t, 0.12, 0.3) for t in T[2:4]]
-    return [*boxes, *cylinders, Sphere(T[4], 0.15), Sphere(frames.rigid(np.eye(3), (9.0, 0.0, 0.0)), 0.2)]
+    return [*boxes, *cylinders, Sphere(T[4], 0.15), Sphere(transforms.rigid(np.eye(3), (9.0, 0.0, 0.0)), 0.2)]
 
 
 def test_what_is_solid_agrees_with_its_reference():
@@ -116,7 +116,7 @@ import numba
 import numpy as np
 from test_voxels import K, shapes_about, wall_view
 from caryatid.config import VoxelConfig
-from caryatid.voxels import VoxelMap
+from caryatid.sensing.voxel_map import VoxelMap
 voxels = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
 for depth in (1.0, 1.2):
     voxels = voxels.integrate(wall_view(depth, np.random.default_rng(0).normal(0.0, 0.1, (120, 160))), 3.0)
@@ -202,7 +202,7 @@ def test_evidence_does_not_overflow():
 
 
 def test_lines_of_sight_stop_at_what_is_solid_and_leave_the_clearance_out():
-    box = Box(frames.rigid(np.eye(3), (0.0, 0.0, 0.0)), np.array([0.1, 0.1, 0.1]))
+    box = Box(transforms.rigid(np.eye(3), (0.0, 0.0, 0.0)), np.array([0.1, 0.1, 0.1]))
     solid = VoxelMap.around((0.0, 0.0, 0.0), CONFIG).solid([box])
     points = np.array([[-0.2, 0.0, 0.0], [0.0, 0.0, 0.0]])
     targets = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [-0.2, 0.0, 1.0]])
@@ -211,14 +211,14 @@ def test_lines_of_sight_stop_at_what_is_solid_and_leave_the_clearance_out():
 
 
 def test_shapes_are_solid_inside_and_only_there():
-    ball = Sphere(frames.rigid(np.eye(3), (0.38, 0.0, 0.1)), 0.1)
+    ball = Sphere(transforms.rigid(np.eye(3), (0.38, 0.0, 0.1)), 0.1)
     voxels = VoxelMap.around((0.0, 0.0, 0.0), CONFIG)
     solid = voxels.solid([ball])
     centres = voxels.centres_world(np.argwhere(voxels.states == UNKNOWN))
     inside = solid.holds(centres)
     assert inside.sum() > 100
     np.testing.assert_array_equal(inside, ball.signed_distance(centres) < 0.0)
-    outside = Sphere(frames.rigid(np.eye(3), (3.0, 0.0, 0.1)), 0.1)
+    outside = Sphere(transforms.rigid(np.eye(3), (3.0, 0.0, 0.1)), 0.1)
     assert not VoxelMap.around((0.0, 0.0, 0.0), CONFIG).solid([outside]).grid.any()
 
 

@@ -21,11 +21,11 @@ EXTRAS = {
 
 CLOUD = """
 import numpy as np
-from caryatid import frames
+from caryatid.geometry import transforms
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 
-T_world_camera = frames.look_at(np.array([-1.2, 0.0, 1.5]), np.array([0.0, 0.0, 0.8]))
+T_world_camera = transforms.look_at(np.array([-1.2, 0.0, 1.5]), np.array([0.0, 0.0, 0.8]))
 view = SimulatedCamera(load_scene("tower")).capture(T_world_camera)
 points = view.points_camera[view.valid]
 header = "ply\\nformat ascii 1.0\\nelement vertex %d\\n" % len(points)

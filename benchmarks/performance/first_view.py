@@ -15,7 +15,7 @@ STARTED = time.perf_counter()
 def look() -> None:
     """Explore the scene of `caryatid demo` for two views, with all that a turn compiles."""
     import caryatid as ct
-    from caryatid.commands.demo import SCENE
+    from caryatid.cli.demo import SCENE
     from caryatid.simulation import load_scene
     from caryatid.simulation.stage import set_stage
 

@@ -9,11 +9,11 @@ import fits
 import numpy as np
 
 import caryatid as ct
-from caryatid import frames
-from caryatid.clouds import estimate_normals
 from caryatid.config import FitConfig
-from caryatid.primitives import Fit
-from caryatid.shapes import Shape
+from caryatid.fitting.primitives import Fit
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Shape
+from caryatid.sensing.clouds import estimate_normals
 from performance import limits
 from performance.clock import timed
 from performance.effort import FULL, Effort
@@ -192,7 +192,7 @@ def errors(estimate: Estimate, shape: Shape) -> dict[str, float]:
         return {"radius": radius}
     if estimate.axis is None:
         return {"axis": np.nan, "radius": radius}
-    angle = float(np.degrees(frames.angle_between(estimate.axis, shape.T_world_object[:3, 2])))
+    angle = float(np.degrees(transforms.angle_between(estimate.axis, shape.T_world_object[:3, 2])))
     return {"axis": min(angle, 180.0 - angle), "radius": radius}
 
 

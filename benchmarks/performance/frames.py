@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from caryatid import frames
 from caryatid.config import Config, SensorConfig
-from caryatid.frames import Array
-from caryatid.robot import Robot
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.robots.humanoid import Robot
+from caryatid.sensing.view_sphere import ViewSphere, direction
+from caryatid.sensing.views import View
 from caryatid.simulation.mjcf import TABLE_HEIGHT, Solid, build_spec
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.solids import table_top
 from caryatid.simulation.stage import set_stage
 from caryatid.simulation.world import SimulatedScene, scene_from_spec
-from caryatid.view_sphere import ViewSphere, direction
-from caryatid.views import View
 
 HEAP = "pile-10-1"
 """Scene of ten objects, some on others."""
@@ -112,11 +112,11 @@ def _standing(
     xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False
 ) -> Box | Cylinder | Sphere:
     """A shape that stands over the table at a height [m]; with `flat` one that others can stand on."""
-    turn = frames.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    turn = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
     kind = rng.choice(["box", "cylinder"] if flat else ["box", "cylinder", "sphere"])
     size = rng.uniform(0.04, 0.07, 3)
     tall = size[0] if kind == "sphere" else size[2]
-    T = frames.rigid(turn, (*xy, TABLE_HEIGHT + height + tall / 2.0 + 1e-4))
+    T = transforms.rigid(turn, (*xy, TABLE_HEIGHT + height + tall / 2.0 + 1e-4))
     if kind == "box":
         return Box(T, size)
     if kind == "cylinder":

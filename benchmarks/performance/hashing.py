@@ -6,9 +6,9 @@ import numpy as np
 from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
-from caryatid import frames
-from caryatid.frames import Array
-from caryatid.views import View
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import View
 
 EMPTY = -1
 """What stands in a free place of a table; no key is negative."""
@@ -38,7 +38,7 @@ def hash_voxels(view: View, size: float) -> NDArray[np.int64]:
 def hash_voxels_reference(view: View, size: float) -> NDArray[np.int64]:
     """The same with NumPy: keys in ascending order."""
     points_camera = view.points_camera[view.valid]
-    index = np.floor(frames.transform(view.pose, points_camera) / size).astype(np.int64) + REACH // 2
+    index = np.floor(transforms.transform(view.pose, points_camera) / size).astype(np.int64) + REACH // 2
     return np.unique((index[:, 0] * REACH + index[:, 1]) * REACH + index[:, 2])
 
 

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numba import njit, prange
 
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from performance.clock import in_turns
 
 TRIAD = 16_000_000

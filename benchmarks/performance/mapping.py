@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from caryatid.threads import one_blas_thread
-from caryatid.voxels import VoxelMap
+from caryatid.runtime.threads import one_blas_thread
+from caryatid.sensing.voxel_map import VoxelMap
 from performance import limits
 from performance.clock import in_turns
 from performance.effort import FULL, Effort

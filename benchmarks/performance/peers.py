@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.frames import Array
-from caryatid.views import View
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import View
 
 OPEN3D, PYRANSAC3D, CGAL = "open3d", "pyransac3d", "CGAL.CGAL_Shape_detection"
 DISTRIBUTIONS = {OPEN3D: "open3d", PYRANSAC3D: "pyransac3d", CGAL: "cgal"}
@@ -218,6 +218,6 @@ def read_cgal(line: str) -> Estimate:
     radius = re.search(rf"radius: ?{_NUMBER}", line)
     axis = re.search(rf"axis: {_TRIPLE}", line)
     return Estimate(
-        None if axis is None else frames.unit([float(v) for v in axis.groups()]),
+        None if axis is None else transforms.unit([float(v) for v in axis.groups()]),
         None if radius is None else float(radius[1]),
     )

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 
 from caryatid import Config, Scene, SceneObject, Support, SupportGraph
-from caryatid.candidates import Candidates
-from caryatid.frames import Array
-from caryatid.interest import points_of_interest
-from caryatid.planners import Decision, PlanningState, make_planner
-from caryatid.threads import one_blas_thread
-from caryatid.view_sphere import ViewSphere
+from caryatid.geometry.transforms import Array
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import Decision, PlanningState, make_planner
+from caryatid.planning.points_of_interest import points_of_interest
+from caryatid.runtime.threads import one_blas_thread
+from caryatid.sensing.view_sphere import ViewSphere
 from performance import limits
 from performance.clock import in_turns
 from performance.effort import FULL, Effort

@@ -9,8 +9,8 @@ import fits
 import numpy as np
 from scipy.spatial import cKDTree
 
-from caryatid.frames import Array
-from caryatid.shapes import Shape
+from caryatid.geometry.shapes import Shape
+from caryatid.geometry.transforms import Array
 from performance.peers import NEIGHBOURS
 
 Kind = Literal["cylinder", "box", "sphere"]

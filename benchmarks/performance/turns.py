@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from caryatid import Scene, View, next_best_view
-from caryatid.clouds import oriented_points
 from caryatid.config import SegmentationMethod
-from caryatid.frames import Array
-from caryatid.perception import UP
-from caryatid.segmentation import segment
-from caryatid.surface import find_support_surface
+from caryatid.geometry.transforms import Array
+from caryatid.segmentation.perception import UP
+from caryatid.segmentation.segments import segment
+from caryatid.segmentation.support_plane import find_support_surface
+from caryatid.sensing.clouds import oriented_points
 from performance import limits
 from performance.clock import PAUSE, in_turns, timed
 from performance.effort import FULL, Effort

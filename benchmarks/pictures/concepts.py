@@ -35,15 +35,15 @@ from stages import (
 
 from caryatid.config import Config
 from caryatid.exploration import Step, explore
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.manipulation.order import plan_order
-from caryatid.planners import Decision, PlanningState, make_planner
-from caryatid.report import colours
+from caryatid.planning.planners import Decision, PlanningState, make_planner
 from caryatid.scene import Scene
+from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.mjcf import box, build_spec, cylinder, sphere
 from caryatid.simulation.stage import set_stage
 from caryatid.simulation.world import SimulatedScene, scene_from_spec
-from caryatid.views import SUPPORT_LABEL
+from caryatid.viz import colours
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures" / "concepts"
 SIZE = (560, 430)

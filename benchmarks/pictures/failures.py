@@ -38,20 +38,20 @@ from panels import (
     show_view,
 )
 
-from caryatid import frames
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.scores import TABLE, Score, score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Step, explore
-from caryatid.frames import Array
-from caryatid.report.colours import PALETTE
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.solids import table_top, true_shapes
 from caryatid.simulation.stage import set_stage
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import SimulatedScene
-from caryatid.support import explain
+from caryatid.support.relations import explain
+from caryatid.viz.colours import PALETTE
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures"
 
@@ -226,7 +226,7 @@ def sample(shape: Shape) -> Array:
     """Points (N, 3) [m] inside a shape."""
     rng = np.random.default_rng(0)
     local = rng.uniform(-0.5, 0.5, (4000, 3)) * shape.extents
-    points_world = frames.transform(shape.T_world_object, local)
+    points_world = transforms.transform(shape.T_world_object, local)
     return points_world[shape.signed_distance(points_world) < 0.0]
 
 

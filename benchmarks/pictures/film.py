@@ -32,15 +32,15 @@ from PIL import Image, ImageDraw, ImageFont
 
 import caryatid as ct
 from caryatid.evaluation import score, true_scene_from_simulation
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.report import colours
-from caryatid.report.layout import arrange
-from caryatid.report.svg import keep_apart
+from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation import ground_truth, load_scene
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.stage import Stage, set_stage
-from caryatid.views import SUPPORT_LABEL
+from caryatid.viz import colours
+from caryatid.viz.layout import arrange
+from caryatid.viz.svg import keep_apart
 
 OUT = Path(__file__).parents[2] / "docs/pictures/explore.gif"
 SCENE, SEED = "clutter", 0

@@ -11,18 +11,18 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 import caryatid as ct
-from caryatid import frames
 from caryatid.config import SensorConfig
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.report import colours
-from caryatid.report.wireframes import Projection
-from caryatid.shapes import Box, Cylinder
 from caryatid.simulation.camera import intrinsics, pixel_rays, render
 from caryatid.simulation.mjcf import quaternion
 from caryatid.simulation.solids import static_boxes, table_top
 from caryatid.simulation.stage import Stage
 from caryatid.simulation.world import SimulatedScene
+from caryatid.viz import colours
+from caryatid.viz.wireframes import Projection
 
 FINE = 2
 """Rays a pixel along each side."""
@@ -57,7 +57,7 @@ def eye(
     towards = np.array([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
     width, height = FINE * size[0], FINE * size[1]
     sensor = SensorConfig(width=width, height=height, focal=f * width, far=30.0, ambient=0.55)
-    return Eye(frames.look_at(target + distance * towards, target), sensor)
+    return Eye(transforms.look_at(target + distance * towards, target), sensor)
 
 
 def geoms_of(graph: SupportGraph) -> Solids:
@@ -80,15 +80,15 @@ def robot_geoms(T_world_camera: Array) -> Solids:
     z = position[2]
 
     def at(x: float, y: float, height: float) -> Array:
-        return frames.rigid(R, foot + R @ np.array([x, y, 0.0]) + (0.0, 0.0, height))
+        return transforms.rigid(R, foot + R @ np.array([x, y, 0.0]) + (0.0, 0.0, height))
 
-    head = frames.rigid(T_world_camera[:3, :3], position - 0.09 * forward)
+    head = transforms.rigid(T_world_camera[:3, :3], position - 0.09 * forward)
     solids = [
         (Cylinder(np.eye(4), 0.3, 0.22), at(0.0, 0.0, 0.12), DARK),
         (Box(np.eye(4), np.array([0.16, 0.2, z - 0.45])), at(0.0, 0.0, 0.2 + (z - 0.45) / 2.0), ROBOT),
         (Box(np.eye(4), np.array([0.18, 0.52, 0.16])), at(0.0, 0.0, z - 0.26), ROBOT),
         (Box(np.eye(4), np.array([0.2, 0.2, 0.18])), head, ROBOT),
-        (Box(np.eye(4), np.array([0.16, 0.06, 0.03])), frames.rigid(head[:3, :3], position), DARK),
+        (Box(np.eye(4), np.array([0.16, 0.06, 0.03])), transforms.rigid(head[:3, :3], position), DARK),
     ]
     for side in (-1.0, 1.0):
         solids.append((Box(np.eye(4), np.array([0.1, 0.09, 0.5])), at(0.02, 0.3 * side, z - 0.45), DARK))
@@ -127,9 +127,9 @@ def furniture(stage: Stage, low: float) -> Solids:
             extents[2] = low
             centre[2] = low / 2.0
         colour = WALL if wall else WOOD
-        solids.append((Box(np.eye(4), extents), frames.rigid(box.T_world_object[:3, :3], centre), colour))
+        solids.append((Box(np.eye(4), extents), transforms.rigid(box.T_world_object[:3, :3], centre), colour))
     middle = table_centre(stage) * (1.0, 1.0, 0.0) - (0.0, 0.0, 0.011)
-    solids.append((Cylinder(np.eye(4), 2.0, 0.02), frames.rigid(np.eye(3), middle), FLOOR))
+    solids.append((Cylinder(np.eye(4), 2.0, 0.02), transforms.rigid(np.eye(3), middle), FLOOR))
     return solids
 
 
@@ -177,7 +177,7 @@ def dome(step: ct.Step, at: Eye) -> list[tuple[Array, Array, Array]]:
     for sign, full, pale in ((1.0, 0.85, 0.4), (-1.0, 0.45, 0.12)):
         t = (-b + sign * root) / a
         met = np.isfinite(t)
-        directions = frames.unit(offset + t[met, None] * rays[met])
+        directions = transforms.unit(offset + t[met, None] * rays[met])
         _, nearest = tree.query(directions)
         shown = colours.scale(saliency[nearest], colours.SALIENCY_STOPS).astype(float)
         good = reachable[nearest]

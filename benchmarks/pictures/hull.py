@@ -11,10 +11,10 @@ from matplotlib import pyplot as plt
 from scipy.spatial import ConvexHull
 from solids import Eye, draw_solids
 
-from caryatid import frames
-from caryatid.frames import Array
-from caryatid.report.colours import PALETTE
-from caryatid.shapes import Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.viz.colours import PALETTE
 
 RADIUS = 0.0334
 """Of a tennis ball [m]."""
@@ -39,7 +39,7 @@ class Hull:
 
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] from the farthest plane; outside never more than that from the hull."""
-        local = frames.transform(frames.invert(self.T_world_object), points_world)
+        local = transforms.transform(transforms.invert(self.T_world_object), points_world)
         return np.max(local @ self.planes[:, :3].T + self.planes[:, 3], axis=1)
 
 
@@ -50,7 +50,7 @@ def coarse_hull() -> Hull:
     angle = i * np.pi * (3.0 - np.sqrt(5.0))
     level = np.sqrt(1.0 - z**2)
     corners = CORNER_RADIUS * np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
-    pose = frames.rigid(np.eye(3), CENTRE)
+    pose = transforms.rigid(np.eye(3), CENTRE)
     return Hull(ConvexHull(corners).equations, pose, np.full(3, 2.0 * RADIUS))
 
 
@@ -70,9 +70,9 @@ def draw_hull(size: tuple[int, int]) -> Any:
     Returns:
         The figure.
     """
-    ball, hull = Sphere(frames.rigid(np.eye(3), CENTRE), RADIUS), coarse_hull()
+    ball, hull = Sphere(transforms.rigid(np.eye(3), CENTRE), RADIUS), coarse_hull()
     colour = matplotlib.colors.to_rgb(PALETTE[0])
-    eye = Eye.towards(CENTRE, frames.unit(np.array([-1.0, 0.4, 0.45])), 1.35 * RADIUS, *size)
+    eye = Eye.towards(CENTRE, transforms.unit(np.array([-1.0, 0.4, 0.45])), 1.35 * RADIUS, *size)
     seen, ball_mask = draw_solids([ball], [colour], 0.0, eye)
     true, _ = draw_solids([hull], [matplotlib.colors.to_rgb(PALETTE[1])], 0.0, eye)
     figure, panels = plt.subplots(1, 3, figsize=(3 * size[0] / 100, size[1] / 100 + 0.75), dpi=100)

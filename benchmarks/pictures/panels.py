@@ -14,8 +14,8 @@ from PIL import Image
 from solids import Eye, draw_solids
 
 from caryatid.exploration import Step
-from caryatid.frames import Array
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
 
 Shape = Box | Cylinder | Sphere
 Colour = tuple[float, float, float]

@@ -9,12 +9,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 
 STEPS, REACHED = 80, 2e-4
 """Steps along a ray at the most, and the distance from a surface that counts as on it [m]."""
-LIGHT = frames.unit(np.array([0.3, -0.5, 1.0]))
+LIGHT = transforms.unit(np.array([0.3, -0.5, 1.0]))
 AMBIENT = 0.45
 """Share of the light that comes from everywhere [1]."""
 TABLE_COLOUR, SKY_COLOUR = (0.91, 0.89, 0.86), (1.0, 1.0, 1.0)
@@ -57,18 +57,18 @@ class Eye:
         distance = 7.0 * radius
         focal = 0.5 * min(width, height) * distance / radius
         K = np.array([[focal, 0.0, (width - 1) / 2.0], [0.0, focal, (height - 1) / 2.0], [0.0, 0.0, 1.0]])
-        return cls(frames.look_at(centre_world + distance * direction, centre_world), K, width, height)
+        return cls(transforms.look_at(centre_world + distance * direction, centre_world), K, width, height)
 
     def project(self, points_world: Array) -> Array:
         """Pixels (N, 2) of points (N, 3) [m]."""
-        points_camera = frames.transform(frames.invert(self.T_world_camera), points_world)
+        points_camera = transforms.transform(transforms.invert(self.T_world_camera), points_world)
         return points_camera[:, :2] / points_camera[:, 2:] @ self.K[:2, :2].T + self.K[:2, 2]
 
     def rays_world(self) -> Array:
         """Unit directions (H·W, 3) of the pixels' rays, row by row."""
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
-        return frames.unit(pixels @ np.linalg.inv(self.K).T @ self.T_world_camera[:3, :3].T)
+        return transforms.unit(pixels @ np.linalg.inv(self.K).T @ self.T_world_camera[:3, :3].T)
 
 
 def draw_solids(
@@ -138,4 +138,4 @@ def _gradient(shape: Solid, points_world: Array) -> Array:
         shape.signed_distance(points_world + step * axis) - shape.signed_distance(points_world - step * axis)
         for axis in np.eye(3)
     ]
-    return frames.unit(np.stack(slopes, axis=1))
+    return transforms.unit(np.stack(slopes, axis=1))

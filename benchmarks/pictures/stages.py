@@ -12,15 +12,15 @@ from panels import HALO
 from scipy.spatial import cKDTree
 from solids import Eye, draw_solids
 
-from caryatid import frames
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.interest import PointOfInterest
-from caryatid.planners import Decision
-from caryatid.report import colours
-from caryatid.report.layout import arrange
-from caryatid.view_sphere import ViewSphere
-from caryatid.views import SUPPORT_LABEL, Cloud
+from caryatid.planning.planners import Decision
+from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+from caryatid.viz import colours
+from caryatid.viz.layout import arrange
 
 CERTAIN, UNCERTAIN = "#3b4252", "#d55e00"
 """Colours of supports."""
@@ -64,7 +64,7 @@ def show_points(panel: Any, cloud: Cloud, eye: Eye) -> None:
     pixels = np.rint(eye.project(cloud.points_world)).astype(np.intp)
     towards = eye.T_world_camera[:3, 3] - cloud.points_world
     facing = np.sum(towards * cloud.normals_world, axis=1) > 0.0
-    light = 0.55 + 0.45 * np.abs(cloud.normals_world @ frames.unit(np.array([0.3, -0.5, 1.0])))
+    light = 0.55 + 0.45 * np.abs(cloud.normals_world @ transforms.unit(np.array([0.3, -0.5, 1.0])))
     shade = colours.label_colours(cloud.labels) / 255.0 * light[:, None]
     shade = np.where(facing[:, None], shade, 0.35 * shade + 0.65)
     shade[cloud.labels == SUPPORT_LABEL] = 0.82
@@ -99,7 +99,7 @@ def show_planes(panel: Any, supports: Sequence[Support], eye: Eye) -> None:
             continue
         colour = CERTAIN if support.certain else UNCERTAIN
         normal = support.normal_world
-        u = frames.perpendicular(normal)
+        u = transforms.perpendicular(normal)
         v = np.cross(normal, u)
         corners = [support.contact_world + PLANE * (a * u + b * v) for a, b in CORNERS]
         panel.fill(*eye.project(np.array(corners)).T, facecolor=colour, edgecolor=colour, alpha=0.4, zorder=3)

@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from browser import Tab, browser
 
-from caryatid.commands.sources import open_source
 from caryatid.config import Config
+from caryatid.sources import open_source
 from caryatid.viewer.controls import Controls
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.page import Page

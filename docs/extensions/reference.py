@@ -60,7 +60,7 @@ class EveryCommand(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Write the help."""
         for name, module in sys.modules.items():
-            if name.startswith("caryatid.commands.") or module is cli:
+            if name.startswith("caryatid.cli.") or module is cli:
                 self.env.note_dependency(module.__file__ or "")
         return list(self.parse_text_to_nodes(command_pages(), allow_section_headings=True))
 

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 from sphinx_gallery.scrapers import figure_rst
 
-from caryatid import primitives
+from caryatid.fitting import primitives
 from caryatid.scene import Scene
 from caryatid.simulation.camera import SimulatedCamera
 

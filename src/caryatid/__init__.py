@@ -4,22 +4,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caryatid.late import imported_late
+from caryatid.runtime.display import hooks
+from caryatid.runtime.late import imported_late
 
 if TYPE_CHECKING:
     from caryatid.config import Config
     from caryatid.errors import CaryatidError, InputError
     from caryatid.exploration import Step, explore, next_best_view
+    from caryatid.fitting.primitives import fit
+    from caryatid.geometry.shapes import Box, Cylinder, Sphere
     from caryatid.graph import SceneObject, Support, SupportGraph
-    from caryatid.planners import Planner
-    from caryatid.primitives import fit
-    from caryatid.robot import Robot
+    from caryatid.planning.planners import Planner
+    from caryatid.robots.humanoid import Robot
     from caryatid.scene import Scene
+    from caryatid.sensing.views import Camera, Cloud, View
     from caryatid.sessions.session import Session
-    from caryatid.shapes import Box, Cylinder, Sphere
-    from caryatid.views import Camera, Cloud, View
 
 __version__ = "0.1.0"
+
+hooks |= {"notebook cell": "caryatid.viz.notebook:draw_cell", "viewer": "caryatid.viewer:show"}
 
 __all__ = [
     "Box",
@@ -52,13 +55,13 @@ if not TYPE_CHECKING:
             "errors": ["CaryatidError", "InputError"],
             "exploration": ["Step", "explore", "next_best_view"],
             "graph": ["SceneObject", "Support", "SupportGraph"],
-            "planners": ["Planner"],
-            "primitives": ["fit"],
-            "robot": ["Robot"],
+            "planning.decision": ["Planner"],
+            "fitting.primitives": ["fit"],
+            "robots.humanoid": ["Robot"],
             "scene": ["Scene"],
             "sessions.session": ["Session"],
-            "shapes": ["Box", "Cylinder", "Sphere"],
-            "views": ["Camera", "Cloud", "View"],
+            "geometry.shapes": ["Box", "Cylinder", "Sphere"],
+            "sensing.views": ["Camera", "Cloud", "View"],
         },
     )
 

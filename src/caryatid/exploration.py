@@ -8,21 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
-from caryatid.candidates import Candidates
-from caryatid.change import changed
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import PlanningError
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.pictured import Pictured
-from caryatid.planners import Decision, Planner, PlanningState, make_planner
-from caryatid.robot import Robot, refusal_of, view_sphere_of
+from caryatid.objects.change import changed
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import Decision, Planner, PlanningState, make_planner
+from caryatid.robots.humanoid import Robot, refusal_of, view_sphere_of
+from caryatid.runtime.display import Pictured
+from caryatid.runtime.stopwatch import Stopwatch
+from caryatid.runtime.threads import one_blas_thread
 from caryatid.scene import Scene
-from caryatid.stopwatch import Stopwatch
-from caryatid.threads import one_blas_thread
-from caryatid.view_sphere import ViewSphere
-from caryatid.views import Camera, Cloud, View
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import Camera, Cloud, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -111,7 +111,7 @@ def explore(
             view = view.with_pose(scene.T_world_camera)
         visited.append(sphere.direction_of(robot.T_world_camera))
         if len(visited) > 1:
-            angle += float(frames.angle_between(visited[-2], visited[-1]))
+            angle += float(transforms.angle_between(visited[-2], visited[-1]))
         stop = _reason_to_stop(before, graph, len(visited), config, early_stop)
         watch.lap("update")
         decision, candidates = None, None

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
-from caryatid import frames
-from caryatid.frames import Array
-from caryatid.pictured import Pictured
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.uncertainty import Uncertainty
+from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.runtime.display import Pictured
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -145,8 +145,8 @@ class SupportGraph(Pictured):
         supports = tuple(
             replace(
                 s,
-                contact_world=None if s.contact_world is None else frames.transform(T, s.contact_world),
-                normal_world=None if s.normal_world is None else frames.rotate(T, s.normal_world),
+                contact_world=None if s.contact_world is None else transforms.transform(T, s.contact_world),
+                normal_world=None if s.normal_world is None else transforms.rotate(T, s.normal_world),
             )
             for s in self.supports
         )

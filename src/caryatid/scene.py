@@ -5,36 +5,34 @@ from __future__ import annotations
 import copy
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.completion import complete
 from caryatid.config import Config, SegmentationMethod
-from caryatid.frames import Array
-from caryatid.fusion import Evidence, absorbed, fuse, fused_graph
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
-from caryatid.joint_registration import ViewRegistration
-from caryatid.kernels.compiling import compile_kernels
-from caryatid.manipulation.effects import Effect, predict_removal
-from caryatid.object_models import ObjectModels
-from caryatid.perception import UP, Percept, label_image, perceive
-from caryatid.pictured import Pictured
-from caryatid.plausibility import reconcile
-from caryatid.stopwatch import Stopwatch
-from caryatid.support import explain, infer
-from caryatid.surface import SupportSurface, refitted
-from caryatid.threads import one_blas_thread
-from caryatid.view_sphere import ViewSphere
-from caryatid.views import SUPPORT_LABEL, Cloud, View
-from caryatid.visibility import seen_through
-from caryatid.voxels import VoxelMap
+from caryatid.objects.fusion import Evidence, absorbed, fuse, fused_graph
+from caryatid.objects.hidden_extents import complete
+from caryatid.objects.models import ObjectModels
+from caryatid.runtime.compiling import compile_kernels
+from caryatid.runtime.display import Pictured, call
+from caryatid.runtime.stopwatch import Stopwatch
+from caryatid.runtime.threads import one_blas_thread
+from caryatid.segmentation.perception import UP, Percept, label_image, perceive
+from caryatid.segmentation.support_plane import SupportSurface, refitted
+from caryatid.sensing.joint_registration import ViewRegistration
+from caryatid.sensing.seen_through import seen_through
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.voxel_map import VoxelMap
+from caryatid.support.plausibility import reconcile
+from caryatid.support.relations import explain, infer
+from caryatid.support.removal import Effect, predict_removal
 
 if TYPE_CHECKING:
     import networkx as nx
-
-    from caryatid.viewer import Shown
 
 
 class Scene(Pictured):
@@ -113,7 +111,7 @@ class Scene(Pictured):
         """
         return predict_removal(self.graph, object_id, self.config.support)
 
-    def show(self) -> Shown:
+    def show(self) -> Any:
         """Open the viewer on what is known: a page in the browser, which a notebook shows in place.
 
         Returns:
@@ -122,9 +120,7 @@ class Scene(Pictured):
         Raises:
             InputError: viser is not installed, which comes with the extra `view`; or no port is free.
         """
-        from caryatid.viewer import show
-
-        return show(self)
+        return call("viewer", self)
 
     def copy(self) -> Scene:
         """Return a scene that knows the same; what one of the two learns, the other does not.

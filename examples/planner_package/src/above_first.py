@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.planners import Decision, PlanningState
-from caryatid.planners.decision import check_candidates, path_cost
+from caryatid.geometry import transforms
+from caryatid.planning.decision import check_candidates, path_cost
+from caryatid.planning.planners import Decision, PlanningState
 
 
 class AboveFirst:
@@ -26,7 +26,7 @@ class AboveFirst:
         else:
             # The view from above is from no side.
             sides = np.delete(state.visited, 1, axis=0) * (1.0, 1.0, 0.0)
-            around = frames.angle_between((directions * (1.0, 1.0, 0.0))[:, None], sides[None])
+            around = transforms.angle_between((directions * (1.0, 1.0, 0.0))[:, None], sides[None])
             worth = around.min(axis=1) / np.pi
             best = int(np.argmax(worth))
             why = f"{np.degrees(np.pi * worth[best]):.0f}° around from the nearest earlier view"

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 
 
 @dataclass(frozen=True, slots=True)

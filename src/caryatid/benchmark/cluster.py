@@ -13,10 +13,11 @@ from threading import Lock
 from typing import TYPE_CHECKING
 
 from caryatid.benchmark.episodes import run_episode
-from caryatid.benchmark.fingerprint import fingerprint, plugin_of
+from caryatid.benchmark.plugins import plugin_of
 from caryatid.benchmark.records import Episode, Outcome
 from caryatid.errors import CaryatidError, InputError
-from caryatid.threads import one_blas_thread
+from caryatid.runtime.fingerprint import fingerprint
+from caryatid.runtime.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from distributed import Client, Future

@@ -11,7 +11,7 @@ from caryatid.benchmark.bootstrap import Bootstrap, Estimate
 from caryatid.benchmark.records import MEASURES
 from caryatid.benchmark.samples import Sample, scene_means
 from caryatid.benchmark.thresholds import F1, reach_of_means
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 
 
 @dataclass(frozen=True, slots=True)

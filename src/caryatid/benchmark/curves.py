@@ -11,7 +11,7 @@ import numpy as np
 from caryatid.benchmark.bootstrap import Estimate
 from caryatid.benchmark.plotting import LEGEND, SOFT, Mark, add_axes, label_lines, name_width
 from caryatid.benchmark.statistics import MethodSummary
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 
 Plot = Callable[[Any], None]
 """Draws into matplotlib's figure."""

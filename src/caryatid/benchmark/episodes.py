@@ -10,12 +10,12 @@ from caryatid.benchmark.records import Episode, Outcome, ViewRow
 from caryatid.benchmark.scenes import opened
 from caryatid.benchmark.taking import AFTER, take_apart
 from caryatid.config import Config
+from caryatid.config.settings import read_settings
 from caryatid.errors import in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, score
 from caryatid.evaluation.truths import SEED
 from caryatid.exploration import Step, explore
-from caryatid.settings import read_settings
 from caryatid.simulation.stage import set_stage
 
 

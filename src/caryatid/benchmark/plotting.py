@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9")
 """Of Okabe and Ito, told apart with any kind of colour vision; without their yellow, too pale for a line."""

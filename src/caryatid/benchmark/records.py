@@ -50,7 +50,7 @@ class Episode:
         """Digest of the episode and of the code that runs it; where a scene's folder lies does not matter.
 
         Args:
-            fingerprint: Of the code, see `caryatid.benchmark.fingerprint`.
+            fingerprint: Of the code, see `caryatid.runtime.fingerprint`.
         """
         told = asdict(self) | ({"scene": ""} if self.content else {})
         text = json.dumps([fingerprint, told], sort_keys=True)

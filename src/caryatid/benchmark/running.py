@@ -14,7 +14,7 @@ from caryatid.benchmark.episodes import run_episode
 from caryatid.benchmark.records import Episode, Outcome
 from caryatid.benchmark.store import ResultStore
 from caryatid.errors import CaryatidError
-from caryatid.interrupts import interrupts_held
+from caryatid.runtime.interrupts import interrupts_held
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Set to 1 in the environment of the processes, unless set already: they share the cores."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from caryatid.benchmark.records import MEASURES, Record, ViewRow
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 
 Key = tuple[str, int]
 """Scene and seed."""

@@ -18,7 +18,7 @@ from caryatid.benchmark.records import MEASURES, Record
 from caryatid.benchmark.samples import Sample, group, sample, scene_means
 from caryatid.benchmark.thresholds import Reach, area_over_path, path_budget, reach
 from caryatid.config import StatisticsConfig
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
 
-from caryatid.benchmark.fingerprint import plugin_of
+from caryatid.benchmark.plugins import plugin_of
 from caryatid.benchmark.records import ORDERS, Episode, Member, OrderName
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
-from caryatid.planners import VOLUMETRIC
+from caryatid.planning.planners import VOLUMETRIC
 
 DESIGNED = ("tower", "bridge", "counterweight", "leaning_plank", "hidden_stack", "shelf", "clutter")
 """Scenes with one difficulty each."""

@@ -14,7 +14,7 @@ import numpy as np
 from caryatid.benchmark.bootstrap import Bootstrap, Estimate
 from caryatid.benchmark.records import MEASURES
 from caryatid.benchmark.samples import Sample, scene_means
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 
 ROUNDING = 1e-9
 """A mean this far below a threshold reaches it [1]: what sums of equal figures differ by."""

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 from caryatid.benchmark.suites import Condition, Method, Suite
 from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config.settings import read_settings
 from caryatid.errors import InputError
-from caryatid.settings import read_settings
 
 OF_THE_EPISODE = {"fusion.method": "--fusion", "active.max_views": "--views"}
 """Settings every episode has of its own → the option that changes them."""

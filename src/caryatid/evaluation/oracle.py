@@ -1,7 +1,7 @@
 """The planner that knows the truth: what any planner that thinks one view ahead could reach at best.
 
 It tries candidates in simulation, each on a copy of what is known, and takes the one after which the score is
-in fact highest. Nobody else may see what it sees: it is not among `caryatid.planners.BUILT_IN`.
+in fact highest. Nobody else may see what it sees: it is not among `caryatid.planning.planners.BUILT_IN`.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import CaryatidError, InputError
 from caryatid.evaluation.scores import TrueScene, score
 from caryatid.evaluation.truths import SEED
-from caryatid.formats.graph_json import graph_text
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.planners import ORACLE, Decision, Planner, PlanningState, SupportPlanner, make_planner
-from caryatid.planners.decision import check_candidates, path_cost
+from caryatid.io.graph_json import graph_text
+from caryatid.planning.decision import check_candidates, path_cost
+from caryatid.planning.planners import ORACLE, Decision, Planner, PlanningState, SupportPlanner, make_planner
 from caryatid.scene import Scene
+from caryatid.sensing.views import Camera, View
 from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
-from caryatid.views import Camera, View
 
 EQUAL = 1e-9
 """Scores nearer than this are the same [1]; they are ratios of small whole numbers."""

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from caryatid.errors import InputError
-from caryatid.frames import Array
-from caryatid.views import SUPPORT_LABEL
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import SUPPORT_LABEL
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from caryatid.config import EvaluationConfig
 from caryatid.evaluation.overlaps import TrueObject, assign, mask_ious, volume_ious
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SupportGraph
-from caryatid.shapes import Box, Cylinder, Sphere
 
 TABLE: Final = "table"
 """Name of the support surface among the true vertices."""

@@ -12,8 +12,8 @@ from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.overlaps import TrueObject
 from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
-from caryatid.formats.bop import Frame, Recording, read_recording
-from caryatid.formats.runs import Run, RunView, read_run
+from caryatid.io.bop import Frame, Recording, read_recording
+from caryatid.io.runs import Run, RunView, read_run
 from caryatid.simulation import solids
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import GroundTruth, read_truth

@@ -8,7 +8,7 @@ from typing import Any
 import networkx as nx
 
 from caryatid.graph import SupportGraph
-from caryatid.report.colours import ink_on, object_colour
+from caryatid.viz.colours import ink_on, object_colour
 
 
 def to_graphml(graph: SupportGraph) -> str:

@@ -8,9 +8,9 @@ from trimesh.exchange.gltf import export_glb, export_gltf
 from trimesh.visual.material import PBRMaterial
 
 from caryatid.config import ExportConfig
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.report.colours import object_colour, rgb
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.viz.colours import object_colour, rgb
 
 WORLD = "z_up"
 """Name of the node whose frame is caryatid's world; the file itself has y up, as glTF wants."""

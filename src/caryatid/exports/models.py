@@ -12,12 +12,12 @@ from scipy.spatial.transform import Rotation
 
 from caryatid.config import ExportConfig
 from caryatid.errors import InputError
-from caryatid.frames import Array
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.report.colours import object_colour, rgb
-from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.simulation.mjcf import Solid, add_solid, quaternion
 from caryatid.simulation.world import TABLE
+from caryatid.viz.colours import object_colour, rgb
 
 WORLD = "world"
 """Name of a URDF's root link."""

@@ -8,8 +8,8 @@ from typing import Final
 from caryatid.config import ExportConfig
 from caryatid.config.choices import ExportFormat
 from caryatid.errors import InputError
-from caryatid.formats.staging import write_file
 from caryatid.graph import SupportGraph
+from caryatid.io.staging import write_file
 
 ENDINGS: Final[dict[ExportFormat, tuple[str, ...]]] = {
     "mjcf": (".xml",),

@@ -10,7 +10,7 @@ import numpy as np
 
 from caryatid.config import Config, EvaluationConfig
 from caryatid.evaluation.scores import TrueScene, score
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.order import TakeStep
 from caryatid.simulation.lifting import Lifting

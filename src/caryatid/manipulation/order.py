@@ -12,7 +12,7 @@ from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.rehearsal import Rehearsal, Trial
-from caryatid.pictured import Pictured
+from caryatid.runtime.display import Pictured
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from caryatid.config import Config
 from caryatid.errors import InputError
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.plausibility import drawn, reconcile
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.mjcf import Solid, add_solid, quaternion
 from caryatid.simulation.world import TABLE
+from caryatid.support.plausibility import drawn, reconcile
 
 TIME_STEP = 0.004
 """Of rehearsals [s]: twice MuJoCo's own, which its implicit integrator bears, for half the time."""

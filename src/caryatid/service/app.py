@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from importlib.metadata import version
 from typing import Annotated, Any
 
 from fastapi import Depends, FastAPI, HTTPException, Path, Request, Response
@@ -13,11 +14,11 @@ from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-import caryatid
 from caryatid.config import Config
+from caryatid.config.settings import changed_settings
 from caryatid.errors import CaryatidError, PlanningError
-from caryatid.formats.graph_json import graph_to_json
-from caryatid.formats.json_files import json_text
+from caryatid.io.graph_json import graph_to_json
+from caryatid.io.json_files import json_text
 from caryatid.service.desk import Desk, FullError, MissingError
 from caryatid.service.documents import (
     Candidates,
@@ -36,7 +37,6 @@ from caryatid.sessions.folder import TakenError
 from caryatid.sessions.lock import SessionBusyError
 from caryatid.sessions.next_view import candidates_from
 from caryatid.sessions.session import WrongNumberError
-from caryatid.settings import changed_settings
 
 LOCAL = ["127.0.0.1", "localhost", "[::1]"]
 """Names this machine has for itself; a page of another one that a browser here shows has no business."""
@@ -91,7 +91,7 @@ def make_app(desk: Desk, *, token: str | None, max_request: int, host: str = "12
     app = FastAPI(
         title="caryatid",
         summary="Sessions of active vision: views in, support graph and next view out",
-        version=caryatid.__version__,
+        version=version("caryatid"),
         lifespan=lifespan,
         max_body_size=max_request,
         responses=PROBLEMS,

@@ -12,10 +12,10 @@ import uvicorn
 
 from caryatid.config import Config
 from caryatid.errors import InputError
-from caryatid.formats.json_files import json_text
-from caryatid.formats.staging import said_clearly
-from caryatid.interrupts import interruptible
-from caryatid.kernels.compiling import compile_kernels
+from caryatid.io.json_files import json_text
+from caryatid.io.staging import said_clearly
+from caryatid.runtime.compiling import compile_kernels
+from caryatid.runtime.interrupts import interruptible
 from caryatid.service.app import make_app
 from caryatid.service.desk import Desk
 

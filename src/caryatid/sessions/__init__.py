@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caryatid.late import imported_late
+from caryatid.runtime.late import imported_late
 
 if TYPE_CHECKING:
     from caryatid.sessions.captures import Capture

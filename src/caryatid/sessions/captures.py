@@ -13,14 +13,14 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
 from caryatid.config import SessionConfig
 from caryatid.errors import InputError
-from caryatid.formats.images import DEPTH_MODES, MASK_MODES, decode_image, png
-from caryatid.formats.json_files import field as json_field
-from caryatid.formats.json_files import number, numbers, read_json
-from caryatid.frames import Array
-from caryatid.views import View, check_intrinsics
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.io.images import DEPTH_MODES, MASK_MODES, decode_image, png
+from caryatid.io.json_files import field as json_field
+from caryatid.io.json_files import number, numbers, read_json
+from caryatid.sensing.views import View, check_intrinsics
 
 IMAGES: Final = ("depth", "rgb", "labels", "normals")
 """Names of the images of a view; the first one it must have."""
@@ -137,7 +137,7 @@ class Capture:
         return cls(
             images,
             check_intrinsics(K, f"{where}: K"),
-            frames.as_rigid(T, f"{where}: T_world_camera"),
+            transforms.as_rigid(T, f"{where}: T_world_camera"),
             scale,
             name=str(name),
         )

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from caryatid import frames
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 from caryatid.scene import Scene
-from caryatid.surface import SupportSurface
-from caryatid.views import View
-from caryatid.voxels import VoxelMap
+from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.sensing.views import View
+from caryatid.sensing.voxel_map import VoxelMap
 
 SAME_CAMERA = 1e-3
 """Pinhole matrices that differ by less than this share of the focal length are of the same camera [1]."""
@@ -166,4 +166,4 @@ def _points(view: View, nearest: float, farthest: float) -> Array:
     stride = max(1, int(np.sqrt(view.depth.size / SAMPLES)))
     picked = view.points_camera[stride // 2 :: stride, stride // 2 :: stride].reshape(-1, 3)
     within = (picked[:, 2] >= nearest) & (picked[:, 2] <= farthest)
-    return frames.transform(view.pose, picked[within])
+    return transforms.transform(view.pose, picked[within])

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from caryatid.formats.staging import said_clearly
+from caryatid.io.staging import said_clearly
 
 PARTIAL = ".partial-"
 """What names of files and folders in the making begin with; what a death leaves of them is garbage."""

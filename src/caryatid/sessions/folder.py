@@ -18,13 +18,13 @@ from pathlib import Path
 from typing import Any, Final, get_args
 
 from caryatid.config import Config, SegmentationMethod
+from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
-from caryatid.formats.json_files import field, read_json
-from caryatid.formats.staging import said_clearly
-from caryatid.robots import HUMANOID
+from caryatid.io.json_files import field, read_json
+from caryatid.io.staging import said_clearly
+from caryatid.robots.registry import HUMANOID
 from caryatid.sessions.captures import Capture, Entry, read_entry
 from caryatid.sessions.durable import publish_durably, remove_durably, settle, write_durably
-from caryatid.settings import changed_settings
 
 FORMAT: Final = "caryatid/session"
 VERSION: Final = 1

@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from caryatid import frames
-from caryatid.candidates import Candidates
 from caryatid.config import Config
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import next_best_view
-from caryatid.floor import FloorGrid
-from caryatid.formats.json_files import field, numbers
-from caryatid.frames import Array
-from caryatid.planners import Decision
-from caryatid.robot import OwnViews, Posture, Unreachable, refusal_of, view_sphere_of
-from caryatid.robots import HUMANOID, Surroundings, find_robot
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.io.json_files import field, numbers
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import Decision
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import OwnViews, Posture, Unreachable, refusal_of, view_sphere_of
+from caryatid.robots.registry import HUMANOID, Surroundings, find_robot
 from caryatid.scene import Scene
-from caryatid.view_sphere import ViewSphere
+from caryatid.sensing.view_sphere import ViewSphere
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -151,7 +151,7 @@ class _Standing(OwnViews):
         eye = self.T_world_camera[:3, 3]
         ways = [self.T_world_camera]
         if np.linalg.norm(eye - centre_world) > 1e-6:
-            ways.append(frames.look_at(eye, centre_world))
+            ways.append(transforms.look_at(eye, centre_world))
         for T in ways:
             if isinstance(self._robot.solve(T), Posture):
                 self._robot.move_to(T)
@@ -183,7 +183,7 @@ class _Reaching:
 
     def __init__(self, T_world_camera: Array, poses: Array, ways: Array | None) -> None:
         self.T_world_camera = T_world_camera
-        self._poses = np.array([frames.as_rigid(T, f"candidates[{n}]") for n, T in enumerate(poses)])
+        self._poses = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in enumerate(poses)])
         self._poses = self._poses.reshape(-1, 4, 4)
         self._ways = _straight(T_world_camera, self._poses) if ways is None else np.asarray(ways, np.float64)
         if self._ways.shape != (len(self._poses),) or not (self._ways >= 0.0).all():

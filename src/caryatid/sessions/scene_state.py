@@ -19,20 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.fusion import Evidence
+from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
-from caryatid.joint_registration import Placement, ViewRegistration
-from caryatid.object_models import ObjectModels, _Parts
-from caryatid.object_points import ObjectPoints, _Seen
-from caryatid.pose_graph import Ties
-from caryatid.registration import RegisteredView
+from caryatid.objects.fusion import Evidence
+from caryatid.objects.models import ObjectModels, _Parts
+from caryatid.objects.points import ObjectPoints, _Seen
 from caryatid.scene import Scene
-from caryatid.shapes import Box, Cylinder, Sphere
-from caryatid.surface import SupportSurface
-from caryatid.uncertainty import Uncertainty
-from caryatid.view_sphere import ViewSphere
-from caryatid.views import Cloud
-from caryatid.voxels import VoxelMap
+from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.sensing.joint_registration import Placement, ViewRegistration
+from caryatid.sensing.pose_graph import Ties
+from caryatid.sensing.registration import RegisteredView
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import Cloud
+from caryatid.sensing.voxel_map import VoxelMap
 
 VALUES: dict[str, type] = {
     kind.__name__: kind

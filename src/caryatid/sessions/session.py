@@ -12,14 +12,15 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from caryatid.change import changed
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.planners import make_planner
-from caryatid.robots import HUMANOID, find_robot
+from caryatid.objects.change import changed
+from caryatid.planning.planners import make_planner
+from caryatid.robots.registry import HUMANOID, find_robot
 from caryatid.scene import Scene
+from caryatid.sensing.views import View
 from caryatid.sessions.captures import Capture, Entry
 from caryatid.sessions.checks import check_camera, check_labels, check_pose, check_same_camera
 from caryatid.sessions.durable import clear_partials
@@ -27,7 +28,6 @@ from caryatid.sessions.folder import Beginning, SessionFolder, begin, chain
 from caryatid.sessions.lock import FolderLock
 from caryatid.sessions.next_view import NextView, plan_next
 from caryatid.sessions.snapshots import Snapshots, State
-from caryatid.views import View
 
 
 class WrongNumberError(InputError):

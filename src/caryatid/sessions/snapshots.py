@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from caryatid.benchmark.fingerprint import fingerprint
 from caryatid.config import Config, SegmentationMethod
+from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
 from caryatid.sessions.durable import PARTIAL
 from caryatid.sessions.scene_state import SceneWriter, read_scene

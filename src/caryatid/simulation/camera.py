@@ -9,13 +9,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
 from caryatid.config import NoiseConfig, NoiseModel, SensorConfig
 from caryatid.errors import InputError
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import View, check_intrinsics
 from caryatid.simulation.noise import add_depth_noise, misregister
 from caryatid.simulation.world import INVISIBLE_GROUP, SimulatedScene
-from caryatid.views import View, check_intrinsics
 
 GEOM_GROUPS = 6
 """Groups MuJoCo sorts geoms into."""
@@ -101,7 +101,7 @@ class SimulatedCamera:
         Raises:
             InputError: The pose is no rigid transform.
         """
-        T = frames.as_rigid(T_world_camera, "T_world_camera")
+        T = transforms.as_rigid(T_world_camera, "T_world_camera")
         image = render(self.scene, T, self.K, self.sensor)
         number = self._captures
         rng = np.random.default_rng([self._seed, number])
@@ -201,7 +201,7 @@ def _shade(
     plain = (model.geom_matid >= 0) & (colours == UNSET_COLOUR).all(axis=1)
     colours[plain] = model.mat_rgba[model.geom_matid[plain], :3]
     colours = np.concatenate([colours, np.array([BACKGROUND], dtype=np.float32)])
-    lit = np.einsum("ij,j->i", normals_world, frames.unit(sensor.light))
+    lit = np.einsum("ij,j->i", normals_world, transforms.unit(sensor.light))
     brightness = sensor.ambient + (1.0 - sensor.ambient) * np.maximum(lit, 0.0)
     brightness[geoms < 0] = 1.0
     shaded = colours[geoms] * (255.0 * brightness.astype(np.float32))[:, None] + np.float32(0.5)

@@ -9,11 +9,11 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from caryatid import frames
 from caryatid.config import GenerationConfig, PhysicsConfig
 from caryatid.errors import InputError
-from caryatid.frames import Array
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
 from caryatid.simulation.mjcf import TABLE_HEIGHT, TABLE_SIZE, Side, Solid, build_spec
 from caryatid.simulation.solids import bounds, true_shapes
 from caryatid.simulation.world import SimulatedScene, displacement, scene_from_spec, state_of
@@ -234,13 +234,13 @@ def let_go(
         scene: What is there already, or None.
         habits: How far above.
     """
-    over = shape.moved(frames.rigid(np.eye(3), (*xy, 0.0)))
+    over = shape.moved(transforms.rigid(np.eye(3), (*xy, 0.0)))
     tops = [TABLE_HEIGHT]
     if scene is not None:
         shapes = true_shapes(scene)
         tops += [float(bounds(scene, label)[1][2]) for label in shapes if _over(over, [shapes[label]])]
     z = max(tops) + float(shape.support(DOWN)[0]) + habits.gap
-    return Solid(over.moved(frames.rigid(np.eye(3), (0.0, 0.0, z))))
+    return Solid(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
 
 
 def _over(shape: Box | Cylinder | Sphere, others: Sequence[Box | Cylinder | Sphere]) -> bool:
@@ -261,17 +261,17 @@ def upright(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinde
         rng: For every random choice.
         habits: Kinds and sizes.
     """
-    yaw = frames.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    yaw = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
     R = yaw @ _ON_ITS_SIDE if rng.random() < habits.lying else yaw
     return _shape(rng, R, habits)
 
 
 def _tilted(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
-    return _shape(rng, frames.random_rotation(rng), habits)
+    return _shape(rng, transforms.random_rotation(rng), habits)
 
 
 def _shape(rng: np.random.Generator, R: Array, habits: GenerationConfig) -> Box | Cylinder | Sphere:
-    T = frames.rigid(R, np.zeros(3))
+    T = transforms.rigid(R, np.zeros(3))
     kind = rng.choice(3, p=habits.mixture)
     radius = float(rng.uniform(*habits.radius))
     if kind == 0:
@@ -291,7 +291,7 @@ def _screens(rng: np.random.Generator, habits: GenerationConfig) -> list[Solid]:
         distance = rng.uniform(*habits.screen_distance)
         width, height = rng.uniform(*habits.screen_width), rng.uniform(*habits.screen_height)
         at = (distance * np.cos(azimuth), distance * np.sin(azimuth), TABLE_HEIGHT + height / 2.0)
-        T = frames.rigid(frames.rotation_from_vector((0.0, 0.0, azimuth)), at)
+        T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, azimuth)), at)
         screens.append(Solid(Box(T, np.array([habits.screen_thickness, width, height])), _SCREEN_DENSITY))
     return screens
 
@@ -319,4 +319,4 @@ def check_request(name: str, size: int, seed: int, sizes: tuple[int, int]) -> No
         raise InputError(name, f"seed {seed} is negative", "give 0 or more")
 
 
-_ON_ITS_SIDE = frames.rotation_from_vector((np.pi / 2.0, 0.0, 0.0))
+_ON_ITS_SIDE = transforms.rotation_from_vector((np.pi / 2.0, 0.0, 0.0))

@@ -16,7 +16,7 @@ from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 
 from caryatid.config.manipulation import LiftConfig
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.simulation.world import mujoco_warnings_ignored
 
 ASIDE = 50.0

@@ -10,9 +10,9 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 
-from caryatid import frames
-from caryatid.frames import Array
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
 from caryatid.simulation.world import TABLE
 
 TABLE_HEIGHT = 0.75
@@ -140,8 +140,8 @@ def quaternion(R: Array) -> Array:
 
 
 def _placed(at: tuple[float, float, float], turn: tuple[float, float, float]) -> Array:
-    R = frames.rotation_from_vector(np.deg2rad(turn))
-    return frames.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
+    R = transforms.rotation_from_vector(np.deg2rad(turn))
+    return transforms.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
 
 
 def _add_table(table: Any, size: tuple[float, float]) -> None:

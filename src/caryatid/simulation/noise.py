@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid import frames
 from caryatid.config import NoiseConfig
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
 
 
 def axial_sigma(depth: Array, config: NoiseConfig) -> Array:
@@ -64,7 +64,7 @@ def misregister(T_world_camera: Array, config: NoiseConfig, rng: np.random.Gener
         rng: Source of the error.
     """
     angle = np.deg2rad(config.rotation) * rng.standard_normal()
-    axis = frames.unit(rng.standard_normal(3))
+    axis = transforms.unit(rng.standard_normal(3))
     shift = config.translation * rng.standard_normal(3)
-    R_world_camera = frames.rotation_from_vector(angle * axis) @ T_world_camera[:3, :3]
-    return frames.rigid(R_world_camera, T_world_camera[:3, 3] + shift)
+    R_world_camera = transforms.rotation_from_vector(angle * axis) @ T_world_camera[:3, :3]
+    return transforms.rigid(R_world_camera, T_world_camera[:3, 3] + shift)

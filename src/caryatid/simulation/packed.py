@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from caryatid import frames
 from caryatid.config import GenerationConfig, PhysicsConfig
-from caryatid.frames import Array
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
 from caryatid.simulation.generate import (
     AXES,
     DOWN,
@@ -49,7 +49,7 @@ def generate_packed(
     check_request(name, size, seed, PACKED_SIZES)
     habits = config or GenerationConfig()
     rng = np.random.default_rng([2, size, seed])
-    turn = frames.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    turn = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
 
     def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> Drop:
         shape = upright(rng, habits)
@@ -74,8 +74,8 @@ def _turned(shape: Box | Cylinder | Sphere, turn: Array) -> Box | Cylinder | Sph
     R = shape.T_world_object[:3, :3]
     level = int(np.argmin(np.abs(R[2])))
     yaw = np.arctan2(R[1, level], R[0, level])
-    back = frames.rotation_from_vector((0.0, 0.0, -yaw))
-    return shape.moved(frames.rigid(turn @ back, np.zeros(3)))
+    back = transforms.rotation_from_vector((0.0, 0.0, -yaw))
+    return shape.moved(transforms.rigid(turn @ back, np.zeros(3)))
 
 
 def _pushed(
@@ -88,7 +88,7 @@ def _pushed(
     z = TABLE_HEIGHT + float(shape.support(DOWN)[0]) + habits.packed_gap
     distance = float(np.hypot(*TABLE_SIZE))
     for _ in range(_STEPS):
-        at = shape.moved(frames.rigid(np.eye(3), distance * outward_world + (0.0, 0.0, z)))
+        at = shape.moved(transforms.rigid(np.eye(3), distance * outward_world + (0.0, 0.0, z)))
         gap = min(_gap(at, other) for other in others)
         if gap < habits.packed_gap or distance <= 0.0:
             break

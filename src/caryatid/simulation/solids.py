@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from caryatid import frames
 from caryatid.errors import InputError
-from caryatid.frames import Array
-from caryatid.shapes import Box, Cylinder, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
 from caryatid.simulation.world import SimulatedScene
 
 _GEOM = mujoco.mjtGeom
@@ -51,8 +51,8 @@ def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[
     """
     inside = np.zeros(len(points_world), dtype=bool)
     for geom in solid_geoms(scene, label):
-        T_geom_world = frames.invert(_geom_pose(scene, geom))
-        inside |= _inside_geom(scene.model, geom, frames.transform(T_geom_world, points_world))
+        T_geom_world = transforms.invert(_geom_pose(scene, geom))
+        inside |= _inside_geom(scene.model, geom, transforms.transform(T_geom_world, points_world))
     return inside
 
 
@@ -62,7 +62,7 @@ def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
     for geom in solid_geoms(scene, label):
         T_world_geom = _geom_pose(scene, geom)
         if scene.model.geom_type[geom] == _GEOM.mjGEOM_MESH:
-            corners = frames.transform(T_world_geom, _mesh_vertices(scene.model, geom))
+            corners = transforms.transform(T_world_geom, _mesh_vertices(scene.model, geom))
             low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
         else:
             reach = _reach(scene.model, geom, T_world_geom[:3, :3])
@@ -96,7 +96,7 @@ def table_top(scene: SimulatedScene) -> TableTop:
     top = max(boxes, key=lambda box: box.extents[0] * box.extents[1])
     height = top.T_world_object[2, 3] + top.extents[2] / 2.0
     signs = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
-    corners_world = frames.transform(top.T_world_object, signs * top.extents / 2.0)
+    corners_world = transforms.transform(top.T_world_object, signs * top.extents / 2.0)
     return TableTop(float(height), corners_world, top)
 
 
@@ -109,7 +109,7 @@ def solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
 
 
 def _geom_pose(scene: SimulatedScene, geom: int) -> Array:
-    return frames.rigid(scene.data.geom_xmat[geom].reshape(3, 3), scene.data.geom_xpos[geom])
+    return transforms.rigid(scene.data.geom_xmat[geom].reshape(3, 3), scene.data.geom_xpos[geom])
 
 
 def _primitive(scene: SimulatedScene, geom: int) -> Box | Cylinder | Sphere | None:
@@ -128,7 +128,7 @@ def _geom_box(scene: SimulatedScene, geom: int) -> Box:
     """Return the box around a geom along the geom's own axes."""
     centre, half = scene.model.geom_aabb[geom, :3], scene.model.geom_aabb[geom, 3:]
     T_world_geom = _geom_pose(scene, geom)
-    return Box(T_world_geom @ frames.rigid(np.eye(3), centre), 2.0 * half)
+    return Box(T_world_geom @ transforms.rigid(np.eye(3), centre), 2.0 * half)
 
 
 def _level(box: Box) -> Box:
@@ -137,12 +137,12 @@ def _level(box: Box) -> Box:
     upright = int(np.argmax(np.abs(R[2])))
     if abs(R[2, upright]) < np.cos(np.deg2rad(1.0)):
         half = np.abs(R) @ (box.extents / 2.0)
-        return Box(frames.rigid(np.eye(3), box.T_world_object[:3, 3]), 2.0 * half)
+        return Box(transforms.rigid(np.eye(3), box.T_world_object[:3, 3]), 2.0 * half)
     first, second = (upright + 1) % 3, (upright + 2) % 3
     x = R[:, first] * (1.0, 1.0, 0.0)
     x = x / np.linalg.norm(x)
     R_level = np.stack([x, np.cross((0.0, 0.0, 1.0), x), (0.0, 0.0, 1.0)], axis=1)
-    return Box(frames.rigid(R_level, box.T_world_object[:3, 3]), box.extents[[first, second, upright]])
+    return Box(transforms.rigid(R_level, box.T_world_object[:3, 3]), box.extents[[first, second, upright]])
 
 
 def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from caryatid.config import Config, NoiseModel
-from caryatid.floor import FloorGrid
-from caryatid.robot import Robot, home_view
-from caryatid.robots import HUMANOID, RobotMaker, Surroundings, find_robot
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import Robot, home_view
+from caryatid.robots.registry import HUMANOID, RobotMaker, Surroundings, find_robot
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.solids import static_boxes, table_top
 from caryatid.simulation.world import SimulatedScene
-from caryatid.view_sphere import ViewSphere
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
-from caryatid.formats.json_files import json_text, read_json
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind
+from caryatid.io.json_files import json_text, read_json
 from caryatid.simulation.world import SimulatedScene, displacement, state_of
 
 ASIDE = 100.0

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
-from caryatid.frames import Array
-from caryatid.views import SUPPORT_LABEL
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import SUPPORT_LABEL
 
 TABLE = "table"
 """Name of the body that is the support surface."""

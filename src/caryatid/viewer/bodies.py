@@ -9,13 +9,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from caryatid import frames
-from caryatid.frames import Array
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
 from caryatid.graph import Support, SupportGraph
-from caryatid.report.colours import Colour, object_colour, rgb
-from caryatid.shapes import Box, Cylinder, Sphere
 from caryatid.viewer.marks import Copies, Drawing, Label, Lines, Mesh
 from caryatid.viewer.moments import Standing
+from caryatid.viz.colours import Colour, object_colour, rgb
 
 ROUND = 40
 """Corners of a drawn circle."""
@@ -51,7 +51,7 @@ def draw_shapes(graph: SupportGraph, chosen: str = "") -> Drawing:
         drawing[f"shapes/{item.id}"] = Mesh(
             T, vertices, faces, colour, opacity, item.id, flat=item.shape.kind == "box"
         )
-        outline = frames.transform(T, _outline(item.shape).reshape(-1, 3)).reshape(-1, 2, 3)
+        outline = transforms.transform(T, _outline(item.shape).reshape(-1, 3)).reshape(-1, 2, 3)
         ends.append(outline)
         ink = (17, 17, 17) if item.id == chosen else tuple(int(0.55 * c) for c in colour)
         colours.append(np.tile(np.array(ink, np.uint8), (len(outline), 1)))

@@ -13,14 +13,14 @@ import numpy as np
 from caryatid.config import FusionMethod
 from caryatid.errors import CaryatidError, in_one_line
 from caryatid.manipulation.order import plan_order
-from caryatid.planners import BUILT_IN, ORACLE, offered
+from caryatid.planning.planners import BUILT_IN, ORACLE, offered
+from caryatid.runtime.threads import cores
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.threads import cores
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.moments import Moment
 from caryatid.viewer.page import Page
+from caryatid.viewer.removal import Picture, lifts_in_physics, lifts_told, pictured
 from caryatid.viewer.steering import candidate_under
-from caryatid.viewer.taking import Picture, lifts_in_physics, lifts_told, pictured
 
 PICTURE_TIME = 0.12
 """How long each picture of a lift is shown [s]."""

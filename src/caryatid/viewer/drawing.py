@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from caryatid.frames import Array
-from caryatid.report.colours import NOTHING_COLOUR, SALIENCY_STOPS, object_colour, rgb, scale
+from caryatid.geometry.transforms import Array
 from caryatid.viewer.bodies import draw_robot, draw_shapes, draw_supports
 from caryatid.viewer.marks import Colours, Drawing, Frustum, Label, Lines, Points
 from caryatid.viewer.moments import Dots, Moment, Shot
+from caryatid.viz.colours import NOTHING_COLOUR, SALIENCY_STOPS, object_colour, rgb, scale
 
 LAYERS = ("cloud", "shapes", "names", "supports", "sphere", "interest", "cameras", "robot")
 """What can be shown and hidden, as the page has it."""

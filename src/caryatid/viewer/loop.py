@@ -8,22 +8,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from caryatid.arm_robot import ArmRobot
-from caryatid.change import changed
 from caryatid.config import Config, FusionMethod, SegmentationMethod
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
 from caryatid.exploration import Step, explore
 from caryatid.graph import SupportGraph
-from caryatid.planners import ORACLE, Decision, make_planner
-from caryatid.recording_robot import RecordingRobot
-from caryatid.robot import Posture, Robot, refusal_of
+from caryatid.objects.change import changed
+from caryatid.planning.planners import ORACLE, Decision, make_planner
+from caryatid.robots.arm import ArmRobot
+from caryatid.robots.humanoid import Posture, Robot, refusal_of
+from caryatid.robots.recording import RecordingRobot
 from caryatid.viewer.moments import Moment, Standing, moment_of_step
 from caryatid.viewer.steering import SteeredRobot, SwitchedPlanner, planned_anew, taken_by_hand
 
 if TYPE_CHECKING:
-    from caryatid.commands.sources import Source
+    from caryatid.sources import Source
 
 ENDLESS = 100_000
 """Views the loop underneath may take [1]: it is the person who ends it."""

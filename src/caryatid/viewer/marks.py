@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.frames import Array
-from caryatid.report.colours import Colour
+from caryatid.geometry.transforms import Array
+from caryatid.viz.colours import Colour
 
 Colours = NDArray[np.uint8]
 """Red, green and blue 0…255, (..., 3)."""

@@ -8,18 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.formats.runs import RunView
-from caryatid.frames import Array
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.report.colours import DEPTH_STOPS, scale
-from caryatid.view_sphere import ViewSphere
-from caryatid.views import Cloud, View
+from caryatid.io.runs import RunView
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import Cloud, View
+from caryatid.viz.colours import DEPTH_STOPS, scale
 
 if TYPE_CHECKING:
-    from caryatid.candidates import Candidates
     from caryatid.exploration import Step
-    from caryatid.planners import Decision
-    from caryatid.robot import Posture
+    from caryatid.planning.candidates import Candidates
+    from caryatid.planning.planners import Decision
+    from caryatid.robots.humanoid import Posture
     from caryatid.scene import Scene
 
 MOST_POINTS = 1_000_000

@@ -17,12 +17,12 @@ from numpy.typing import ArrayLike
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
-from caryatid.manipulation.effects import predict_removal
-from caryatid.report.colours import SERIES
+from caryatid.support.removal import predict_removal
 from caryatid.viewer import words
 from caryatid.viewer.canvas import Canvas
 from caryatid.viewer.drawing import LAYERS, draw_moment
 from caryatid.viewer.moments import Moment
+from caryatid.viz.colours import SERIES
 
 POINT_SIZE = 0.003
 """Diameter of a point at first [m]."""

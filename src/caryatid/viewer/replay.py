@@ -11,20 +11,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from caryatid.config import Config
-from caryatid.formats.graph_json import graph_text
-from caryatid.formats.json_files import field
-from caryatid.formats.point_clouds import read_stored_cloud
-from caryatid.formats.runs import Run
-from caryatid.perception import level_cloud
+from caryatid.io.graph_json import graph_text
+from caryatid.io.json_files import field
+from caryatid.io.point_clouds import read_stored_cloud
+from caryatid.io.runs import Run
 from caryatid.scene import Scene
+from caryatid.segmentation.perception import level_cloud
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.moments import Moment, moment_of_scene, shot_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from caryatid.commands.sources import Source
-    from caryatid.formats.bop import Recording
+    from caryatid.io.bop import Recording
+    from caryatid.sources import Source
 
     OpenSource = Callable[..., Source]
     OpenRecording = Callable[..., Recording]

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from caryatid.config import Config
-from caryatid.formats.json_files import field, number, numbers, rigid_transform
-from caryatid.formats.runs import Run
-from caryatid.frames import Array
-from caryatid.interest import PointOfInterest
-from caryatid.planners import Decision
-from caryatid.settings import changed_settings
-from caryatid.view_sphere import ViewSphere
+from caryatid.config.settings import changed_settings
+from caryatid.geometry.transforms import Array
+from caryatid.io.json_files import field, number, numbers, rigid_transform
+from caryatid.io.runs import Run
+from caryatid.planning.planners import Decision
+from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.viewer.moments import Moment, moment_of_run_view
 
 

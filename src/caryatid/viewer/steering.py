@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from caryatid.candidates import Candidates
 from caryatid.errors import PlanningError
-from caryatid.frames import Array
-from caryatid.planners import Decision, Planner, PlanningState
-from caryatid.planners.decision import path_cost
-from caryatid.robot import OwnViews, Posture, Robot, Unreachable, refusal_of, view_sphere_of
-from caryatid.view_sphere import ViewSphere
+from caryatid.geometry.transforms import Array
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.decision import path_cost
+from caryatid.planning.planners import Decision, Planner, PlanningState
+from caryatid.robots.humanoid import OwnViews, Posture, Robot, Unreachable, refusal_of, view_sphere_of
+from caryatid.sensing.view_sphere import ViewSphere
 
 
 class SwitchedPlanner:

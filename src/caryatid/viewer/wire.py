@@ -10,12 +10,12 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.candidates import Candidates
-from caryatid.formats.graph_json import graph_from_json, graph_to_json
-from caryatid.interest import PointOfInterest
-from caryatid.planners import Decision
-from caryatid.robot import Posture
-from caryatid.view_sphere import ViewSphere
+from caryatid.io.graph_json import graph_from_json, graph_to_json
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.planners import Decision
+from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.robots.humanoid import Posture
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.viewer.moments import Dots, Moment, Shot, Standing
 
 LENGTH = 8

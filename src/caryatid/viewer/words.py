@@ -8,12 +8,12 @@ from html import escape
 from importlib import resources
 
 from caryatid.graph import SupportGraph
-from caryatid.manipulation.effects import Effect
-from caryatid.report.colours import SALIENCY_STOPS
-from caryatid.report.graphs import draw_graph
-from caryatid.report.layout import arrange
-from caryatid.report.rows import ObjectRow, object_rows, support_rows
+from caryatid.support.removal import Effect
 from caryatid.viewer.moments import Moment
+from caryatid.viz.colours import SALIENCY_STOPS
+from caryatid.viz.graphs import draw_graph
+from caryatid.viz.layout import arrange
+from caryatid.viz.rows import ObjectRow, object_rows, support_rows
 
 NOTHING_CHOSEN = "Click an object in the scene to see what is known of it."
 """What stands where an object's figures will."""

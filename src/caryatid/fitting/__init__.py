@@ -1,0 +1,1 @@
+"""Boxes, cylinders and spheres fitted to oriented points: search, least squares, scoring, uncertainty."""

@@ -1,0 +1,1 @@
+"""Rigid transforms, shapes and their distances, polygons, sampling, rays; nothing about scenes."""

@@ -1,0 +1,193 @@
+"""Compiled convex polygons in the ground plane: hulls, common areas, and the parts of solids that touch.
+
+A polygon is an array (M, 2) [m] of its corners, counter-clockwise; two are a line, one is a point, none is
+nothing. shapely's geometry is the reference the tests compare all this with.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from caryatid.geometry.transforms import Array
+
+WORTH_SIFTING = 64
+"""Points above which it takes less time to leave out those far inside than to sort them [1]."""
+
+
+@njit(cache=True, error_model="numpy")
+def hull(points: NDArray[np.float64]) -> Array:
+    """Convex hull of points laid onto the ground (N, 2) or (N, 3)."""
+    p, count = _maybe_corners(points)
+    gap = count // 2
+    while gap > 0:
+        for i in range(gap, count):
+            x, y = p[i, 0], p[i, 1]
+            j = i
+            while j >= gap and (p[j - gap, 0] > x or (p[j - gap, 0] == x and p[j - gap, 1] > y)):
+                p[j, 0], p[j, 1] = p[j - gap, 0], p[j - gap, 1]
+                j -= gap
+            p[j, 0], p[j, 1] = x, y
+        gap //= 2
+    corners = np.empty((2 * count + 1, 2))
+    size, first = 0, 0
+    for k in range(2 * count):
+        # There along the lower side, and back along the upper one.
+        i = k if k < count else 2 * count - 1 - k
+        if k == count:
+            first = size - 1
+        x, y = p[i, 0], p[i, 1]
+        if size > 0 and corners[size - 1, 0] == x and corners[size - 1, 1] == y:
+            continue
+        while size - first >= 2 and _turn(corners, size - 2, size - 1, x, y) <= 0.0:
+            size -= 1
+        corners[size, 0], corners[size, 1] = x, y
+        size += 1
+    # The way back ends where the way there began.
+    return corners[: size - 1 if size > 1 else size]
+
+
+@njit(cache=True, error_model="numpy")
+def _maybe_corners(points: NDArray[np.float64]) -> tuple[Array, int]:
+    """Points of which some are corners of the hull, and how many: those inside an octagon of others are not.
+
+    After Akl and Toussaint, A fast convex hull algorithm, 1978.
+    """
+    count = len(points)
+    p = np.empty((count, 2))
+    for i in range(count):
+        p[i, 0], p[i, 1] = points[i, 0], points[i, 1]
+    if count < WORTH_SIFTING:
+        return p, count
+    # Outermost to the right, the upper right, and so on counter-clockwise.
+    outermost = np.zeros(8, dtype=np.int64)
+    farthest = np.full(8, -np.inf)
+    for i in range(count):
+        x, y = p[i, 0], p[i, 1]
+        for k, reach in enumerate((x, x + y, y, y - x, -x, -x - y, -y, x - y)):
+            if reach > farthest[k]:
+                farthest[k], outermost[k] = reach, i
+    octagon = np.empty((8, 2))
+    for k in range(8):
+        octagon[k, 0], octagon[k, 1] = p[outermost[k], 0], p[outermost[k], 1]
+    kept = 0
+    for i in range(count):
+        x, y = p[i, 0], p[i, 1]
+        inside = False
+        for k in range(8):
+            if octagon[k, 0] == octagon[k - 1, 0] and octagon[k, 1] == octagon[k - 1, 1]:
+                continue
+            inside = _turn(octagon, k - 1, k, x, y) > 0.0
+            if not inside:
+                break
+        if not inside:
+            p[kept, 0], p[kept, 1] = x, y
+            kept += 1
+    return p, kept
+
+
+@njit(cache=True, error_model="numpy")
+def intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
+    """Common area (K, 2) of two convex polygons (N, 2) and (M, 2): one cut along each edge of the other."""
+    now, cut = np.empty((2 * (len(a) + len(b)), 2)), np.empty((2 * (len(a) + len(b)), 2))
+    count = len(a) if len(b) > 2 else 0
+    for i in range(count):
+        now[i, 0], now[i, 1] = a[i, 0], a[i, 1]
+    for k in range(len(b)):
+        kept = 0
+        before = _turn(b, k - 1, k, now[count - 1, 0], now[count - 1, 1])
+        for i in range(count):
+            x, y = now[i, 0], now[i, 1]
+            here = _turn(b, k - 1, k, x, y)
+            if (before < 0.0 < here) or (here < 0.0 < before):
+                last = i - 1 if i > 0 else count - 1
+                share = before / (before - here)
+                cut[kept, 0] = now[last, 0] + share * (x - now[last, 0])
+                cut[kept, 1] = now[last, 1] + share * (y - now[last, 1])
+                kept += 1
+            if here >= 0.0:
+                cut[kept, 0], cut[kept, 1] = x, y
+                kept += 1
+            before = here
+        now, cut = cut, now
+        count = kept
+    return now[:count]
+
+
+@njit(cache=True, error_model="numpy")
+def area(polygon: NDArray[np.float64]) -> float:
+    """Area [m²] of a polygon (N, 2) [m]."""
+    total = 0.0
+    for i in range(2, len(polygon)):
+        total += _turn(polygon, 0, i - 1, polygon[i, 0], polygon[i, 1])
+    return total / 2.0
+
+
+@njit(cache=True, error_model="numpy")
+def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple[float, float, float, bool]:
+    """Distance [m] of a point to a polygon's (N, 2) border, the point nearest there, and if it is inside.
+
+    Nothing is inside a line or a point; what lies on the border of an area is.
+    """
+    least, near_x, near_y = np.inf, x, y
+    inside = len(polygon) > 2
+    for i in range(len(polygon)):
+        from_x, from_y = polygon[i - 1, 0], polygon[i - 1, 1]
+        along_x, along_y = polygon[i, 0] - from_x, polygon[i, 1] - from_y
+        squared = along_x * along_x + along_y * along_y
+        share = 0.0
+        if squared > 0.0:
+            share = ((x - from_x) * along_x + (y - from_y) * along_y) / squared
+            share = min(max(share, 0.0), 1.0)
+        at_x, at_y = from_x + share * along_x, from_y + share * along_y
+        distance = np.hypot(x - at_x, y - at_y)
+        if distance < least:
+            least, near_x, near_y = distance, at_x, at_y
+        inside = inside and _turn(polygon, i - 1, i, x, y) >= 0.0
+    return least, near_x, near_y, inside
+
+
+@njit(cache=True, error_model="numpy")
+def cap(
+    corners: NDArray[np.float64],
+    edges: NDArray[np.int64],
+    direction: NDArray[np.float64],
+    depth: float,
+) -> Array:
+    """Outline (K, 2) on the ground of the part of a convex solid near its outermost point along a direction.
+
+    Args:
+        corners: (N, 3) [m].
+        edges: Both ends (E, 2) of each edge.
+        direction: Unit vector (3,).
+        depth: How far the part reaches from the outermost point [m]; infinite for the whole solid.
+    """
+    farthest = -np.inf
+    reach = np.empty(len(corners))
+    for i in range(len(corners)):
+        reach[i] = 0.0
+        for k in range(3):
+            reach[i] += corners[i, k] * direction[k]
+        farthest = max(farthest, reach[i])
+    kept = np.empty((len(corners) + len(edges), 2))
+    count = 0
+    for i in range(len(corners)):
+        reach[i] += depth - farthest
+        if reach[i] >= 0.0:
+            kept[count, 0], kept[count, 1] = corners[i, 0], corners[i, 1]
+            count += 1
+    for k in range(len(edges)):
+        i, j = edges[k, 0], edges[k, 1]
+        if (reach[i] >= 0.0) != (reach[j] >= 0.0):
+            share = reach[i] / (reach[i] - reach[j])
+            for m in range(2):
+                kept[count, m] = corners[i, m] + share * (corners[j, m] - corners[i, m])
+            count += 1
+    return hull(kept[:count])
+
+
+@njit(cache=True)
+def _turn(p: NDArray[np.float64], a: int, b: int, x: float, y: float) -> float:
+    """Twice the area [m²] of the triangle from p[a] over p[b] to a point; positive counter-clockwise."""
+    return (p[b, 0] - p[a, 0]) * (y - p[a, 1]) - (p[b, 1] - p[a, 1]) * (x - p[a, 0])

@@ -1,0 +1,204 @@
+"""Compiled ways of a ray through a voxel grid, beside the plain NumPy reference they are tested against.
+
+A ray is the part t ∈ [t_from, t_to] of the segment start + t · (end − start), t from 0 at the start to 1
+at the end. `traverse` finds all its voxels at once; with `enter` and `advance` it goes from one voxel to the
+next (Amanatides and Woo, 1987), where what has been met decides whether to go on.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from caryatid.geometry.transforms import Array
+
+Grid = NDArray[np.uint8]
+"""One byte a voxel, indexed [x, y, z]."""
+Triple = tuple[float, float, float]
+"""One number an axis."""
+Voxel = tuple[int, int, int]
+"""Index of a voxel."""
+
+BATCH = 8
+"""Slabs worked on together; a ray takes up a whole number of batches [1]."""
+
+
+@njit(cache=True)
+def room(shape: Voxel) -> NDArray[np.int32]:
+    """Make room (3, M) for the voxels of any ray through a grid: what `traverse` writes to."""
+    return np.empty((3, max(shape) + BATCH), dtype=np.int32)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def traverse(
+    found: NDArray[np.int32], shape: Voxel, start: Triple, ray: Triple, t_from: float, t_to: float
+) -> int:
+    """Find the voxels a ray traverses, slab by slab along the axis it goes along most.
+
+    Within a slab it meets no more than three voxels: where it enters, where it leaves, and where it crosses
+    over if both other axes change. All slabs are worked alike, without a branch, so several at a time.
+
+    Args:
+        found: Flat indices (3, M), written to: the voxels of each slab, which may be the same; see `room`.
+        shape: Voxels of the grid along each axis.
+        start: Start of the ray in voxels from the grid's corner.
+        ray: Its direction, length 1 in t, in voxels.
+        t_from: Where it begins.
+        t_to: Where it ends.
+
+    Returns:
+        How many slabs it crosses.
+    """
+    x, y, z = start
+    dx, dy, dz = ray
+    nx, ny, nz = float(shape[0]), float(shape[1]), float(shape[2])
+    per_x, t_from, t_to = _clip(x, dx, nx, t_from, t_to)
+    per_y, t_from, t_to = _clip(y, dy, ny, t_from, t_to)
+    per_z, t_from, t_to = _clip(z, dz, nz, t_from, t_to)
+    if not t_from < t_to:
+        return 0
+    ax, ay, az = abs(dx), abs(dy), abs(dz)
+    if ax >= ay and ax >= az:
+        return _slabs(found, (nx, ny, nz), (ny * nz, nz, 1.0), start, ray, per_x, t_from, t_to)
+    if ay >= az:
+        return _slabs(found, (ny, nz, nx), (nz, 1.0, ny * nz), (y, z, x), (dy, dz, dx), per_y, t_from, t_to)
+    return _slabs(found, (nz, nx, ny), (1.0, ny * nz, nz), (z, x, y), (dz, dx, dy), per_z, t_from, t_to)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+def _clip(start: float, ray: float, count: float, t_from: float, t_to: float) -> tuple[float, float, float]:
+    """Cut a ray to the grid along one axis: t per voxel, begin and end; nothing where the end is no later."""
+    if ray == 0.0:
+        return np.inf, t_from, t_to if 0.0 <= start < count else t_from
+    per_voxel = 1.0 / ray
+    near, far = -start * per_voxel, (count - start) * per_voxel
+    return per_voxel, max(t_from, min(near, far)), min(t_to, max(near, far))
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _slabs(
+    found: NDArray[np.int32],
+    counts: Triple,
+    strides: Triple,
+    start: Triple,
+    ray: Triple,
+    per_voxel: float,
+    t_from: float,
+    t_to: float,
+) -> int:
+    """Do as `traverse` does, the axes turned so that the ray goes along the first most."""
+    x, y, z = start
+    dx, dy, dz = ray
+    last_x, last_y, last_z = counts[0] - 1.0, counts[1] - 1.0, counts[2] - 1.0
+    first = min(max(np.floor(x + t_from * dx), 0.0), last_x)
+    slabs = 1 + int(abs(min(max(np.floor(x + t_to * dx), 0.0), last_x) - first))
+    direction = 1.0 if dx > 0.0 else -1.0
+    t_slab = abs(per_voxel)
+    t_first = (first - x if dx > 0.0 else first + 1.0 - x) * per_voxel
+    steep_y, steep_z = abs(dy), abs(dz)
+    for n in range((slabs + BATCH - 1) // BATCH * BATCH):
+        t_in = min(max(t_first + n * t_slab, t_from), t_to)
+        t_out = min(t_first + (n + 1) * t_slab, t_to)
+        y_in, y_out, z_in, z_out = y + t_in * dy, y + t_out * dy, z + t_in * dz, z + t_out * dz
+        j_in = min(max(np.floor(y_in), 0.0), last_y)
+        j_out = min(max(np.floor(y_out), 0.0), last_y)
+        k_in = min(max(np.floor(z_in), 0.0), last_z)
+        k_out = min(max(np.floor(z_out), 0.0), last_z)
+        y_first = abs(max(j_in, j_out) - y_in) * steep_z < abs(max(k_in, k_out) - z_in) * steep_y
+        j_between = j_out if y_first else j_in
+        k_between = k_in if y_first else k_out
+        slab = (first + n * direction) * strides[0]
+        found[0, n] = np.int32(slab + j_in * strides[1] + k_in * strides[2])
+        found[1, n] = np.int32(slab + j_between * strides[1] + k_between * strides[2])
+        found[2, n] = np.int32(slab + j_out * strides[1] + k_out * strides[2])
+    return slabs
+
+
+@njit(cache=True)
+def enter(
+    shape: Voxel, start: Triple, ray: Triple, t_from: float, t_to: float
+) -> tuple[float, float, Voxel, Triple, Triple]:
+    """Cut a ray to a grid and find where it enters.
+
+    Args:
+        shape: Voxels of the grid along each axis.
+        start: Start of the ray in voxels from the grid's corner.
+        ray: Its direction, length 1 in t, in voxels.
+        t_from: Where it begins.
+        t_to: Where it ends.
+
+    Returns:
+        Begin and end within the grid (nothing is left where the end is not beyond the begin), the first
+        voxel, how much t there is between planes of each axis, and t at the next plane of each axis.
+    """
+    for axis in range(3):
+        position, direction, count = start[axis], ray[axis], shape[axis]
+        if direction == 0.0:
+            if position < 0.0 or position >= count:
+                t_to = t_from
+            continue
+        near, far = -position / direction, (count - position) / direction
+        t_from, t_to = max(t_from, min(near, far)), min(t_to, max(near, far))
+    x, y, z = start
+    dx, dy, dz = ray
+    if t_from >= t_to:
+        return t_from, t_from, (-1, -1, -1), (np.inf, np.inf, np.inf), (np.inf, np.inf, np.inf)
+    i = min(max(int(np.floor(x + t_from * dx)), 0), shape[0] - 1)
+    j = min(max(int(np.floor(y + t_from * dy)), 0), shape[1] - 1)
+    k = min(max(int(np.floor(z + t_from * dz)), 0), shape[2] - 1)
+    step = (
+        abs(1.0 / dx) if dx != 0.0 else np.inf,
+        abs(1.0 / dy) if dy != 0.0 else np.inf,
+        abs(1.0 / dz) if dz != 0.0 else np.inf,
+    )
+    ahead = (
+        (i + (1 if dx > 0.0 else 0) - x) / dx if dx != 0.0 else np.inf,
+        (j + (1 if dy > 0.0 else 0) - y) / dy if dy != 0.0 else np.inf,
+        (k + (1 if dz > 0.0 else 0) - z) / dz if dz != 0.0 else np.inf,
+    )
+    return t_from, t_to, (i, j, k), step, ahead
+
+
+@njit(cache=True)
+def advance(voxel: Voxel, ray: Triple, step: Triple, ahead: Triple) -> tuple[Voxel, Triple]:
+    """Go on to the next voxel of a ray: the one beyond the nearest plane.
+
+    Args:
+        voxel: Where the ray is.
+        ray: Its direction.
+        step: How much t there is between planes of each axis.
+        ahead: t at the next plane of each axis.
+
+    Returns:
+        The next voxel, and t at the next planes from there.
+    """
+    i, j, k = voxel
+    x, y, z = ahead
+    if x <= y and x <= z:
+        return (i + (1 if ray[0] > 0.0 else -1), j, k), (x + step[0], y, z)
+    if y <= z:
+        return (i, j + (1 if ray[1] > 0.0 else -1), k), (x, y + step[1], z)
+    return (i, j, k + (1 if ray[2] > 0.0 else -1)), (x, y, z + step[2])
+
+
+@njit(cache=True)
+def within(voxel: Voxel, shape: Voxel) -> bool:
+    """Whether a voxel belongs to a grid."""
+    return 0 <= voxel[0] < shape[0] and 0 <= voxel[1] < shape[1] and 0 <= voxel[2] < shape[2]
+
+
+def traversed_reference(
+    shape: tuple[int, ...], start: Array, end: Array, t_from: float, t_to: float, origin: Array, size: float
+) -> NDArray[np.intp]:
+    """Voxels (K, 3) a ray traverses: between two neighbouring plane crossings it is inside one voxel."""
+    position, direction = (start - origin) / size, (end - start) / size
+    crossings = [np.array([t_from, t_to])]
+    for axis in range(3):
+        if direction[axis] != 0.0:
+            crossings.append((np.arange(shape[axis] + 1) - position[axis]) / direction[axis])
+    t = np.unique(np.concatenate(crossings))
+    t = t[(t >= t_from) & (t <= t_to)]
+    middle = (t[1:] + t[:-1]) / 2.0
+    voxels = np.floor(position + middle[:, None] * direction).astype(np.intp)
+    return voxels[((voxels >= 0) & (voxels < shape)).all(axis=1)]

@@ -1,0 +1,351 @@
+"""Compiled kernels of the shape fits: signed distances, and least squares on them from start to end.
+
+`refine.linearise` and `refine.refine_reference` are the NumPy references the tests compare them with.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from caryatid.geometry.linear import solve_positive
+from caryatid.geometry.ranks import quantile
+from caryatid.geometry.transforms import Array
+
+SPHERE, CYLINDER, BOX = 0, 1, 2
+"""Codes of the shapes."""
+
+
+@njit(cache=True, error_model="numpy")
+def signed_distances(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+) -> Array:
+    """Distance (N,) [m] of points (N, 3) to a shape's surface, negative inside; arguments as below."""
+    distance = np.empty(len(points))
+    write_distances(kind, R, centre, half, points, distance)
+    return distance
+
+
+@njit(cache=True, error_model="numpy")
+def write_distances(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+    distance: NDArray[np.float64],
+) -> None:
+    """Find the distance of points to a shape's surface, negative inside.
+
+    Args:
+        kind: Code of the shape.
+        R: Axes (3, 3), columns = x, y, z of the object.
+        centre: (3,) [m].
+        half: Half extents (3,) [m] along the axes.
+        points: (N, 3) [m].
+        distance: (N,) [m]; written to.
+    """
+    hx, hy, hz = half[0], half[1], half[2]
+    for i in range(len(points)):
+        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
+        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
+        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        distance[i] = signed_distance(kind, x, y, z, hx, hy, hz)
+
+
+@njit(cache=True, inline="always")
+def signed_distance(kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float) -> float:
+    """Signed distance [m] of one point in the object's frame to a shape with these half extents [m].
+
+    Args:
+        kind: Code of the shape.
+        x: x of the point [m].
+        y: Its y.
+        z: Its z.
+        hx: Half extent along x [m].
+        hy: Along y.
+        hz: Along z.
+    """
+    if kind == SPHERE:
+        return np.sqrt(x * x + y * y + z * z) - hx
+    if kind == CYLINDER:
+        q0, q2 = np.sqrt(x * x + y * y) - hx, abs(z) - hz
+        if q0 > 0.0 and q2 > 0.0:
+            return np.sqrt(q0 * q0 + q2 * q2)
+        return max(q0, q2)
+    qx, qy, qz = abs(x) - hx, abs(y) - hy, abs(z) - hz
+    most = max(qx, qy, qz)
+    if most <= 0.0:
+        return most
+    ox, oy, oz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
+    return np.sqrt(ox * ox + oy * oy + oz * oz)
+
+
+@njit(cache=True, error_model="numpy")
+def distances_and_gradients(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+) -> tuple[Array, Array]:
+    """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame.
+
+    Args:
+        kind: Code of the shape.
+        R: Its axes (3, 3).
+        centre: Its centre (3,) [m].
+        half: Its half extents (3,) [m].
+        points: (N, 3) [m].
+    """
+    distance = np.empty(len(points))
+    gradients = np.empty((len(points), 3))
+    hx, hy, hz = half[0], half[1], half[2]
+    for i in range(len(points)):
+        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
+        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
+        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        distance[i], gradients[i, 0], gradients[i, 1], gradients[i, 2] = gradient(kind, x, y, z, hx, hy, hz)
+    return distance, gradients
+
+
+@njit(cache=True, error_model="numpy")
+def levenberg_marquardt(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+    steps: int,
+    min_extent: float,
+    shrink: float,
+    robust_width: float,
+    noise_floor: float,
+    ridge: NDArray[np.float64],
+    converged: float,
+) -> None:
+    """Minimise the Geman–McClure cost of signed distances; arguments as of `refine.refine_reference`.
+
+    Args:
+        kind: Code of the shape.
+        R: Axes (3, 3) at the start; replaced by those of the least cost.
+        centre: (3,) [m] at the start; replaced.
+        half: Half extents (3,) [m] at the start; replaced.
+        points: (N, 3) [m].
+        steps: Steps at the most.
+        min_extent: Least extent [m].
+        shrink: Pull on the extents [m].
+        robust_width: Residuals beyond this many robust standard deviations lose most of their weight.
+        noise_floor: Least standard deviation the weights assume [m].
+        ridge: Added to the diagonal (9,), times the damping.
+        converged: Share of the cost that the last step lowers it by at the most.
+    """
+    columns, size = np.empty(9, np.intp), 0
+    for a in range(9):
+        if a < 7 or kind == BOX or (kind == CYLINDER and a == 8):
+            columns[size] = a
+            size += 1
+    damping = 1e-3
+    H_all, g_all = np.empty((9, 9)), np.empty(9)
+    H, g = np.empty((size, size)), np.empty(size)
+    R_trial, centre_trial, half_trial = np.empty((3, 3)), np.empty(3), np.empty(3)
+    distance, absolute = np.empty(len(points)), np.empty(len(points))
+    write_distances(kind, R, centre, half, points, distance)
+    for _ in range(steps):
+        for i in range(len(points)):
+            absolute[i] = abs(distance[i])
+        scale = robust_width * max(1.4826 * quantile(absolute, 0.5), noise_floor)
+        normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
+        cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
+        improved = False
+        trial_cost = cost
+        for _ in range(6):
+            for a in range(size):
+                g[a] = -(g_all[columns[a]] + (shrink / 2.0 if a >= 6 else 0.0))
+                for b in range(size):
+                    H[a, b] = H_all[columns[a], columns[b]]
+                H[a, a] += damping * (H[a, a] + ridge[a])
+            step = solve_positive(H, g)
+            _stepped(kind, R, centre, half, step, columns, min_extent, R_trial, centre_trial, half_trial)
+            write_distances(kind, R_trial, centre_trial, half_trial, points, distance)
+            trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half_trial)
+            if trial_cost < cost:
+                improved = True
+                for a in range(3):
+                    centre[a], half[a] = centre_trial[a], half_trial[a]
+                    for b in range(3):
+                        R[a, b] = R_trial[a, b]
+                break
+            damping *= 6.0
+        if not improved:
+            break
+        damping = max(damping / 10.0, 1e-7)
+        if cost - trial_cost < converged * cost:
+            break
+
+
+@njit(cache=True, error_model="numpy")
+def normal_equations(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+    scale: float,
+    H: NDArray[np.float64],
+    g: NDArray[np.float64],
+) -> None:
+    """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
+
+    Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
+    x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6).
+
+    Args:
+        kind: Code of the shape.
+        R: Its axes (3, 3).
+        centre: Its centre (3,) [m].
+        half: Its half extents (3,) [m].
+        points: (N, 3) [m].
+        scale: Width of the cost [m]: a point at this distance weighs a quarter.
+        H: Written to (9, 9).
+        g: Written to (9,).
+    """
+    J = np.empty(9)
+    for a in range(9):
+        g[a] = J[a] = 0.0
+        for b in range(9):
+            H[a, b] = 0.0
+    share = 1.0 / len(points)
+    hx, hy, hz = half[0], half[1], half[2]
+    for i in range(len(points)):
+        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
+        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
+        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
+        weight = share / (1.0 + (d / scale) ** 2) ** 2
+        J[0], J[1], J[2] = -gx, -gy, -gz
+        J[3], J[4], J[5] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
+        if kind == BOX:
+            J[6], J[7], J[8] = -abs(gx), -abs(gy), -abs(gz)
+        elif kind == CYLINDER:
+            J[6], J[8] = -np.sqrt(gx * gx + gy * gy), -abs(gz)
+        else:
+            J[6] = -1.0
+        for a in range(9):
+            if J[a] != 0.0:
+                weighted = weight * J[a]
+                g[a] += weighted * d
+                for b in range(a + 1):
+                    H[a, b] += weighted * J[b]
+    for a in range(9):
+        for b in range(a):
+            H[b, a] = H[a, b]
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def gradient(
+    kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float
+) -> tuple[float, float, float, float]:
+    """Signed distance [m] of one point in the object's frame, and its gradient there.
+
+    Args:
+        kind: Code of the shape.
+        x: x of the point [m].
+        y: Its y.
+        z: Its z.
+        hx: Half extent along x [m].
+        hy: Along y.
+        hz: Along z.
+    """
+    if kind == SPHERE:
+        length = np.sqrt(x * x + y * y + z * z)
+        inverse = 1.0 / max(length, 1e-12)
+        return length - hx, x * inverse, y * inverse, z * inverse
+    if kind == CYLINDER:
+        ring = np.sqrt(x * x + y * y)
+        inverse = 1.0 / max(ring, 1e-12)
+        q0, q2 = ring - hx, abs(z) - hz
+        if q0 > 0.0 and q2 > 0.0:
+            outside = np.sqrt(q0 * q0 + q2 * q2)
+            s0, s2 = q0 / outside, q2 / outside
+            return outside, s0 * x * inverse, s0 * y * inverse, s2 * np.sign(z)
+        if q0 >= q2:
+            return q0, x * inverse, y * inverse, 0.0
+        return q2, 0.0, 0.0, np.sign(z)
+    qx, qy, qz = abs(x) - hx, abs(y) - hy, abs(z) - hz
+    ox, oy, oz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
+    outside = np.sqrt(ox * ox + oy * oy + oz * oz)
+    if outside > 1e-9:
+        inverse = 1.0 / outside
+        return outside, ox * inverse * np.sign(x), oy * inverse * np.sign(y), oz * inverse * np.sign(z)
+    if qx >= qy and qx >= qz:
+        return qx, np.sign(x), 0.0, 0.0
+    if qy >= qz:
+        return qy, 0.0, np.sign(y), 0.0
+    return qz, 0.0, 0.0, np.sign(z)
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _stepped(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    step: NDArray[np.float64],
+    columns: NDArray[np.intp],
+    min_extent: float,
+    turned: NDArray[np.float64],
+    moved: NDArray[np.float64],
+    grown: NDArray[np.float64],
+) -> None:
+    """Write the shape after a step in its own frame, shortened to 3 cm and 0.3 rad, no extent too short."""
+    longest = 1.0
+    for a in range(len(step)):
+        longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
+    for a in range(3):
+        grown[a], moved[a] = half[a], centre[a]
+    for a in range(6, len(step)):
+        grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
+    if kind == SPHERE:
+        grown[1] = grown[2] = grown[0]
+    elif kind == CYLINDER:
+        grown[1] = grown[0]
+    x, y, z = step[3] / longest, step[4] / longest, step[5] / longest
+    angle = np.sqrt(x * x + y * y + z * z)
+    # Rodrigues' formula for the rows of R: v cos + (v × k) sin + k (k · v)(1 − cos).
+    sine = np.sin(angle) / angle if angle >= 1e-12 else 1.0
+    rest = (1.0 - np.cos(angle)) / (angle * angle) if angle >= 1e-12 else 0.0
+    for i in range(3):
+        u, v, w = R[i, 0], R[i, 1], R[i, 2]
+        moved[i] += (u * step[0] + v * step[1] + w * step[2]) / longest
+        along = rest * (u * x + v * y + w * z)
+        cosine = np.cos(angle) if angle >= 1e-12 else 1.0
+        turned[i, 0] = cosine * u + sine * (v * z - w * y) + along * x
+        turned[i, 1] = cosine * v + sine * (w * x - u * z) + along * y
+        turned[i, 2] = cosine * w + sine * (u * y - v * x) + along * z
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
+    total = 0.0
+    for d in distance:
+        squared = (d / scale) ** 2
+        total += squared / (1.0 + squared)
+    return total / len(distance) * scale**2
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _sum_of_sizes(kind: int, half: NDArray[np.float64]) -> float:
+    if kind == SPHERE:
+        return half[0]
+    if kind == CYLINDER:
+        return half[0] + half[2]
+    return half[0] + half[1] + half[2]

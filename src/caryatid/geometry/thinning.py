@@ -1,0 +1,116 @@
+"""Compiled loops over points by the voxels they are in, each beside the plain reference it is held to."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from caryatid.geometry.transforms import Array
+
+
+def most_central(points: Array, groups: NDArray[np.int32], edges: Array) -> NDArray[np.intp]:
+    """Of the points of each group in each voxel, the one nearest to their mean; of two as near, the first.
+
+    Args:
+        points: (N, 3) [m].
+        groups: Group (N,) of each point, an index of `edges`.
+        edges: Edge length (G,) [m] of the voxels of each group; points of groups without one are left out.
+
+    Returns:
+        Indices (M,), ascending.
+    """
+    points = np.ascontiguousarray(points)
+    voxel, count = _numbered(points, groups, edges)
+    means, sizes = np.zeros((count, 3)), np.zeros(count, dtype=np.int64)
+    least, nearest = np.full(count, np.inf), np.zeros(count, dtype=np.int64)
+    _most_central(points, voxel, means, sizes, least, nearest)
+    return np.sort(nearest)
+
+
+def most_central_reference(points: Array, groups: NDArray[np.int32], edges: Array) -> NDArray[np.intp]:
+    """Do as `most_central` does."""
+    index = np.flatnonzero(edges[groups] > 0.0)
+    cells = np.floor(points[index] / edges[groups[index], None]).astype(np.int64)
+    _, owner = np.unique(np.column_stack([groups[index], cells]), axis=0, return_inverse=True)
+    owner = owner.ravel()
+    count = np.bincount(owner)
+    mean = np.stack([np.bincount(owner, x) / count for x in points[index].T], axis=-1)
+    distance = np.sum((points[index] - mean[owner]) ** 2, axis=-1)
+    order = np.lexsort((distance, owner))
+    return np.sort(index[order[np.cumsum(count) - count]])
+
+
+def last_in_voxels(points: Array, edge: float, depth: int) -> NDArray[np.intp]:
+    """Of the points (N, 3) [m] in each voxel of this edge length [m] the last `depth`; indices, ascending."""
+    points = np.ascontiguousarray(points)
+    voxel, count = _numbered(points, np.zeros(len(points), dtype=np.int32), np.array([edge]))
+    backwards = voxel[::-1]
+    order = np.argsort(backwards, kind="stable")
+    sizes = np.bincount(backwards, minlength=count)
+    rank = np.arange(len(points)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return np.sort(len(points) - 1 - order[rank < depth])
+
+
+def _numbered(points: Array, groups: NDArray[np.int32], edges: Array) -> tuple[NDArray[np.int32], int]:
+    """Number the occupied voxels of each group by appearance: numbers (N,), −1 = left out, and how many."""
+    table = np.full(1 << (2 * len(points) + 128).bit_length(), -1, dtype=np.int32)
+    cells, voxel = np.empty((len(points), 4)), np.empty(len(points), dtype=np.int32)
+    return voxel, _number(points, groups, np.asarray(edges, dtype=np.float64), table, cells, voxel)
+
+
+@njit(cache=True, error_model="numpy")
+def _most_central(points, voxel, means, sizes, least, nearest):  # type: ignore[no-untyped-def]
+    for i in range(len(points)):
+        k = voxel[i]
+        if k >= 0:
+            sizes[k] += 1
+            for a in range(3):
+                means[k, a] += points[i, a]
+    for k in range(len(means)):
+        for a in range(3):
+            means[k, a] /= sizes[k]
+    for i in range(len(points)):
+        k = voxel[i]
+        if k >= 0:
+            x, y, z = points[i, 0] - means[k, 0], points[i, 1] - means[k, 1], points[i, 2] - means[k, 2]
+            distance = x * x + y * y + z * z
+            if distance < least[k]:
+                least[k], nearest[k] = distance, i
+
+
+@njit(cache=True, error_model="numpy")
+def _number(points, groups, edges, table, cells, voxel):  # type: ignore[no-untyped-def]
+    """Number voxels by a hash table with linear probing; neighbours in the image are often in one voxel."""
+    mask = len(table) - 1
+    count, last = 0, -1
+    for i in range(len(points)):
+        group = groups[i]
+        edge = edges[group]
+        voxel[i] = -1
+        if edge <= 0.0:
+            continue
+        x, y, z = np.floor(points[i, 0] / edge), np.floor(points[i, 1] / edge), np.floor(points[i, 2] / edge)
+        if last < 0 or not _same(cells[last], x, y, z, group):
+            slot = _mixed(np.int64(x), np.int64(y), np.int64(z), np.int64(group)) & mask
+            while table[slot] >= 0 and not _same(cells[table[slot]], x, y, z, group):
+                slot = (slot + 1) & mask
+            if table[slot] < 0:
+                table[slot] = count
+                cells[count, 0], cells[count, 1], cells[count, 2], cells[count, 3] = x, y, z, group
+                count += 1
+            last = table[slot]
+        voxel[i] = last
+    return count
+
+
+@njit(cache=True, inline="always")
+def _same(cell, x, y, z, group):  # type: ignore[no-untyped-def]
+    return cell[0] == x and cell[1] == y and cell[2] == z and cell[3] == group
+
+
+@njit(cache=True, inline="always")
+def _mixed(x, y, z, group):  # type: ignore[no-untyped-def]
+    """A hash of four integers: a sum with odd factors, its upper bits folded into the lower (Fibonacci)."""
+    h = (x * 0x9E3779B1 + y * 0x85EBCA77 + z * 0xC2B2AE3D + group * 0x27D4EB2F) * 0x9E3779B97F4A7C1
+    return (h ^ (h >> 29)) & 0x7FFFFFFF

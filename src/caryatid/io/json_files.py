@@ -1,0 +1,180 @@
+"""JSON read strictly and written so that the same content gives the same bytes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from caryatid.errors import InputError
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+
+DECIMALS: Final = 9
+"""Decimals floats are written with: a nanometre, far below the sensor's noise, far above rounding errors."""
+
+
+def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any]:
+    """Read a file that holds one JSON object.
+
+    Args:
+        path: The file.
+        remedy: What the user can do where it is missing or broken.
+
+    Raises:
+        InputError: The file is missing, unreadable, no JSON, holds NaN or infinity, or is no object.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(path, "the file is missing", remedy) from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
+    except UnicodeDecodeError as error:
+        raise InputError(path, "is no text in UTF-8", remedy) from error
+    try:
+        document = json.loads(text, parse_constant=_refuse_constant)
+    except RecursionError as error:
+        raise InputError(path, "is nested too deep", remedy) from error
+    except ValueError as error:
+        raise InputError(path, f"broken JSON: {error}", remedy) from error
+    if not isinstance(document, dict):
+        raise InputError(path, f"holds a {type(document).__name__}, not an object", remedy)
+    return document
+
+
+def json_text(document: Mapping[str, Any]) -> str:
+    """Write a document as JSON text: keys in the order given, floats rounded to `DECIMALS`, no negative zero.
+
+    NumPy scalars and arrays become numbers and lists.
+
+    Raises:
+        ValueError: A number is NaN or infinite.
+    """
+    return json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def plain(value: Any) -> Any:
+    """Turn NumPy values, tuples and paths into what JSON knows, floats rounded to `DECIMALS`."""
+    match value:
+        case Mapping():
+            return {str(key): plain(item) for key, item in value.items()}
+        case np.ndarray() | np.generic():
+            return plain(value.tolist())
+        case list() | tuple():
+            return [plain(item) for item in value]
+        case float():
+            return round(value, DECIMALS) + 0.0
+        case Path():
+            return str(value)
+    return value
+
+
+def field(
+    document: Mapping[str, Any], key: str, kind: type | tuple[type, ...], source: str, **default: Any
+) -> Any:
+    """Return one key of a JSON object, checked for its type.
+
+    Args:
+        document: The object.
+        key: The key.
+        kind: The types allowed; a bool is no number here.
+        source: What to call the object in the error.
+        **default: `default=…` where the key may be missing.
+
+    Raises:
+        InputError: The key is missing or of another type.
+    """
+    if key not in document:
+        if "default" in default:
+            return default["default"]
+        raise InputError(source, f"the key '{key}' is missing", "add it")
+    value = document[key]
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        names = " or ".join(_NAMES.get(k, k.__name__) for k in kinds)
+        raise InputError(source, f"'{key}' is {_shown(value)}, not {names}", "correct it")
+    return value
+
+
+def numbers(value: Any, shape: tuple[int, ...], source: str) -> Array:
+    """Turn nested JSON lists of finite numbers into an array (...) of the given shape.
+
+    Args:
+        value: What a JSON document holds.
+        shape: Sizes, such as (4, 4).
+        source: What to call it in the error.
+
+    Raises:
+        InputError: Another shape, or an entry that is no finite number.
+    """
+    expected = "×".join(map(str, shape)) + " finite numbers"
+    if not _all_numbers(value):
+        raise InputError(source, f"{_shown(value)} is not {expected}", "correct it")
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (ValueError, OverflowError) as error:
+        raise InputError(source, f"{_shown(value)} is not {expected}", "correct it") from error
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(source, f"{_shown(value)} is not {expected}", "correct it")
+    return array
+
+
+def rigid_transform(value: Any, source: str) -> Array:
+    """Turn a nested list into a rigid transform (4, 4).
+
+    Raises:
+        InputError: No 4×4 finite numbers, or no rigid transform.
+    """
+    return transforms.as_rigid(numbers(value, (4, 4), source), source)
+
+
+def number(document: Mapping[str, Any], key: str, source: str, **default: Any) -> float:
+    """Return one finite number of a JSON object.
+
+    Args:
+        document: The object.
+        key: Of the number.
+        source: What to call the object in the error.
+        **default: `default=…`, the number where the key is missing.
+
+    Raises:
+        InputError: The key is missing or holds no finite number.
+    """
+    value = field(document, key, (int, float), source, **default)
+    try:
+        result = float(value)
+    except OverflowError:
+        result = math.inf
+    if not math.isfinite(result):
+        raise InputError(source, f"'{key}' is {_shown(value)}, not finite", "correct it")
+    return result
+
+
+def _all_numbers(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(_all_numbers(item) for item in value)
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _refuse_constant(constant: str) -> float:
+    raise ValueError(f"{constant} is no JSON number")
+
+
+def _shown(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= 40 else text[:37] + "…"
+
+
+_NAMES: Final[Mapping[type, str]] = {
+    dict: "an object",
+    list: "a list",
+    str: "a text",
+    int: "a whole number",
+    float: "a number",
+    bool: "true or false",
+}

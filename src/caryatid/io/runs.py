@@ -1,0 +1,235 @@
+"""Run folders: written whole or not at all, and read back."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.errors import CaryatidError, InputError
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SupportGraph
+from caryatid.io import images
+from caryatid.io.graph_json import graph_text, read_graph
+from caryatid.io.json_files import field, json_text, numbers, read_json, rigid_transform
+from caryatid.io.staging import StagedFolder
+from caryatid.sensing.views import SUPPORT_LABEL
+
+FORMAT: Final = "caryatid/run"
+VERSION: Final = 1
+"""What run.json says it is."""
+
+
+class RunWriter:
+    """Writes a run folder as views come in.
+
+    Until `finish` everything lies in a hidden sibling folder `.NAME.partial-…`, so nothing half-written
+    looks whole; leaving the `with` block without `finish`, by an error or otherwise, removes it. After an
+    interrupt call `finish`, inside the block, to keep the views done so far. A run folder already there is
+    replaced, at `finish` and not before; a folder that is no run is never touched.
+
+    Args:
+        folder: RUN.
+
+    Raises:
+        InputError: RUN holds something else, or cannot be written.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        self.views = 0
+        self._staged = StagedFolder(
+            self.folder, is_run, "give another --out; only a folder written by caryatid is replaced"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._staged.discard()
+
+    def add_view(
+        self,
+        graph: SupportGraph,
+        labels: NDArray[np.integer[Any]],
+        *,
+        name: str,
+        T_world_camera: Array | None = None,
+        K: Array | None = None,
+        record: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Write the next view.
+
+        Args:
+            graph: The fused graph after this view.
+            labels: Label image (H, W), or one label per point (N,) of a cloud; 0 = nothing.
+            name: The view's name; a recording's frame is found again by it.
+            T_world_camera: Camera pose (4, 4) in the run's world, if there is one.
+            K: Pinhole matrix (3, 3) [px], if there is one.
+            record: What else view.json shall hold: the candidates' summary and the choice.
+
+        Raises:
+            InputError: Labels leave 16 bits, or the disk is full or refuses; nothing is left behind.
+        """
+        if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
+            raise InputError(name, f"labels leave 0…{SUPPORT_LABEL}", "number objects from 1, 0 = nothing")
+        folder = _view_folder(self.views)
+        self._staged.write(f"{folder}/graph.json", graph_text(graph).encode())
+        if labels.ndim == 2:
+            self._staged.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
+        else:
+            buffer = io.BytesIO()
+            np.save(buffer, labels.astype(np.int32))
+            self._staged.write(f"{folder}/labels.npy", buffer.getvalue())
+        document = {"view": self.views, "name": name, "T_world_camera": T_world_camera, "K": K}
+        self._staged.write(f"{folder}/view.json", json_text(document | dict(record or {})).encode())
+        self.views += 1
+
+    def finish(
+        self,
+        graph: SupportGraph,
+        record: Mapping[str, Any],
+        report: str | None = None,
+        stored: str | None = None,
+    ) -> None:
+        """Write the rest and put the folder in its place.
+
+        Args:
+            graph: The final fused graph.
+            record: For run.json: settings, seed, versions, source, timings [s], angle and path travelled.
+            report: Text of report.html.
+            stored: Text of report.json, from which report.html is made again.
+
+        Raises:
+            CaryatidError: No view was added.
+            InputError: The disk is full or refuses; nothing is left behind.
+        """
+        if self.views == 0:
+            self._staged.discard()
+            raise CaryatidError(f"{self.folder}: no view was finished, so there is no run to keep")
+        self._staged.remove(_view_folder(self.views))
+        self._staged.write("graph.json", graph_text(graph).encode())
+        if report is not None:
+            self._staged.write("report.html", report.encode())
+        if stored is not None:
+            self._staged.write("report.json", stored.encode())
+        document = {"format": FORMAT, "version": VERSION, "views": self.views} | dict(record)
+        self._staged.write("run.json", json_text(document).encode())
+        self._staged.publish()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RunView:
+    """One view of a run.
+
+    Attributes:
+        index: 0 for the first.
+        name: The view's name.
+        graph: The fused graph after this view.
+        T_world_camera: Camera pose (4, 4), or None.
+        K: Pinhole matrix (3, 3) [px], or None.
+        record: All of view.json.
+        labels_path: labels.png or labels.npy.
+    """
+
+    index: int
+    name: str
+    graph: SupportGraph
+    T_world_camera: Array | None
+    K: Array | None
+    record: dict[str, Any]
+    labels_path: Path
+
+    def load_labels(self) -> NDArray[np.int32]:
+        """Read the label image (H, W), or the labels (N,) of a cloud's points.
+
+        Raises:
+            InputError: The file is missing, broken or of another kind.
+        """
+        if self.labels_path.suffix == ".png":
+            return images.read_units(self.labels_path)
+        remedy = "run caryatid again"
+        try:
+            labels = np.load(self.labels_path, allow_pickle=False)
+        except FileNotFoundError:
+            raise InputError(self.labels_path, "the file is missing", remedy) from None
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(self.labels_path, f"is no label array ({error})", remedy) from error
+        if not isinstance(labels, np.ndarray) or labels.ndim != 1 or labels.dtype.kind not in "iu":
+            raise InputError(self.labels_path, "is no array of whole numbers (N,)", remedy)
+        return labels.astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Run:
+    """A run folder as read.
+
+    Attributes:
+        folder: RUN.
+        record: All of run.json: settings, seed, versions, source, timings.
+        graph: The final fused graph.
+        views: The views in their order.
+    """
+
+    folder: Path
+    record: dict[str, Any]
+    graph: SupportGraph
+    views: tuple[RunView, ...]
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read a run folder; label images are loaded when asked for.
+
+    Raises:
+        InputError: It is no run folder, or a file in it is missing or broken.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(folder, "is no folder", "give the folder a run was written to with --out")
+    path = folder / "run.json"
+    record = read_json(path, "give the folder a run was written to with --out")
+    if record.get("format") != FORMAT or record.get("version") != VERSION:
+        raise InputError(path, f"is not of format '{FORMAT}', version {VERSION}", "run caryatid again")
+    count: int = field(record, "views", int, str(path))
+    return Run(
+        folder,
+        record,
+        read_graph(folder / "graph.json"),
+        tuple(_read_view(folder / _view_folder(index), index) for index in range(count)),
+    )
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder was written by `RunWriter`, whatever its version."""
+    try:
+        return read_json(folder / "run.json").get("format") == FORMAT
+    except InputError:
+        return False
+
+
+def _view_folder(index: int) -> str:
+    return f"views/{index:02d}"
+
+
+def _read_view(folder: Path, index: int) -> RunView:
+    path = folder / "view.json"
+    record = read_json(path, "run caryatid again")
+    T, K = record.get("T_world_camera"), record.get("K")
+    image = folder / "labels.png"
+    return RunView(
+        index=index,
+        name=field(record, "name", str, str(path)),
+        graph=read_graph(folder / "graph.json"),
+        T_world_camera=None if T is None else rigid_transform(T, f"{path}: T_world_camera"),
+        K=None if K is None else numbers(K, (3, 3), f"{path}: K"),
+        record=record,
+        labels_path=image if image.exists() else folder / "labels.npy",
+    )

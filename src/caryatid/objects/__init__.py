@@ -1,0 +1,1 @@
+"""Objects over views: association, points, shapes, hidden extents, and the fusion of graphs."""

@@ -1,0 +1,207 @@
+"""Hidden extents: how far a shape reaches where nobody looked, bounded by free space and by what is there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caryatid.config import CompletionConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.shape_arrays import ShapeArrays, boxes_around, shape_arrays
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject
+from caryatid.objects.sweeps import way_to_shapes
+from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.sensing.voxel_map import FREE, VoxelMap
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Face:
+    """One side of a box, or one end of a cylinder.
+
+    Attributes:
+        axis: Of the object, which the face is across.
+        sign: Of the axis, along which the face is outermost.
+        outward_world: Its normal (3,).
+        points_world: Points (N, 3) [m] all over it, rim included.
+        rim_world: Its rim (M, 3) [m], drawn in to lie inside the shape's walls.
+    """
+
+    axis: int
+    sign: float
+    outward_world: Array
+    points_world: Array
+    rim_world: Array
+
+
+def complete(
+    objects: Sequence[SceneObject], surface: SupportSurface, voxels: VoxelMap, config: CompletionConfig
+) -> list[SceneObject]:
+    """Extend the unseen lower side of each object until it meets free space, another shape or the table.
+
+    An object of which one side alone was seen is taken to be as deep as it is wide, in the same bounds.
+
+    Objects are taken from the lowest up, so that each finds what lies below it already completed.
+
+    Args:
+        objects: Objects without the support surface; `seen` says which sides points bear out.
+        surface: The table top.
+        voxels: What has been seen free.
+        config: Steps and tolerances.
+    """
+    done = list(objects)
+    shapes = shape_arrays([o.shape for o in objects])
+    lowest = boxes_around(shapes)[0][:, 2]
+    for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
+        done[k] = _extended(done[k], k, shapes, surface, voxels, config)
+        shapes.centres[k], shapes.half[k] = done[k].centre_world, done[k].shape.extents / 2.0
+    return done
+
+
+def _extended(
+    candidate: SceneObject,
+    index: int,
+    shapes: ShapeArrays,
+    surface: SupportSurface,
+    voxels: VoxelMap,
+    config: CompletionConfig,
+) -> SceneObject:
+    """Extend an object, the one with this index among the shapes."""
+    shape = candidate.shape
+    if isinstance(shape, Sphere):
+        return candidate
+    axis, sign = _downward_side(shape)
+    down_world = sign * shape.T_world_object[:3, axis]
+    upright = -down_world[2] >= np.cos(np.radians(config.max_tilt))
+    if upright and not candidate.seen[2 * axis + (sign > 0)]:
+        bottom = _face(shape, axis, sign, config)
+        lowest = float(surface.height(bottom.points_world).min())
+        to_table = lowest / -float(down_world @ surface.normal_world)
+        if to_table <= 0.0:
+            candidate = replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
+        else:
+            aim = "down to the table"
+            candidate = _moved_out(candidate, bottom, to_table, aim, index, shapes, voxels, config)
+    hidden = _depth_side(candidate, config)
+    if hidden is None or isinstance(candidate.shape, Sphere) or (upright and hidden[0] == axis):
+        return candidate
+    extents = candidate.shape.extents
+    guess = float(np.delete(extents, hidden[0]).min()) - float(extents[hidden[0]])
+    back = _face(candidate.shape, *hidden, config)
+    return _moved_out(candidate, back, guess, "as deep as it is wide", index, shapes, voxels, config)
+
+
+def _moved_out(
+    candidate: SceneObject,
+    face: _Face,
+    limit: float,
+    aim: str,
+    index: int,
+    shapes: ShapeArrays,
+    voxels: VoxelMap,
+    config: CompletionConfig,
+) -> SceneObject:
+    """Move one side outwards up to a limit [m], another shape or free space, whichever comes first."""
+    shape = candidate.shape
+    if isinstance(shape, Sphere) or limit < config.least:
+        return candidate
+    length, reason = limit, f"is taken to reach {aim}"
+    to_object = _way_to_others(face, limit, index, shapes, config)
+    if to_object < length:
+        length, reason = to_object, "ends at the next object"
+    to_free = _free_before(face, length, voxels, config)
+    if to_free < length:
+        length, reason = to_free, "ends where free space was seen"
+    if length < config.least:
+        return candidate
+    why = f"a side that was not seen {reason}, {1000 * length:.0f} mm further"
+    why = f"{candidate.why}; {why}" if candidate.why else why
+    return replace(candidate, shape=_lengthened(shape, face.axis, face.sign, length), why=why)
+
+
+def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, float] | None:
+    """The hidden side (axis, sign) opposite the only one seen, where the points say nothing of the depth."""
+    seen = np.flatnonzero(candidate.seen)
+    if len(seen) != 1:
+        return None
+    axis, side = divmod(int(seen[0]), 2)
+    if isinstance(candidate.shape, Cylinder) and axis != 2:
+        return None
+    if candidate.shape.extents[axis] > config.flat:
+        return None
+    return axis, -1.0 if side else 1.0
+
+
+def _way_to_others(
+    face: _Face, limit: float, index: int, shapes: ShapeArrays, config: CompletionConfig
+) -> float:
+    """How far [m] the face of one of the shapes can move before it meets another one, by sphere tracing."""
+    points, outward = face.points_world, face.outward_world
+    middle = points.mean(axis=0)
+    to_centres = shapes.centres - middle
+    ahead = np.clip(to_centres @ outward, 0.0, limit)
+    aside = np.linalg.norm(to_centres - ahead[:, None] * outward, axis=1)
+    # No ball around a shape that is further than the limit from the one around the face ever bounds a step.
+    reach = np.linalg.norm(points - middle, axis=1).max() + np.linalg.norm(shapes.half, axis=1)
+    near = np.flatnonzero(aside < limit + reach)
+    return way_to_shapes(points, outward, limit, config.overlap, config.least, near[near != index], *shapes)
+
+
+def _free_before(face: _Face, limit: float, voxels: VoxelMap, config: CompletionConfig) -> float:
+    """How far [m] a face can move before its rim lies in space seen free."""
+    lengths = np.append(0.0, np.cumsum(np.full(int(limit / config.step) + 1, config.step)))
+    lengths = lengths[limit - lengths > config.step]
+    if not len(lengths):
+        return limit
+    middles = face.rim_world + (lengths[:, None] + config.step / 2.0)[:, None] * face.outward_world
+    free = voxels.state_at(middles.reshape(-1, 3)).reshape(len(lengths), -1) == FREE
+    stops = np.flatnonzero(free.mean(axis=1) > config.max_free)
+    return float(lengths[stops[0]]) if len(stops) else limit
+
+
+def _downward_side(shape: Box | Cylinder) -> tuple[int, float]:
+    down = -shape.T_world_object[2, :3]
+    axis = 2 if isinstance(shape, Cylinder) else int(np.argmax(np.abs(down)))
+    return axis, 1.0 if down[axis] >= 0.0 else -1.0
+
+
+def _face(shape: Box | Cylinder, axis: int, sign: float, config: CompletionConfig) -> _Face:
+    across = [(axis + 1) % 3, (axis + 2) % 3]
+    half = shape.extents / 2.0
+    u, v = (_ticks(half[k], config.spacing) for k in across)
+    grid = np.empty((len(u), len(v), 3))
+    grid[..., axis], grid[..., across[0]], grid[..., across[1]] = sign * half[axis], u[:, None], v
+    points = grid.reshape(-1, 3)
+    if isinstance(shape, Cylinder):
+        outward = np.hypot(points[:, 0], points[:, 1]) / shape.radius
+        points[:, :2] /= np.maximum(outward, 1.0)[:, None]
+    else:
+        outward = np.abs(points[:, across] / half[across]).max(axis=1)
+    rim = points[outward > 0.99]
+    rim[:, across] *= np.maximum(1.0 - config.inset / half[across], 0.0)
+    T = shape.T_world_object
+    return _Face(
+        axis, sign, sign * T[:3, axis], transforms.transform(T, points), transforms.transform(T, rim)
+    )
+
+
+def _ticks(half: float, spacing: float) -> Array:
+    """Evenly spaced numbers from −half to half, both included, at most `spacing` apart."""
+    count = max(2, int(np.ceil(2.0 * half / spacing)))
+    return half * (2.0 * np.arange(count + 1) / count - 1.0)
+
+
+def _lengthened(shape: Box | Cylinder, axis: int, sign: float, length: float) -> Box | Cylinder:
+    extents = shape.extents
+    length = max(length, -0.8 * float(extents[axis]))
+    shift = np.zeros(3)
+    shift[axis] = sign * length / 2.0
+    T = transforms.rigid(shape.T_world_object[:3, :3], transforms.transform(shape.T_world_object, shift))
+    if isinstance(shape, Cylinder):
+        return Cylinder(T, shape.radius, shape.height + length)
+    grown = extents.copy()
+    grown[axis] += length
+    return Box(T, grown)

@@ -1,0 +1,110 @@
+"""The views a robot can reach, and the few of them that stand for all: so many tell what there is to see."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from caryatid.geometry.shapes import fibonacci_sphere
+from caryatid.geometry.transforms import Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Looks:
+    """Some of N views, and which of them each of all stands with.
+
+    Attributes:
+        chosen: Indices (C,) of the views, ascending.
+        nearest: Which of the chosen is nearest to each view (N,).
+    """
+
+    chosen: NDArray[np.intp]
+    nearest: NDArray[np.intp]
+
+    def without(self, left_out: NDArray[np.bool_], directions: Array) -> Looks:
+        """Leave some of the chosen (C,) out; unit directions (N, 3) tell which is nearest now.
+
+        Args:
+            left_out: Which of the chosen (C,).
+            directions: Unit vectors (N, 3) of all views.
+        """
+        kept = np.flatnonzero(~left_out)
+        place = np.full(len(self.chosen), -1)
+        place[kept] = np.arange(len(kept))
+        nearest = place[self.nearest]
+        orphans = np.flatnonzero(nearest < 0)
+        nearest[orphans] = np.argmax(directions[orphans] @ directions[self.chosen[kept]].T, axis=1)
+        return Looks(self.chosen[kept], nearest)
+
+
+def looks_among(directions: Array, count: int) -> Looks:
+    """Pick the views nearest to those of `count` directions all over the sphere that have one near.
+
+    Args:
+        directions: Unit vectors (N, 3) of the views.
+        count: How many there would be on the whole sphere; of fewer than an eighth of that all are taken.
+    """
+    if len(directions) <= count // 8:
+        every = np.arange(len(directions))
+        return Looks(every, every)
+    distance, nearest = KDTree(directions).query(fibonacci_sphere(count))
+    near = distance < np.sqrt(4.0 * np.pi / count)
+    chosen = np.unique(nearest[near]) if near.any() else np.unique(nearest)
+    return Looks(chosen, KDTree(directions[chosen]).query(directions)[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """The views a robot can reach.
+
+    Attributes:
+        T_world_camera: Camera poses (N, 4, 4).
+        directions: Unit vectors (N, 3) from the view sphere's centre.
+        path_length: Way (N,) [m] from where the robot is: over the floor, or of its hand.
+        rejected: Reason → how many views of the sphere were refused for it.
+        indices: Which point of the view sphere each candidate is (N,), or None where they lie elsewhere.
+    """
+
+    T_world_camera: Array
+    directions: Array
+    path_length: Array
+    rejected: dict[str, int]
+    indices: NDArray[np.intp] | None = None
+    _looks: dict[int, Looks] = field(default_factory=dict, init=False, repr=False)
+
+    def __len__(self) -> int:
+        return len(self.directions)
+
+    def looks(self, count: int) -> Looks:
+        """Pick those nearest to `count` directions all over the sphere; found once for the same views."""
+        if count not in self._looks:
+            self._looks[count] = looks_among(self.directions, count)
+        return self._looks[count]
+
+    def without(self, index: int, reason: str) -> Candidates:
+        """Return the other views, one more being refused for a reason.
+
+        Args:
+            index: Which is left out.
+            reason: Why, for `rejected`.
+        """
+        T_world_camera, directions, way = (
+            np.delete(of_each, index, axis=0)
+            for of_each in (self.T_world_camera, self.directions, self.path_length)
+        )
+        indices = None if self.indices is None else np.delete(self.indices, index)
+        rejected = self.rejected | {reason: self.rejected.get(reason, 0) + 1}
+        return Candidates(T_world_camera, directions, way, rejected, indices)
+
+    def from_elsewhere(self, path_length: Array) -> Candidates:
+        """Return the same views as they are to a robot with another way (N,) [m] to each."""
+        others = replace(self, path_length=path_length)
+        object.__setattr__(others, "_looks", self._looks)
+        return others
+
+    def __repr__(self) -> str:
+        refused = ", ".join(f"{count} {reason}" for reason, count in self.rejected.items())
+        return f"Candidates({len(self)}{f'; refused: {refused}' if refused else ''})"

@@ -1,0 +1,202 @@
+"""What a planner is given and what it decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.errors import PlanningError
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SupportGraph
+from caryatid.planning.candidates import Candidates, Looks
+from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.runtime.display import Pictured
+from caryatid.runtime.threads import one_blas_thread
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.voxel_map import VoxelMap
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PlanningState:
+    """Everything a planner may look at.
+
+    Attributes:
+        graph: The fused support graph.
+        sphere: The view sphere.
+        voxels: Space seen free, occupied, or not at all.
+        visited: Unit directions (V, 3) from the centre to the views so far; the last is the current one.
+        candidates: The views that can be reached.
+        config: Settings of section IV.
+    """
+
+    graph: SupportGraph
+    sphere: ViewSphere
+    voxels: VoxelMap
+    visited: Array
+    candidates: Candidates
+    config: ActiveVisionConfig
+
+    def __repr__(self) -> str:
+        views, candidates = len(self.visited), len(self.candidates)
+        return f"PlanningState(views={views}, candidates={candidates}, graph={self.graph})"
+
+
+class Painted:
+    """A field whose value is given, or painted when it is first looked at: most pictures are never drawn."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._key = f"_{name}"
+
+    def __get__(self, holder: object, owner: type | None = None) -> Array | None:
+        if holder is None:
+            return None
+        value = holder.__dict__[self._key]
+        if callable(value):
+            value = holder.__dict__[self._key] = value()
+        return value
+
+    def __set__(self, holder: object, value: Array | Callable[[], Array] | None) -> None:
+        holder.__dict__[self._key] = value
+
+
+@dataclass(frozen=True, eq=False)
+class Decision(Pictured):
+    """The next best view and why.
+
+    Attributes:
+        T_world_camera: Pose (4, 4) to go to.
+        index: Which of the candidates it is.
+        saliency: s of eq. 3 there, with the inhibition of return [1].
+        cost: h of eq. 3 there [1].
+        score: c = s − h, eq. 3 [1].
+        why: One sentence for a person to read.
+        points_of_interest: What the planner took into account.
+        candidate_saliency: s (N,) of every candidate, or None.
+        sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None; may be given as what
+            paints it.
+    """
+
+    T_world_camera: Array
+    index: int
+    saliency: float
+    cost: float
+    score: float
+    why: str
+    points_of_interest: tuple[PointOfInterest, ...] = ()
+    candidate_saliency: Array | None = None
+    sphere_saliency: Painted = Painted()
+
+    def __repr__(self) -> str:
+        return f"Decision(candidate {self.index}, score {self.score:.3f}: {self.why})"
+
+
+class Planner(Protocol):
+    """Chooses where to look next."""
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose one of the candidates.
+
+        Args:
+            state: What is known.
+            rng: For every random choice.
+
+        Raises:
+            PlanningError: There is no candidate.
+        """
+        ...
+
+
+def check_candidates(state: PlanningState) -> None:
+    """Raise PlanningError, with the reasons, where no view can be reached.
+
+    Args:
+        state: What is known.
+
+    Raises:
+        PlanningError: There is none.
+    """
+    if len(state.candidates) == 0:
+        reasons = ", ".join(f"{reason} ({n})" for reason, n in state.candidates.rejected.items())
+        raise PlanningError(f"no view is left to go to: {reasons or 'the robot offers no candidates'}")
+
+
+def path_cost(state: PlanningState) -> Array:
+    """What it costs to go to each candidate, h(v) of eq. 3 (N,).
+
+    `angle`: sin(α/2), α the angle at the sphere's centre between the current view and the candidate.
+    `path`: the way over the floor in diameters of the view sphere. `none`: nothing.
+    """
+    match state.config.path_cost:
+        case "angle":
+            alpha = transforms.angle_between(state.visited[-1], state.candidates.directions)
+            return np.sin(alpha / 2.0)
+        case "path":
+            return state.candidates.path_length / (2.0 * state.sphere.radius)
+        case "none":
+            return np.zeros(len(state.candidates))
+
+
+def decide(
+    candidates: Candidates,
+    saliency: Array,
+    cost: Array,
+    why: Callable[[int], str],
+    *,
+    looks: Looks | None = None,
+    points: tuple[PointOfInterest, ...] = (),
+    elsewhere: Callable[[], Array],
+) -> Decision:
+    """Choose the view with the largest c = s − h, eq. 3; of equal ones the first.
+
+    Args:
+        candidates: The views that can be reached.
+        saliency: s (C,) of each view that was judged.
+        cost: h (C,) of each.
+        why: Gives the reason for one of these.
+        looks: Which of the candidates were judged, and stand for the others; None = all.
+        points: What was taken into account.
+        elsewhere: Gives s (M,) of the points of the view sphere, as a new array, but for the candidates.
+    """
+    score = saliency - cost
+    best = int(np.argmax(score))
+    index = best if looks is None else int(looks.chosen[best])
+    candidate_saliency = saliency if looks is None else saliency[looks.nearest]
+    return Decision(
+        candidates.T_world_camera[index],
+        index,
+        float(saliency[best]),
+        float(cost[best]),
+        float(score[best]),
+        why(best),
+        points,
+        candidate_saliency,
+        partial(_paint, elsewhere, candidates.indices, candidate_saliency),
+    )
+
+
+def go_to(state: PlanningState, index: int, why: str) -> Decision:
+    """Take a candidate whatever there is to see: the decision of planners that do not look at the scene.
+
+    Args:
+        state: What is known.
+        index: Which of the candidates.
+        why: One sentence for a person to read.
+    """
+    cost = float(path_cost(state)[index])
+    return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
+
+
+@one_blas_thread
+def _paint(elsewhere: Callable[[], Array], indices: NDArray[np.intp] | None, saliency: Array) -> Array:
+    """Saliency (M,) of the view sphere with that of the candidates at their points."""
+    painted = elsewhere()
+    if indices is not None:
+        painted[indices] = saliency
+    return painted

@@ -1,0 +1,239 @@
+"""What there is to see, as weighted points: the objects' surfaces, unseen space, relations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.geometry.polygons import hull
+from caryatid.geometry.sampling import sample_surfaces
+from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject, SupportGraph
+from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.planning.unseen_space import unseen_space
+from caryatid.sensing.visibility import shown
+from caryatid.sensing.voxel_map import Solid, VoxelMap
+from caryatid.support.stability import ground_outline
+
+SPACE = "unseen space"
+"""What a sample of unseen space is about."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Samples:
+    """Points a view is to show.
+
+    Attributes:
+        points_world: (K, 3) [m].
+        normals_world: Outward unit normals (K, 3); zero where a point looks the same from all sides.
+        weights: Worth (K,) of each, 0 or more.
+        subjects: Index (K,) into `names`.
+        names: Ids of objects, or `SPACE`.
+    """
+
+    points_world: Array
+    normals_world: Array
+    weights: Array
+    subjects: NDArray[np.intp]
+    names: tuple[str, ...]
+
+
+def join(parts: Sequence[Samples]) -> Samples:
+    """Put samples together; each part keeps its own names."""
+    starts = np.cumsum([0] + [len(part.names) for part in parts])
+    return Samples(
+        np.concatenate([part.points_world for part in parts]),
+        np.concatenate([part.normals_world for part in parts]),
+        np.concatenate([part.weights for part in parts]),
+        np.concatenate([part.subjects + start for part, start in zip(parts, starts, strict=False)]),
+        tuple(name for part in parts for name in part.names),
+    )
+
+
+def surface_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig) -> Samples:
+    """Spread points over the objects' surfaces; together they weigh 1.
+
+    Every object weighs the same, small or large: each is one vertex of the graph. What touches another
+    shape or the table can never be seen and is left out.
+
+    Args:
+        graph: The objects.
+        solid: What was seen occupied, and the shapes.
+        config: How many points.
+    """
+    objects = [o for o in graph.objects if o.role == "object"]
+    if not objects:
+        return _nothing()
+    size = solid.voxels.config.size
+    areas = np.array([_area(o) for o in objects])
+    spacings = np.maximum(np.sqrt(areas * len(objects) / config.surface_samples), size)
+    points, normals, counts = sample_surfaces(*shape_arrays([o.shape for o in objects]), spacings)
+    subjects = np.repeat(np.arange(len(objects)), counts)
+    open_ = np.flatnonzero(~solid.holds(points + 1.5 * size * normals))
+    subjects = subjects[open_]
+    weights = (1.0 / (len(objects) * counts))[subjects]
+    return Samples(points[open_], normals[open_], weights, subjects, tuple(o.id for o in objects))
+
+
+def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
+    """Find the box over the table in which something may stand, up to the height of the highest object.
+
+    Args:
+        graph: The objects and the table.
+        voxels: Bounds the box; it begins two voxels over the table, clear of readings of its top.
+
+    Returns:
+        Its corners (3,) and (3,) [m], or None without a table, objects, or space between them.
+    """
+    table = graph.support_surface
+    objects = [o for o in graph.objects if o.role == "object"]
+    if table is None or not objects:
+        return None
+    axes = np.eye(3)
+    reach = table.shape.support(axes)
+    low, high = table.centre_world - reach, table.centre_world + reach
+    low[2] = high[2] + 2.0 * voxels.config.size
+    high[2] = max(float(o.centre_world[2] + o.shape.support(axes[2:])[0]) for o in objects)
+    low, high = np.maximum(low, voxels.origin_world), np.minimum(high, voxels.end_world)
+    return None if (high <= low).any() else (low, high)
+
+
+def space_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig) -> Samples:
+    """Spread points over the unseen space on the table, where something may stand.
+
+    Space counts up to the height of the highest object, fully at the table and less the higher it is: what
+    stands there has to be carried. All of the table unseen up to there weighs `config.space_weight`; the
+    space among the objects, over the convex hull of their outlines, weighs `config.heap_weight` beside: what
+    holds up a heap, or leans on it, is in there.
+
+    Args:
+        graph: The objects and the table.
+        solid: What was seen occupied, and the shapes.
+        config: Spacing of the points, and their worth.
+    """
+    table = graph.support_surface
+    corners = space_above(graph, solid.voxels)
+    if table is None or corners is None:
+        return _nothing()
+    low, high = corners
+    x, y, z = (np.arange(a, b, config.space_spacing) for a, b in zip(low, high, strict=True))
+    outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
+    heap = hull(np.concatenate(outlines))
+    voxels = solid.voxels
+    points, on_table, in_heap = unseen_space(
+        x, y, z, float(high[2] - low[2]), table.shape.T_world_object, table.shape.extents[:2] / 2.0, heap,
+        voxels.states, voxels.origin_world, solid.grid.view(np.int8), solid.origin_world, voxels.config.size,
+    )  # fmt: skip
+    weights = config.space_weight * on_table + config.heap_weight * in_heap
+    return Samples(points, np.zeros_like(points), weights, np.zeros(len(points), dtype=np.intp), (SPACE,))
+
+
+def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
+    """Take the points of interest of Algorithm 1 as points seen from any side; together they weigh 1."""
+    if not points:
+        return _nothing()
+    positions = np.stack([p.position_world for p in points])
+    saliency = np.array([p.saliency for p in points])
+    total = max(float(saliency.sum()), 1e-9)
+    names = tuple(p.subject[-1] for p in points)
+    return Samples(positions, np.zeros_like(positions), saliency / total, np.arange(len(points)), names)
+
+
+def weighted(samples: Samples, weight: float | Array) -> Samples:
+    """Scale all weights, by one number or each by its own (K,).
+
+    Args:
+        samples: The samples.
+        weight: One number, or one for each (K,).
+    """
+    return replace(samples, weights=samples.weights * weight)
+
+
+def visibility(samples: Samples, T_world_camera: Array, solid: Solid, config: ActiveVisionConfig) -> Array:
+    """How well each camera (T, 4, 4) sees each sample: (K, T) from 0 hidden to 1.
+
+    A sample is seen when its line of sight is free and within the image; surface turned away by more than
+    `config.good_incidence` is seen less well, as the cosine. Lines of sight are all free where
+    `config.occlusion` is `ignore`.
+
+    Args:
+        samples: K of them.
+        T_world_camera: Poses (T, 4, 4).
+        solid: What blocks lines of sight.
+        config: Image, incidence, and how occlusion is treated.
+    """
+    alike = replace(samples, weights=np.ones_like(samples.weights))
+    return shown_anew(alike, np.zeros_like(samples.weights), T_world_camera, solid, config)
+
+
+def shown_anew(
+    samples: Samples, before: Array, T_world_camera: Array, solid: Solid, config: ActiveVisionConfig
+) -> Array:
+    """Worth (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).
+
+    Lines of sight that could show nothing new are not followed.
+
+    Args:
+        samples: K of them.
+        before: How well they were seen before (K,), 0 … 1.
+        T_world_camera: Poses (T, 4, 4).
+        solid: What blocks lines of sight.
+        config: Image, incidence, and how occlusion is treated.
+    """
+    see_through = config.occlusion == "ignore"
+    return shown(
+        np.zeros((0, 0, 0), dtype=np.uint8) if see_through else solid.grid,
+        solid.origin_world,
+        solid.voxels.config.size,
+        samples.points_world,
+        samples.normals_world,
+        before,
+        samples.weights,
+        np.ascontiguousarray(T_world_camera[:, :3, 3].T),
+        np.ascontiguousarray(T_world_camera[:, :3, 2].T),
+        float(config.sample_clearance),
+        float(np.cos(np.deg2rad(config.good_incidence))),
+        float(np.cos(np.deg2rad(config.view_cone))),
+    )
+
+
+def unseen_shares(samples: Samples, seen: Array) -> Array:
+    """How much of what each sample is about has not been seen (K,): 1 nothing, 0 all of it.
+
+    Args:
+        samples: Points.
+        seen: How well each has been seen (K,), from 0 to 1.
+    """
+    count = np.bincount(samples.subjects, minlength=len(samples.names))
+    left = np.bincount(samples.subjects, weights=1.0 - seen, minlength=len(samples.names))
+    return (left / np.maximum(count, 1))[samples.subjects]
+
+
+def _area(subject: SceneObject) -> float:
+    """Surface of the box around a shape [m²]."""
+    x, y, z = subject.shape.extents
+    return float(2.0 * (x * y + y * z + z * x))
+
+
+def _nothing() -> Samples:
+    return Samples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.intp), ())
+
+
+__all__ = [
+    "SPACE",
+    "Samples",
+    "join",
+    "relation_samples",
+    "shown_anew",
+    "space_above",
+    "space_samples",
+    "surface_samples",
+    "unseen_shares",
+    "visibility",
+    "weighted",
+]

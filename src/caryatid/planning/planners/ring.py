@@ -1,0 +1,35 @@
+"""A fixed ring around the scene: a plan that does not look at what has been found."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caryatid.planning.decision import Decision, PlanningState, check_candidates, go_to
+from caryatid.sensing.view_sphere import direction
+
+
+class RingPlanner:
+    """Goes around the scene in `active.ring_views` equal steps of azimuth, at the first view's elevation.
+
+    Each further round is turned into the gaps of those before: by a half, a quarter, three quarters of a
+    step, and so on.
+    """
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the candidate nearest to the next stop; of equal ones the first."""
+        check_candidates(state)
+        stops = state.config.ring_views
+        rounds, stop = divmod(len(state.visited), stops)
+        first = state.visited[0]
+        turned = 2.0 * np.pi * (stop + _halving(rounds)) / stops
+        azimuth = float(np.arctan2(first[1], first[0]) + turned)
+        wanted = direction(azimuth, float(np.arcsin(np.clip(first[2], -1.0, 1.0))))
+        index = int(np.argmax(state.candidates.directions @ wanted))
+        why = f"stop {stop + 1} of {stops} around the scene, {np.rad2deg(turned):.0f}° from the first view"
+        return go_to(state, index, why)
+
+
+def _halving(n: int) -> float:
+    """The sequence 0, 1/2, 1/4, 3/4, 1/8, …, each in a largest gap of those before (van der Corput)."""
+    digits = f"{n:b}"[::-1]
+    return int(digits, 2) / 2.0 ** len(digits)

@@ -1,0 +1,135 @@
+"""The default planner: look where most of what is hidden would come into sight.
+
+It keeps the frame of Algorithm 2, c = s − h with inhibition of return over the reachable part of the view
+sphere, and asks of each candidate what it would show that no earlier view has: the surface of the fitted
+objects, most of those of which least has been seen; the unseen space on the table in which a supporter may
+stand, most of it among the objects; and the points of Algorithm 1. A point counts when its line of sight is
+free of what was seen occupied and of the fitted shapes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
+from caryatid.planning.hidden_surface import (
+    SPACE,
+    Samples,
+    join,
+    relation_samples,
+    shown_anew,
+    space_samples,
+    surface_samples,
+    unseen_shares,
+    visibility,
+    weighted,
+)
+from caryatid.planning.points_of_interest import (
+    PointOfInterest,
+    inhibition_of_return,
+    painted,
+    points_of_doubt,
+    points_of_interest,
+)
+
+WORTH_SAYING = 0.05
+"""Shares of the whole below this are not mentioned."""
+
+
+class SupportPlanner:
+    """Takes the candidate that promises to show most of what is hidden, at little cost."""
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
+
+        s is the worth of what a candidate shows anew, h the cost of going there, `config.effort` times that
+        of eq. 3, and so is the inhibition of return: both only decide where views show about as much.
+        """
+        check_candidates(state)
+        config, sphere, candidates = state.config, state.sphere, state.candidates
+        looks = candidates.looks(config.look_directions)
+        relations = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
+        relations += points_of_doubt(state.graph, sphere, state.visited)
+        samples, gain = _expected_gain(state, relations, candidates.T_world_camera[looks.chosen])
+
+        inhibition = inhibition_of_return(state.visited, candidates.directions[looks.chosen], config)
+        points = (*relations, *_hidden_points(state, samples, gain))
+        return decide(
+            candidates,
+            gain.sum(axis=0) + config.effort * inhibition,
+            config.effort * path_cost(state)[looks.chosen],
+            lambda best: _why(samples, gain[:, best]),
+            looks=looks,
+            points=points,
+            elsewhere=partial(_on_sphere, points, state.visited, sphere.directions, config),
+        )
+
+
+def _expected_gain(
+    state: PlanningState, relations: list[PointOfInterest], T_world_camera: Array
+) -> tuple[Samples, Array]:
+    """Samples, and what cameras (C, 4, 4) show of them anew (K, C)."""
+    config = state.config
+    solid = state.voxels.solid([o.shape for o in state.graph.objects])
+    surfaces = surface_samples(state.graph, solid, config)
+    points = relation_samples(relations)
+    T_world_visited = state.sphere.poses(state.visited)
+    seen = visibility(join([surfaces, points]), T_world_visited, solid, config).max(axis=1, initial=0.0)
+    surfaces = weighted(surfaces, unseen_shares(surfaces, seen[: len(surfaces.weights)]))
+    space = space_samples(state.graph, solid, config)
+    samples = join([surfaces, weighted(points, config.relation_weight), space])
+    before = np.concatenate([seen, np.zeros(len(space.weights))])
+    return samples, shown_anew(samples, before, T_world_camera, solid, config)
+
+
+def _on_sphere(
+    points: Sequence[PointOfInterest], visited: Array, directions: Array, config: ActiveVisionConfig
+) -> Array:
+    """Saliency (M,) the points and the earlier views alone give directions (M, 3)."""
+    own = painted(points, directions, float(np.deg2rad(config.spread))).max(axis=1, initial=0.0)
+    return own + inhibition_of_return(visited, directions, config)
+
+
+def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[PointOfInterest]:
+    """One point of interest per object and for the unseen space: the middle of what is left to be seen of it.
+
+    Its saliency is how much of that there is, in shares of the subject with most of it.
+    """
+    left = gain.max(axis=1, initial=0.0)
+    about, count = samples.subjects, len(samples.names)
+    worth = np.bincount(about, weights=left, minlength=count)
+    shown = np.bincount(about, weights=left > 0.0, minlength=count)
+    spots, ways = (
+        np.stack([np.bincount(about, weights=left * v, minlength=count) for v in vectors.T], axis=-1)
+        for vectors in (samples.points_world, samples.normals_world)
+    )
+    points = []
+    for i in np.flatnonzero((worth > WORTH_SAYING * worth.max(initial=0.0)) & (shown > 1)):
+        name, middle, outward = samples.names[i], spots[i] / worth[i], ways[i]
+        if np.linalg.norm(outward) < 1e-9:
+            outward = middle - state.sphere.centre_world
+        subject = () if name == SPACE else (name,)
+        why = f"{name} on the table" if name == SPACE else f"part of {name} has not been seen"
+        saliency = float(worth[i] / worth.max())
+        points.append(PointOfInterest(middle, transforms.unit(outward), saliency, subject, why))
+    return points
+
+
+def _why(samples: Samples, gain: Array) -> str:
+    """One sentence: which objects a view shows more of."""
+    total = float(gain.sum())
+    if total <= 0.0:
+        return "nothing hidden is expected to come into sight; the cheapest new view"
+    worth: dict[str, float] = {}
+    shares = np.bincount(samples.subjects, weights=gain, minlength=len(samples.names))
+    for name, share in zip(samples.names, shares, strict=True):
+        worth[name] = worth.get(name, 0.0) + float(share)
+    ranked = sorted(worth.items(), key=lambda item: -item[1])[:3]
+    parts = [f"{name} ({share / total:.0%})" for name, share in ranked if share > WORTH_SAYING * total]
+    return "shows most of what is still hidden: " + ", ".join(parts)

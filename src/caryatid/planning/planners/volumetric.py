@@ -1,0 +1,154 @@
+"""Planners of the field: the view whose rays gather most volumetric information in the voxel map.
+
+The formulations are those of Isler et al. (An Information Gain Formulation for Active Volumetric 3D
+Reconstruction, 2016) and Delmerico et al. (A Comparison of Volumetric Information Gain Metrics for Active 3D
+Object Reconstruction, 2018). With p_o the occupancy of a voxel, H its binary entropy and p_v = ∏ (1 − p_o)
+over the voxels before it, a ray gathers up to the first occupied voxel
+
+* `occlusion-aware`: Σ p_v H(p_o). Space seen free counts as well: at the lower clamp a long ray through it
+  gathers more than one through unknown space, which soon hides what is behind;
+* `unobserved-voxel`: the same over unknown voxels only;
+* `rear-side-voxel`: 1 where that occupied voxel is met from an unknown one, which is its unseen back;
+* `rear-side-entropy`: Σ H over the run of unknown voxels that ends there;
+* `proximity-count`: Σ (d_max − d) over unknown voxels at a distance d < d_max from an occupied one. What
+  lies before a surface has been seen free, so these are at its back.
+
+They come from the reconstruction of one object in a box known beforehand. Here the box is the space over
+the table up to the height of the highest object. Without it the room behind, the floor, and what is outside
+the image would outweigh everything: half of the map's voxels are still unknown after a first view. For the
+same reason p_v is 1 where a ray enters the box. Unknown space inside objects counts, as it does there: these
+planners know of no shapes.
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.geometry.transforms import Array, unit
+from caryatid.planning.candidates import Looks
+from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
+from caryatid.planning.hidden_surface import space_above
+from caryatid.planning.information import FORMULATIONS, gather
+from caryatid.sensing.voxel_map import OCCUPIED, UNKNOWN, VoxelMap
+
+
+class VolumetricPlanner:
+    """Takes the candidate with the largest utility IG / ΣIG − w · cost / Σcost.
+
+    Args:
+        formulation: How information is counted, one of `FORMULATIONS`.
+    """
+
+    def __init__(self, formulation: str) -> None:
+        self.formulation = formulation
+        self._column = FORMULATIONS.index(formulation)
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the candidate with the largest utility; of equal ones the first.
+
+        The decision's saliency, cost and score are the two terms of the utility and their difference, in
+        units of the largest share of information. Candidates beside an earlier view are left out: a planner
+        of the field does not choose a view of its list twice.
+        """
+        check_candidates(state)
+        candidates, config = state.candidates, state.config
+        looks = _new_views(state, candidates.looks(config.look_directions))
+        T_world_camera = candidates.T_world_camera[looks.chosen]
+        proximity = config.proximity if self.formulation == "proximity-count" else 0.0
+        gain = ray_information(state, T_world_camera, proximity)[:, self._column]
+        largest = float(gain.max())
+        saliency = gain / largest if largest > 0.0 else gain
+        cost = config.cost_weight * _shares(path_cost(state)[looks.chosen])
+        return decide(
+            candidates,
+            saliency,
+            cost * float(saliency.sum()) if largest > 0.0 else cost,
+            lambda best: self._why(gain, best),
+            looks=looks,
+            elsewhere=partial(np.zeros, len(state.sphere.directions)),
+        )
+
+    def _why(self, gain: Array, best: int) -> str:
+        """One sentence: how the chosen view's information compares with the others'."""
+        if gain.max() <= 0.0:
+            return f"no view is expected to give {self.formulation} information; the cheapest new view"
+        ratio, share = gain[best] / gain.mean(), gain[best] / gain.max()
+        return f"{ratio:.1f} times the views' mean {self.formulation} information, {share:.0%} of the most"
+
+
+def ray_information(state: PlanningState, T_world_camera: Array, proximity: float = 0.0) -> Array:
+    """What the rays of cameras (C, 4, 4) gather (C, 5), a column each of `FORMULATIONS`.
+
+    Without a table or objects there is no box to look into, and nothing is gathered; without a `proximity`,
+    d_max [m], nothing is near.
+
+    Args:
+        state: What is known.
+        T_world_camera: Poses (C, 4, 4).
+        proximity: d_max [m].
+    """
+    corners = space_above(state.graph, state.voxels)
+    if corners is None:
+        return np.zeros((len(T_world_camera), len(FORMULATIONS)))
+    box, config = state.voxels.cut(*corners), state.config
+    return gather(
+        np.ascontiguousarray(box.states),
+        layers(box, proximity),
+        np.ascontiguousarray(T_world_camera),
+        image_rays(config),
+        box.origin_world,
+        box.config.size,
+    )
+
+
+def layers(voxels: VoxelMap, proximity: float) -> NDArray[np.float32]:
+    """Occupancy [1], its entropy [bit] and nearness of unknown voxels to occupied ones [m] (X, Y, Z, 3).
+
+    Args:
+        voxels: The map.
+        proximity: d_max: nearness is d_max − d where that is more than 0 [m]; 0 where it is not asked for.
+    """
+    occupancy = voxels.occupancy
+    entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
+    nearness = np.zeros_like(occupancy)
+    occupied = voxels.states == OCCUPIED
+    if proximity > 0.0 and occupied.any():
+        distance = voxels.config.size * distance_transform_edt(~occupied)
+        unknown = voxels.states == UNKNOWN
+        nearness[unknown] = np.maximum(proximity - distance[unknown], 0.0)
+    return np.stack([occupancy, entropy, nearness], axis=-1)
+
+
+@cache
+def image_rays(config: ActiveVisionConfig) -> Array:
+    """Directions (R, 3) in the camera, unit: a square grid over the image within `config.view_cone`.
+
+    Neighbours are `config.ray_spacing` apart at the view sphere's centre.
+    """
+    spacing, edge = config.ray_spacing / config.sphere_radius, np.tan(np.deg2rad(config.view_cone))
+    steps = spacing * np.arange(-np.floor(edge / spacing), np.floor(edge / spacing) + 1.0)
+    x, y = (g.ravel() for g in np.meshgrid(steps, steps))
+    inside = np.hypot(x, y) <= edge
+    return unit(np.column_stack([x[inside], y[inside], np.ones(inside.sum())]))
+
+
+def _new_views(state: PlanningState, looks: Looks) -> Looks:
+    """Leave out what is nearer to an earlier view than candidates are to one another, unless that is all."""
+    directions = state.candidates.directions
+    cosine = directions[looks.chosen] @ state.visited.T
+    old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / state.config.look_directions))
+    return looks if old.all() else looks.without(old, directions)
+
+
+def _shares(values: Array) -> Array:
+    """Each value's share of their sum; nought where that is nought."""
+    total = float(values.sum())
+    return values / total if total > 0.0 else np.zeros_like(values)
+
+
+__all__ = ["FORMULATIONS", "VolumetricPlanner", "image_rays", "layers", "ray_information"]

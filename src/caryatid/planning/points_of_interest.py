@@ -1,0 +1,180 @@
+"""Points of interest from the support graph (Algorithm 1), their saliency (eq. 2) and how it spreads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.geometry.shapes import Shape
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.sensing.view_sphere import ViewSphere, spread
+
+MAX_SALIENCY = 1.0
+"""Saliency of an object nothing is known to support: eq. 2 never exceeds it."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PointOfInterest:
+    """A point in the scene worth another look.
+
+    Attributes:
+        position_world: (3,) [m].
+        direction: Where it is projected on the view sphere (3,), unit, from the sphere's centre.
+        saliency: How much it is worth, −1 … 1 [1].
+        subject: Ids of the objects it is about.
+        why: For a person to read.
+    """
+
+    position_world: Array
+    direction: Array
+    saliency: float
+    subject: tuple[str, ...]
+    why: str
+
+
+def points_of_interest(
+    graph: SupportGraph, sphere: ViewSphere, visited: Array, views: int, config: ActiveVisionConfig
+) -> list[PointOfInterest]:
+    """Generate the points of interest of a support graph, Algorithm 1.
+
+    An object without a supporter gives the point where the line from the middle of the largest arc between
+    earlier views to its centre meets its surface. Every support relation gives one point where
+    `config.edge_point` says.
+
+    Args:
+        graph: What is known.
+        sphere: The view sphere.
+        visited: Unit directions (V, 3) of the earlier views.
+        views: How many views there have been, #views of eq. 2.
+        config: λ_s, the period of eq. 2 and where a relation's point lies.
+    """
+    middle = largest_arc(visited)
+    centres = {o.id: o.centre_world for o in graph.objects}
+    points = []
+    for supported in graph.objects:
+        if supported.role == "support_surface":
+            continue
+        supports = graph.supporters(supported.id)
+        if not supports:
+            points.append(_unsupported(supported, sphere, middle))
+        for support in supports:
+            between = (centres[support.supporter] + centres[support.supported]) / 2.0
+            points.append(_relation(support, between, sphere, views, config))
+    return points
+
+
+def points_of_doubt(graph: SupportGraph, sphere: ViewSphere, visited: Array) -> list[PointOfInterest]:
+    """Where shapes are physically implausible: one point an object, to be looked at from the largest arc.
+
+    Args:
+        graph: What is known.
+        sphere: The view sphere.
+        visited: Unit directions (V, 3) of the earlier views.
+    """
+    middle = largest_arc(visited)
+    return [_looked_at(o, sphere, middle, f"{o.id} {o.doubt}") for o in graph.objects if o.doubt]
+
+
+def largest_arc(visited: Array) -> float:
+    """Azimuth [rad] of the middle of the largest arc between views on the horizontal circle.
+
+    With one earlier view it is the opposite side. Of arcs of the same size the first from −π upwards counts.
+
+    Args:
+        visited: Unit directions (V, 3), V ≥ 1.
+    """
+    azimuth = np.sort(np.arctan2(visited[:, 1], visited[:, 0]))
+    arc = np.diff(np.append(azimuth, azimuth[0] + 2.0 * np.pi))
+    first = int(np.argmax(arc > arc.max() - 1e-9))
+    middle = azimuth[first] + arc[first] / 2.0
+    return float((middle + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) -> float:
+    """How interesting a relation is that was seen in some of the views, eq. 2.
+
+    s = λ_s + (1 − λ_s) · cos(2π · #occ / #views) as printed (`paper`), or with π in place of 2π
+    (`decreasing`), which falls from 1 for a relation never seen to 2λ_s − 1 for one always seen.
+
+    Args:
+        occurrences: #occ(e): in how many views it was extracted.
+        views: #views: how many there have been.
+        config: λ_s, and the period.
+    """
+    period = 2.0 * np.pi if config.saliency == "paper" else np.pi
+    share = min(1.0, occurrences / max(1, views))
+    return config.saliency_weight + (1.0 - config.saliency_weight) * math.cos(period * share)
+
+
+def surface_point(shape: Shape, towards_world: Array) -> Array:
+    """Where the line from a shape's centre to an outer point (3,) [m] leaves the shape (3,) [m].
+
+    Args:
+        shape: The shape.
+        towards_world: The outer point (3,) [m].
+    """
+    centre = shape.T_world_object[:3, 3]
+    inside, outside = 0.0, 1.0
+    for _ in range(40):
+        t = (inside + outside) / 2.0
+        if shape.signed_distance((centre + t * (towards_world - centre))[None])[0] < 0.0:
+            inside = t
+        else:
+            outside = t
+    return centre + inside * (towards_world - centre)
+
+
+def painted(points: Sequence[PointOfInterest], directions: Array, sigma: float) -> Array:
+    """Saliency each point of interest gives each view (M, K): its own, falling off with the angle.
+
+    Args:
+        points: K points of interest.
+        directions: Unit vectors (M, 3) from the sphere's centre.
+        sigma: Angle of the fall-off [rad].
+    """
+    if not points:
+        return np.zeros((len(directions), 0))
+    tops = np.stack([p.direction for p in points])
+    return spread(tops, directions, sigma) * np.array([p.saliency for p in points])
+
+
+def inhibition_of_return(visited: Array, directions: Array, config: ActiveVisionConfig) -> Array:
+    """The negative saliency (M,) around earlier views that forces the robot to attend new ones.
+
+    Args:
+        visited: Unit directions (V, 3) of the earlier views.
+        directions: Unit directions (M, 3) to be judged.
+        config: How deep and how wide it is.
+    """
+    bumps = spread(visited, directions, float(np.deg2rad(config.spread)))
+    return -config.inhibition * bumps.max(axis=1, initial=0.0)
+
+
+def _unsupported(subject: SceneObject, sphere: ViewSphere, azimuth: float) -> PointOfInterest:
+    return _looked_at(subject, sphere, azimuth, f"nothing is known to support {subject.id}")
+
+
+def _looked_at(subject: SceneObject, sphere: ViewSphere, azimuth: float, reason: str) -> PointOfInterest:
+    middle = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    position = surface_point(subject.shape, sphere.centre_world + sphere.radius * middle)
+    gap = f"the largest gap between views is at {np.rad2deg(azimuth):.0f}°"
+    return PointOfInterest(position, middle, MAX_SALIENCY, (subject.id,), f"{reason}; {gap}")
+
+
+def _relation(
+    support: Support, between: Array, sphere: ViewSphere, views: int, config: ActiveVisionConfig
+) -> PointOfInterest:
+    """Where two objects meet, `between` (3,) [m] the middle of their centres."""
+    touch = support.contact_world if config.edge_point == "contact" else None
+    position = between if touch is None else touch
+    offset = position - sphere.centre_world
+    length = math.sqrt(offset @ offset)
+    direction = offset / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+    saliency = relation_saliency(support.occurrences, views, config)
+    why = f"{support.supporter} supports {support.supported}: found in {support.occurrences} of {views} views"
+    return PointOfInterest(position, direction, saliency, support.pair, why)

@@ -1,0 +1,247 @@
+"""An arm with a camera in its hand: which views of its sphere the hand reaches, and rolled how."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from caryatid.config import ArmConfig
+from caryatid.errors import InputError, PlanningError
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import fibonacci_sphere
+from caryatid.geometry.transforms import Array
+from caryatid.planning.candidates import Candidates
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import OwnViews, Posture, Unreachable
+from caryatid.sensing.view_sphere import ViewSphere
+
+Reachable = Callable[[Array], NDArray[np.bool_]]
+"""Which camera poses the hand reaches: `T_base_camera` (N, 4, 4) → (N,)."""
+
+REASONS = (
+    "the camera would be too low over the table",
+    "a wall stands in the line of sight",
+    "the hand does not reach there",
+)
+"""Why a view is refused; the first that applies counts."""
+
+UNCONFIRMED = "the arm cannot go there on a closer look"
+"""Why one is refused that seemed to be within reach."""
+
+
+class ArmRobot(OwnViews):
+    """An arm that stands still, in simulation or as the plan for a real one.
+
+    The views of its sphere look at the centre. Each is tried level first and then rolled about the optical
+    axis, nearest to level first, since a picture shows the same however it is turned and a wrist seldom holds
+    a camera level everywhere; the candidate is the pose with the first roll that the hand reaches.
+
+    The way to a view is the straight line between the camera's positions [m]. Between two views of one sphere
+    that is its diameter times sin(α/2), α the angle at the centre: the cost of eq. 3 of the paper.
+
+    Args:
+        reachable: Which poses the hand can bring the camera to, in the frame of the arm's base: inverse
+            kinematics of your own, or a `ReachabilityMap`. It answers for itself, not for the table.
+        T_world_base: Where the base is (4, 4).
+        config: Radii to choose among, rolls, clearance over the table.
+        confirm: Says of one pose (4, 4) in the frame of the base whether the arm can go there. It is asked
+            about a view before it is taken, and where it says no another one is chosen: for slow but exact
+            inverse kinematics, or a motion planner, behind a coarse map. None takes `reachable` for true.
+        centre_world: Centre (3,) of its view sphere [m], or None for the middle of the table top.
+        furniture: Knows the walls no view may look through, or None.
+        T_world_camera: Where its camera is (4, 4), or None while it has not been put anywhere; then any view
+            is reached by a way of length 0.
+
+    Raises:
+        InputError: A pose is no rigid transform.
+    """
+
+    def __init__(
+        self,
+        reachable: Reachable,
+        T_world_base: ArrayLike,
+        config: ArmConfig | None = None,
+        *,
+        confirm: Callable[[Array], bool] | None = None,
+        centre_world: ArrayLike | None = None,
+        furniture: FloorGrid | None = None,
+        T_world_camera: ArrayLike | None = None,
+    ) -> None:
+        self._reachable = reachable
+        self.T_world_base = transforms.as_rigid(T_world_base, "T_world_base")
+        self._config = config or ArmConfig()
+        self._centre = None if centre_world is None else np.array(centre_world, dtype=np.float64)
+        self._confirm = confirm
+        self._furniture = furniture
+        self._T_world_camera: Array | None = None
+        self._sphere: ViewSphere | None = None
+        self._offer: _Offer | None = None
+        if T_world_camera is not None:
+            self._T_world_camera = transforms.as_rigid(T_world_camera, "T_world_camera").copy()
+
+    @property
+    def T_world_camera(self) -> Array:
+        """Where the camera is now (4, 4).
+
+        Raises:
+            PlanningError: The arm has not been put anywhere.
+        """
+        if self._T_world_camera is None:
+            raise PlanningError("the camera is nowhere yet; move the arm to a first view")
+        return self._T_world_camera
+
+    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
+        """Choose the largest radius at which about as many views are within reach as at any other.
+
+        The points of the sphere are spread evenly in the frame of the base, so that the arm has the same
+        views wherever it and its table stand.
+        """
+        centre = proposed.centre_world if self._centre is None else self._centre
+        if self._sphere is None or not np.array_equal(self._sphere.centre_world, centre):
+            radius = self._radius_around(centre)
+            self._sphere = self._sphere_around(centre, radius, self._config.sphere_points)
+        return self._sphere
+
+    def solve(self, T_world_camera: Array, target_world: Array | None = None) -> Posture | Unreachable:
+        """Say how the arm would hold its camera at a pose, or why it cannot.
+
+        Args:
+            T_world_camera: Camera pose (4, 4), with the roll it has.
+            target_world: A point (3,) [m] on the table no wall may hide and over which the camera has to keep
+                clear, or None.
+
+        Returns:
+            The platform of the posture is the base; its yaw and pitch are where the camera looks.
+        """
+        T = transforms.as_rigid(T_world_camera, "T_world_camera")
+        code = int(self._refused(T[None], target_world)[0])
+        if code >= 0:
+            return Unreachable(REASONS[code])
+        if not self._reaches(T[None])[0]:
+            distance = float(np.linalg.norm(T[:3, 3] - self.T_world_base[:3, 3]))
+            turned = self._in_some_roll(T[None])[1][0]
+            how = "; rolled otherwise it does" if turned else ""
+            return Unreachable(f"{REASONS[2]}, {distance:.2f} m from the base{how}")
+        if (refused := self.confirm(T)) is not None:
+            return refused
+        x_base, forward = self.T_world_base[:3, 0], T[:3, 2]
+        base_yaw = float(np.arctan2(x_base[1], x_base[0]))
+        turn = float(np.arctan2(forward[1], forward[0])) - base_yaw
+        pitch = float(np.arcsin(np.clip(forward[2], -1.0, 1.0)))
+        base = np.array([*self.T_world_base[:2, 3], base_yaw])
+        return Posture(base, float(T[2, 3]), float(np.arctan2(np.sin(turn), np.cos(turn))), pitch)
+
+    def candidates(self, sphere: ViewSphere) -> Candidates:
+        """Return the views of the sphere within reach, clear of the table, that see its centre past walls.
+
+        They are found once for a sphere; then only the ways are.
+        """
+        if self._offer is None or self._offer.sphere is not sphere:
+            self._offer = _Offer(sphere, self._offered(sphere))
+        views = self._offer.candidates
+        return views.from_elsewhere(self._way(views.T_world_camera))
+
+    def confirm(self, T_world_camera: Array) -> Unreachable | None:
+        """Look closer whether the arm can go to a candidate (4, 4); None = it can."""
+        if self._confirm is None or self._confirm(transforms.invert(self.T_world_base) @ T_world_camera):
+            return None
+        return Unreachable(UNCONFIRMED)
+
+    def move_to(self, T_world_camera: Array) -> float:
+        """Go there and return the straight distance from where the camera was [m].
+
+        For a real arm: inherit, have the arm go there, and then call this.
+
+        Raises:
+            PlanningError: The hand does not reach the pose.
+        """
+        posture = self.solve(T_world_camera)
+        if isinstance(posture, Unreachable):
+            raise PlanningError(f"the camera cannot go to this view: {posture.reason}")
+        length = float(self._way(T_world_camera[None])[0])
+        self._T_world_camera = np.array(T_world_camera, dtype=np.float64)
+        return length
+
+    def _radius_around(self, centre_world: Array) -> float:
+        config = self._config
+        if config.radius[0] == config.radius[1]:
+            return config.radius[0]
+        radii = np.linspace(*config.radius, config.radii)
+        spheres = [self._sphere_around(centre_world, float(r), config.radius_views) for r in radii]
+        views = np.array([len(self._offered(sphere)) for sphere in spheres])
+        return float(radii[views >= config.radius_share * views.max()][-1])
+
+    def _sphere_around(self, centre_world: Array, radius: float, count: int) -> ViewSphere:
+        return ViewSphere(centre_world, radius, transforms.rotate(self.T_world_base, fibonacci_sphere(count)))
+
+    def _way(self, T_world_camera: Array) -> Array:
+        """Length (N,) [m] of the way to poses (N, 4, 4)."""
+        if self._T_world_camera is None:
+            return np.zeros(len(T_world_camera))
+        return np.linalg.norm(T_world_camera[:, :3, 3] - self._T_world_camera[:3, 3], axis=1)
+
+    def _offered(self, sphere: ViewSphere) -> Candidates:
+        poses = sphere.poses(sphere.directions)
+        code = self._refused(poses, sphere.centre_world)
+        left = np.flatnonzero(code < 0)
+        held, reached = self._in_some_roll(poses[left])
+        code[left[~reached]] = 2
+        counts = np.bincount(code + 1, minlength=len(REASONS) + 1)[1:]
+        rejected = {reason: int(n) for reason, n in zip(REASONS, counts, strict=True) if n}
+        good = left[reached]
+        return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
+
+    def _refused(self, T_world_camera: Array, target_world: Array | None) -> NDArray[np.intp]:
+        """Which reason the surroundings give against poses (N, 4, 4) looking at a target (3,), −1 = none."""
+        code = np.full(len(T_world_camera), -1)
+        if target_world is not None:
+            eyes = T_world_camera[:, :3, 3]
+            if self._furniture is not None:
+                code[self._furniture.hidden(eyes, target_world, self._config.table_margin)] = 1
+            code[eyes[:, 2] < target_world[2] + self._config.clearance] = 0
+        return code
+
+    def _in_some_roll(self, T_world_camera: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Roll poses (N, 4, 4) as little as the hand needs; return them, and which it reaches (N,)."""
+        held = T_world_camera.copy()
+        reached = np.zeros(len(held), dtype=np.bool_)
+        turns = np.arange(self._config.rolls) * (2.0 * np.pi / self._config.rolls)
+        turns = np.minimum(turns, 2.0 * np.pi - turns) * np.where(turns > np.pi, -1.0, 1.0)
+        for turn in turns[np.argsort(np.abs(turns), kind="stable")]:
+            left = np.flatnonzero(~reached)
+            if len(left) == 0:
+                break
+            rolled = T_world_camera[left]
+            if turn != 0.0:
+                rolled = rolled @ transforms.rigid(
+                    transforms.rotation_from_vector((0.0, 0.0, turn)), np.zeros(3)
+                )
+            found = self._reaches(rolled)
+            held[left[found]], reached[left[found]] = rolled[found], True
+        return held, reached
+
+    def _reaches(self, T_world_camera: Array) -> NDArray[np.bool_]:
+        """Ask which poses (N, 4, 4) the hand reaches (N,).
+
+        Raises:
+            InputError: The answer is not one bool a pose.
+        """
+        answer = np.asarray(self._reachable(transforms.invert(self.T_world_base) @ T_world_camera))
+        if answer.shape != (len(T_world_camera),) or answer.dtype != np.bool_:
+            raise InputError(
+                "reachable",
+                f"returned {answer.dtype} of shape {answer.shape} for {len(T_world_camera)} poses",
+                f"return bool of shape ({len(T_world_camera)},)",
+            )
+        return answer
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Offer:
+    """What can be reached of a sphere."""
+
+    sphere: ViewSphere
+    candidates: Candidates

@@ -1,0 +1,355 @@
+"""Which camera poses a robot can reach, how it would stand there, and how far the way is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import RobotConfig
+from caryatid.errors import PlanningError
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.planning.candidates import Candidates
+from caryatid.robots.floor import FloorGrid
+from caryatid.sensing.view_sphere import ViewSphere, direction
+
+REASONS = (
+    "the camera would be too low",
+    "the camera would be too high",
+    "the head pitch is beyond its limits",
+    "the camera would be rolled",
+    "the platform would stand outside the floor",
+    "the platform would stand in an obstacle",
+    "no path leads there",
+    "a wall stands in the line of sight",
+)
+"""Why a view is refused; the first that applies counts."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Posture:
+    """How the robot holds its camera at a pose.
+
+    Attributes:
+        platform_world: Platform (3,): x, y, yaw [m, m, rad].
+        camera_height: Height of the camera centre over the floor [m], set by the torso lift.
+        head_yaw: Against the platform, to the left [rad].
+        head_pitch: Upwards [rad].
+    """
+
+    platform_world: Array
+    camera_height: float
+    head_yaw: float
+    head_pitch: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unreachable:
+    """No posture.
+
+    Attributes:
+        reason: Why, for a person to read.
+    """
+
+    reason: str
+
+
+class Robot(Protocol):
+    """What carries the camera; one with views of its own is an `OwnViews` too."""
+
+    @property
+    def T_world_camera(self) -> Array:
+        """Where the camera is now (4, 4)."""
+        ...
+
+    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
+        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot.
+
+        Args:
+            T_world_camera: Pose of its camera (4, 4).
+        """
+        ...
+
+    def candidates(self, sphere: ViewSphere) -> Candidates:
+        """Return the views of the sphere that can be reached.
+
+        Args:
+            sphere: The view sphere.
+        """
+        ...
+
+    def move_to(self, T_world_camera: Array) -> float:
+        """Go there and return the length of the way [m].
+
+        Args:
+            T_world_camera: Pose of its camera (4, 4).
+
+        Raises:
+            PlanningError: The pose cannot be reached.
+        """
+        ...
+
+
+class OwnViews:
+    """What a robot may say beyond `Robot`: one that inherits this is asked, another is not."""
+
+    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
+        """Say on which sphere this robot's views lie: radius, centre and points.
+
+        What is asked twice, also about its own answer, is answered with the same sphere.
+
+        Args:
+            proposed: The sphere of the settings around the middle of the table top.
+
+        Returns:
+            The proposed one, unless a robot says otherwise.
+        """
+        return proposed
+
+    def confirm(self, T_world_camera: Array) -> Unreachable | None:
+        """Say why a candidate (4, 4) that was chosen cannot be taken after all; then another one is chosen.
+
+        Returns:
+            None, go ahead, unless a robot says otherwise.
+        """
+        return None
+
+
+class HumanoidRobot:
+    """A humanoid of ARMAR-6's kind in simulation: holonomic platform, torso lift, head with yaw and pitch.
+
+    Args:
+        floor: Where it may drive, and the furniture it knows of.
+        config: Its limits.
+        T_world_camera: Where its camera is (4, 4), or None while it has not been put anywhere; then any
+            place is reached by a way of length 0.
+
+    Raises:
+        PlanningError: It cannot stand at that pose.
+    """
+
+    def __init__(self, floor: FloorGrid, config: RobotConfig, T_world_camera: Array | None = None) -> None:
+        self._floor = floor
+        self._config = config
+        self._T_world_camera: Array | None = None
+        self._path_lengths = np.where(floor.free, 0.0, np.inf)
+        self._offer: _Offer | None = None
+        if T_world_camera is not None:
+            self.move_to(T_world_camera)
+
+    @property
+    def T_world_camera(self) -> Array:
+        """Where the camera is now (4, 4).
+
+        Raises:
+            PlanningError: The robot has not been put anywhere.
+        """
+        if self._T_world_camera is None:
+            raise PlanningError("the robot stands nowhere yet; move it to a first view")
+        return self._T_world_camera
+
+    def solve(self, T_world_camera: Array, target_world: Array | None = None) -> Posture | Unreachable:
+        """Say how the robot would stand with its camera at a pose, or why it cannot.
+
+        Args:
+            T_world_camera: Camera pose (4, 4).
+            target_world: A point (3,) [m] no wall may hide from there, or None.
+        """
+        T = transforms.as_rigid(T_world_camera, "T_world_camera")
+        reach = self._reach(T[None], target_world)
+        code = int(reach.code[0])
+        if code >= 0:
+            return Unreachable(REASONS[code] + self._figures(code, T))
+        return Posture(
+            reach.platform_world[0], float(T[2, 3]), float(reach.head_yaw[0]), float(reach.head_pitch[0])
+        )
+
+    def candidates(self, sphere: ViewSphere) -> Candidates:
+        """Return the views of the sphere that can be reached and see its centre past the furniture.
+
+        They are found anew for another sphere, or where ways lead to other places; else only the ways are.
+        """
+        lengths = self._path_lengths.ravel()
+        led_to = np.isfinite(lengths)
+        offer = self._offer
+        if offer is None or offer.sphere is not sphere or not np.array_equal(offer.led_to, led_to):
+            offer = self._offer = self._offered(sphere, led_to)
+        return offer.candidates.from_elsewhere(lengths[offer.cells])
+
+    def _offered(self, sphere: ViewSphere, led_to: NDArray[np.bool_]) -> _Offer:
+        height = sphere.positions_world[:, 2]
+        low, high = self._config.camera_height
+        indices = np.flatnonzero((height >= low) & (height <= high))
+        poses = sphere.poses(sphere.directions[indices])
+        reach = self._reach(poses, sphere.centre_world)
+        counts = np.bincount(reach.code + 1, minlength=len(REASONS) + 1)[1:]
+        counts[:2] += (height < low).sum(), (height > high).sum()
+        rejected = {reason: int(n) for reason, n in zip(REASONS, counts, strict=True) if n}
+        good = reach.code < 0
+        cells = reach.cell[good]
+        lengths = self._path_lengths.ravel()[cells]
+        candidates = Candidates(
+            poses[good], sphere.directions[indices[good]], lengths, rejected, indices[good]
+        )
+        return _Offer(sphere, led_to, candidates, cells)
+
+    def move_to(self, T_world_camera: Array) -> float:
+        """Go there and return the length of the way over the floor [m].
+
+        Raises:
+            PlanningError: The pose cannot be reached.
+        """
+        posture = self.solve(T_world_camera)
+        if isinstance(posture, Unreachable):
+            raise PlanningError(f"the robot cannot go to this view: {posture.reason}")
+        cell, _ = self._floor.cells(posture.platform_world[None])
+        length = float(self._path_lengths.ravel()[cell[0]])
+        self._path_lengths = self._floor.path_lengths(posture.platform_world)
+        self._T_world_camera = np.array(T_world_camera, dtype=np.float64)
+        return length
+
+    def _reach(self, T_world_camera: Array, target_world: Array | None) -> _Reach:
+        """Find platform and gaze for poses (N, 4, 4), trying head yaws from straight ahead outwards."""
+        config = self._config
+        eyes = T_world_camera[:, :3, 3]
+        right, forward = T_world_camera[:, :3, 0], T_world_camera[:, :3, 2]
+        roll = np.arctan2(np.abs(right[:, 2]), -T_world_camera[:, 2, 1])
+        level = np.hypot(forward[:, 0], forward[:, 1]) < 1e-6
+        roll = np.where(level, np.arcsin(np.clip(np.abs(right[:, 2]), 0.0, 1.0)), roll)
+        pitch = np.arcsin(np.clip(forward[:, 2], -1.0, 1.0))
+        # Without roll the right axis is level: it gives the heading even where the view is straight down.
+        heading = np.arctan2(right[:, 0], -right[:, 1])
+
+        yaws = np.deg2rad(np.linspace(*config.yaw, config.head_yaws))
+        yaws = yaws[np.argsort(np.abs(yaws), kind="stable")]
+        lengths = self._path_lengths.ravel()
+        quality, best = np.full(len(eyes), -1), np.zeros(len(eyes), dtype=np.intp)
+        cell = np.zeros(len(eyes), dtype=np.intp)
+        left = np.arange(len(eyes))
+        for n, head_yaw in enumerate(yaws):
+            found, here = self._standing(eyes[left], heading[left] - head_yaw, lengths)
+            better = found > quality[left]
+            rows = left[better]
+            quality[rows], best[rows], cell[rows] = found[better], n, here[better]
+            left = left[quality[left] < 3]
+
+        tolerance = 1e-9
+        tests = (
+            eyes[:, 2] < config.camera_height[0] - tolerance,
+            eyes[:, 2] > config.camera_height[1] + tolerance,
+            (pitch < np.deg2rad(config.pitch[0]) - tolerance)
+            | (pitch > np.deg2rad(config.pitch[1]) + tolerance),
+            roll > np.deg2rad(config.max_roll),
+            quality == 0,
+            quality == 1,
+            quality == 2,
+            np.zeros(len(eyes), dtype=np.bool_)
+            if target_world is None
+            else self._floor.hidden(eyes, target_world, config.table_margin),
+        )
+        refused = np.stack(tests)
+        code = np.where(refused.any(axis=0), refused.argmax(axis=0), -1)
+        head_yaw = yaws[best]
+        yaw = heading - head_yaw
+        platform_world = np.column_stack([eyes[:, :2] - self._forward(yaw), _wrap(yaw)])
+        return _Reach(code, platform_world, head_yaw, pitch, cell)
+
+    def _standing(
+        self, eyes_world: Array, yaw: Array, lengths: Array
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """How well the platform stands with a yaw (N,), from 0 outside the floor to 3, and in which cell."""
+        cell, inside = self._floor.cells(eyes_world[:, :2] - self._forward(yaw))
+        free = self._floor.free.ravel()[cell] & inside
+        return inside.astype(np.intp) + free + (free & np.isfinite(lengths[cell])), cell
+
+    def _forward(self, yaw: Array) -> Array:
+        """How far (N, 2) [m] the camera stands before the platform's centre with a yaw (N,)."""
+        return self._config.camera_forward * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+
+    def _figures(self, code: int, T_world_camera: Array) -> str:
+        """The numbers behind a reason."""
+        low, high = self._config.camera_height
+        pitch = np.rad2deg(np.arcsin(np.clip(T_world_camera[2, 2], -1.0, 1.0)))
+        match code:
+            case 0 | 1:
+                return f": {T_world_camera[2, 3]:.2f} m, it reaches {low:.2f}…{high:.2f} m"
+            case 2:
+                down, up = self._config.pitch
+                return f": {pitch:.0f}°, it reaches {down:.0f}…{up:.0f}°"
+            case 4 | 5 | 6:
+                return f" at x = {T_world_camera[0, 3]:.2f} m, y = {T_world_camera[1, 3]:.2f} m"
+        return ""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Reach:
+    """Reachability of N poses: index of the reason or −1, platform, gaze, and the cell it stands in."""
+
+    code: NDArray[np.intp]
+    platform_world: Array
+    head_yaw: Array
+    head_pitch: Array
+    cell: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Offer:
+    """What can be reached of a sphere while ways lead to the same cells, and the cell of each view (N,)."""
+
+    sphere: ViewSphere
+    led_to: NDArray[np.bool_]
+    candidates: Candidates
+    cells: NDArray[np.intp]
+
+
+def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
+    """Return the sphere a robot's views lie on: its own where it has one, else the proposed.
+
+    Args:
+        robot: Is asked where it inherits `OwnViews`.
+        proposed: The sphere of the settings around the middle of the table top.
+    """
+    return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
+
+
+def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
+    """Why a robot, looking closer where it can, does not take a candidate (4, 4), or None.
+
+    Args:
+        robot: Is asked where it inherits `OwnViews`.
+        T_world_camera: The candidate (4, 4).
+    """
+    return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
+
+
+def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
+    """Pick the first view: the reachable candidate (4, 4) nearest to `config.home` on its view sphere.
+
+    Args:
+        robot: Says what it can reach.
+        sphere: What it is proposed.
+        config: Where the first view is to be.
+
+    Raises:
+        PlanningError: No view of the sphere can be reached.
+    """
+    candidates = robot.candidates(view_sphere_of(robot, sphere))
+    if len(candidates) == 0:
+        why = ", ".join(f"{reason} ({count})" for reason, count in candidates.rejected.items())
+        raise PlanningError(f"no view of the sphere can be reached: {why}")
+    nearness = candidates.directions @ direction(*np.deg2rad(config.home))
+    reasons: set[str] = set()
+    for index in np.argsort(-nearness, kind="stable"):
+        refused = refusal_of(robot, candidates.T_world_camera[index])
+        if refused is None:
+            return candidates.T_world_camera[index]
+        reasons.add(refused.reason)
+    raise PlanningError(f"no view of the sphere can be reached: {', '.join(sorted(reasons))}")
+
+
+def _wrap(angle: Array) -> Array:
+    """Bring angles into [−π, π) [rad]."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi

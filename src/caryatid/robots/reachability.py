@@ -1,0 +1,163 @@
+"""Where an arm can hold its camera: a map of positions, directions and rolls, sampled from its joints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from caryatid.config import ArmConfig
+from caryatid.errors import InputError
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import fibonacci_sphere
+from caryatid.geometry.transforms import Array
+
+Forward = Callable[[Array], Array]
+"""Forward kinematics: joints (N, J) [rad, or m] → `T_base_camera` (N, 4, 4)."""
+
+ROLLS = 8
+"""Rolls a map tells apart: the bits of a byte, 45° each."""
+
+CHUNK = 100_000
+"""Postures that are sampled at a time at the most: 13 MB of poses."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ReachabilityMap:
+    """In which cells, looking which way, and rolled how an arm has been seen to hold its camera.
+
+    A camera looks the same way however it is rolled, so a cell and a direction have one byte, and each of its
+    bits is an eighth of a turn about the optical axis. Who needs a view from there takes the roll that was
+    reached; who asks for a pose is told about its own roll.
+
+    Attributes:
+        reached: Rolls (X, Y, Z, D) uint8 by cell and by the nearest of D directions all over the sphere.
+        origin_base: Lowest corner (3,) of the cells in the frame of the base [m].
+        cell: Edge of a cell [m].
+        fresh: Share of the last samples, at most a tenth of all, that were the first in their cell and
+            direction [1]; so much of what such an arm can reach is about missing in the map.
+    """
+
+    reached: NDArray[np.uint8]
+    origin_base: Array
+    cell: float
+    fresh: float
+
+    def __call__(self, T_base_camera: Array) -> NDArray[np.bool_]:
+        """Which camera poses (N, 4, 4) lie in a cell, direction and roll that was reached (N,)."""
+        cells = np.floor((T_base_camera[:, :3, 3] - self.origin_base) / self.cell).astype(np.intp)
+        shape = np.array(self.reached.shape[:3])
+        inside = np.logical_and.reduce((cells >= 0) & (cells < shape), axis=1)
+        x, y, z = np.where(inside[:, None], cells, 0).T
+        directions, bits = _Bins(self.reached.shape[3]).of(T_base_camera)
+        return inside & ((self.reached[x, y, z, directions] & bits) != 0)
+
+
+def sample_reachability(
+    forward: Forward,
+    limits: ArrayLike,
+    count: int,
+    rng: np.random.Generator,
+    config: ArmConfig | None = None,
+) -> ReachabilityMap:
+    """Map where an arm brings its camera, from postures drawn evenly between the limits of its joints.
+
+    Args:
+        forward: Forward kinematics up to the camera's optical frame (x right, y down, z forward): with the
+            transform from hand to camera. Postures in which the arm meets itself or its surroundings may be
+            given as NaN; they are left out.
+        limits: Lowest and highest value (J, 2) of each joint [rad, or m].
+        count: Postures to draw [1]; see `ReachabilityMap.fresh` whether they were enough.
+        rng: Draws them.
+        config: Size of cells and number of directions.
+
+    Raises:
+        InputError: Limits, count or what `forward` returns are not as they should be.
+    """
+    config = config or ArmConfig()
+    bounds = np.asarray(limits, dtype=np.float64)
+    if bounds.ndim != 2 or bounds.shape[1] != 2 or len(bounds) == 0 or not np.isfinite(bounds).all():
+        raise InputError("limits", f"shape {bounds.shape} is not (J, 2) of finite numbers", "give low, high")
+    crossed = np.flatnonzero(bounds @ (1.0, -1.0) > 0.0)
+    if len(crossed):
+        raise InputError("limits", f"joint {crossed[0]} begins above its end", "give the lowest value first")
+    if count < 1:
+        raise InputError("count", f"{count} postures make no map", "draw some hundred thousand")
+    bins = _Bins(config.view_directions)
+    reached = np.zeros((0, 0, 0, config.view_directions), dtype=np.uint8)
+    low = np.zeros(3, dtype=np.intp)
+    fresh = 1.0
+    chunk = min(CHUNK, -(-count // 10))
+    for start in range(0, count, chunk):
+        joints = rng.uniform(bounds[:, 0], bounds[:, 1], (min(chunk, count - start), len(bounds)))
+        T_base_camera = _checked(forward(joints), len(joints))
+        if len(T_base_camera) == 0:
+            continue
+        cells = np.floor(T_base_camera[:, :3, 3] / config.cell).astype(np.intp)
+        reached, low = _grown(reached, low, cells.min(axis=0), cells.max(axis=0) + 1)
+        directions, bits = bins.of(T_base_camera)
+        x, y, z = (cells - low).T
+        fresh = float((reached[x, y, z, directions] == 0).mean())
+        np.bitwise_or.at(reached, (x, y, z, directions), bits)
+    if not reached.any():
+        raise InputError("forward", "holds no posture possible, all are NaN", "check it and the limits")
+    return ReachabilityMap(reached, low.astype(np.float64) * config.cell, config.cell, fresh)
+
+
+class _Bins:
+    """The bins of directions (D) and rolls.
+
+    A roll is measured from a vector at right angles to the middle of its direction's bin, not from the
+    level: so it does not turn about itself where the camera looks straight up or down.
+    """
+
+    def __init__(self, count: int) -> None:
+        directions = fibonacci_sphere(count)
+        self._tree = KDTree(directions)
+        self._right = transforms.perpendicular(directions)
+        self._down = np.cross(directions, self._right)
+
+    def of(self, T_base_camera: Array) -> tuple[NDArray[np.intp], NDArray[np.uint8]]:
+        """Bin (N,) of the viewing direction, and bit (N,) of the roll of poses (N, 4, 4)."""
+        nearest = self._tree.query(T_base_camera[:, :3, 2])[1]
+        right = T_base_camera[:, :3, 0]
+        x = np.einsum("ij,ij->i", right, self._right[nearest])
+        y = np.einsum("ij,ij->i", right, self._down[nearest])
+        eighth = np.floor(np.arctan2(y, x) * (ROLLS / (2.0 * np.pi))).astype(np.intp) % ROLLS
+        return nearest, np.left_shift(1, eighth).astype(np.uint8)
+
+
+def _checked(T_base_camera: ArrayLike, count: int) -> Array:
+    """Poses (M, 4, 4) of the postures that are possible.
+
+    Raises:
+        InputError: There are not as many poses as postures, or they are no rigid transforms.
+    """
+    poses = np.asarray(T_base_camera, dtype=np.float64)
+    if poses.shape != (count, 4, 4):
+        raise InputError(
+            "forward", f"returned shape {poses.shape} for {count} postures", f"return ({count}, 4, 4)"
+        )
+    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
+    R = poses[:, :3, :3]
+    skewed = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2), initial=0.0)
+    odd = (skewed > transforms.RIGID_TOLERANCE) | (np.linalg.det(R) < 0.0)
+    if odd.any():
+        transforms.as_rigid(poses[int(np.argmax(odd))], "forward")
+    return poses
+
+
+def _grown(
+    reached: NDArray[np.uint8], low: NDArray[np.intp], least: NDArray[np.intp], end: NDArray[np.intp]
+) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+    """Make room for cells from `least` (3,) to before `end` (3,); return the map and its lowest cell (3,)."""
+    if reached.size == 0:
+        return np.zeros((*(end - least), reached.shape[3]), dtype=np.uint8), least
+    before = np.maximum(low - least, 0)
+    after = np.maximum(end - low - reached.shape[:3], 0)
+    if not (before.any() or after.any()):
+        return reached, low
+    return np.pad(reached, [*zip(before, after, strict=True), (0, 0)]), low - before

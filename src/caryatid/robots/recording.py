@@ -1,0 +1,94 @@
+"""A robot that plays a recording back: its camera can only be where a recorded view is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from caryatid.errors import InputError, PlanningError
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.planning.candidates import Candidates
+from caryatid.robots.humanoid import Posture, Unreachable
+from caryatid.sensing.view_sphere import ViewSphere
+
+SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3
+"""Poses nearer than this [m], [rad] are the same recorded view."""
+
+
+class RecordingRobot:
+    """Reaches each view of a recording once.
+
+    Args:
+        T_world_cameras: The recorded poses (N, 4, 4).
+        start: Index of the view it begins at.
+
+    Raises:
+        InputError: There is no recorded pose, or `start` is not one of them.
+    """
+
+    def __init__(self, T_world_cameras: Array | Sequence[Array], start: int = 0) -> None:
+        self._recorded = np.array(T_world_cameras, dtype=np.float64).reshape(-1, 4, 4)
+        if not 0 <= start < len(self._recorded):
+            raise InputError(
+                "recording", f"has no view {start} of {len(self._recorded)}", "give poses to be at"
+            )
+        self._used = [start]
+
+    @property
+    def T_world_camera(self) -> Array:
+        """Where the camera is now (4, 4)."""
+        return self._recorded[self._used[-1]]
+
+    def index_of(self, T_world_camera: Array) -> int | None:
+        """Which recorded view has this pose (4, 4); of several the first that has not been used."""
+        distance = np.linalg.norm(self._recorded[:, :3, 3] - T_world_camera[:3, 3], axis=-1)
+        cosine = (np.einsum("nij,ij->n", self._recorded[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
+        angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+        same = np.flatnonzero((distance <= SAME_POSITION) & (angle <= SAME_ANGLE))
+        unused = [int(i) for i in same if i not in self._used]
+        return unused[0] if unused else (int(same[0]) if len(same) else None)
+
+    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
+        """Say where the recording's camera was, or that it has not been at a pose (4, 4)."""
+        T = transforms.as_rigid(T_world_camera, "T_world_camera")
+        index = self.index_of(T)
+        if index is None:
+            nearest = float(np.linalg.norm(self._recorded[:, :3, 3] - T[:3, 3], axis=-1).min())
+            return Unreachable(
+                f"the recording has no view from there; the nearest of its {len(self._recorded)} views is "
+                f"{nearest:.2f} m away"
+            )
+        if index in self._used:
+            return Unreachable(f"view {index} of the recording has already been used")
+        forward = T[:3, 2]
+        yaw = float(np.arctan2(forward[1], forward[0]))
+        pitch = float(np.arcsin(np.clip(forward[2], -1.0, 1.0)))
+        return Posture(np.array([T[0, 3], T[1, 3], yaw]), float(T[2, 3]), 0.0, pitch)
+
+    def candidates(self, sphere: ViewSphere) -> Candidates:
+        """Return the recorded views that have not been used; the way is the straight line between cameras."""
+        left = np.setdiff1d(np.arange(len(self._recorded)), self._used)
+        poses = self._recorded[left]
+        way = np.linalg.norm(poses[:, :3, 3] - self.T_world_camera[:3, 3], axis=-1)
+        rejected = {
+            "already used": len(self._used),
+            "the recording has no view from there": len(sphere.directions),
+        }
+        return Candidates(poses, sphere.direction_of(poses), way, rejected)
+
+    def move_to(self, T_world_camera: Array) -> float:
+        """Go on to a recorded view and return the straight distance [m].
+
+        Raises:
+            PlanningError: The recording has no such view, or it has been used.
+        """
+        posture = self.solve(T_world_camera)
+        if isinstance(posture, Unreachable):
+            raise PlanningError(f"the camera cannot go to this view: {posture.reason}")
+        index = self.index_of(T_world_camera)
+        assert index is not None
+        length = float(np.linalg.norm(self._recorded[index, :3, 3] - self.T_world_camera[:3, 3]))
+        self._used.append(index)
+        return length

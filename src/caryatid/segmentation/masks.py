@@ -1,0 +1,87 @@
+"""From the masks of a learned segmenter to the label image a view takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from caryatid.config import MaskConfig
+from caryatid.errors import InputError
+from caryatid.sensing.views import SUPPORT_LABEL
+
+Masks = NDArray[np.bool_]
+
+
+def labels_from_masks(
+    masks: ArrayLike | Sequence[ArrayLike],
+    scores: ArrayLike | None = None,
+    config: MaskConfig | None = None,
+) -> NDArray[np.int32]:
+    """Lay masks that may overlap over each other, the smallest on top, into one label image.
+
+    Masks that are too small, as large as a background, doubted by the segmenter, or another mask once more
+    are left out; of two that are the same the one with the better score stays, without scores the first.
+
+    Args:
+        masks: N masks (N, H, W), or a sequence of (H, W): true where the object is.
+        scores: The segmenter's confidence in each mask (N,), or None where it gives none.
+        config: What is left out.
+
+    Returns:
+        Label image (H, W) int32: k where mask k − 1 is on top, 0 where none is.
+
+    Raises:
+        InputError: The masks are no stack of images of one size, hold other values than true and false, or
+            are more than labels; or there is not one finite score a mask.
+    """
+    config = config or MaskConfig()
+    stack = _stack(masks)
+    quality = _scores(scores, len(stack))
+    pixels = stack.sum(axis=(1, 2))
+    kept = (pixels >= config.min_pixels) & (pixels <= config.max_share * stack[0].size)
+    kept &= quality >= config.min_score
+    chosen: list[int] = []
+    for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: (-quality[k], k)):
+        if all(_iou(stack[k], stack[other]) <= config.same for other in chosen):
+            chosen.append(k)
+    labels = np.zeros(stack.shape[1:], dtype=np.int32)
+    for k in sorted(chosen, key=lambda k: (-pixels[k], k)):
+        labels[stack[k]] = k + 1
+    left = np.bincount(labels.ravel(), minlength=len(stack) + 1)
+    labels[left[labels] < config.min_pixels] = 0
+    return labels
+
+
+def _stack(masks: ArrayLike | Sequence[ArrayLike]) -> Masks:
+    try:
+        stack = np.asarray(masks)
+    except ValueError:
+        raise InputError("masks", "differ in size", "give masks of the size of the depth image") from None
+    if stack.ndim != 3 or 0 in stack.shape:
+        raise InputError("masks", f"have shape {stack.shape}", "give a stack (N, H, W) of at least one mask")
+    if len(stack) >= SUPPORT_LABEL:
+        raise InputError("masks", f"are {len(stack)}", f"give fewer than {SUPPORT_LABEL}")
+    if stack.dtype != np.bool_:
+        values = np.unique(stack)
+        if not np.isin(values, (0, 1)).all() and not np.isin(values, (0, 255)).all():
+            raise InputError("masks", "hold values beside true and false", "threshold them first: masks > 0")
+    return stack.astype(bool)
+
+
+def _scores(scores: ArrayLike | None, count: int) -> NDArray[np.float64]:
+    if scores is None:
+        return np.full(count, np.inf)
+    quality = np.asarray(scores, dtype=np.float64)
+    if quality.shape != (count,) or not np.isfinite(quality).all():
+        raise InputError(
+            "scores",
+            f"have shape {quality.shape} or hold NaN for {count} masks",
+            "give one finite score a mask, or none at all",
+        )
+    return quality
+
+
+def _iou(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
+    return float((first & second).sum() / max((first | second).sum(), 1))

@@ -1,0 +1,234 @@
+"""From one view or cloud to labelled, oriented points in the world, and the support surface among them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import Config, SegmentationMethod, SurfaceConfig
+from caryatid.errors import InputError, PerceptionError
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.segmentation.segments import segment, segment_cloud
+from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
+from caryatid.sensing.clouds import oriented_points
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+
+UP = np.array([0.0, 0.0, 1.0])
+"""The world's vertical (3,)."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Percept:
+    """What one view shows.
+
+    Attributes:
+        view: The view, posed; None where the source was a cloud.
+        cloud: Oriented points in the world frame with labels: 0 nothing, 65535 the support surface.
+        pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
+        surface: The support surface as this view shows it.
+    """
+
+    view: View | None
+    cloud: Cloud
+    pixels: NDArray[np.intp]
+    surface: SupportSurface
+
+    @property
+    def labels(self) -> NDArray[np.int32]:
+        """Label (N,) of each point."""
+        if self.cloud.labels is None:
+            raise ValueError("a percept's cloud is labelled")
+        return self.cloud.labels
+
+    @property
+    def shown(self) -> list[int]:
+        """Labels that points carry, each once, in ascending order."""
+        last_of_run = np.append(self.labels[1:] != self.labels[:-1], True)[: len(self.labels)]
+        labels: list[int] = np.unique(self.labels[last_of_run]).tolist()
+        return labels
+
+    def relabelled(self, names: dict[int, int]) -> Percept:
+        """Return the percept with some labels changed: old → new."""
+        if not names:
+            return self
+        labels = self.labels.copy()
+        for old, new in names.items():
+            labels[self.labels == old] = new
+        return self.with_labels(labels)
+
+    def with_labels(self, labels: NDArray[np.int32]) -> Percept:
+        """Return the percept with other labels (N,)."""
+        return replace(self, cloud=replace(self.cloud, labels=labels))
+
+    def moved(self, T: Array) -> Percept:
+        """Return the percept moved by a rigid transform (4, 4) of the world."""
+        view = None if self.view is None else self.view.with_pose(T @ self.view.pose)
+        return replace(self, view=view, cloud=self.cloud.moved(T), surface=self.surface.moved(T))
+
+
+def perceive(
+    source: View | Cloud,
+    config: Config,
+    *,
+    segmentation: SegmentationMethod | None,
+    known: SupportSurface | None,
+    rng: np.random.Generator,
+) -> Percept:
+    """Find the support surface and the parts on it.
+
+    Args:
+        source: A view (only the first one may lack a pose: the table then gives it one) or a cloud, z up.
+        config: All stages' settings.
+        segmentation: `labels` demands labels, `auto` ignores them, None takes them where they are given.
+        known: The support surface as known before, or None.
+        rng: Source of the samples.
+
+    Raises:
+        InputError: Labels are demanded and missing, or a later view has no pose.
+        PerceptionError: There are no readings, or no support surface.
+    """
+    if segmentation == "labels" and source.labels is None:
+        raise InputError(source.name, "has no labels", "give masks, or segment with --segmentation auto")
+    use_labels = source.labels is not None and segmentation != "auto"
+    if isinstance(source, View) and source.T_world_camera is None:
+        if known is not None:
+            raise InputError(source.name, "has no camera pose", "only a single view may come without one")
+        source = levelled(source, config, rng, use_labels=use_labels)
+    cloud, pixels = _points(source, config, known)
+    given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
+    surface = _surface(cloud, given, known, UP, config, rng)
+    if given is not None:
+        labels = given
+    elif isinstance(source, View):
+        labels = segment(source, surface, config.segmentation, config.cloud, config.fit, rng).ravel()[pixels]
+    else:
+        labels = segment_cloud(cloud, surface, config.segmentation)
+    reach = config.surface.tolerance
+    on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
+    labels = np.where(on_surface, np.int32(SUPPORT_LABEL), labels)
+    view = source if isinstance(source, View) else None
+    return Percept(view, replace(cloud, labels=labels), pixels, surface)
+
+
+def level_cloud(
+    cloud: Cloud, config: Config, *, segmentation: SegmentationMethod | None, rng: np.random.Generator
+) -> Cloud:
+    """Move a cloud from its sensor's frame into the world frame of its support plane.
+
+    Args:
+        cloud: The points, in the frame of their sensor.
+        config: How the plane is found.
+        segmentation: `auto` ignores labels.
+        rng: For every random choice.
+
+    Raises:
+        PerceptionError: There are no points, or no support surface.
+    """
+    if len(cloud) == 0:
+        raise PerceptionError(f"{cloud.name}: holds no points")
+    given = None if segmentation == "auto" else cloud.labels
+    surface = _surface(cloud, given, None, None, config, rng)
+    T = transforms.level_world(surface.normal_world, surface.point_world)
+    return cloud.moved(T)
+
+
+def label_image(percept: Percept, source: View | Cloud) -> NDArray[np.int32]:
+    """Labels of all pixels (H, W) of a view, or of all points (N,) of a cloud."""
+    labels = percept.labels
+    shape = source.depth.shape if isinstance(source, View) else (len(source),)
+    image = np.zeros(shape, dtype=np.int32)
+    image.ravel()[percept.pixels] = labels
+    return image
+
+
+def _points(
+    source: View | Cloud, config: Config, known: SupportSurface | None = None
+) -> tuple[Cloud, NDArray[np.intp]]:
+    """Oriented points of a view, and their pixels; of a cloud, all there are.
+
+    What is further below the known support surface than that may be sought is left out.
+    """
+    if isinstance(source, Cloud):
+        if len(source) == 0:
+            raise PerceptionError(f"{source.name}: holds no points")
+        return source, np.arange(len(source), dtype=np.intp)
+    among = None if known is None else _not_below(source, known, config.surface.search)
+    points, normals, pixels = oriented_points(source, config.cloud, among=among)
+    if len(points) == 0:
+        limits = f"{config.cloud.min_depth:g}–{config.cloud.max_depth:g} m"
+        raise PerceptionError(f"{source.name}: holds no depth readings within {limits}")
+    rgb = None if source.rgb is None else np.take(source.rgb.reshape(-1, 3), pixels, axis=0)
+    eye = None if source.T_world_camera is None else source.T_world_camera[:3, 3]
+    return Cloud(points, normals, None, rgb, eye, source.name), pixels
+
+
+def _not_below(view: View, surface: SupportSurface, depth: float) -> NDArray[np.bool_] | None:
+    """Pixels (H, W) that are labelled, or not this far [m] below a surface; None where there are none."""
+    x, y, z = transforms.rotate(transforms.invert(view.pose), surface.normal_world).astype(np.float32)
+    rows, columns = (np.arange(n, dtype=np.float32) for n in view.depth.shape)
+    across = x * (columns - np.float32(view.K[0, 2])) / np.float32(view.K[0, 0])
+    along = y * (rows - np.float32(view.K[1, 2])) / np.float32(view.K[1, 1]) + z
+    height = view.depth * (across + along[:, None])
+    among = (height > np.float32(-depth - surface.height(view.pose[:3, 3]))) & view.valid
+    if view.labels is not None:
+        among |= view.labels > 0
+    return among if among.any() else None
+
+
+def levelled(view: View, config: Config, rng: np.random.Generator, *, use_labels: bool = False) -> View:
+    """Give a view without a pose the world frame of its support plane.
+
+    Args:
+        view: Without a pose.
+        config: How points and planes are found.
+        rng: Draws the hypotheses.
+        use_labels: Leave out what belongs to a labelled object.
+
+    Raises:
+        PerceptionError: There are no readings, or no support surface.
+    """
+    cloud, pixels = _points(view, config)
+    given = np.take(view.labels, pixels) if use_labels and view.labels is not None else None
+    surface = _surface(cloud, given, None, None, config, rng)
+    return view.with_pose(transforms.level_world(surface.normal_world, surface.point_world))
+
+
+def _surface(
+    cloud: Cloud,
+    given: NDArray[np.int32] | None,
+    known: SupportSurface | None,
+    up: Array | None,
+    config: Config,
+    rng: np.random.Generator,
+) -> SupportSurface:
+    """Find the support surface in points that belong to no given object: near the known one, or anywhere."""
+    loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
+    if known is None and not loose.any():
+        raise PerceptionError(
+            f"{cloud.name}: every point has the label of an object, none is left for the table; give the "
+            "table label 0 (of a cloud --label-divisor may do so), or use --segmentation auto"
+        )
+    if known is None:
+        return _found(_spread(cloud, loose, config.surface.max_points), up, config.surface, rng)
+    near = np.abs(known.height(cloud.points_world)) < config.surface.search
+    try:
+        largest = replace(config.surface, planes=1)
+        return _found(_spread(cloud, loose & near, config.surface.max_points_known), up, largest, rng)
+    except PerceptionError:
+        return known
+
+
+def _spread(cloud: Cloud, among: NDArray[np.bool_], count: int) -> Cloud:
+    """About this many, and less than twice as many, of some points (N,), spread evenly."""
+    index = np.flatnonzero(among)
+    return cloud.select(index[:: max(1, len(index) // count)])
+
+
+def _found(cloud: Cloud, up: Array | None, config: SurfaceConfig, rng: np.random.Generator) -> SupportSurface:
+    try:
+        return find_support_surface(cloud.points_world, cloud.normals_world, up, config, rng)
+    except PerceptionError as error:
+        raise PerceptionError(f"{cloud.name}: {error}") from None

@@ -1,0 +1,102 @@
+"""The view sphere: possible camera positions around the scene, all looking at its centre (section IV)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import fibonacci_sphere
+from caryatid.geometry.transforms import Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ViewSphere:
+    """Evenly spread view points around a centre.
+
+    Attributes:
+        centre_world: Centre (3,) [m]: the centroid of the table-top segment of the first view.
+        radius: Distance of the views from the centre [m].
+        directions: Unit vectors (N, 3) from the centre to the views.
+    """
+
+    centre_world: Array
+    radius: float
+    directions: Array
+
+    @classmethod
+    def around(cls, centre_world: ArrayLike, config: ActiveVisionConfig) -> ViewSphere:
+        """Build the sphere of `config.sphere_points` views around a point.
+
+        Args:
+            centre_world: The centre (3,) [m].
+            config: Radius and number of views.
+        """
+        centre = np.array(centre_world, dtype=np.float64)
+        return cls(centre, config.sphere_radius, fibonacci_sphere(config.sphere_points))
+
+    @property
+    def positions_world(self) -> Array:
+        """Camera positions (N, 3) [m]."""
+        return self.centre_world + self.radius * self.directions
+
+    def poses(self, directions: Array) -> Array:
+        """Camera poses that look at the centre without roll.
+
+        Straight above and below, where that leaves the roll open, the image's top points along world +x.
+
+        Args:
+            directions: Unit vectors (M, 3) from the centre.
+
+        Returns:
+            `T_world_camera` (M, 4, 4).
+        """
+        forward = -directions
+        right = np.stack([forward[:, 1], -forward[:, 0], np.zeros(len(forward))], axis=-1)
+        vertical = np.linalg.norm(right, axis=-1) < 1e-6
+        if vertical.any():
+            right[vertical] = np.cross(forward[vertical], (1.0, 0.0, 0.0))
+        right = transforms.unit(right)
+        T_world_camera = np.zeros((len(directions), 4, 4))
+        T_world_camera[:, :3, 0] = right
+        for n in range(3):
+            a, b = (n + 1) % 3, (n + 2) % 3
+            T_world_camera[:, n, 1] = forward[:, a] * right[:, b] - forward[:, b] * right[:, a]
+        T_world_camera[:, :3, 2] = forward
+        T_world_camera[:, :3, 3] = self.centre_world + self.radius * directions
+        T_world_camera[:, 3, 3] = 1.0
+        return T_world_camera
+
+    def direction_of(self, T_world_camera: Array) -> Array:
+        """Unit vectors (..., 3) from the centre to cameras (..., 4, 4), wherever they are."""
+        return transforms.unit(T_world_camera[..., :3, 3] - self.centre_world)
+
+
+def spread(direction_from: Array, directions: Array, sigma: float) -> Array:
+    """Fall off with the angle: exp(−angle² / 2σ²), a Gaussian on the sphere.
+
+    Args:
+        direction_from: Unit vectors (K, 3) of the bumps' tops, where the value is 1.
+        directions: Unit vectors (M, 3).
+        sigma: Angle at which the value has fallen to exp(−½) [rad].
+
+    Returns:
+        (M, K).
+    """
+    angle = np.arccos(np.clip(directions @ direction_from.T, -1.0, 1.0))
+    return np.exp(-0.5 * (angle / sigma) ** 2)
+
+
+def direction(azimuth: float, elevation: float) -> Array:
+    """Unit vector (3,) with an azimuth and an elevation.
+
+    Args:
+        azimuth: From +x towards +y [rad].
+        elevation: Over the horizontal [rad].
+    """
+    return np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )

@@ -1,0 +1,209 @@
+"""What a camera gives: one registered RGB-D view, and the oriented points in it."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.errors import InputError
+from caryatid.geometry import points as kernels
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.runtime.display import Pictured
+
+SUPPORT_LABEL = 65535
+"""The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
+
+
+@dataclass(frozen=True, eq=False)
+class View(Pictured):
+    """One registered RGB-D view.
+
+    Attributes:
+        depth: Depth along the optical axis (H, W) [m]; 0 or NaN = no reading.
+        K: Pinhole matrix (3, 3) [px].
+        T_world_camera: Camera pose (4, 4), OpenCV camera frame, or None where it is not known.
+        rgb: Colour (H, W, 3) uint8, or None.
+        labels: Object number of each pixel (H, W), 0 = nothing, or None where no segmentation is given.
+        normals_camera: Surface normals (H, W, 3) in the camera frame, or None to estimate them from depth.
+        name: What to call the view in messages.
+
+    Raises:
+        InputError: Sizes differ, depth is negative or infinite, K or the pose is not valid.
+    """
+
+    depth: NDArray[np.float32]
+    K: Array
+    T_world_camera: Array | None = None
+    rgb: NDArray[np.uint8] | None = None
+    labels: NDArray[np.int32] | None = None
+    normals_camera: NDArray[np.float32] | None = None
+    name: str = "view"
+
+    def __post_init__(self) -> None:
+        depth = np.asarray(self.depth, dtype=np.float32)
+        if depth.ndim != 2 or depth.size == 0:
+            raise InputError(
+                self.name, f"depth has shape {depth.shape}", "give a depth image (H, W) in metres"
+            )
+        depth = np.where(np.isnan(depth), np.float32(0.0), depth)
+        if np.isinf(depth).any() or (depth < 0.0).any():
+            bad = "infinite" if np.isinf(depth).any() else "negative"
+            raise InputError(self.name, f"depth holds {bad} values", "mark missing readings with 0 or NaN")
+        object.__setattr__(self, "depth", depth)
+        object.__setattr__(self, "K", check_intrinsics(self.K, self.name))
+        if self.T_world_camera is not None:
+            T = transforms.as_rigid(self.T_world_camera, f"{self.name}: T_world_camera")
+            object.__setattr__(self, "T_world_camera", T)
+        for field, dtype in (("rgb", np.uint8), ("labels", np.int32), ("normals_camera", np.float32)):
+            image = getattr(self, field)
+            if image is None:
+                continue
+            image = np.asarray(image)
+            if image.shape[:2] != depth.shape:
+                raise InputError(
+                    self.name,
+                    f"{field} is {_size(image)}, depth is {_size(depth)}",
+                    "register the images to one size",
+                )
+            if field == "labels" and ((image < 0).any() or (image >= SUPPORT_LABEL).any()):
+                raise InputError(
+                    self.name, f"labels leave 0…{SUPPORT_LABEL - 1}", "number objects from 1, 0 = nothing"
+                )
+            object.__setattr__(self, field, image.astype(dtype, copy=False))
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """Pixels (H, W) that hold a reading."""
+        return self.depth > 0.0
+
+    @cached_property
+    def points_camera(self) -> Array:
+        """Points (H, W, 3) [m] in the camera frame; the origin where there is no reading."""
+        height, width = self.depth.shape
+        u = (np.arange(width) - self.K[0, 2]) / self.K[0, 0]
+        v = (np.arange(height) - self.K[1, 2]) / self.K[1, 1]
+        z = self.depth.astype(np.float64)
+        return np.stack([u[None, :] * z, v[:, None] * z, z], axis=-1)
+
+    @property
+    def pose(self) -> Array:
+        """`T_world_camera` (4, 4), for code that cannot go on without one.
+
+        Raises:
+            InputError: The view has no pose.
+        """
+        if self.T_world_camera is None:
+            raise InputError(self.name, "has no camera pose", "give T_world_camera")
+        return self.T_world_camera
+
+    def with_pose(self, T_world_camera: Array) -> View:
+        """Return the same view seen from another pose (4, 4).
+
+        Raises:
+            InputError: The pose is no rigid transform.
+        """
+        other = copy.copy(self)
+        T = transforms.as_rigid(T_world_camera, f"{self.name}: T_world_camera")
+        object.__setattr__(other, "T_world_camera", T)
+        return other
+
+    def __repr__(self) -> str:
+        given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
+        given += [] if self.T_world_camera is None else ["pose"]
+        return f"View({self.name}: depth {_size(self.depth)}{''.join(f', {name}' for name in given)})"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Cloud(Pictured):
+    """Oriented points in the world frame, organised or not.
+
+    Attributes:
+        points_world: (N, 3) [m].
+        normals_world: Unit normals (N, 3) that point towards the sensor.
+        labels: Object number of each point (N,), 0 = nothing, or None.
+        rgb: (N, 3) uint8, or None.
+        viewpoint_world: Where the sensor was (3,) [m], or None.
+        name: What to call the cloud in messages.
+    """
+
+    points_world: Array
+    normals_world: Array
+    labels: NDArray[np.int32] | None = None
+    rgb: NDArray[np.uint8] | None = None
+    viewpoint_world: Array | None = None
+    name: str = "cloud"
+
+    def __len__(self) -> int:
+        return len(self.points_world)
+
+    def select(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Cloud:
+        """Return the points picked by a mask (N,) or by indices."""
+        index = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep
+        return Cloud(
+            np.take(self.points_world, index, axis=0),
+            np.take(self.normals_world, index, axis=0),
+            None if self.labels is None else np.take(self.labels, index),
+            None if self.rgb is None else np.take(self.rgb, index, axis=0),
+            self.viewpoint_world,
+            self.name,
+        )
+
+    def moved(self, T: Array) -> Cloud:
+        """Return the cloud moved by a rigid transform (4, 4) of the world."""
+        if np.array_equal(T, np.eye(4)):
+            return self
+        eye, only = self.viewpoint_world, np.zeros(len(self), dtype=np.intp)
+        return replace(
+            self,
+            points_world=kernels.transform(T[None], only, self.points_world),
+            normals_world=kernels.rotate(T[None], only, self.normals_world),
+            viewpoint_world=None if eye is None else transforms.transform(T, eye),
+        )
+
+    def __repr__(self) -> str:
+        given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
+        return f"Cloud({self.name}: {len(self)} points{''.join(f', {name}' for name in given)})"
+
+
+class Camera(Protocol):
+    """What gives a view from a pose: simulation, recording or hardware."""
+
+    def capture(self, T_world_camera: Array) -> View:
+        """Take a view.
+
+        Args:
+            T_world_camera: Where the camera is to be (4, 4); the view says where it believes it was.
+        """
+        ...
+
+
+def check_intrinsics(K: Array, name: str) -> Array:
+    """Check a pinhole matrix and return it as float64 (3, 3).
+
+    Args:
+        K: Pinhole matrix (3, 3) [px].
+        name: What to call it in the error.
+
+    Raises:
+        InputError: Wrong shape, NaN, or a focal length that is not positive.
+    """
+    matrix = np.asarray(K, dtype=np.float64)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
+        raise InputError(name, "K is not a finite 3×3 matrix", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
+    if matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0:
+        raise InputError(
+            name,
+            f"K has focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g}",
+            "give positive focal lengths in pixels",
+        )
+    return matrix
+
+
+def _size(image: NDArray[np.generic]) -> str:
+    return f"{image.shape[1]}×{image.shape[0]}"

@@ -1,0 +1,170 @@
+"""Compiled: what cameras see of points in a scene, beside the plain NumPy reference."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from caryatid.geometry.rays import Grid, room, traverse, traversed_reference
+from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import for_each
+
+SHARES = 64
+"""Parts the work is dealt out to in turn, so that every thread has as much to do [1]."""
+EYES = 128
+"""Cameras of one piece of work, all with one point [1]."""
+
+
+class Sights(NamedTuple):
+    """Points in a scene and the cameras that may see them.
+
+    Attributes:
+        solid: What blocks lines of sight (X, Y, Z), not 0 = solid.
+        origin: Corner (3,) [m] of voxel [0, 0, 0].
+        size: Edge of a voxel [m].
+        points: (P, 3) [m].
+        normals: Outward unit normals (P, 3); zero where a point looks the same from all sides.
+        before: How well each has been shown (P,), from 0 to 1.
+        weights: Worth (P,) of showing each fully.
+        eyes: Camera centres (3, C) [m].
+        axes: Optical axes (3, C), unit.
+        clearance: Length of a line of sight's beginning at the point that does not count [m].
+        good: Cosine of the angle to the normal up to which a point is shown fully.
+        cone: Least cosine of the angle to the optical axis within the image.
+        worth: Of what each camera shows of each point anew (P, C); written to.
+    """
+
+    solid: Grid
+    origin: Array
+    size: float
+    points: Array
+    normals: Array
+    before: Array
+    weights: Array
+    eyes: Array
+    axes: Array
+    clearance: float
+    good: float
+    cone: float
+    worth: Array
+
+
+def shown(
+    solid: Grid,
+    origin: Array,
+    size: float,
+    points: Array,
+    normals: Array,
+    before: Array,
+    weights: Array,
+    eyes: Array,
+    axes: Array,
+    clearance: float,
+    good: float,
+    cone: float,
+) -> Array:
+    """Worth of what each camera shows of each point anew.
+
+    A camera shows a point as well as the cosine of the angle to its normal over `good`, fully beyond that;
+    not at all where the point lies outside its image or the line of sight is blocked. The arguments are as
+    in `Sights`.
+
+    Returns:
+        (P, C): weight · (how well it is shown − how well before), 0 where that is less.
+    """
+    worth = np.empty((len(points), eyes.shape[1]))
+    sights = Sights(
+        solid, origin, size, points, normals, before, weights, eyes, axes, clearance, good, cone, worth
+    )
+    for_each(show, SHARES, sights)
+    return worth
+
+
+@njit(cache=True, error_model="numpy")
+def show(share: int, sights: Sights) -> None:
+    """Write the worth of every so manieth piece of work: one point and some of the cameras."""
+    found = room(sights.solid.shape)
+    cameras = sights.eyes.shape[1]
+    across = (cameras + EYES - 1) // EYES
+    for piece in range(share, len(sights.points) * across, SHARES):
+        p, first = piece // across, piece % across * EYES
+        end = min(first + EYES, cameras)
+        _face(sights, p, first, end)
+        _hide(sights, found, p, first, end)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _face(sights: Sights, p: int, first: int, end: int) -> None:
+    """Write what each camera shows of one point anew where nothing is in between."""
+    x, y, z = sights.points[p, 0], sights.points[p, 1], sights.points[p, 2]
+    a, b, c = sights.normals[p, 0], sights.normals[p, 1], sights.normals[p, 2]
+    before, weight, good, cone = sights.before[p], sights.weights[p], sights.good, sights.cone
+    eyes, axes, worth = sights.eyes, sights.axes, sights.worth[p]
+    around = a == 0.0 and b == 0.0 and c == 0.0
+    for n in range(first, end):
+        dx, dy, dz = eyes[0, n] - x, eyes[1, n] - y, eyes[2, n] - z
+        distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
+        facing = 1.0 if around else min((a * dx + b * dy + c * dz) / (distance * good), 1.0)
+        along = -(axes[0, n] * dx + axes[1, n] * dy + axes[2, n] * dz)
+        new = facing - before
+        worth[n] = weight * new if new > 0.0 and along >= cone * distance else 0.0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _hide(sights: Sights, found: NDArray[np.int32], p: int, first: int, end: int) -> None:
+    """Set to nought what cameras would show of one point but for what is in between."""
+    shape, flat, worth, eyes = sights.solid.shape, sights.solid.reshape(-1), sights.worth[p], sights.eyes
+    per_metre = 1.0 / sights.size
+    x, y, z = sights.points[p, 0], sights.points[p, 1], sights.points[p, 2]
+    origin = sights.origin
+    start = ((x - origin[0]) * per_metre, (y - origin[1]) * per_metre, (z - origin[2]) * per_metre)
+    for n in range(first, end):
+        if worth[n] == 0.0:
+            continue
+        dx, dy, dz = eyes[0, n] - x, eyes[1, n] - y, eyes[2, n] - z
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if length <= sights.clearance:
+            continue
+        ray = (dx * per_metre, dy * per_metre, dz * per_metre)
+        slabs = traverse(found, shape, start, ray, sights.clearance / length, 1.0)
+        blocked = np.uint8(0)
+        for m in range(slabs):
+            blocked |= flat[np.uint32(found[0, m])]
+            blocked |= flat[np.uint32(found[1, m])]
+            blocked |= flat[np.uint32(found[2, m])]
+        if blocked:
+            worth[n] = 0.0
+
+
+def shown_reference(
+    solid: Grid,
+    origin: Array,
+    size: float,
+    points: Array,
+    normals: Array,
+    before: Array,
+    weights: Array,
+    eyes: Array,
+    axes: Array,
+    clearance: float,
+    good: float,
+    cone: float,
+) -> Array:
+    """Do the same as `shown`, ray by ray from all crossings with the grid's planes."""
+    worth = np.zeros((len(points), eyes.shape[1]))
+    for p, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        for c, (eye, axis) in enumerate(zip(eyes.T, axes.T, strict=True)):
+            length = float(np.linalg.norm(eye - point))
+            ray = (eye - point) / max(length, 1e-6)
+            facing = min(float(normal @ ray) / good, 1.0) if normal.any() else 1.0
+            if -float(axis @ ray) < cone or facing <= before[p]:
+                continue
+            if length > clearance:
+                voxels = traversed_reference(solid.shape, point, eye, clearance / length, 1.0, origin, size)
+                if solid[tuple(voxels.T)].any():
+                    continue
+            worth[p, c] = weights[p] * (facing - before[p])
+    return worth

@@ -1,0 +1,137 @@
+"""What SOURCE is: a scene to simulate, a recording to play back, or a cloud."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caryatid.config import Config, NoiseModel, SegmentationMethod
+from caryatid.errors import InputError
+from caryatid.evaluation.scores import TrueScene
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.io.bop import Recording, read_recording
+from caryatid.robots.humanoid import Robot
+from caryatid.robots.recording import RecordingRobot
+from caryatid.robots.recording_camera import RecordingCamera
+from caryatid.robots.registry import HUMANOID, find_robot
+from caryatid.sensing.views import Camera
+from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.stage import set_stage
+from caryatid.simulation.truth import ground_truth, read_truth
+
+CLOUD_SUFFIXES = (".pcd", ".ply")
+"""Endings of files that are clouds."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Source:
+    """Something to explore.
+
+    Attributes:
+        name: Short name.
+        camera: Gives its views.
+        robot: Stands at the first view.
+        truth: What is really there, where known.
+        views: Views there are, or None without a limit.
+    """
+
+    name: str
+    camera: Camera
+    robot: Robot
+    truth: TrueScene | None
+    views: int | None
+
+
+def is_recording(source: str) -> bool:
+    """Whether SOURCE is a folder in the BOP format."""
+    return (Path(source) / "scene_camera.json").is_file() or (Path(source) / "depth").is_dir()
+
+
+def open_source(
+    source: str,
+    config: Config,
+    *,
+    noise: NoiseModel,
+    segmentation: SegmentationMethod | None,
+    seed: int,
+    robot: str = HUMANOID,
+) -> Source:
+    """Open an MJCF file or folder, the name of a built-in scene, or a recording.
+
+    Args:
+        source: What the user gave.
+        config: All settings.
+        noise: Noise of the simulated camera.
+        segmentation: Where parts are to come from.
+        seed: Seed of the noise.
+        robot: Name of the simulated robot.
+
+    Raises:
+        InputError: It is none of them, or broken, or lacks the labels that are demanded; or there is no such
+            robot, or a robot is given for a recording.
+        PlanningError: The robot reaches no view of the table.
+    """
+    if Path(source).suffix.lower() in CLOUD_SUFFIXES:
+        raise InputError(source, "is a single cloud, and there is nowhere to go", "use `caryatid extract`")
+    if is_recording(source):
+        if robot != HUMANOID:
+            reason = "is a recording, its camera can only be where a recorded view is"
+            raise InputError(source, reason, "leave --robot out")
+        return _open_recording(open_recording(source, config, segmentation))
+    make = find_robot(robot)
+    scene = load_scene(source)
+    truth_file = Path(scene.source).parent / "gt.json"
+    known = read_truth(truth_file) if truth_file.is_file() else None
+    truth = ground_truth(scene) if known is None else known
+    stage = set_stage(scene, config, noise=noise, seed=seed, robot=make)
+    return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
+
+
+def open_recording(folder: str, config: Config, segmentation: SegmentationMethod | None) -> Recording:
+    """Read a recording and decode every frame once, so that what is broken is said before any work is done.
+
+    Raises:
+        InputError: It is broken, has no labels where they are demanded, or a segment too small for a shape.
+    """
+    recording = read_recording(folder)
+    if segmentation == "labels" and not recording.has_labels:
+        raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
+    points: Counter[int] = Counter()
+    for frame in recording.frames:
+        view = frame.load()
+        if view.labels is not None:
+            points.update(view.labels[view.valid].tolist())
+    if segmentation != "auto":
+        check_segments(folder, points, config)
+    return recording
+
+
+def check_segments(source: str, points: Mapping[int, int], config: Config) -> None:
+    """Refuse given segments that can never become objects.
+
+    Args:
+        source: What the user gave.
+        points: Points with depth of each label, over all views; 0 is no object.
+        config: All settings.
+
+    Raises:
+        InputError: A segment has fewer points than a shape needs.
+    """
+    least = config.fit.min_points
+    small = sorted(label for label, count in points.items() if label != 0 and count < least)
+    if small:
+        raise InputError(
+            source,
+            f"segment {small[0]} has {points[small[0]]} points with depth, a shape needs {least}",
+            "take it out, show more of it, or use --segmentation auto",
+        )
+
+
+def _open_recording(recording: Recording) -> Source:
+    camera = RecordingCamera(recording)
+    poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
+    return Source(recording.folder.name, camera, RecordingRobot(poses), None, len(recording))

@@ -1,0 +1,1 @@
+"""Support relations (section III-A): contacts, support polygons, the relations, plausibility, removal."""

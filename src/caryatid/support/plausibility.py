@@ -1,0 +1,204 @@
+"""Physical plausibility of the whole scene: shapes do not fill one another, and nothing floats."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, eye_array
+from scipy.sparse.linalg import spsolve
+
+from caryatid.config import PlausibilityConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject
+from caryatid.support.contacts import Contact, find_contacts, local_frames
+
+_FEW = 100
+"""Gaps up to which a dense matrix is solved faster than a sparse one, whose cost follows their number [1]."""
+
+
+def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> list[SceneObject]:
+    """Move shapes, and their unsure sides, until they neither overlap nor float: within their uncertainty.
+
+    Each overlap is a measurement that the gap there is zero, and so is the smallest gap below an object that
+    touches nothing below it. All of them together correct poses, sizes and hidden extents at once, each in
+    proportion to its variance (the update of a Kalman filter). A gap beyond what the fits' uncertainty can
+    explain is left as it is and said of the objects: their shapes are doubtful.
+
+    Args:
+        objects: The support surface and the objects on it; without `uncertainty` they stay as they are.
+        config: How exactly shapes touch, and what uncertainty can explain.
+
+    Returns:
+        The objects in the same order, `doubt` telling what could not be explained.
+    """
+    done = list(objects)
+    sigma = np.array([_sigma(o) for o in objects]).reshape(-1, 9)
+    variance = sigma**2
+    doubts: dict[int, str] = {}
+    for number in range(config.rounds):
+        contacts = find_contacts([o.shape for o in done], config.reach)
+        wrong = [c for c in contacts if c.distance < -config.touch] + _floating(done, contacts, config)
+        if not wrong:
+            break
+        pairs = np.array([(c.a, c.b) for c in wrong], dtype=np.intp)
+        gaps = np.array([c.distance for c in wrong])
+        rows = _rows(done, wrong, pairs)
+        scatter = np.einsum("kpv,kpv->k", rows**2, variance[pairs]) + config.touch**2
+        explained = np.abs(gaps) <= config.sigmas * np.sqrt(scatter)
+        if number == 0:
+            doubts = _doubts(done, [c for c, fine in zip(wrong, explained, strict=True) if not fine])
+        if not explained.any():
+            break
+        change = closing(pairs[explained], rows[explained], variance, gaps[explained], config.touch**2)
+        for k in np.flatnonzero(change.any(axis=1)):
+            shape = done[k].shape
+            done[k] = replace(done[k], shape=_changed(shape, _EFFECT[shape.kind] @ change[k], config))
+    said = [doubts.get(k, "") for k in range(len(done))]
+    return [o if o.doubt == doubt else replace(o, doubt=doubt) for o, doubt in zip(done, said, strict=True)]
+
+
+def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) -> SceneObject:
+    """Return an object whose shape is as likely as its own: moved, turned and sized by its uncertainty.
+
+    Args:
+        o: An object; without `uncertainty` it stays as it is.
+        rng: Source of the draw.
+        config: Least extent, and how many standard deviations uncertainty can explain.
+    """
+    change = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas) * _sigma(o)
+    return replace(o, shape=_changed(o.shape, _EFFECT[o.shape.kind] @ change, config))
+
+
+def _effect(kind: str) -> Array:
+    """What each of an object's independent variables (9,) does to it.
+
+    Returns:
+        Translation [m], rotation [rad] and change of the half extents [m], in the object's frame (9, 9).
+    """
+    effect = np.zeros((9, 9))
+    effect[3:6, 3:6] = np.eye(3)
+    for axis, round_ in enumerate(_ROUND[kind]):
+        if round_:
+            # What is round moves as a whole, and its radius is one number.
+            effect[axis, axis] = 1.0
+        else:
+            effect[[axis, 6 + axis], axis] = -0.5, 0.5
+            effect[[axis, 6 + axis], 6 + axis] = 0.5, 0.5
+    if _ROUND[kind][0]:
+        effect[6:9, 6] = _ROUND[kind]
+    return effect
+
+
+_ROUND = {"box": (False, False, False), "cylinder": (True, True, False), "sphere": (True, True, True)}
+"""Along which axes a shape's two sides are one round surface."""
+_EFFECT = {kind: _effect(kind) for kind in _ROUND}
+
+
+def _sigma(o: SceneObject) -> Array:
+    """Standard deviation of each of an object's independent variables (9,); zero where it cannot change."""
+    sigma = np.zeros(9)
+    known = o.uncertainty
+    if known is None or o.role == "support_surface":
+        return sigma
+    sigma[0:3], sigma[3:6], sigma[6:9] = known.sides[0::2], known.rotation, known.sides[1::2]
+    round_ = sum(_ROUND[o.shape.kind])
+    if round_:
+        sigma[:round_], sigma[6 : 6 + round_] = known.position[:round_], 0.0
+        sigma[6] = known.sizes[0] / 2.0
+    return sigma
+
+
+def _floating(
+    objects: Sequence[SceneObject], contacts: Sequence[Contact], config: PlausibilityConfig
+) -> list[Contact]:
+    """The nearest contact below each object that touches nothing below it, among those with a small gap."""
+    nearest: dict[int, Contact] = {}
+    steep = np.cos(np.radians(config.max_tilt))
+    for contact in contacts:
+        upper = contact.b if contact.normal_world[2] > 0.0 else contact.a
+        level = abs(contact.normal_world[2]) > steep and objects[upper].role != "support_surface"
+        if level and (upper not in nearest or contact.distance < nearest[upper].distance):
+            nearest[upper] = contact
+    return [c for c in nearest.values() if c.distance > config.touch]
+
+
+def _rows(objects: Sequence[SceneObject], contacts: Sequence[Contact], pairs: NDArray[np.intp]) -> Array:
+    """How much (K, 2, 9) each variable of the two objects of a contact closes its gap."""
+    points_world = np.array([c.point_world for c in contacts])
+    normals_world = np.array([c.normal_world for c in contacts])
+    shapes = [o.shape for o in objects]
+    p, u = local_frames(shape_arrays(shapes), pairs, points_world, normals_world)
+    round_ = np.array([_ROUND[s.kind] for s in shapes])[pairs]
+    sizes = np.where(round_, 0.0, np.abs(u))
+    sizes[..., 0] += np.linalg.norm(np.where(round_, u, 0.0), axis=-1)
+    effects = np.array([_EFFECT[s.kind] for s in shapes])[pairs]
+    rows: Array = np.einsum("kpi,kpij->kpj", np.concatenate([u, np.cross(p, u), sizes], axis=-1), effects)
+    return rows
+
+
+def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, noise: float) -> Array:
+    """Most likely change (N, V) of N objects' variables that closes gaps: the update of a Kalman filter.
+
+    Args:
+        pairs: The two objects of each gap (K, 2).
+        rows: How much (K, 2, V) each variable of the two closes it.
+        variance: Of each variable (N, V); zero for what cannot change.
+        gaps: (K,).
+        noise: Variance of a gap that is closed [m²].
+    """
+    weighted = rows * variance[pairs]
+    if len(pairs) <= _FEW:
+        ends = pairs.ravel()
+        shared = np.where(ends[:, None] == ends, _ends(weighted) @ _ends(rows).T, 0.0)
+        scatter = shared.reshape(len(pairs), 2, len(pairs), 2).sum(axis=(1, 3)) + noise * np.eye(len(pairs))
+        solved = np.linalg.solve(scatter, gaps)
+    else:
+        size = variance.shape[1]
+        columns = (pairs[:, :, None] * size + np.arange(size)).ravel()
+        starts = np.arange(0, rows.size + 1, 2 * size)
+        left, right = (
+            csr_array((a.ravel(), columns, starts), (len(pairs), variance.size)) for a in (weighted, rows)
+        )
+        solved = spsolve((left @ right.T + noise * eye_array(len(pairs))).tocsc(), gaps)
+    change = np.zeros(variance.shape)
+    np.add.at(change, pairs, weighted * solved[:, None, None])
+    return change
+
+
+def _ends(rows: Array) -> Array:
+    """Both ends of each pair one after another (2 K, V)."""
+    return rows.reshape(-1, rows.shape[-1])
+
+
+def _changed(
+    shape: Box | Cylinder | Sphere, change: Array, config: PlausibilityConfig
+) -> Box | Cylinder | Sphere:
+    """Apply a translation, a rotation and a change of the half extents (9,) in the shape's own frame."""
+    T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(change[3:6]), change[:3])
+    extents = np.maximum(shape.extents + 2.0 * change[6:9], config.min_extent)
+    if isinstance(shape, Sphere):
+        return Sphere(T, float(extents[0]) / 2.0)
+    if isinstance(shape, Cylinder):
+        return Cylinder(T, float(extents[0]) / 2.0, float(extents[2]))
+    return Box(T, extents)
+
+
+def _doubts(objects: Sequence[SceneObject], contacts: Sequence[Contact]) -> dict[int, str]:
+    """What to say of the objects of contacts that uncertainty does not explain."""
+    doubts: dict[int, str] = {}
+    for c in contacts:
+        for k, other in ((c.a, c.b), (c.b, c.a)):
+            if objects[k].role == "support_surface":
+                continue
+            what = "overlaps" if c.distance < 0.0 else "floats over"
+            by = f"{1000.0 * abs(c.distance):.0f} mm, more than both fits explain"
+            more = f"{what} {objects[other].id} by {by}"
+            if c.distance < 0.0 or objects[k].centre_world[2] > objects[other].centre_world[2]:
+                doubts[k] = f"{doubts[k]}; {more}" if k in doubts else more
+    return doubts

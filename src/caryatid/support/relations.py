@@ -1,0 +1,316 @@
+"""Support relations from shapes: separating planes, leaning, weight from above, and why (section III-A)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from caryatid.config import SupportConfig
+from caryatid.errors import InputError
+from caryatid.geometry import transforms
+from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.transforms import Array, rigid
+from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
+from caryatid.support.contacts import Contact, find_contacts, find_gap, local_frames
+from caryatid.support.stability import (
+    Tipping,
+    assess,
+    beneath,
+    centroid,
+    contact_patch,
+    drop_distance,
+    find_tipping,
+    support_polygon,
+)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Touch:
+    """A contact as one of its two objects feels it.
+
+    Attributes:
+        other: The object that touches it.
+        normal_world: Unit normal (3,) of the separating plane, pointing away from `other`.
+        gap: [m], negative where they overlap.
+        tilt: Angle of the normal to the vertical [deg]; below 90 where `other` is the lower one.
+        points_world: Contact points (K, 3) [m].
+        point_world: Centre (3,) [m] of the contact.
+        margin: Gap up to which the two are taken to touch [m].
+    """
+
+    other: SceneObject
+    normal_world: Array
+    gap: float
+    tilt: float
+    points_world: Array
+    point_world: Array
+    margin: float
+
+    def __str__(self) -> str:
+        return f"normal {self.tilt:.0f}° from the vertical, {_gap(self.gap)}"
+
+
+def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph:
+    """Infer who supports whom among the objects of one scene model.
+
+    From each separating plane the lower object supports the upper one. An object whose centre of mass lies
+    outside what then carries it looks for what keeps it from tipping: first contacts below it that a slightly
+    wrong fit may have opened or made steep, then neighbours it leans on and objects that weigh it down. What
+    touches nothing below it is let down until it does.
+
+    Args:
+        objects: Shapes in the world frame; the one with role `support_surface` is supported by nothing.
+        config: The stage's numbers.
+
+    Raises:
+        InputError: Two objects have the same id.
+    """
+    if len({o.id for o in objects}) < len(objects):
+        raise InputError("objects", "two of them have the same id", "give every object an id of its own")
+    ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
+    shapes = shape_arrays([o.shape for o in ordered])
+    touches = _find_touches(ordered, config)
+    supported = [o for o in ordered if o.role != "support_surface"]
+    carried: dict[str, tuple[list[Support], Tipping]] = {}
+    stability: dict[str, Stability] = {}
+    for o in supported:
+        supports, patches = _from_below(o, touches[o.id], config)
+        if not supports:
+            near = [ordered[k] for k in beneath(shapes, ordered.index(o), config.max_drop)]
+            supports, patches = _let_down(o, near, config)
+        polygon = support_polygon(patches)
+        tipping = find_tipping(o.shape, polygon)
+        carried[o.id] = supports, tipping
+        stability[o.id] = assess(o.shape, polygon, tipping, config)
+    edges: list[Support] = []
+    for o in supported:
+        supports, tipping = carried[o.id]
+        edges += supports
+        known = {s.supporter for s in supports}
+        beside = [t for t in touches[o.id] if t.other.id not in known]
+        riders = [t for t in beside if any(s.supporter == o.id for s in carried.get(t.other.id, ([],))[0])]
+        if supports and stability[o.id].tips:
+            edges += _leaning(o, [t for t in beside if t not in riders], tipping, config)
+        edges += _weighed_down(o, riders, stability[o.id], tipping, config)
+    rank = {o.id: i for i, o in enumerate(ordered)}
+    edges.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))
+    return SupportGraph(ordered, tuple(edges), stability)
+
+
+def explain(graph: SupportGraph, supporter: str, supported: str, config: SupportConfig) -> str:
+    """Say in a sentence why `supporter` supports `supported`, or why it does not.
+
+    Args:
+        graph: As `infer` returns it.
+        supporter: Id of the one below, beside or on top.
+        supported: Id of the one held.
+        config: The numbers the graph was inferred with.
+
+    Raises:
+        InputError: There is no object with one of the ids, or both are the same.
+    """
+    for name in (supporter, supported):
+        if name not in {o.id for o in graph.objects}:
+            raise InputError(
+                name, "no such object in the graph", f"there are {', '.join(o.id for o in graph.objects)}"
+            )
+    if supporter == supported:
+        raise InputError(supporter, "an object does not support itself", "ask about two different objects")
+    edge = graph.support(supporter, supported)
+    if edge is not None:
+        return edge.why
+    a, b = graph[supporter], graph[supported]
+    if b.role == "support_surface":
+        return f"{supported} is the support surface: nothing supports it."
+    touch = next(iter(_find_touches([a, b], config)[b.id]), None)
+    head = f"{supporter} does not support {supported}: "
+    if touch is None:
+        gap = _gap(find_gap(a.shape, b.shape))
+        limits = f"margin {_mm(config.contact_margin)}, {_mm(config.reach)} where it is needed"
+        return f"{head}they do not touch, {gap} ({limits})."
+    stability = graph.stability.get(supported)
+    verdict = _verdict(supported, stability, config) if stability else f"how {supported} stands is not known"
+    if touch.tilt >= 180.0 - config.max_tilt:
+        return f"{head}it lies above it ({touch}) and could only weigh it down; {verdict}."
+    if touch.tilt > config.max_tilt:
+        steep = f"{touch.tilt:.0f}° from the vertical, bottom-up up to {config.max_tilt:.0f}°"
+        return f"{head}they touch side by side (normal {steep}); {verdict}, and it does not lean that way."
+    return f"{head}the contact is doubtful ({touch}, margin {_mm(touch.margin)}) and not needed; {verdict}."
+
+
+def _find_touches(objects: Sequence[SceneObject], config: SupportConfig) -> dict[str, list[Touch]]:
+    """What touches each object, by id."""
+    touches: dict[str, list[Touch]] = {o.id: [] for o in objects}
+    for a, b, touch in _touching(objects, find_contacts([o.shape for o in objects], config.reach), config):
+        touches[b.id].append(touch)
+        touches[a.id].append(
+            replace(touch, other=b, normal_world=-touch.normal_world, tilt=180.0 - touch.tilt)
+        )
+    return touches
+
+
+def _touching(
+    objects: Sequence[SceneObject], contacts: Sequence[Contact], config: SupportConfig
+) -> list[tuple[SceneObject, SceneObject, Touch]]:
+    """Both objects of each contact, and the contact as the second of them feels it."""
+    pairs = [(objects[c.a], objects[c.b]) for c in contacts]
+    normals_world = [_plane_normal(a, b, c) for (a, b), c in zip(pairs, contacts, strict=True)]
+    tilts = np.degrees(transforms.angle_between(np.array(normals_world).reshape(-1, 3), (0.0, 0.0, 1.0)))
+    margins = _margins(objects, contacts, normals_world, config)
+    rows = zip(pairs, contacts, normals_world, tilts.tolist(), margins, strict=True)
+    return [
+        (a, b, Touch(a, normal_world, c.distance, tilt, c.points_world, c.point_world, margin))
+        for (a, b), c, normal_world, tilt, margin in rows
+    ]
+
+
+def _margins(
+    objects: Sequence[SceneObject],
+    contacts: Sequence[Contact],
+    normals_world: Sequence[Array],
+    config: SupportConfig,
+) -> list[float]:
+    """Gaps [m] up to which shapes touch: what their fits' uncertainty across each contact explains."""
+    sides, rotation = np.zeros((len(objects), 3, 2)), np.zeros((len(objects), 3))
+    for k, o in enumerate(objects):
+        if o.uncertainty is not None:
+            sides[k], rotation[k] = o.uncertainty.sides.reshape(3, 2), o.uncertainty.rotation
+    pairs = np.array([(c.a, c.b) for c in contacts], dtype=np.intp).reshape(-1, 2)
+    points_world = np.array([c.point_world for c in contacts]).reshape(-1, 3)
+    normals = np.array(normals_world).reshape(-1, 3)
+    points, outward = local_frames(shape_arrays([o.shape for o in objects]), pairs, points_world, normals)
+    facing = np.where(outward > 0.0, sides[pairs, :, 1], sides[pairs, :, 0])
+    spread = (outward * facing) ** 2 + (np.cross(points, outward) * rotation[pairs]) ** 2
+    margins = config.margin_sigma * np.sqrt(spread.sum(axis=(1, 2)))
+    explained: list[float] = np.clip(margins, config.contact_margin, config.max_margin).tolist()
+    return explained
+
+
+def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:
+    """Normal (3,) of the separating plane from `other` to `o`; everything lies above the support surface."""
+    for surface, sign in ((other, 1.0), (o, -1.0)):
+        if surface.role == "support_surface":
+            axes_world = surface.shape.T_world_object[:3, :3]
+            normal_world = axes_world[:, np.argmax(np.abs(axes_world[2]))]
+            return sign * np.sign(normal_world[2]) * normal_world
+    return contact.normal_world
+
+
+def _patch(t: Touch, o: SceneObject, config: SupportConfig) -> Array:
+    """Contact area projected to the ground: a polygon (M, 2) [m]."""
+    return contact_patch(o.shape, t.other.shape, t.normal_world, t.points_world, config)
+
+
+def _from_below(
+    o: SceneObject, touches: list[Touch], config: SupportConfig
+) -> tuple[list[Support], list[Array]]:
+    """Bottom-up supports, and the contact areas they carry the object by."""
+    below = [t for t in touches if t.tilt <= config.max_tilt]
+    sure = [t for t in below if t.gap <= (t.margin if t.tilt <= config.gentle_tilt else 0.0)]
+    supports = [_support(t, o, "bottom-up", True, f"{_below_text(t, o)}.") for t in sure]
+    patches = [_patch(t, o, config) for t in sure]
+    doubtful = sorted((t for t in below if t not in sure), key=lambda t: t.gap)
+    overhang = find_tipping(o.shape, support_polygon(patches)).overhang if doubtful else 0.0
+    for t in doubtful:
+        if overhang <= config.overhang:
+            break
+        patch = _patch(t, o, config)
+        gained = find_tipping(o.shape, support_polygon([*patches, patch])).overhang
+        if gained < overhang:
+            why = f"{_below_text(t, o)}; without it {_overhang_text(o.id, overhang)}."
+            supports.append(_support(t, o, "bottom-up", t.gap <= t.margin, why))
+            patches.append(patch)
+            overhang = gained
+    return supports, patches
+
+
+def _let_down(
+    o: SceneObject, near: Sequence[SceneObject], config: SupportConfig
+) -> tuple[list[Support], list[Array]]:
+    """Supports of an object that touches nothing below it: what it lands on first when let straight down."""
+    landings: list[tuple[float, SceneObject, Touch]] = []
+    for other in near:
+        drop = drop_distance(o.shape, other.shape, config.max_drop)
+        if np.isfinite(drop):
+            lowered = replace(o, shape=o.shape.moved(rigid(np.eye(3), (0.0, 0.0, -drop))))
+            contacts = find_contacts([other.shape, lowered.shape], config.contact_margin)
+            landings += [
+                (drop, lowered, touch) for _, _, touch in _touching([other, lowered], contacts, config)
+            ]
+    landings = [landing for landing in landings if landing[2].tilt <= config.max_tilt]
+    first = min((drop for drop, _, _ in landings), default=np.inf)
+    landings = [landing for landing in landings if landing[0] <= first + config.contact_margin]
+    head = f"{o.id} touches nothing below it; let down"
+    supports = [
+        _support(
+            t, o, "bottom-up", drop <= config.contact_margin, f"{head} {_mm(drop)} it meets {t.other.id}."
+        )
+        for drop, _, t in landings
+    ]
+    return supports, [_patch(t, lowered, config) for _, lowered, t in landings]
+
+
+def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
+    """Leaning supports of an object that tips: who pushes against it, the nearest one if none touches."""
+    push = np.cos(np.radians(config.lean_angle))
+    aside = [t for t in touches if config.max_tilt < t.tilt < 180.0 - config.max_tilt]
+    against = [t for t in aside if t.normal_world[:2] @ tipping.direction_xy < -push]
+    against.sort(key=lambda t: t.gap)
+    touching = [t for t in against if t.gap <= t.margin] or against[:1]
+    head = _overhang_text(o.id, tipping.overhang)
+    return [_support(t, o, "lean", False, f"{head}; {t.other.id} stands in its way ({t}).") for t in touching]
+
+
+def _weighed_down(
+    o: SceneObject, riders: list[Touch], stability: Stability, tipping: Tipping, config: SupportConfig
+) -> list[Support]:
+    """Top-down supports: what rests on an unstable object, all or only what weighs against its tipping."""
+    if stability.stable:
+        return []
+    head = _verdict(o.id, stability, config)
+    found = []
+    for t in riders:
+        load_xy = centroid(_patch(t, o, config))
+        lever = float((tipping.pivot_xy - load_xy) @ tipping.direction_xy)
+        if config.top_down == "paper":
+            found.append(_support(t, o, "top-down", False, f"{head}; {t.other.id} rests on it."))
+        elif stability.tips and lever > 0.0:
+            why = f"{head}; {t.other.id} rests on it {_mm(lever)} behind the edge it tips over."
+            found.append(_support(t, o, "top-down", False, why))
+    return found
+
+
+def _support(t: Touch, o: SceneObject, kind: Kind, certain: bool, why: str) -> Support:
+    return Support(
+        t.other.id, o.id, kind, certain, contact_world=t.point_world, normal_world=t.normal_world, why=why
+    )
+
+
+def _below_text(t: Touch, o: SceneObject) -> str:
+    return f"{t.other.id} lies below the plane that parts it from {o.id} ({t})"
+
+
+def _verdict(object_id: str, stability: Stability, config: SupportConfig) -> str:
+    """Both tests in words."""
+    if not np.isfinite(stability.overhang):
+        return _overhang_text(object_id, stability.overhang)
+    sign = "<" if stability.small_area else "≥"
+    ratio = f"{object_id} has a support area ratio {stability.ratio:.2f} {sign} {config.min_area_ratio:g}"
+    return f"{ratio}, {_overhang_text('it', stability.overhang)}"
+
+
+def _overhang_text(name: str, overhang: float) -> str:
+    if not np.isfinite(overhang):
+        return f"{name} rests on nothing"
+    side = "outside" if overhang > 0.0 else "inside"
+    return f"{name} has its centre of mass {_mm(abs(overhang))} {side} its support polygon"
+
+
+def _gap(gap: float) -> str:
+    return f"gap {_mm(gap)}" if gap >= 0.0 else f"overlap {_mm(-gap)}"
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1000.0:.1f} mm"

@@ -1,0 +1,211 @@
+"""Support polygons: what carries an object, how much of it, and which way it tips (section III-A)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import SupportConfig
+from caryatid.geometry import polygons, transforms
+from caryatid.geometry.shape_arrays import ShapeArrays, boxes_around, shape_arrays
+from caryatid.geometry.shapes import Shape
+from caryatid.geometry.signed_distance import signed_distances
+from caryatid.geometry.transforms import Array
+from caryatid.graph import Stability
+
+_UP = np.array([0.0, 0.0, 1.0])
+_NO_AREA = 1e-12
+"""Contact areas below this are lines and points, blurred by rounding [m²]; a micrometre squared."""
+_CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in 2.0 * np.pi * np.arange(48) / 48])
+"""Polygon (48, 2) that stands for the rim of a ball's cap; 0.2 % of its radius off."""
+_SIDES = 24
+"""Sides of the prism that stands for a cylinder; 1 % of its radius off."""
+_MARCH_POINTS = 16
+"""Surface points along the longest side of a shape that is let down."""
+_MARCH_STEPS = 40
+"""Steps by the signed distance: enough to come within a hair wherever the way is not along a wall."""
+_MARCH_HIT = 5e-4
+"""A point this near to the other shape has met it [m]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Tipping:
+    """How the centre of mass lies to the support polygon, in the ground plane.
+
+    Attributes:
+        overhang: How far the centre of mass lies outside [m], negative inside; infinite without any support.
+        pivot_xy: Point (2,) [m] of the polygon's border nearest to the centre of mass: what it tips over.
+        direction_xy: Unit vector (2,) the object tips towards; zero without any support.
+    """
+
+    overhang: float
+    pivot_xy: Array
+    direction_xy: Array
+
+
+def _cube() -> tuple[Array, NDArray[np.int64]]:
+    """Corners (8, 3) and edges (12, 2) of a cube of half extent 1."""
+    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    return corners, np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+
+
+def _prism() -> tuple[Array, NDArray[np.int64]]:
+    """Corners (48, 3) and edges (72, 2) of a prism of radius and half height 1."""
+    angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
+    ring = np.stack([np.cos(angle), np.sin(angle), np.ones(_SIDES)], axis=-1)
+    low, after = np.arange(_SIDES) + _SIDES, (np.arange(_SIDES) + 1) % _SIDES
+    ends = [(low - _SIDES, low), (low - _SIDES, after), (low, after + _SIDES)]
+    return np.concatenate([ring, ring * (1.0, 1.0, -1.0)]), np.concatenate(
+        [np.stack(e, axis=-1) for e in ends]
+    )
+
+
+_SOLIDS = {"box": _cube(), "cylinder": _prism()}
+"""Corners, in half extents, and edges of the solids that stand for shapes."""
+
+
+def ground_outline(shape: Shape) -> Array:
+    """P_A: the polygon (M, 2) [m] the shape's extent projects to on the ground."""
+    return _cap(shape, _UP, np.inf)
+
+
+def contact_patch(
+    shape: Shape, other: Shape, normal_world: Array, points_world: Array, config: SupportConfig
+) -> Array:
+    """Project to the ground the area over which two shapes touch: a polygon (M, 2) [m].
+
+    What of each shape lies within `patch_depth` of its extreme point along the normal counts as touching, and
+    a little more on long shapes, so that faces a fit has turned against each other still touch all over.
+
+    Args:
+        shape: The shape the normal points to.
+        other: The shape the normal comes from.
+        normal_world: Unit normal (3,) of the separating plane, from `other` to `shape`.
+        points_world: Contact points (K, 3) [m]; they stand in where those parts do not overlap.
+        config: `patch_depth` and `patch_tilt`.
+    """
+    depth = _touching_depth(shape, config)
+    upper = _cap(shape, -normal_world, depth)
+    patch = polygons.intersection(
+        upper, _cap(other, normal_world, min(depth, _touching_depth(other, config)))
+    )
+    return patch if polygons.area(patch) > _NO_AREA else polygons.hull(points_world)
+
+
+def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
+    """How far [m] a shape falls straight down until it meets another one; infinite beyond `limit` [m].
+
+    Points all over the lower side of the one and the upper side of the other march to the opposite shape by
+    its signed distance.
+    """
+    apart = float(np.linalg.norm(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3]))
+    if apart > (np.linalg.norm(shape.extents) + np.linalg.norm(other.extents)) / 2.0:
+        return float(np.inf)
+    return min(_march(shape, other, -_UP, limit), _march(other, shape, _UP, limit))
+
+
+def beneath(shapes: ShapeArrays, index: int, limit: float) -> list[int]:
+    """Indices of the shapes that one could meet, by their boxes, when it falls down by a limit [m]."""
+    low, high = boxes_around(shapes)
+    near = 2.0 * _MARCH_HIT
+    below = (low[index, 2] - limit <= high[:, 2] + near) & (high[index, 2] >= low[:, 2] - near)
+    apart = np.maximum(low[:, :2] - high[index, :2], low[index, :2] - high[:, :2]).max(axis=1)
+    return [int(k) for k in np.flatnonzero(below & (apart <= near)) if k != index]
+
+
+def support_polygon(patches: Sequence[Array]) -> Array:
+    """P_s: the convex hull (M, 2) [m] of the contact areas."""
+    return polygons.hull(np.concatenate([np.empty((0, 2)), *patches]))
+
+
+def find_tipping(shape: Shape, polygon: Array) -> Tipping:
+    """Where the centre of mass (the shape's centre) projects against the support polygon (M, 2) [m]."""
+    centre_xy = shape.T_world_object[:2, 3]
+    if not len(polygon):
+        return Tipping(np.inf, centre_xy, np.zeros(2))
+    distance, x, y, inside = polygons.nearest_on_border(polygon, centre_xy[0], centre_xy[1])
+    overhang, pivot_xy = -distance if inside else distance, np.array([x, y])
+    direction_xy = (centre_xy - pivot_xy) / overhang if overhang else np.zeros(2)
+    return Tipping(overhang, pivot_xy, direction_xy)
+
+
+def assess(shape: Shape, polygon: Array, tipping: Tipping, config: SupportConfig) -> Stability:
+    """Both tests of an object that rests on a support polygon: r_s of eq. 1 and the centre of mass.
+
+    Args:
+        shape: The object.
+        polygon: Its support polygon (N, 2) [m].
+        tipping: How it would tip over it.
+        config: r_s,min, and how far outside the centre of mass may lie.
+    """
+    ratio = min(1.0, polygons.area(polygon) / polygons.area(ground_outline(shape)))
+    overhang = tipping.overhang
+    return Stability(ratio, overhang, ratio < config.min_area_ratio, overhang > config.overhang)
+
+
+def centroid(polygon: Array) -> Array:
+    """Centre (2,) [m] of a polygon (M, 2), or of the border of one without area."""
+    x, y = polygon.T - polygon[:1].T
+    cross = x * np.roll(y, -1) - np.roll(x, -1) * y
+    after = np.roll(polygon, -1, axis=0)
+    if cross.sum() > 2.0 * _NO_AREA:
+        return polygon[0] + cross @ (polygon + after - 2.0 * polygon[0]) / (3.0 * cross.sum())
+    length = np.linalg.norm(after - polygon, axis=1)
+    return length @ (polygon + after) / (2.0 * length.sum()) if length.sum() > 0.0 else polygon[0]
+
+
+def _touching_depth(shape: Shape, config: SupportConfig) -> float:
+    if shape.kind == "sphere":
+        return config.patch_depth
+    turned = np.sin(np.radians(config.patch_tilt)) * float(shape.extents.max()) / 2.0
+    return config.patch_depth + float(turned)
+
+
+def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) -> float:
+    """Way [m] until the first surface point meets the target; what touches at once lies beside it."""
+    own, aim = zip(*shape_arrays([shape, target]), strict=True)
+    spacing = float(shape.extents.max()) / _MARCH_POINTS
+    corners_world = shape.outline() if shape.kind != "sphere" else np.empty((0, 3))
+    points_world = np.concatenate([shape.surface(spacing)[0], corners_world])
+    in_front = signed_distances(*own, points_world + 2.0 * _MARCH_HIT * direction_world) > _MARCH_HIT
+    points_world = points_world[in_front & (signed_distances(*aim, points_world) > _MARCH_HIT)]
+    travelled = np.zeros(len(points_world))
+    step = np.full(len(points_world), np.inf)
+    for _ in range(_MARCH_STEPS):
+        step = signed_distances(*aim, points_world + travelled[:, None] * direction_world)
+        on_its_way = (travelled + step <= limit) & (step > -_MARCH_HIT)
+        points_world, step = points_world[on_its_way], step[on_its_way]
+        travelled = travelled[on_its_way] + step
+        if not len(step) or step.max() < _MARCH_HIT:
+            break
+    return float(travelled[step < _MARCH_HIT].min(initial=np.inf))
+
+
+def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
+    """Outline on the ground (M, 2) [m] of what lies within `depth` of a shape's extreme point that way."""
+    if shape.kind == "sphere":
+        return polygons.hull(_ball_cap(shape, direction_world, depth))
+    corners, edges = _SOLIDS[shape.kind]
+    corners_world = transforms.transform(shape.T_world_object, corners * (shape.extents / 2.0))
+    return polygons.cap(corners_world, edges, direction_world, depth)
+
+
+def _ball_cap(ball: Shape, direction_world: Array, depth: float) -> Array:
+    """Rim (48, 2) [m] of a ball's cap, or of its middle where the cap is deeper, laid onto the ground."""
+    radius = float(ball.extents[0]) / 2.0
+    depth = min(depth, radius)
+    x, y, z = direction_world.tolist()
+    R_world_object = ball.T_world_object[:3, :3]
+    turned = direction_world @ R_world_object
+    least = int(np.argmin(np.abs(turned)))
+    across = np.zeros(3)
+    across[(least + 1) % 3], across[(least + 2) % 3] = turned[(least + 2) % 3], -turned[(least + 1) % 3]
+    u = R_world_object @ across / math.sqrt(across @ across)
+    v_xy = np.array([y * u[2] - z * u[1], z * u[0] - x * u[2]])
+    wide = math.sqrt(depth * (2.0 * radius - depth))
+    middle_xy = ball.T_world_object[:2, 3] + (radius - depth) * direction_world[:2]
+    return middle_xy + wide * (_CIRCLE @ np.stack([u[:2], v_xy]))

@@ -1,0 +1,111 @@
+"""The report's colours: one for each object, the same in every picture, and the scale of saliency."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import SUPPORT_LABEL
+
+Colour = tuple[int, int, int]
+
+PALETTE = (
+    "#0072b2", "#d55e00", "#56b4e9", "#e69f00", "#009e73", "#f0e442", "#cc79a7",
+    "#332288", "#44aa99", "#999933", "#882255", "#ddcc77", "#aa4499", "#117733",
+)  # fmt: skip
+"""Colours for objects 1, 2, …: first the seven of Okabe and Ito, then seven of Tol's muted set, each in the
+order in which neighbours stay furthest apart also for the colour-blind."""
+PLAIN = 7
+"""So many colours are told apart by everyone; the next so many are striped as well."""
+STRIPES = ((), (1,), (-1,), (1, -1))
+"""Directions of the stripes on objects of the first, second, … such turn: 1 rises to the right, −1 falls."""
+STRIPE_WHITE = 0.5
+"""Share of white in a stripe."""
+SERIES = ("#0072b2", "#d55e00", "#56b4e9", "#882255", "#e69f00", "#8a8f96", "#f0e442", "#009e73")
+"""Colours of a chart's lines and of its bars' parts, on light and dark; none of them means an object."""
+SURFACE_COLOUR = "#9c9184"
+"""The support surface."""
+NOTHING_COLOUR = "#b9bec4"
+"""Points that belong to no object."""
+SALIENCY_STOPS = (
+    (-1.0, "#1f4e9e"), (-0.5, "#86a9d9"), (0.0, "#ececec"),
+    (0.35, "#fbe08a"), (0.7, "#f39c34"), (1.0, "#b3301b"),
+)  # fmt: skip
+"""Saliency −1 … 1: blue where it is inhibited, grey at 0, yellow to red where there is something to see."""
+DEPTH_STOPS = ((0.0, "#ffe945"), (0.33, "#bcae6c"), (0.66, "#4b6579"), (1.0, "#00204c"))
+"""Depth images without colour, near to far: the ends and two steps of cividis."""
+
+
+def rgb(colour: str) -> Colour:
+    """Return red, green and blue 0…255 of `#rrggbb`."""
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+def css(colour: Colour) -> str:
+    """Return `#rrggbb`."""
+    return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+def object_colour(label: int) -> str:
+    """Return `#rrggbb` of the object with this label; it depends on nothing but the label.
+
+    The palette starts anew, darker, after its last colour.
+    """
+    if label in (0, SUPPORT_LABEL):
+        return SURFACE_COLOUR
+    turn, position = divmod(label - 1, len(PALETTE))
+    shade = (1.0, 0.72, 0.5)[turn % 3]
+    red, green, blue = (round(shade * c) for c in rgb(PALETTE[position]))
+    return css((red, green, blue))
+
+
+def object_stripes(label: int) -> tuple[int, ...]:
+    """Return the directions of the stripes on the object with this label, which tell like colours apart."""
+    if label in (0, SUPPORT_LABEL):
+        return ()
+    return STRIPES[(label - 1) // PLAIN % len(STRIPES)]
+
+
+def striped_colours(labels: NDArray[np.int32], u: Array, v: Array, pitch: float) -> Array:
+    """Return the colours (..., 3), 0 … 255, of labelled pixels, with the stripes of those that have some.
+
+    Args:
+        labels: Of the pixels (...).
+        u: Their columns (...) [px].
+        v: Their rows (...) [px].
+        pitch: From stripe to stripe along a row or column [px]; the stripe takes a third of it.
+    """
+    stripe = np.zeros(labels.shape, dtype=np.bool_)
+    for label in np.unique(labels):
+        for direction in object_stripes(int(label)):
+            stripe |= (labels == label) & ((u + direction * v) % pitch < pitch / 3.0)
+    colour = label_colours(labels).astype(np.float64)
+    return np.where(stripe[..., None], 255.0 * STRIPE_WHITE + (1.0 - STRIPE_WHITE) * colour, colour)
+
+
+def label_colours(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """Return the colours (..., 3) of an array of labels (...); 0 = belongs to no object."""
+    values, position = np.unique(labels, return_inverse=True)
+    table = [rgb(NOTHING_COLOUR if v == 0 else object_colour(int(v))) for v in values]
+    return np.array(table, dtype=np.uint8).reshape(-1, 3)[position].reshape(*labels.shape, 3)
+
+
+def ink_on(colour: str) -> str:
+    """Return black or white, whichever is read better on this colour."""
+    red, green, blue = rgb(colour)
+    return "#111111" if 0.299 * red + 0.587 * green + 0.114 * blue > 120.0 else "#ffffff"
+
+
+def scale(values: Array, stops: tuple[tuple[float, str], ...]) -> NDArray[np.uint8]:
+    """Map values (...) to colours (..., 3) between the stops; beyond the ends the ends' colours."""
+    positions = [position for position, _ in stops]
+    channels = np.array([rgb(colour) for _, colour in stops], dtype=np.float64)
+    mapped = [np.interp(values, positions, channels[:, c]) for c in range(3)]
+    return np.stack(mapped, axis=-1).round().astype(np.uint8)
+
+
+def saliency_colour(saliency: float) -> str:
+    """Return `#rrggbb` of one saliency value."""
+    red, green, blue = scale(np.array([saliency]), SALIENCY_STOPS)[0]
+    return css((int(red), int(green), int(blue)))
