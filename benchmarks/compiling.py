@@ -65,7 +65,7 @@ def rehearse() -> None:
         truth = true_scene_from_simulation(stage.scene, ground_truth(stage.scene))
         score(steps[-1].graph, truth, np.random.default_rng(0))
         clouds.append(steps[-1].cloud)
-    views = [step.view for step in steps]
+    views = [step.view for step in steps if step.view is not None]
     with TemporaryDirectory() as folder:
         write_recording(folder, views)
         for segmentation in ("labels", "auto"):

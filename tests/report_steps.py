@@ -82,6 +82,7 @@ def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
     decision = Decision(poses[3], 3, 0.8, 0.25, 0.55, "sees o2 & o7 best", (point,), None, saliency)
     return Step(
         index=index,
+        name="view <7> & more",
         view=make_view(graph, rgb),
         labels=make_view(graph).labels,
         graph=graph,

@@ -1,7 +1,8 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import FrozenInstanceError, replace
+import json
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -9,13 +10,15 @@ from synthetic import SENSOR, model_of, simulated_scene, simulated_views
 
 from caryatid.config import ActiveVisionConfig, Config
 from caryatid.errors import InputError, PlanningError
-from caryatid.exploration import Step, explore, next_best_view
+from caryatid.exploration import Explorer, Step, explore, next_best_view
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
+from caryatid.io.runs import RunWriter, read_run
 from caryatid.planning.planners import RandomPlanner
 from caryatid.robots.recording import RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.stage import set_stage
+from caryatid.steps import read_steps, write_step
 
 CONFIG = Config(
     sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
@@ -82,7 +85,8 @@ def test_a_step_tells_all_of_a_turn_and_cannot_be_changed(steps):
         assert step.labels.shape == step.view.depth.shape
         assert len(step.visited) == step.index + 1
         assert len(step.cloud) > 0
-        assert {"capture", "segment", "fit", "plan"} <= set(step.timings)
+        assert {"capture", "segment", "fit"} <= set(step.timings)
+        assert ("plan" in step.timings) == (step.stop is None)
     assert len(steps[0].cloud) < len(steps[-1].cloud)
     with pytest.raises(FrozenInstanceError):
         steps[0].index = 7
@@ -175,3 +179,110 @@ def test_labels_that_are_demanded_and_missing_end_the_loop():
     robot = RecordingRobot([v.pose for v in views])
     with pytest.raises(InputError, match="has no labels"):
         next(explore(Playback(views), robot, config=CONFIG, segmentation="labels"))
+
+
+def test_an_explorer_driven_by_hand_does_what_explore_does(steps):
+    set_up = stage()
+    explorer = Explorer(set_up.camera, set_up.robot, config=CONFIG)
+    for step in steps:
+        explorer.look()
+        planned = explorer.plan()
+        assert graph_text(planned.graph) == graph_text(step.graph)
+        assert planned.path_travelled == step.path_travelled
+        if step.decision is not None:
+            assert repr(planned) == repr(step)
+            explorer.go()
+
+
+def test_a_person_may_choose_another_view_and_another_planner():
+    set_up = stage()
+    explorer = Explorer(set_up.camera, set_up.robot, config=CONFIG, planner="support")
+    explorer.look()
+    planned = explorer.plan()
+    explorer.use_planner("farthest")
+    other = explorer.plan()
+    assert other.decision.index != planned.decision.index
+    index = (other.decision.index + 7) % len(other.candidates)
+    chosen = explorer.choose(explorer.alternative(index))
+    assert chosen.decision.why == "chosen by hand"
+    assert chosen.decision.score == chosen.decision.saliency - chosen.decision.cost
+    explorer.go()
+    seen = explorer.look()
+    np.testing.assert_array_equal(seen.view.pose, chosen.decision.T_world_camera)
+    assert seen.path_travelled > 0.0
+    with pytest.raises(PlanningError, match="no next view"):
+        explorer.go()
+    with pytest.raises(PlanningError, match="no such view"):
+        explorer.alternative(0)
+
+
+def test_views_may_be_handed_in_without_camera_or_robot():
+    explorer = Explorer(config=CONFIG)
+    with pytest.raises(PlanningError, match="no camera"):
+        explorer.look()
+    steps = [explorer.look(view) for view in simulated_views("tower")]
+    straight = np.linalg.norm(steps[1].view.pose[:3, 3] - steps[0].view.pose[:3, 3])
+    assert steps[1].path_travelled == pytest.approx(straight)
+    assert steps[-1].angle_travelled > steps[1].angle_travelled > 0.0
+    with pytest.raises(PlanningError, match="no robot"):
+        explorer.plan()
+
+
+def written(folder, steps):
+    with RunWriter(folder) as writer:
+        for step in steps:
+            write_step(writer, step)
+        writer.finish(steps[-1].graph, {"versions": {"caryatid": "0.2.0"}})
+    return read_run(folder)
+
+
+def test_steps_come_back_from_a_run_folder_as_they_were(steps, tmp_path):
+    found = list(read_steps(written(tmp_path / "run", steps)))
+    assert len(found) == len(steps)
+    for step, read in zip(steps, found, strict=True):
+        assert repr(read) == repr(step)
+        assert graph_text(read.graph) == graph_text(step.graph)
+        for part in ("view", "candidates", "decision", "robot", "cloud", "sphere"):
+            one, other = getattr(step, part), getattr(read, part)
+            assert (one is None) == (other is None)
+            for field in () if one is None else fields(one):
+                if not field.name.startswith("_"):
+                    check_same(getattr(one, field.name), getattr(other, field.name))
+        for name in ("name", "labels", "visited", "timings", "angle_travelled", "path_travelled", "stop"):
+            check_same(getattr(step, name), getattr(read, name))
+
+
+def check_same(one, other):
+    if isinstance(one, np.ndarray):
+        assert one.dtype == other.dtype
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    elif isinstance(one, tuple):
+        assert [repr(item) for item in one] == [repr(item) for item in other]
+    elif is_dataclass(one):
+        assert repr(one) == repr(other)
+    else:
+        assert one == other
+
+
+def test_a_broken_step_is_refused_by_its_name(steps, tmp_path):
+    run = written(tmp_path / "run", steps[:1])
+    path = run.views[0].folder / "step.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(InputError, match="is not a step of a run") as caught:
+        list(read_steps(run))
+    assert "views/00/step.npz" in str(caught.value)
+    path.unlink()
+    with pytest.raises(InputError, match="the file is missing"):
+        list(read_steps(run))
+
+
+def test_a_run_of_the_first_version_keeps_its_graph_and_has_no_steps(steps, tmp_path):
+    run = written(tmp_path / "run", steps[:1])
+    path = run.folder / "run.json"
+    old = json.loads(path.read_text()) | {"version": 1, "versions": {"caryatid": "0.1.0"}}
+    path.write_text(json.dumps(old))
+    (run.views[0].folder / "step.npz").unlink()
+    read = read_run(run.folder)
+    assert graph_text(read.graph) == graph_text(steps[0].graph)
+    with pytest.raises(InputError, match=r"written by caryatid 0\.1\.0, which kept no views"):
+        read_steps(read)

@@ -90,6 +90,7 @@ def tell() -> Story:
     stage = set_stage(scene, config, noise="carmine", seed=0)
     steps = tuple(explore(stage.camera, stage.robot, config=config, segmentation="auto", early_stop=False))
     first = Scene(config, segmentation="auto")
+    assert steps[0].view is not None
     first.update(steps[0].view)
     assert first.voxels is not None
     assert steps[0].candidates is not None
@@ -124,6 +125,7 @@ def draw_view(story: Story) -> bytes:
     """What the camera gives: colour and depth."""
     view = story.steps[0].view
     figure, (left, right) = panels(2, 480, 300)
+    assert view is not None
     assert view.rgb is not None
     near, far = np.percentile(view.depth[view.valid], (2.0, 60.0))
     shade = colours.scale((view.depth - near) / (far - near), colours.DEPTH_STOPS)
@@ -140,6 +142,7 @@ def draw_parts(story: Story) -> bytes:
     """What is taken for one thing."""
     step = story.steps[0]
     figure, (left, right) = panels(2, 480, 300)
+    assert step.view is not None
     assert step.view.rgb is not None
     grey = np.repeat(step.view.rgb.mean(axis=-1, keepdims=True) / 255.0, 3, axis=2) * 0.45 + 0.5
     surface = step.labels == SUPPORT_LABEL
@@ -227,6 +230,7 @@ def draw_next(story: Story) -> bytes:
     figure, (left, right) = panels(2, SQUARE, SQUARE)
     decision, following = story.steps[0].decision, story.steps[1].view
     assert decision is not None
+    assert following is not None
     assert following.rgb is not None
     show_on_sphere(left, story, decision)
     left.set_title("what each view would show anew, less the way there", fontsize=10)

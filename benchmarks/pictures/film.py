@@ -249,6 +249,7 @@ def film() -> tuple[list[Image.Image], list[int]]:
 
     known, graph_drawn = model(stage, None, near), graph_picture(None)
     for step in ct.explore(stage.camera, stage.robot, config=config, seed=SEED):
+        assert step.view is not None
         T, rgb, number = step.view.pose, step.view.rgb, step.index + 1
         if rgb is None:
             raise RuntimeError("a simulated view has colours")

@@ -72,8 +72,10 @@ def show_view(panel: Any, steps: Sequence[Step], tags: Mapping[int, tuple[str, C
         return float(sum(np.sqrt(np.sum(labels_of(step) == label)) for label in tags))
 
     best = max(steps, key=pixels)
-    labels, rgb = labels_of(best), best.view.rgb
-    assert rgb is not None
+    labels = labels_of(best)
+    assert best.view is not None
+    assert best.view.rgb is not None
+    rgb = best.view.rgb
     grey = rgb.mean(axis=-1, keepdims=True) / 255.0
     image = np.repeat(0.35 + 0.6 * grey, 3, axis=2)
     for label, (_, colour) in tags.items():
@@ -95,6 +97,7 @@ def show_view(panel: Any, steps: Sequence[Step], tags: Mapping[int, tuple[str, C
 
 def labels_of(step: Step) -> NDArray[np.int32]:
     """True labels (H, W) of a simulated view."""
+    assert step.view is not None
     assert step.view.labels is not None
     return step.view.labels
 

@@ -10,7 +10,7 @@ from caryatid.runtime.late import imported_late
 if TYPE_CHECKING:
     from caryatid.config import Config
     from caryatid.errors import CaryatidError, InputError
-    from caryatid.exploration import Step, explore, next_best_view
+    from caryatid.exploration import Explorer, Step, explore, next_best_view
     from caryatid.fitting.primitives import fit
     from caryatid.geometry.shapes import Box, Cylinder, Sphere
     from caryatid.graph import SceneObject, Support, SupportGraph
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from caryatid.sensing.views import Camera, Cloud, View
     from caryatid.sessions.session import Session
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 hooks |= {"notebook cell": "caryatid.viz.notebook:draw_cell", "viewer": "caryatid.viewer:show"}
 
@@ -31,6 +31,7 @@ __all__ = [
     "Cloud",
     "Config",
     "Cylinder",
+    "Explorer",
     "InputError",
     "Planner",
     "Robot",
@@ -53,7 +54,7 @@ if not TYPE_CHECKING:
         {
             "config": ["Config"],
             "errors": ["CaryatidError", "InputError"],
-            "exploration": ["Step", "explore", "next_best_view"],
+            "exploration": ["Explorer", "Step", "explore", "next_best_view"],
             "graph": ["SceneObject", "Support", "SupportGraph"],
             "planning.decision": ["Planner"],
             "fitting.primitives": ["fit"],

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.config import Config, SegmentationMethod
+from caryatid.config import ActiveVisionConfig, Config, SegmentationMethod
 from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.objects.change import changed
 from caryatid.planning.candidates import Candidates
+from caryatid.planning.decision import path_cost
 from caryatid.planning.planners import Decision, Planner, PlanningState, make_planner
-from caryatid.robots.humanoid import Robot, refusal_of, view_sphere_of
+from caryatid.robots.arm import ArmRobot
+from caryatid.robots.humanoid import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.runtime.display import Pictured
 from caryatid.runtime.stopwatch import Stopwatch
 from caryatid.runtime.threads import one_blas_thread
@@ -26,27 +28,49 @@ from caryatid.sensing.views import Camera, Cloud, View
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class RobotPose:
+    """How a robot holds its camera.
+
+    Attributes:
+        posture: Pose of the platform, or of an arm's base, and gaze.
+        T_world_camera: Camera pose (4, 4).
+        footprint: Radius of the platform [m].
+        arm: Whether it is an arm; then the platform is what it stands on.
+    """
+
+    posture: Posture
+    T_world_camera: Array
+    footprint: float
+    arm: bool
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class Step(Pictured):
     """One turn of the loop.
 
     Attributes:
-        index: Number of the view, 0 the first.
-        view: What the camera gave; a view without a pose has the one the table gave it.
-        labels: Label image (H, W) of the view.
+        index: Number of the view, 0 is the first.
+        name: Name of the view or cloud.
+        view: The view, or None where a cloud was given. Its pose is the one the camera reported; where it
+            reported none, or there is no robot, it is the one found by registration.
+        labels: Label image (H, W) of the view, or labels (N,) of a cloud.
         graph: The fused graph after this view.
         cloud: All points so far, thinned, with labels.
-        sphere: The view sphere, as the robot has it.
+        sphere: The view sphere of the robot.
         visited: Unit directions (V, 3) of the views so far from the sphere's centre.
         candidates: The views that could be reached next, or None where the loop stops.
         decision: The next view, or None where the loop stops.
-        timings: Seconds each stage took.
+        timings: Seconds of each stage.
         angle_travelled: Sum of the angles between consecutive views at the sphere's centre [rad].
-        path_travelled: Way of the robot [m], as it measures it: a platform over the floor, an arm its hand.
+        path_travelled: Path length of the robot [m]: of a platform over the floor, of an arm's hand. Without
+            a robot, of the camera.
         stop: Why this is the last step, or None.
+        robot: How the robot holds its camera, or None where that is not known.
     """
 
     index: int
-    view: View
+    name: str
+    view: View | None
     labels: NDArray[np.int32]
     graph: SupportGraph
     cloud: Cloud
@@ -58,11 +82,200 @@ class Step(Pictured):
     angle_travelled: float
     path_travelled: float
     stop: str | None
+    robot: RobotPose | None = None
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
         vertices, edges = len(self.graph.objects), len(self.graph.supports)
         return f"Step(index={self.index}, vertices={vertices}, edges={edges}; {following})"
+
+
+class Explorer:
+    """Explores a scene one view at a time: `look()`, `plan()`, `go()`, and again.
+
+    Between any two calls the planner may be replaced (`use_planner`) or another view chosen (`choose`).
+
+    Args:
+        camera: Gives views, or None where they are handed to `look`.
+        robot: Stands where the first view is taken, or None where nothing is planned.
+        planner: Chooses the next view, or its name.
+        config: Settings of all stages.
+        segmentation: `labels`, `auto`, or None to use labels where views have them.
+        seed: Seed of every random choice.
+
+    Attributes:
+        scene: What is known so far.
+        robot: The robot.
+        step: The newest step, or None before the first view.
+        changed: Whether the newest view changed the graph.
+
+    Raises:
+        InputError: There is no such planner.
+    """
+
+    def __init__(
+        self,
+        camera: Camera | None = None,
+        robot: Robot | None = None,
+        *,
+        planner: Planner | str = "support",
+        config: Config | None = None,
+        segmentation: SegmentationMethod | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.scene = Scene(config, segmentation=segmentation, seed=seed)
+        self.robot = robot
+        self.step: Step | None = None
+        self.changed = False
+        self._camera = camera
+        self.use_planner(planner)
+
+    def use_planner(self, planner: Planner | str) -> None:
+        """Let another planner, or the one of this name, choose from now on.
+
+        Raises:
+            InputError: There is no such planner.
+        """
+        self._planner = make_planner(planner) if isinstance(planner, str) else planner
+
+    def look(self, given: View | Cloud | None = None) -> Step:
+        """Take a view where the robot stands and update the scene with it.
+
+        Args:
+            given: The view, or a cloud with z up, in place of one of the camera.
+
+        Returns:
+            The new step, without candidates and decision.
+
+        Raises:
+            CaryatidError: The view cannot be used, or there is neither a view nor a camera.
+        """
+        scene, robot, before = self.scene, self.robot, self.step
+        watch = Stopwatch()
+        source = self._captured() if given is None else given
+        watch.lap("capture")
+        graph_before = scene.graph
+        graph = scene.update(source)
+        self.changed = changed(graph_before, graph, scene.config.fusion)
+        if scene.sphere is None or scene.labels is None:
+            raise RuntimeError("an updated scene has a sphere and labels")
+        view = source if isinstance(source, View) else None
+        unposed = view is not None and (robot is None or view.T_world_camera is None)
+        if view is not None and unposed and scene.T_world_camera is not None:
+            view = view.with_pose(scene.T_world_camera)
+        sphere = scene.sphere if robot is None else view_sphere_of(robot, scene.sphere)
+        T_world_camera = scene.T_world_camera if robot is None else robot.T_world_camera
+        visited = np.zeros((0, 3)) if before is None else before.visited
+        angle, path = (0.0, 0.0) if before is None else (before.angle_travelled, before.path_travelled)
+        if T_world_camera is not None:
+            visited = np.concatenate([visited, sphere.direction_of(T_world_camera)[None]])
+        if len(visited) > 1:
+            angle += float(transforms.angle_between(visited[-2], visited[-1]))
+        if robot is None and view is not None and before is not None and before.view is not None:
+            path += float(np.linalg.norm(view.pose[:3, 3] - before.view.pose[:3, 3]))
+        self.step = Step(
+            scene.views - 1, source.name, view, scene.labels, graph, scene.cloud, sphere, visited,
+            None, None, {"capture": watch.laps["capture"]} | scene.timings, angle, path, None,
+            None if robot is None else _robot_pose(robot, scene.config),
+        )  # fmt: skip
+        return self.step
+
+    def plan(self) -> Step:
+        """Choose the next view. Where the robot, looking closer, refuses one, plan again among the others.
+
+        Returns:
+            The newest step, with candidates and decision; where no view can be reached, with why in `stop`.
+
+        Raises:
+            PlanningError: Nothing has been seen yet, or there is no robot.
+        """
+        step, robot = self._newest(), self._moving()
+        watch = Stopwatch()
+        decision, stop = None, None
+        candidates: Candidates | None = None
+        try:
+            candidates = robot.candidates(step.sphere)
+            decision, candidates = _decide(
+                self.scene, robot, step.sphere, candidates, step.visited, self._planner, self.scene.seed
+            )
+        except PlanningError as error:
+            stop = str(error)
+        watch.lap("plan")
+        timings = step.timings | watch.laps
+        self.step = replace(step, candidates=candidates, decision=decision, stop=stop, timings=timings)
+        return self.step
+
+    def alternative(self, index: int) -> Decision:
+        """What choosing another candidate by hand means, with the planner's figures for it.
+
+        Args:
+            index: Which of the newest step's candidates.
+
+        Raises:
+            PlanningError: There is no such candidate, or nothing has been planned.
+        """
+        step = self._newest()
+        if step.decision is None or step.candidates is None or not 0 <= index < len(step.candidates):
+            raise PlanningError("there is no such view to choose")
+        rated = step.decision.candidate_saliency
+        saliency = 0.0 if rated is None or index >= len(rated) else float(rated[index])
+        cost = float(path_cost(_state(self.scene, step.sphere, step.visited, step.candidates))[index])
+        return replace(
+            step.decision,
+            T_world_camera=step.candidates.T_world_camera[index],
+            index=index,
+            saliency=saliency,
+            cost=cost,
+            score=saliency - cost,
+            why="chosen by hand",
+        )
+
+    def choose(self, decision: Decision) -> Step:
+        """Take this decision in place of the planner's.
+
+        Returns:
+            The newest step, with this decision.
+
+        Raises:
+            PlanningError: The robot cannot take the view, or nothing has been seen yet.
+        """
+        refused = refusal_of(self._moving(), decision.T_world_camera)
+        if refused is not None:
+            raise PlanningError(refused.reason)
+        self.step = replace(self._newest(), decision=decision, stop=None)
+        return self.step
+
+    def go(self) -> None:
+        """Send the robot to the next view.
+
+        Raises:
+            PlanningError: There is none, or it cannot be reached.
+        """
+        step = self._newest()
+        if step.decision is None:
+            raise PlanningError("there is no next view to go to")
+        path = self._moving().move_to(step.decision.T_world_camera)
+        self.step = replace(step, path_travelled=step.path_travelled + path)
+
+    def stop(self, reason: str) -> Step:
+        """End the exploration; returns the newest step, with the reason."""
+        self.step = replace(self._newest(), stop=reason)
+        return self.step
+
+    def _captured(self) -> View:
+        if self._camera is None:
+            raise PlanningError("there is no camera; hand the view to look()")
+        return self._camera.capture(self._moving().T_world_camera)
+
+    def _moving(self) -> Robot:
+        if self.robot is None:
+            raise PlanningError("there is no robot to go anywhere")
+        return self.robot
+
+    def _newest(self) -> Step:
+        if self.step is None:
+            raise PlanningError("nothing has been seen yet; look first")
+        return self.step
 
 
 def explore(
@@ -80,8 +293,8 @@ def explore(
     Args:
         camera: Gives views.
         robot: Stands where the first view is taken.
-        planner: Chooses the next view, or the name of one that does.
-        config: All stages' settings; `config.active.max_views` limits the views.
+        planner: Chooses the next view, or its name.
+        config: Settings of all stages; `config.active.max_views` limits the views.
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
         early_stop: Stop when a view did not change the graph.
@@ -92,46 +305,30 @@ def explore(
     Raises:
         CaryatidError: A view cannot be used, or the planner does not exist.
     """
-    config = config or Config()
-    scene = Scene(config, segmentation=segmentation, seed=seed)
-    chooser = make_planner(planner) if isinstance(planner, str) else planner
-    visited: list[Array] = []
-    angle, path = 0.0, 0.0
+    explorer = Explorer(camera, robot, planner=planner, config=config, segmentation=segmentation, seed=seed)
     while True:
-        watch = Stopwatch()
-        view = camera.capture(robot.T_world_camera)
-        watch.lap("capture")
-        before = scene.graph
-        graph = scene.update(view)
-        labels = scene.labels
-        if scene.sphere is None or labels is None:
-            raise RuntimeError("an updated scene has a sphere and labels")
-        sphere = view_sphere_of(robot, scene.sphere)
-        if view.T_world_camera is None and scene.T_world_camera is not None:
-            view = view.with_pose(scene.T_world_camera)
-        visited.append(sphere.direction_of(robot.T_world_camera))
-        if len(visited) > 1:
-            angle += float(transforms.angle_between(visited[-2], visited[-1]))
-        stop = _reason_to_stop(before, graph, len(visited), config, early_stop)
-        watch.lap("update")
-        decision, candidates = None, None
-        if stop is None:
-            try:
-                candidates = robot.candidates(sphere)
-                decision, candidates = _decided(
-                    scene, robot, sphere, candidates, np.array(visited), chooser, seed
-                )
-            except PlanningError as error:
-                stop = str(error)
-        watch.lap("plan")
-        laps = {"capture": watch.laps["capture"]} | scene.timings | {"plan": watch.laps["plan"]}
-        yield Step(
-            len(visited) - 1, view, labels, graph, scene.cloud, sphere, np.array(visited),
-            candidates, decision, laps, angle, path, stop,
-        )  # fmt: skip
-        if decision is None:
+        views = explorer.look().index + 1
+        reason = reason_to_stop(views, explorer.changed or not early_stop, explorer.scene.config.active)
+        step = explorer.plan() if reason is None else explorer.stop(reason)
+        yield step
+        if step.decision is None:
             return
-        path += robot.move_to(decision.T_world_camera)
+        explorer.go()
+
+
+def reason_to_stop(views: int, changed: bool, config: ActiveVisionConfig) -> str | None:
+    """Why looking further may not pay, or None.
+
+    Args:
+        views: Number of views so far.
+        changed: Whether the newest one changed the graph.
+        config: Holds the maximum number of views.
+    """
+    if views >= config.max_views:
+        return f"{views} views were asked for"
+    if views > 1 and not changed:
+        return "the last view changed nothing"
+    return None
 
 
 def next_best_view(
@@ -149,7 +346,7 @@ def next_best_view(
         robot: Says which views it can reach.
         visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
             current one last; None = where the robot is.
-        planner: Chooses among them, or the name of one that does.
+        planner: Chooses among them, or its name.
         seed: Seed of random planners.
 
     Returns:
@@ -164,11 +361,11 @@ def next_best_view(
     sphere = view_sphere_of(robot, scene.sphere)
     if visited is None:
         visited = sphere.direction_of(robot.T_world_camera)[None]
-    return _decided(scene, robot, sphere, robot.candidates(sphere), visited, chooser, seed)[0]
+    return _decide(scene, robot, sphere, robot.candidates(sphere), visited, chooser, seed)[0]
 
 
 @one_blas_thread
-def _decided(
+def _decide(
     scene: Scene,
     robot: Robot,
     sphere: ViewSphere,
@@ -177,20 +374,11 @@ def _decided(
     planner: Planner,
     seed: int,
 ) -> tuple[Decision, Candidates]:
-    """Plan; where the robot, looking closer, cannot take the view, plan anew among the others.
-
-    Returns:
-        The decision, and the candidates it was taken among.
-
-    Raises:
-        PlanningError: No view is left, or the robot could take none of as many as it may try.
-    """
-    if scene.voxels is None:
-        raise PlanningError("nothing has been seen yet; update the scene with a first view")
+    """Return the decision and the candidates it was taken among: without those the robot refused."""
     rng = np.random.default_rng([seed, len(visited)])
+    why = ""
     for _ in range(scene.config.active.attempts):
-        state = PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active)
-        decision = planner.plan(state, rng)
+        decision = planner.plan(_state(scene, sphere, visited, candidates), rng)
         refused = refusal_of(robot, decision.T_world_camera)
         if refused is None:
             return decision, candidates
@@ -199,11 +387,14 @@ def _decided(
     raise PlanningError(f"the robot could take none of {scene.config.active.attempts} views: {why}")
 
 
-def _reason_to_stop(
-    before: SupportGraph, after: SupportGraph, views: int, config: Config, early_stop: bool
-) -> str | None:
-    if views >= config.active.max_views:
-        return f"{views} views were asked for"
-    if early_stop and views > 1 and not changed(before, after, config.fusion):
-        return "the last view changed nothing"
-    return None
+def _state(scene: Scene, sphere: ViewSphere, visited: Array, candidates: Candidates) -> PlanningState:
+    if scene.voxels is None:
+        raise PlanningError("nothing has been seen yet; update the scene with a first view")
+    return PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active)
+
+
+def _robot_pose(robot: Robot, config: Config) -> RobotPose | None:
+    posture = robot.solve(robot.T_world_camera)
+    if not isinstance(posture, Posture):
+        return None
+    return RobotPose(posture, robot.T_world_camera, config.robot.footprint, isinstance(robot, ArmRobot))

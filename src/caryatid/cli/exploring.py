@@ -13,7 +13,7 @@ from caryatid.cli.dismantle import Dismantle
 from caryatid.cli.explore import Explore
 from caryatid.cli.profile import print_profile, profile_record
 from caryatid.cli.progress import Progress, summary
-from caryatid.cli.records import kept, run_record, step_record, view_record
+from caryatid.cli.records import kept, run_record, step_record
 from caryatid.cli.report_texts import report_in_time
 from caryatid.config import Config
 from caryatid.evaluation.oracle import planner_for
@@ -31,6 +31,7 @@ from caryatid.runtime.interrupts import (
     note_interrupts,
 )
 from caryatid.sources import Source, open_source
+from caryatid.steps import write_step
 from caryatid.viz import Figure, ViewPage, draw_view
 
 if TYPE_CHECKING:
@@ -159,14 +160,7 @@ def look_around(
             page = [draw_view(step, config.report)] if report else []
             with interrupts_held():
                 if writer is not None:
-                    writer.add_view(
-                        step.graph,
-                        step.labels,
-                        name=step.view.name,
-                        T_world_camera=step.view.T_world_camera,
-                        K=step.view.K,
-                        record=view_record(step),
-                    )
+                    write_step(writer, step)
                 before, done.last = done.last, step
                 done.steps.append(step_record(step))
                 done.pages += page

@@ -13,11 +13,11 @@ import numpy as np
 from caryatid.cli.extract import Extract
 from caryatid.cli.profile import print_profile, profile_record
 from caryatid.cli.progress import Progress, summary
-from caryatid.cli.records import kept, run_record
+from caryatid.cli.records import kept, run_record, step_record
 from caryatid.cli.report_texts import report_in_time
 from caryatid.config import Config
 from caryatid.errors import InputError
-from caryatid.geometry import transforms
+from caryatid.exploration import Explorer, Step
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.json_files import json_text
@@ -31,11 +31,10 @@ from caryatid.runtime.interrupts import (
     interrupts_held,
     note_interrupts,
 )
-from caryatid.scene import Scene
 from caryatid.segmentation.perception import level_cloud
-from caryatid.sensing.views import View
 from caryatid.sources import CLOUD_SUFFIXES, check_segments, open_recording
-from caryatid.viz import ViewPage, draw_model
+from caryatid.steps import write_step
+from caryatid.viz import ViewPage, draw_view
 
 
 @dataclass(slots=True)
@@ -99,28 +98,24 @@ def _extract_cloud(options: Extract, config: Config, writer: RunWriter, progress
             raise InputError(options.source, "has no field label", "use --segmentation auto")
         if options.segmentation != "auto" and stored.labels is not None:
             check_segments(options.source, Counter(stored.labels[stored.kept].tolist()), config)
-    scene = _new_scene(options, config, progress)
+    explorer = _explorer(options, config, progress)
+    done = Extraction()
     with progress.working("extracting"):
         rng = np.random.default_rng(options.modelling.seed)
         cloud = stored.to_cloud(config.cloud)
-        cloud = level_cloud(cloud, config, segmentation=options.segmentation, rng=rng)
-        graph = scene.update(cloud)
-    if scene.labels is None:
-        raise RuntimeError("an updated scene has labels")
-    writer.add_view(graph, stored.spread(scene.labels), name=stored.name)
-    step = {"view": 0, "timings": scene.timings, "angle_travelled": 0.0, "path_travelled": 0.0}
-    pages = [] if options.no_report else [draw_model(graph, scene.cloud, config=config.report)]
-    return Extraction(graph, [step], pages)
+        step = explorer.look(level_cloud(cloud, config, segmentation=options.segmentation, rng=rng))
+        _keep(replace(step, labels=stored.spread(step.labels)), done, options, config, writer)
+    return done
 
 
 def _extract_recording(options: Extract, config: Config, writer: RunWriter, progress: Progress) -> Extraction:
     with progress.working("reading the recording"):
         recording = open_recording(options.source, config, options.segmentation)
-    scene = _new_scene(options, config, progress)
+    explorer = _explorer(options, config, progress)
     done = Extraction()
     try:
         for frame in recording.frames:
-            _take_in(frame.load(), scene, done, options, config, writer)
+            _keep(explorer.look(frame.load()), done, options, config, writer)
             progress.say(f"view {len(done.steps) - 1:02d}: {summary(done.graph)}")
         note_interrupts()
     except KeyboardInterrupt:
@@ -131,38 +126,16 @@ def _extract_recording(options: Extract, config: Config, writer: RunWriter, prog
     return done
 
 
-def _take_in(
-    view: View, scene: Scene, done: Extraction, options: Extract, config: Config, writer: RunWriter
-) -> None:
-    """Update the scene with a view, and write what came of it."""
-    T_world_before = scene.T_world_camera
-    graph = scene.update(view)
-    labels, T_world_camera, sphere = scene.labels, scene.T_world_camera, scene.sphere
-    if labels is None or T_world_camera is None or sphere is None:
-        raise RuntimeError("a scene updated with a view has labels, a pose and a sphere")
-    angle, path = 0.0, 0.0
-    if T_world_before is not None:
-        before = done.steps[-1]
-        directions = sphere.direction_of(np.stack([T_world_before, T_world_camera]))
-        angle = before["angle_travelled"] + float(transforms.angle_between(*directions))
-        path = float(np.linalg.norm(T_world_camera[:3, 3] - T_world_before[:3, 3]))
-        path += before["path_travelled"]
-    step = {"view": len(done.steps), "timings": scene.timings}
-    step |= {"angle_travelled": angle, "path_travelled": path}
-    pages = []
-    if not options.no_report:
-        posed = view.with_pose(T_world_camera)
-        page = draw_model(graph, scene.cloud, view=posed, labels=labels, config=config.report)
-        page = replace(page, index=len(done.steps), timings=scene.timings)
-        pages.append(replace(page, angle_travelled=angle, path_travelled=path))
+def _keep(step: Step, done: Extraction, options: Extract, config: Config, writer: RunWriter) -> None:
+    pages = [] if options.no_report else [draw_view(step, config.report)]
     with interrupts_held():
-        writer.add_view(graph, labels, name=view.name, T_world_camera=T_world_camera, K=view.K)
-        done.graph = graph
-        done.steps.append(step)
+        write_step(writer, step)
+        done.graph = step.graph
+        done.steps.append(step_record(step))
         done.pages += pages
 
 
-def _new_scene(options: Extract, config: Config, progress: Progress) -> Scene:
+def _explorer(options: Extract, config: Config, progress: Progress) -> Explorer:
     with progress.working("compiling"):
         compile_kernels(progress.say)
-    return Scene(config, segmentation=options.segmentation, seed=options.modelling.seed)
+    return Explorer(config=config, segmentation=options.segmentation, seed=options.modelling.seed)

@@ -9,8 +9,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from caryatid.config import Config
 from caryatid.evaluation.scores import Score
 from caryatid.exploration import Step
@@ -67,35 +65,6 @@ def step_record(step: Step) -> dict[str, Any]:
         "path_travelled": step.path_travelled,
         "stop": step.stop,
     }
-
-
-def view_record(step: Step) -> dict[str, Any]:
-    """The candidates' summary and the choice of the next view."""
-    record: dict[str, Any] = {}
-    if step.candidates is not None:
-        record["candidates"] = {"reachable": len(step.candidates), "rejected": step.candidates.rejected}
-    if step.decision is not None:
-        d = step.decision
-        record["next"] = {
-            "T_world_camera": d.T_world_camera,
-            "saliency": d.saliency,
-            "cost": d.cost,
-            "score": d.score,
-            "why": d.why,
-            "points_of_interest": [
-                {
-                    "position": p.position_world,
-                    "saliency": p.saliency,
-                    "subject": list(p.subject),
-                    "why": p.why,
-                }
-                for p in d.points_of_interest
-            ],
-        }
-        if d.candidate_saliency is not None:
-            quartiles = np.quantile(d.candidate_saliency, (0.0, 0.25, 0.5, 0.75, 1.0))
-            record["next"]["candidate_saliency_quartiles"] = quartiles
-    return record
 
 
 def kept(views: int, folder: Path, *, reported: bool) -> str:

@@ -22,8 +22,8 @@ from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import SUPPORT_LABEL
 
 FORMAT: Final = "caryatid/run"
-VERSION: Final = 1
-"""What run.json says it is."""
+VERSION: Final = 2
+"""What run.json says it is. Version 1, of caryatid 0.1.0, has no step.npz."""
 
 
 class RunWriter:
@@ -65,6 +65,7 @@ class RunWriter:
         T_world_camera: Array | None = None,
         K: Array | None = None,
         record: Mapping[str, Any] | None = None,
+        step: bytes | None = None,
     ) -> None:
         """Write the next view.
 
@@ -75,6 +76,7 @@ class RunWriter:
             T_world_camera: Camera pose (4, 4) in the run's world, if there is one.
             K: Pinhole matrix (3, 3) [px], if there is one.
             record: What else view.json shall hold: the candidates' summary and the choice.
+            step: Content of step.npz.
 
         Raises:
             InputError: Labels leave 16 bits, or the disk is full or refuses; nothing is left behind.
@@ -91,6 +93,8 @@ class RunWriter:
             self._staged.write(f"{folder}/labels.npy", buffer.getvalue())
         document = {"view": self.views, "name": name, "T_world_camera": T_world_camera, "K": K}
         self._staged.write(f"{folder}/view.json", json_text(document | dict(record or {})).encode())
+        if step is not None:
+            self._staged.write(f"{folder}/step.npz", step)
         self.views += 1
 
     def finish(
@@ -138,6 +142,7 @@ class RunView:
         K: Pinhole matrix (3, 3) [px], or None.
         record: All of view.json.
         labels_path: labels.png or labels.npy.
+        folder: Its folder, `views/NN`.
     """
 
     index: int
@@ -147,6 +152,7 @@ class RunView:
     K: Array | None
     record: dict[str, Any]
     labels_path: Path
+    folder: Path
 
     def load_labels(self) -> NDArray[np.int32]:
         """Read the label image (H, W), or the labels (N,) of a cloud's points.
@@ -196,8 +202,8 @@ def read_run(folder: str | Path) -> Run:
         raise InputError(folder, "is no folder", "give the folder a run was written to with --out")
     path = folder / "run.json"
     record = read_json(path, "give the folder a run was written to with --out")
-    if record.get("format") != FORMAT or record.get("version") != VERSION:
-        raise InputError(path, f"is not of format '{FORMAT}', version {VERSION}", "run caryatid again")
+    if record.get("format") != FORMAT or record.get("version") not in (1, VERSION):
+        raise InputError(path, f"is not of format '{FORMAT}', version 1 or {VERSION}", "run caryatid again")
     count: int = field(record, "views", int, str(path))
     return Run(
         folder,
@@ -232,4 +238,5 @@ def _read_view(folder: Path, index: int) -> RunView:
         K=None if K is None else numbers(K, (3, 3), f"{path}: K"),
         record=record,
         labels_path=image if image.exists() else folder / "labels.npy",
+        folder=folder,
     )

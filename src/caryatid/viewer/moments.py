@@ -134,10 +134,10 @@ def moment_of_step(
     """
     return Moment(
         step.index,
-        step.view.name,
+        step.name,
         step.graph,
         dots_of(step.cloud, most_points),
-        shot_of(step.view),
+        None if step.view is None else shot_of(step.view),
         step.sphere,
         step.visited,
         step.candidates,

@@ -97,13 +97,12 @@ def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
         config: Sizes of the pictures.
     """
     config = config or ReportConfig()
-    first = step.visited[0] if len(step.visited) else np.array([1.0, 0.0, 0.0])
     page = draw_model(
         step.graph,
         step.cloud,
         view=step.view,
         labels=step.labels,
-        azimuth=float(np.arctan2(first[1], first[0])),
+        azimuth=float(np.arctan2(*step.visited[0, 1::-1])) if len(step.visited) else None,
         config=config,
     )
     figures = page.figures
@@ -115,6 +114,7 @@ def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
     return replace(
         page,
         index=step.index,
+        name=step.name,
         figures=figures,
         points=point_rows(step.decision),
         choice=_choice(step),

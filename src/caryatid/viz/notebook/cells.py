@@ -65,7 +65,8 @@ def _of_scene(scene: Scene) -> Cell:
 
 @_cell.register
 def _of_step(step: Step) -> Cell:
-    figures = (_image(step.view, step.labels, step.graph), _graph(step.graph))
+    image = () if step.view is None else (_image(step.view, step.labels, step.graph),)
+    figures = (*image, _graph(step.graph))
     note = f"Next: {step.decision.why}" if step.decision is not None else f"Stopped: {step.stop}"
     taken = f"{np.degrees(step.angle_travelled):.0f}° and {step.path_travelled:.1f} m travelled"
     return Cell(
