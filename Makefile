@@ -55,7 +55,7 @@ $(VENV)/.peers: $(VENV)/.installed
 	if test -z "$$failed"; then touch $@; else echo "could not be installed:$$failed"; fi
 
 bench: $(VENV)/.peers
-	$(BIN)/python benchmarks/bench.py --docs docs/performance.md --out bench.json --update
+	$(BIN)/python benchmarks/bench.py --docs docs/performance --out bench.json --update
 
 bench-gate: $(VENV)/.peers
 	$(BIN)/python benchmarks/bench.py --gate

@@ -1,6 +1,6 @@
 """How fast it is: ours against open3d, pyransac3d, CGAL, volumetric planners and the machine's limit.
 
-    python benchmarks/bench.py [--only turn fit.cylinder] [--quick] [--docs docs/performance.md] [--gate]
+    python benchmarks/bench.py [--only turn fit.cylinder] [--quick] [--docs docs/performance] [--gate]
 
 `make bench` installs the peers first and writes the page and the ratios to compare with; `make bench-gate`
 compares. A peer that cannot be imported is a row that says so.
@@ -8,6 +8,7 @@ compares. A peer that cannot be imported is a row that says so.
 
 from __future__ import annotations
 
+import csv
 import json
 import sys
 import time
@@ -27,16 +28,15 @@ from performance.effort import FULL, QUICK, Effort
 from performance.fitting import measure_fits
 from performance.growth import AXES, Curve, measure_growth
 from performance.mapping import measure_map
-from performance.page import Run, write_page
 from performance.planning import measure_decision
 from performance.rows import Row, measures
 from performance.starting import measure_start
-from performance.telling import COLUMNS, cells, notes
+from performance.telling import COLUMNS, NOTHING, cells, notes
 from performance.turns import measure_turns
 from rich.console import Console
 from rich.table import Table
 
-from caryatid.benchmark.provenance import collect_provenance
+from caryatid.benchmark.store import collect_provenance, describe_provenance
 from caryatid.errors import CaryatidError, InputError
 
 BASELINE = Path(__file__).with_name("performance_baseline.json")
@@ -78,7 +78,7 @@ class Bench:
     out: Path | None = None
     """JSON file for the rows and curves."""
     docs: Path | None = None
-    """Page to write of all rows, with its figure in a folder beside it."""
+    """Folder for the tables the documentation shows: a CSV file for each group of rows."""
     gate: bool = False
     """Fail where a ratio is worse than the committed baseline allows."""
     update: bool = False
@@ -121,12 +121,27 @@ def document(rows: Sequence[Row], curves: Sequence[Curve], disturbed: Sequence[s
     figures = ("to_peer", "to_limit", "met")
     return {
         "machine": asdict(limits.machine()),
-        "provenance": collect_provenance().as_strings(),
+        "provenance": collect_provenance(),
         "peers": peers.versions(),
         "disturbed": list(disturbed),
         "rows": [asdict(row) | {name: getattr(row, name) for name in figures} for row in rows],
         "curves": [asdict(c) | {"exponent": c.exponent, "last_exponent": c.last_exponent} for c in curves],
     }
+
+
+def write_docs(rows: Sequence[Row], folder: Path) -> None:
+    """Write a CSV file for each group of rows, without empty columns, and what they were measured on."""
+    folder.mkdir(exist_ok=True)
+    for group in dict.fromkeys(row.group for row in rows):
+        lines = [(*cells(row), row.note or NOTHING) for row in rows if row.group == group]
+        columns = (*COLUMNS, "note")
+        kept = [k for k in range(len(columns)) if any(line[k] != NOTHING for line in lines)]
+        with (folder / f"{group}.csv").open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(
+                [line[k] for k in kept] for line in [columns, *lines]
+            )
+    about = f"{describe_provenance(collect_provenance())}; {peers.versions()}"
+    (folder / "machine.txt").write_text(f"Run by {about}.\n", encoding="utf-8")
 
 
 def update(rows: Sequence[Row], patterns: Sequence[str]) -> None:
@@ -197,8 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if args.out is not None:
         args.out.write_text(json.dumps(document(rows, curves, disturbed), indent=1) + "\n", encoding="utf-8")
     if args.docs is not None:
-        run = Run(rows, curves, disturbed, limits.machine(), collect_provenance(), peers.versions())
-        write_page(run, args.docs)
+        write_docs(rows, args.docs)
     if args.update:
         update(rows, args.only)
     rows_by_name = {name: part for name, (part, _) in outcomes.items()}

@@ -47,7 +47,7 @@ def rehearse() -> None:
     from caryatid.scene import Scene
     from caryatid.sensing.views import SUPPORT_LABEL, Cloud
     from caryatid.simulation.scenes import load_scene
-    from caryatid.simulation.stage import set_stage
+    from caryatid.simulation.setup import make_simulation
     from caryatid.simulation.truth import ground_truth
 
     config = Config()
@@ -60,7 +60,7 @@ def rehearse() -> None:
     clouds: list[Cloud] = []
     for name, segmentation, method in runs:
         settings = replace(fast, fusion=replace(config.fusion, method=method))
-        stage = set_stage(load_scene(name), settings, noise="carmine", seed=0)
+        stage = make_simulation(load_scene(name), settings, noise="carmine", seed=0)
         steps = list(explore(stage.camera, stage.robot, config=settings, segmentation=segmentation))
         truth = true_scene_from_simulation(stage.scene, ground_truth(stage.scene))
         score(steps[-1].graph, truth, np.random.default_rng(0))

@@ -189,11 +189,11 @@ def record_frame(scene: str, folder: Path, config: Config, seed: int) -> None:
     """
     from caryatid.io import write_recording
     from caryatid.simulation.scenes import load_scene
-    from caryatid.simulation.stage import set_stage
+    from caryatid.simulation.setup import make_simulation
     from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, write_truth
 
     simulated = load_scene(scene)
-    stage = set_stage(simulated, config, noise="carmine", seed=seed)
+    stage = make_simulation(simulated, config, noise="carmine", seed=seed)
     view = stage.camera.capture(stage.robot.T_world_camera)
     assert view.labels is not None
     shown, counts = np.unique(view.labels[view.valid], return_counts=True)

@@ -9,13 +9,13 @@ import caryatid as ct
 from caryatid.evaluation import Score, score_masks
 from caryatid.io import read_recording, write_recording
 from caryatid.simulation import ground_truth, load_scene, read_truth
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 
 
 def render_a_frame(folder: Path) -> None:
     """Write what a Carmine would see of the built-in tower, and forget where the camera was."""
     scene = load_scene("tower")
-    stage = set_stage(scene, ct.Config(), noise="carmine", seed=0)
+    stage = make_simulation(scene, ct.Config(), noise="carmine", seed=0)
     seen = stage.camera.capture(stage.robot.T_world_camera)
     write_recording(folder, [ct.View(seen.depth, seen.K, rgb=seen.rgb, labels=seen.labels)])
     # A recording calls its objects by their obj_id.

@@ -5,7 +5,7 @@ import numpy as np
 import caryatid as ct
 from caryatid.evaluation import score, true_scene_from_simulation
 from caryatid.simulation import ground_truth, load_scene
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 
 VIEWS = 3
 
@@ -14,7 +14,7 @@ def main() -> None:
     """Explore, and score every view against what physics says."""
     scene = load_scene("clutter")
     truth = true_scene_from_simulation(scene, ground_truth(scene))
-    stage = set_stage(scene, ct.Config(), noise="carmine", seed=0)
+    stage = make_simulation(scene, ct.Config(), noise="carmine", seed=0)
 
     # `explore` yields after every view; camera and robot could be real ones, or a recording.
     f1 = []

@@ -15,7 +15,7 @@ from caryatid.geometry import transforms
 from caryatid.planning.decision import check_candidates, path_cost
 from caryatid.planning.planners import Decision, PlanningState
 from caryatid.simulation import load_scene
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 
 
 class OppositePlanner:
@@ -42,7 +42,7 @@ class OppositePlanner:
 def main() -> None:
     """Let it look behind a box, beside the planner that comes with caryatid."""
     for planner in (OppositePlanner(), "support"):
-        stage = set_stage(load_scene("hidden_stack"), ct.Config(), noise="none", seed=0)
+        stage = make_simulation(load_scene("hidden_stack"), ct.Config(), noise="none", seed=0)
         name = planner if isinstance(planner, str) else type(planner).__name__
         print(name)
         for step in ct.explore(stage.camera, stage.robot, planner=planner, early_stop=False):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import caryatid as ct
 from caryatid.simulation import load_scene
-from caryatid.simulation.stage import Stage, set_stage
+from caryatid.simulation.setup import Simulation, make_simulation
 
 sys.path.append(str(Path(sys.argv[0]).parent))
 from robot_client import RobotClient, png16
@@ -25,7 +25,7 @@ def image(values: NDArray[Any]) -> bytes:
 
 def main() -> None:
     """Start a service, and drive the robot where it says."""
-    stage = set_stage(load_scene("tower"), ct.Config(), noise="carmine", seed=0)
+    stage = make_simulation(load_scene("tower"), ct.Config(), noise="carmine", seed=0)
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "caryatid", "serve", folder, "--port", "0", "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
@@ -41,7 +41,7 @@ def main() -> None:
     assert service.returncode == 0
 
 
-def drive(robot: RobotClient, stage: Stage) -> dict[str, Any]:
+def drive(robot: RobotClient, stage: Simulation) -> dict[str, Any]:
     """Look, say what was seen, ask, go there."""
     robot.begin("table", segmentation="labels")
     while True:

@@ -12,7 +12,7 @@ from caryatid.robots.arm import ArmRobot
 from caryatid.robots.reachability import sample_reachability
 from caryatid.robots.registry import Surroundings
 from caryatid.simulation import ground_truth, load_scene
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 
 DH = [  # a [m], alpha [rad], d [m] of each joint: an arm of 0.85 m reach
     (0.0, np.pi / 2, 0.1625), (-0.425, 0.0, 0.0), (-0.3922, 0.0, 0.0),
@@ -43,7 +43,7 @@ def main() -> None:
 
     scene = load_scene("pile-8-2")
     truth = true_scene_from_simulation(scene, ground_truth(scene))
-    stage = set_stage(scene, ct.Config(), noise="carmine", seed=0, robot=arm)
+    stage = make_simulation(scene, ct.Config(), noise="carmine", seed=0, robot=arm)
     for step in ct.explore(stage.camera, stage.robot, early_stop=False):
         f1 = score(step.graph, truth, np.random.default_rng(0)).f1
         print(f"view {step.index + 1}: {len(step.graph.objects) - 1} objects, F1 {f1:.2f}", end="")

@@ -21,7 +21,7 @@ from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import load_scene
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 
 PAGE = ROOT / "docs/how-to-own-robot.md"
 
@@ -241,7 +241,7 @@ class TestExploring:
         def make(around):
             return ArmRobot(reachable, around.T_world_base, around.config.arm, furniture=around.floor)
 
-        return set_stage(load_scene("tower"), self.SETTINGS, noise="none", seed=0, robot=make)
+        return make_simulation(load_scene("tower"), self.SETTINGS, noise="none", seed=0, robot=make)
 
     def test_an_arm_goes_around_on_its_own_sphere(self):
         stage = self.stage()
@@ -273,7 +273,7 @@ class TestExploring:
                 return self._other.move_to(T_world_camera)
 
         def run(wrap):
-            stage = set_stage(load_scene("tower"), self.SETTINGS, noise="none", seed=0)
+            stage = make_simulation(load_scene("tower"), self.SETTINGS, noise="none", seed=0)
             return list(explore(stage.camera, wrap(stage.robot), config=self.SETTINGS, early_stop=False))
 
         plain, humanoid = run(Plain), run(lambda robot: robot)

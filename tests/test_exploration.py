@@ -17,7 +17,7 @@ from caryatid.io.runs import RunWriter, read_run
 from caryatid.planning.planners import RandomPlanner
 from caryatid.robots.recording import RecordingRobot
 from caryatid.scene import Scene
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 from caryatid.steps import read_steps, write_step
 
 CONFIG = Config(
@@ -26,7 +26,7 @@ CONFIG = Config(
 
 
 def stage(config=CONFIG, noise="none"):
-    return set_stage(simulated_scene("tower"), config, noise=noise, seed=0)
+    return make_simulation(simulated_scene("tower"), config, noise=noise, seed=0)
 
 
 def exploration(config=CONFIG, noise="none", robot=None, **options):

@@ -18,7 +18,7 @@ from caryatid.evaluation.oracle import OraclePlanner
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
 from caryatid.planning.planners import BUILT_IN, make_planner
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
 
 FORBIDDEN = ("mujoco", "caryatid.simulation", "caryatid.evaluation")
@@ -104,7 +104,7 @@ class Witness:
 
 
 def witnessed(planner):
-    stage = set_stage(simulated_scene("hidden_stack"), CONFIG, noise="carmine", seed=0)
+    stage = make_simulation(simulated_scene("hidden_stack"), CONFIG, noise="carmine", seed=0)
     witness = Witness(planner)
     steps = explore(stage.camera, stage.robot, planner=witness, config=CONFIG, early_stop=False)
     assert len(list(steps)) == 3
@@ -147,7 +147,7 @@ def test_there_the_truth_cannot_be_imported(decided_elsewhere):
 def test_the_truth_would_be_found():
     """The oracle has it; so would have whoever is handed the camera, or a function that knows it."""
     scene = simulated_scene("hidden_stack")
-    camera = set_stage(scene, CONFIG, noise="carmine", seed=0).camera
+    camera = make_simulation(scene, CONFIG, noise="carmine", seed=0).camera
     truth = true_scene_from_simulation(scene, ground_truth(scene))
     oracle = OraclePlanner(camera, truth, CONFIG)
     assert {"caryatid.simulation.world.SimulatedScene", "mujoco._structs.MjData"} <= forbidden(oracle)

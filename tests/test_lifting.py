@@ -7,8 +7,7 @@ import pytest
 
 from caryatid.config import LiftConfig
 from caryatid.simulation.lifting import ASIDE, Lifting
-from caryatid.simulation.mjcf import box, build_spec, sphere
-from caryatid.simulation.world import scene_from_spec
+from caryatid.simulation.world import box, build_spec, scene_from_spec, sphere
 
 CONFIG = LiftConfig(watch=1.0)
 LOWER, UPPER, BESIDE = range(3)

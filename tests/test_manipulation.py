@@ -14,9 +14,8 @@ from caryatid.graph import Support, SupportGraph
 from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses_of
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.manipulation.rehearsal import Rehearsal
-from caryatid.simulation.mjcf import TABLE_HEIGHT, Solid, build_spec
 from caryatid.simulation.truth import ground_truth
-from caryatid.simulation.world import scene_from_spec
+from caryatid.simulation.world import TABLE_HEIGHT, Solid, build_spec, scene_from_spec
 from caryatid.support.relations import infer
 from caryatid.support.removal import predict_removal
 

@@ -15,13 +15,12 @@ import sys
 import numpy as np
 import pytest
 from bag_files import write_tum
-from benchmark_records import make_suite
 from conftest import SMALL, run_command
+from test_benchmark import fill
 
 from caryatid import __version__, cli
-from caryatid.benchmark.store import ResultStore
+from caryatid.benchmark.store import RESULTS
 from caryatid.cli import session
-from caryatid.cli.benchmarking import RESULTS
 from caryatid.cli.reading import read_command
 from caryatid.io.images import png
 
@@ -128,11 +127,7 @@ def kept(tmp_path_factory, scene_file, views):
     write_tum(folder / "tum", views)
     camera = {"fx": views[0].K[0, 0], "fy": views[0].K[1, 1], "cx": views[0].K[0, 2], "cy": views[0].K[1, 2]}
     (folder / "tum.json").write_text(json.dumps(camera))
-    suite = make_suite(["support", "random"], scenes=2, seeds=1, views=2)
-    with ResultStore(folder / "bench" / RESULTS, "code") as store:
-        store.plan("own", [record.member for record in suite])
-        for record in suite:
-            store.add(record.member.episode, record.outcome)
+    fill(folder / "bench" / RESULTS, ("support", "random"), scenes=2)
     (folder / "depth.png").write_bytes(png(np.round(1e4 * views[0].depth).astype(np.uint16)))
     (folder / "labels.png").write_bytes(png(views[0].labels.astype(np.uint8)))
     camera = {"K": views[0].K.tolist(), "T_world_camera": views[0].pose.tolist(), "depth_scale": 0.1}

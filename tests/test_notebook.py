@@ -21,7 +21,7 @@ from caryatid.planning.planners import Decision
 from caryatid.runtime.display import Pictured
 from caryatid.sensing.views import Cloud, View
 from caryatid.simulation import load_scene
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 from caryatid.viz.colours import object_colour
 from caryatid.viz.notebook import draw_cell
 
@@ -38,7 +38,7 @@ def scene(views):
 
 @pytest.fixture(scope="module")
 def steps(scene_file, settings):
-    stage = set_stage(load_scene(scene_file), settings, noise="none", seed=0)
+    stage = make_simulation(load_scene(scene_file), settings, noise="none", seed=0)
     explored = ct.explore(stage.camera, stage.robot, config=settings, early_stop=False)
     return [next(explored), next(explored)]
 

@@ -20,7 +20,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.io.graph_json import graph_text
 from caryatid.planning.planners import make_planner
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
 
 CONFIG = Config(
@@ -48,7 +48,7 @@ def truth_of(name):
 
 def exploration(planner, name="hidden_stack", config=CONFIG, seed=3):
     """Steps and their F1."""
-    stage = set_stage(simulated_scene(name), config, noise="carmine", seed=seed)
+    stage = make_simulation(simulated_scene(name), config, noise="carmine", seed=seed)
     truth = truth_of(name)
     options = {"segmentation": "labels", "seed": seed}
     chooser, camera = (planner, stage.camera)
@@ -109,7 +109,7 @@ def test_the_default_planner_is_never_a_step_ahead():
 def test_of_equal_views_it_takes_the_one_that_shows_most_unseen_surface():
     """Where any overlap makes an object a true one, F1 is 1 from everywhere."""
     config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, min_iou=0.0))
-    stage = set_stage(simulated_scene("tower"), config, noise="none", seed=0)
+    stage = make_simulation(simulated_scene("tower"), config, noise="none", seed=0)
     oracle = OraclePlanner(stage.camera, truth_of("tower"), config, segmentation="labels")
     steps = list(explore(oracle.camera, stage.robot, planner=oracle, config=config, segmentation="labels"))
     first = steps[0]
@@ -132,7 +132,7 @@ def test_views_to_try_are_spread_over_all_there_are():
 
 @pytest.mark.parametrize("wrong", ["camera", "seed"])
 def test_another_exploration_than_its_own_is_refused(wrong):
-    stage = set_stage(simulated_scene("tower"), CONFIG, noise="carmine", seed=0)
+    stage = make_simulation(simulated_scene("tower"), CONFIG, noise="carmine", seed=0)
     oracle = OraclePlanner(stage.camera, truth_of("tower"), CONFIG, segmentation="labels")
     camera, seed = (stage.camera, 0) if wrong == "camera" else (oracle.camera, 1)
     steps = explore(camera, stage.robot, planner=oracle, config=CONFIG, segmentation="labels", seed=seed)

@@ -23,7 +23,7 @@ from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sessions import Session
 from caryatid.sessions.next_view import table_floor
 from caryatid.simulation import load_scene
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 
 QUICK = [*SMALL, "--views=2", "--no-report", "--quiet"]
 
@@ -82,8 +82,10 @@ def test_what_cannot_be_found_is_said(name, message):
         find_robot(name)
 
 
-def test_the_default_stage_is_the_humanoids():
-    assert isinstance(set_stage(load_scene("tower"), Config(), noise="none", seed=0).robot, HumanoidRobot)
+def test_the_default_robot_is_the_humanoid():
+    assert isinstance(
+        make_simulation(load_scene("tower"), Config(), noise="none", seed=0).robot, HumanoidRobot
+    )
 
 
 class TestCommandLine:

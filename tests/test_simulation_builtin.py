@@ -21,8 +21,7 @@ from caryatid.simulation import (
     table_top,
     true_shapes,
 )
-from caryatid.simulation.designed import DESIGNED
-from caryatid.simulation.scenes import is_builtin
+from caryatid.simulation.scenes import DESIGNED, is_builtin
 from caryatid.simulation.world import state_of
 
 dense = cache(generate_dense)

@@ -8,8 +8,7 @@ from caryatid.config import NoiseConfig, SensorConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.simulation import SimulatedCamera, load_scene, true_shapes
-from caryatid.simulation.camera import render
-from caryatid.simulation.noise import add_depth_noise, axial_sigma, depth_edges, misregister
+from caryatid.simulation.camera import add_depth_noise, axial_sigma, depth_edges, misregister, render
 from caryatid.simulation.world import SimulatedScene, scene_from_spec
 
 FROM_THE_ROBOT = transforms.look_at((-1.2, 0.1, 1.6), (0.0, 0.0, 0.8))

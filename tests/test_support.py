@@ -395,8 +395,8 @@ SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 @pytest.mark.skipif(not SCENES.is_dir(), reason="needs ../shared/scenes")
 def test_true_shapes_of_the_shared_primitive_scenes_give_their_edges() -> None:
     from caryatid.simulation.scenes import load_scene
-    from caryatid.simulation.solids import static_boxes, true_shapes
     from caryatid.simulation.truth import read_truth
+    from caryatid.simulation.world import static_boxes, true_shapes
 
     right = wrong = missed = 0
     folders = [f for f in sorted(SCENES.iterdir()) if not f.name.startswith("ycb")]

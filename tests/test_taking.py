@@ -8,8 +8,7 @@ import re
 import pytest
 from conftest import SMALL, run_command
 
-from caryatid.benchmark.episodes import run_episode
-from caryatid.benchmark.records import ORDERS, Episode
+from caryatid.benchmark.episodes import ORDERS, Episode, run_episode
 from caryatid.io.runs import read_run
 from caryatid.viz.colours import object_colour
 
@@ -102,13 +101,13 @@ def test_an_episode_tells_what_came_of_the_order(order):
     outcome = run_episode(Episode(scene="tower", views=2, order=order, settings=BRIEF))
     assert outcome.error is None
     rows = outcome.rows
-    assert rows[0].lifts > 0.0
-    assert (rows[0].unharmed == 1.0) == (rows[0].lifts == 1.0)
-    assert (rows[1].unharmed, rows[1].lifts) == (rows[0].unharmed, rows[0].lifts)
+    assert rows[0]["lifts"] > 0.0
+    assert (rows[0]["unharmed"] == 1.0) == (rows[0]["lifts"] == 1.0)
+    assert (rows[1]["unharmed"], rows[1]["lifts"]) == (rows[0]["unharmed"], rows[0]["lifts"])
     if order != "random":
-        assert rows[0].unharmed == 1.0
+        assert rows[0]["unharmed"] == 1.0
 
 
 def test_without_an_order_nothing_is_taken():
     (row,) = run_episode(Episode(scene="tower", views=1, settings=BRIEF)).rows
-    assert (row.unharmed, row.lifts) == (0.0, 0.0)
+    assert (row["unharmed"], row["lifts"]) == (0.0, 0.0)

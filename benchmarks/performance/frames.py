@@ -14,11 +14,16 @@ from caryatid.geometry.transforms import Array
 from caryatid.robots.humanoid import Robot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.views import View
-from caryatid.simulation.mjcf import TABLE_HEIGHT, Solid, build_spec
 from caryatid.simulation.scenes import load_scene
-from caryatid.simulation.solids import table_top
-from caryatid.simulation.stage import set_stage
-from caryatid.simulation.world import SimulatedScene, scene_from_spec
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.world import (
+    TABLE_HEIGHT,
+    SimulatedScene,
+    Solid,
+    build_spec,
+    scene_from_spec,
+    table_top,
+)
 
 HEAP = "pile-10-1"
 """Scene of ten objects, some on others."""
@@ -58,14 +63,14 @@ def record(
 ) -> Recording:
     """Take views from all around, with the noise and the registration error of the simulated camera."""
     config = replace(Config(), sensor=sensor or SensorConfig())
-    stage = set_stage(scene, config, noise="carmine", seed=seed)
+    stage = make_simulation(scene, config, noise="carmine", seed=seed)
     poses = ring(scene, stage.robot, config, count)
     return Recording(scene.name, config, poses, tuple(stage.camera.capture(T) for T in poses), stage.robot)
 
 
 def capture(scene: SimulatedScene, count: int, seed: int = 0) -> Iterator[tuple[Array, View]]:
     """Pose and view, one after the other, of as many as `record` would take; none is kept."""
-    stage = set_stage(scene, Config(), noise="carmine", seed=seed)
+    stage = make_simulation(scene, Config(), noise="carmine", seed=seed)
     for T_world_camera in ring(scene, stage.robot, Config(), count):
         yield T_world_camera, stage.camera.capture(T_world_camera)
 

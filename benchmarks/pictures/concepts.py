@@ -40,9 +40,8 @@ from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import Decision, PlanningState, make_planner
 from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.simulation.mjcf import box, build_spec, cylinder, sphere
-from caryatid.simulation.stage import set_stage
-from caryatid.simulation.world import SimulatedScene, scene_from_spec
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.world import SimulatedScene, box, build_spec, cylinder, scene_from_spec, sphere
 from caryatid.viz import colours
 
 FOLDER = Path(__file__).parents[2] / "docs" / "pictures" / "concepts"
@@ -87,7 +86,7 @@ def tell() -> Story:
     config = Config()
     config = replace(config, active=replace(config.active, max_views=VIEWS))
     scene: SimulatedScene = scene_from_spec(build_spec(SOLIDS, "concepts"), "concepts", "concepts", least=1.0)
-    stage = set_stage(scene, config, noise="carmine", seed=0)
+    stage = make_simulation(scene, config, noise="carmine", seed=0)
     steps = tuple(explore(stage.camera, stage.robot, config=config, segmentation="auto", early_stop=False))
     first = Scene(config, segmentation="auto")
     assert steps[0].view is not None

@@ -46,10 +46,9 @@ from caryatid.exploration import Step, explore
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.simulation.scenes import load_scene
-from caryatid.simulation.solids import table_top, true_shapes
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, table_top, true_shapes
 from caryatid.support.relations import explain
 from caryatid.viz.colours import PALETTE
 
@@ -134,7 +133,7 @@ def run(picture: Picture) -> Outcome:
     config = replace(config, active=replace(config.active, max_views=picture.views))
     scene = load_scene(picture.scene)
     truth = ground_truth(scene)
-    stage = set_stage(scene, config, noise="carmine", seed=picture.seed)
+    stage = make_simulation(scene, config, noise="carmine", seed=picture.seed)
     steps = tuple(
         explore(
             stage.camera,

@@ -37,7 +37,7 @@ from caryatid.graph import SupportGraph
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation import ground_truth, load_scene
 from caryatid.simulation.camera import intrinsics, render
-from caryatid.simulation.stage import Stage, set_stage
+from caryatid.simulation.setup import Simulation, make_simulation
 from caryatid.viz import colours
 from caryatid.viz.layout import arrange
 from caryatid.viz.svg import keep_apart
@@ -66,7 +66,7 @@ def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     return ImageFont.truetype(str(Path(mpl.get_data_path()) / "fonts/ttf" / name), size)
 
 
-def overview(stage: Stage, step: ct.Step, T_world_camera: Array, at: Eye, painted: bool) -> Image.Image:
+def overview(stage: Simulation, step: ct.Step, T_world_camera: Array, at: Eye, painted: bool) -> Image.Image:
     """The robot around the table, what is known of it, and where it would be good to look from."""
     solids = furniture(stage, 0.2) + geoms_of(step.graph) + robot_geoms(T_world_camera)
     rgb, depth = picture_of(solids, at)
@@ -92,7 +92,7 @@ def disc(draw: ImageDraw.ImageDraw, at: Array, word: str, colour: str, radius: i
     draw.text((x, y), word, fill="#ffffff", font=font(radius + 3, bold=True), anchor="mm")
 
 
-def model(stage: Stage, graph: SupportGraph | None, at: Eye) -> Image.Image:
+def model(stage: Simulation, graph: SupportGraph | None, at: Eye) -> Image.Image:
     """The fitted shapes on the table, with an arrow from each supporter to what it supports."""
     table = [s for s in furniture(stage, 0.0) if s[0].kind == "box" and s[0].extents[2] > 0.0]
     rgb, _ = picture_of(table + ([] if graph is None else geoms_of(graph)), at)
@@ -234,7 +234,7 @@ def film() -> tuple[list[Image.Image], list[int]]:
     scene = load_scene(SCENE)
     truth = true_scene_from_simulation(scene, ground_truth(scene))
     config = ct.Config()
-    stage = set_stage(scene, config, noise="carmine", seed=SEED)
+    stage = make_simulation(scene, config, noise="carmine", seed=SEED)
     centre = table_centre(stage)
     near = eye(centre + (0.02, 0.0, 0.1), 285.0, 34.0, 3.2, TOP, 3.7)
     far = eye(centre * (1.0, 1.0, 0.0) + (0.0, 0.0, 0.98), 232.0, 30.0, 8.0, BELOW, 1.72)

@@ -17,10 +17,8 @@ from caryatid.geometry.shapes import Box, Cylinder
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.simulation.camera import intrinsics, pixel_rays, render
-from caryatid.simulation.mjcf import quaternion
-from caryatid.simulation.solids import static_boxes, table_top
-from caryatid.simulation.stage import Stage
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.setup import Simulation
+from caryatid.simulation.world import SimulatedScene, quaternion, static_boxes, table_top
 from caryatid.viz import colours
 from caryatid.viz.wireframes import Projection
 
@@ -117,7 +115,7 @@ def world_of(solids: Solids) -> SimulatedScene:
     return SimulatedScene(model, data, spec, "picture", "picture", {}, "world", labels, True)
 
 
-def furniture(stage: Stage, low: float) -> Solids:
+def furniture(stage: Simulation, low: float) -> Solids:
     """The table, and walls cut off at a height [m], so that one sees over them; a floor below."""
     solids: Solids = []
     for box in static_boxes(stage.scene):
@@ -133,7 +131,7 @@ def furniture(stage: Stage, low: float) -> Solids:
     return solids
 
 
-def table_centre(stage: Stage) -> Array:
+def table_centre(stage: Simulation) -> Array:
     """Middle of the table top (3,) [m]."""
     top = table_top(stage.scene)
     return np.append(top.corners_world[:, :2].mean(axis=0), top.height)

@@ -20,7 +20,7 @@ from caryatid.robots.recording_camera import RecordingCamera
 from caryatid.robots.registry import HUMANOID, find_robot
 from caryatid.sensing.views import Camera
 from caryatid.simulation.scenes import load_scene
-from caryatid.simulation.stage import set_stage
+from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth, read_truth
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
@@ -87,7 +87,7 @@ def open_source(
     truth_file = Path(scene.source).parent / "gt.json"
     known = read_truth(truth_file) if truth_file.is_file() else None
     truth = ground_truth(scene) if known is None else known
-    stage = set_stage(scene, config, noise=noise, seed=seed, robot=make)
+    stage = make_simulation(scene, config, noise=noise, seed=seed, robot=make)
     return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
 
 

@@ -1,31 +1,106 @@
-"""Running one episode: explore a scene, score every view."""
+"""One episode: a scene is explored and every view scored; and what scenes there are to explore."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 
-from caryatid.benchmark.records import Episode, Outcome, ViewRow
-from caryatid.benchmark.scenes import opened
-from caryatid.benchmark.taking import AFTER, take_apart
-from caryatid.config import Config
+from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.config.settings import read_settings
-from caryatid.errors import in_one_line
+from caryatid.errors import InputError, in_one_line
 from caryatid.evaluation.oracle import planner_for
-from caryatid.evaluation.scores import Score, score
-from caryatid.evaluation.truths import SEED
+from caryatid.evaluation.scores import Score, TrueScene, score
+from caryatid.evaluation.truths import SEED, true_scene_from_simulation
 from caryatid.exploration import Step, explore
-from caryatid.simulation.stage import set_stage
+from caryatid.graph import SupportGraph
+from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
+from caryatid.manipulation.order import TakeStep, plan_order
+from caryatid.planning.planners import offered
+from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, list_scenes, load_scene
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.truth import ground_truth, read_truth
+from caryatid.simulation.world import SimulatedScene
+
+OrderName = Literal["", "one hand", "two hands", "highest first", "random", "true graph"]
+"""How objects are ordered for removal; with the empty name nothing is removed."""
+ORDERS: tuple[OrderName, ...] = tuple(name for name in get_args(OrderName) if name)
+REMOVAL_VIEWS = (1, 3, 5, 10)
+"""Views after which a scene is taken apart, by what is known then."""
+
+Row = dict[str, float]
+"""What was measured after one view: `view` (from 1) and `MEASURES`."""
+SCORES = (
+    "precision", "recall", "f1", "vertex_precision", "vertex_recall", "vertex_f1", "edge_precision",
+    "edge_recall", "edge_f1", "mean_iou",
+)  # fmt: skip
+"""Eq. 4 and 5 for vertices and edges together and alone, and the mean IoU of the matched objects [1]."""
+TIMES = ("planning_seconds", "perception_seconds")
+"""Time to choose this view, and from the view to the fused graph [s]; they differ from run to run."""
+MEASURES = (*SCORES, "angle", "path", *TIMES, "unharmed", "lifts")
+"""Scores; travelled on the view sphere [rad] and over the floor [m]; times; and of scenes taken apart whether
+nothing was disturbed (1 or 0) and the share of lifts that disturbed nothing [1]."""
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One run of the loop: with a fingerprint of the code, everything that determines its figures.
+
+    Attributes:
+        scene: Name of a built-in scene, or a scene folder.
+        content: Digest of a scene folder's files; empty for a built-in scene.
+        fusion: What is fused.
+        planner: Who chooses the views.
+        plugin: Digest of the package that offers the planner; empty for built-in planners.
+        segmentation: Where segments come from.
+        noise: Noise of the camera.
+        settings: Changes of the default settings, `stage.name=value`.
+        views: Number of views, including the first.
+        seed: Seed of the noise and of every choice.
+        order: How the objects are ordered for removal; empty where nothing is removed.
+    """
+
+    scene: str
+    content: str = ""
+    fusion: FusionMethod = "pc+sg"
+    planner: str = "support"
+    plugin: str = ""
+    segmentation: SegmentationMethod = "labels"
+    noise: NoiseModel = "carmine"
+    settings: tuple[str, ...] = ()
+    views: int = 5
+    seed: int = 0
+    order: OrderName = ""
+
+    def key(self, fingerprint: str) -> str:
+        """Digest of the episode and of the code that runs it, wherever a scene's folder lies."""
+        known = asdict(self) | ({"scene": ""} if self.content else {})
+        return hashlib.sha256(json.dumps([fingerprint, known], sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What an episode gave: one row per view, or none and the error in one line."""
+
+    rows: tuple[Row, ...]
+    error: str | None = None
 
 
 def run_episode(episode: Episode) -> Outcome:
     """Run an episode; whatever goes wrong is part of the outcome.
 
-    Views that can no longer be reached repeat the row of the last one that was: the graph stays as it is.
+    Views that can no longer be reached repeat the last row: the graph stays as it is.
     """
     try:
-        return Outcome(_rows(episode))
+        return Outcome(tuple(_rows(episode)))
     except Exception as error:
         return Outcome((), in_one_line(error))
 
@@ -44,18 +119,99 @@ def settings_of(episode: Episode) -> Config:
     )
 
 
-def _rows(episode: Episode) -> tuple[ViewRow, ...]:
+def find_scenes(sources: Iterable[str]) -> list[str]:
+    """Resolve built-in names, scene folders and folders of scene folders to names and folders, each once.
+
+    Raises:
+        InputError: A source is none of these, or a folder holds no scene with its ground truth.
+    """
+    found: list[str] = []
+    for source in sources:
+        found += [source] if is_builtin(source) else _scenes_in(Path(source))
+    return list(dict.fromkeys(found))
+
+
+def content_of(scene: str) -> str:
+    """Digest of a scene folder's files; empty for a built-in scene, which its name determines."""
+    return "" if is_builtin(scene) else _digest(sorted(p for p in Path(scene).rglob("*") if p.is_file()))
+
+
+def plugin_of(planner: str) -> str:
+    """Digest of the package that offers a planner; empty for built-in planners."""
+    point = offered().get(planner)
+    if point is None:
+        return ""
+    spec = find_spec(point.module.split(".")[0])
+    folders = [] if spec is None else [Path(folder) for folder in spec.submodule_search_locations or ()]
+    files = [f for folder in folders for f in sorted(folder.rglob("*.py"))]
+    if spec is not None and spec.origin and not folders:
+        files = [Path(spec.origin)]
+    return hashlib.sha256((point.value + _digest(files)).encode()).hexdigest()[:16]
+
+
+def short_name(scene: str) -> str:
+    """Name of a scene: that of its folder, or the built-in one."""
+    return scene if is_builtin(scene) else Path(scene).resolve().name
+
+
+def family(scene: str) -> str:
+    """Kind of a scene: the letters before the first number of its name, `designed` where there is none."""
+    matched = re.match(r"[A-Za-z_]+(?=[-_]?\d)", short_name(scene))
+    return matched[0].rstrip("_-") if matched else "designed"
+
+
+@lru_cache(maxsize=8)
+def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene]:
+    """Load a scene and its ground truth; kept, as the episodes of a scene are run one after the other.
+
+    Raises:
+        InputError: It cannot be loaded, or its files have another digest than `content`.
+    """
+    if content and Path(scene).is_dir() and content_of(scene) != content:
+        raise InputError(scene, "its files are not those this run was planned with", "start again")
+    simulated = load_scene(scene)
+    truth = ground_truth(simulated) if is_builtin(scene) else read_truth(Path(scene) / TRUTH_FILE)
+    return simulated, true_scene_from_simulation(simulated, truth)
+
+
+def take_apart(
+    scene: SimulatedScene, graph: SupportGraph, truth: TrueScene, order: OrderName, config: Config, seed: int
+) -> tuple[float, float]:
+    """Take a scene apart in physics; objects that were not extracted go last, the highest first.
+
+    Returns:
+        1 where nothing was disturbed, else 0; and the share of the lifts that disturbed nothing.
+    """
+    bodies = bodies_of(graph, truth)
+    steps = [s for s in _removal_steps(order, graph, truth, config, seed) if s.object_id in bodies]
+    height = dict(zip(scene.object_bodies.values(), poses_of(scene)[:, 2], strict=True))
+    missed = sorted(set(height) - {bodies[s.object_id] for s in steps}, key=lambda b: -height[b])
+    ok = [
+        taken.ok
+        for taken in dismantle(
+            scene, [*steps, *map(_unrehearsed, missed)], bodies | {b: b for b in missed}, config
+        )
+    ]
+    return float(all(ok)), float(np.mean(ok))
+
+
+def _rows(episode: Episode) -> list[Row]:
     config = settings_of(episode)
-    scene, truth = opened(episode.scene, episode.content)
-    stage = set_stage(scene, config, noise=episode.noise, seed=episode.seed)
-    rows: list[ViewRow] = []
-    planning, taken = 0.0, (0.0, 0.0)
+    scene, truth = open_scene(episode.scene, episode.content)
+    simulation = make_simulation(scene, config, noise=episode.noise, seed=episode.seed)
     planner, camera = planner_for(
-        episode.planner, stage.camera, truth, config, segmentation=episode.segmentation, seed=episode.seed
+        episode.planner,
+        simulation.camera,
+        truth,
+        config,
+        segmentation=episode.segmentation,
+        seed=episode.seed,
     )
+    rows: list[Row] = []
+    planning, taken = 0.0, (0.0, 0.0)
     for step in explore(
         camera,
-        stage.robot,
+        simulation.robot,
         planner=planner,
         config=config,
         segmentation=episode.segmentation,
@@ -63,37 +219,83 @@ def _rows(episode: Episode) -> tuple[ViewRow, ...]:
         early_stop=False,
     ):
         row = _row(step, score(step.graph, truth, np.random.default_rng(SEED)), planning)
-        if episode.order and row.view in AFTER:
+        if episode.order and row["view"] in REMOVAL_VIEWS:
             taken = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
-        rows.append(replace(row, unharmed=taken[0], lifts=taken[1]))
+        rows.append(row | {"unharmed": taken[0], "lifts": taken[1]})
         planning = step.timings["plan"]
-    last = rows[-1]
-    missing = range(last.view + 1, episode.views + 1)
-    return tuple(
-        rows + [replace(last, view=v, planning_seconds=0.0, perception_seconds=0.0) for v in missing]
+    missing = range(int(rows[-1]["view"]) + 1, episode.views + 1)
+    return rows + [rows[-1] | dict.fromkeys(TIMES, 0.0) | {"view": view} for view in missing]
+
+
+def _row(step: Step, found: Score, planning: float) -> Row:
+    def f1(kind: str) -> float:
+        precision, recall = getattr(found, f"{kind}_precision"), getattr(found, f"{kind}_recall")
+        return 2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0
+
+    measured = {"vertex_f1": f1("vertex"), "edge_f1": f1("edge")}
+    return {
+        "view": step.index + 1,
+        **{name: measured[name] if name in measured else getattr(found, name) for name in SCORES},
+        "angle": step.angle_travelled,
+        "path": step.path_travelled,
+        "planning_seconds": planning,
+        "perception_seconds": sum(s for stage, s in step.timings.items() if stage not in ("capture", "plan")),
+    }
+
+
+def _removal_steps(
+    order: OrderName, graph: SupportGraph, truth: TrueScene, config: Config, seed: int
+) -> Sequence[TakeStep]:
+    objects = [o for o in graph.objects if o.role == "object"]
+    ids = [o.id for o in sorted(objects, key=lambda o: (-o.centre_world[2], o.label))]
+    match order:
+        case "one hand" | "two hands":
+            hands = 1 if order == "one hand" else 2
+            return plan_order(graph, config, hands=hands, seed=seed).steps if objects else ()
+        case "random":
+            ids = [objects[k].id for k in np.random.default_rng(seed).permutation(len(objects))]
+        case "true graph":
+            ids = _by_graph(ids, truth.edges, bodies_of(graph, truth))
+    return [_unrehearsed(i) for i in ids]
+
+
+def _by_graph(ids: Sequence[str], edges: frozenset[tuple[str, str]], bodies: Mapping[str, str]) -> list[str]:
+    """Ids (the highest first) reordered so that what supports nothing that is left goes first."""
+    left, done = list(ids), []
+    while left:
+        carrying = {i for i in left for k in left if (bodies.get(i), bodies.get(k)) in edges}
+        done.append(next((i for i in left if i not in carrying), left[0]))
+        left.remove(done[-1])
+    return done
+
+
+def _unrehearsed(object_id: str) -> TakeStep:
+    return TakeStep(object_id, (), False, 1.0, "not rehearsed")
+
+
+def _digest(files: Iterable[Path]) -> str:
+    digest = hashlib.sha256()
+    for file in files:
+        digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _scenes_in(folder: Path) -> list[str]:
+    if not folder.is_dir():
+        names = ", ".join(list_scenes())
+        raise InputError(
+            folder, "is neither a built-in scene nor a folder", f"give a folder of scenes, or of {names}"
+        )
+    folders = (
+        [folder]
+        if (folder / SCENE_FILE).is_file()
+        else sorted(p.parent for p in folder.glob(f"*/{SCENE_FILE}"))
     )
-
-
-def _row(step: Step, s: Score, planning: float) -> ViewRow:
-    stages = sum(seconds for stage, seconds in step.timings.items() if stage not in ("capture", "plan"))
-    return ViewRow(
-        view=step.index + 1,
-        precision=s.precision,
-        recall=s.recall,
-        f1=s.f1,
-        vertex_precision=s.vertex_precision,
-        vertex_recall=s.vertex_recall,
-        vertex_f1=_f1(s.vertex_precision, s.vertex_recall),
-        edge_precision=s.edge_precision,
-        edge_recall=s.edge_recall,
-        edge_f1=_f1(s.edge_precision, s.edge_recall),
-        mean_iou=s.mean_iou,
-        angle=step.angle_travelled,
-        path=step.path_travelled,
-        planning_seconds=planning,
-        perception_seconds=stages,
-    )
-
-
-def _f1(precision: float, recall: float) -> float:
-    return 2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0
+    if not folders:
+        raise InputError(
+            folder, f"holds no scene: no {SCENE_FILE}", "give a scene folder or a folder of them"
+        )
+    for scene in folders:
+        if not (scene / TRUTH_FILE).is_file():
+            raise InputError(scene, f"has no {TRUTH_FILE}", "write one: the benchmark needs the ground truth")
+    return [str(scene) for scene in folders]

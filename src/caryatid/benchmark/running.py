@@ -1,100 +1,192 @@
-"""Running episodes in processes of this machine, or wherever an executor sends them."""
+"""Running episodes: in processes of this machine, or on the workers of a dask.distributed scheduler."""
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
-from contextlib import closing, contextmanager
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Future,
+    ProcessPoolExecutor,
+    as_completed,
+    wait,
+)
+from contextlib import contextmanager
+from dataclasses import replace
 from multiprocessing import active_children, get_context, parent_process
-from threading import Thread
-from typing import Protocol
+from threading import Lock, Thread
+from typing import TYPE_CHECKING
 
-from caryatid.benchmark.episodes import run_episode
-from caryatid.benchmark.records import Episode, Outcome
-from caryatid.benchmark.store import ResultStore
-from caryatid.errors import CaryatidError
+from caryatid.benchmark.episodes import Episode, Outcome, plugin_of, run_episode
+from caryatid.errors import CaryatidError, InputError
+from caryatid.runtime.fingerprint import fingerprint
 from caryatid.runtime.interrupts import interrupts_held
+from caryatid.runtime.threads import one_blas_thread
 
+if TYPE_CHECKING:
+    from distributed import Client
+
+Outcomes = Generator[tuple[Episode, Outcome]]
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Set to 1 in the environment of the processes, unless set already: they share the cores."""
+PATIENCE = 10.0
+"""How long a scheduler may take to answer [s]."""
+
+_one_at_a_time = Lock()
 
 
-class Executor(Protocol):
-    """Runs episodes somewhere."""
+def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
+    """Run episodes in this many processes; yield each with its outcome as soon as it is done.
 
-    def run(self, episodes: Sequence[Episode]) -> Generator[tuple[Episode, Outcome]]:
-        """Yield each episode with its outcome as soon as it is done, in any order; stop when closed."""
-        ...
-
-
-class LocalExecutor:
-    """Runs episodes in processes of this machine.
-
-    Args:
-        jobs: How many at once.
+    Raises:
+        CaryatidError: A process was killed.
     """
-
-    def __init__(self, jobs: int) -> None:
-        self._jobs = jobs
-
-    def run(self, episodes: Sequence[Episode]) -> Generator[tuple[Episode, Outcome]]:
-        """Yield each episode with its outcome as soon as it is done.
-
-        Raises:
-            CaryatidError: A process was killed.
-        """
-        others = set(active_children())
-        pool = ProcessPoolExecutor(
-            min(self._jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent
+    others, killed = set(active_children()), False
+    pool = ProcessPoolExecutor(min(jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent)
+    try:
+        with _one_thread_each(), interrupts_held():
+            futures = {pool.submit(run_episode, e): e for e in episodes}
+        for future in as_completed(futures):
+            if isinstance(future.exception(), BrokenExecutor):
+                killed = True
+            else:
+                yield futures.pop(future), future.result()
+    except BaseException:
+        for process in set(active_children()) - others:
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+    if killed:
+        raise CaryatidError(
+            "a process was killed, perhaps for want of memory; what is done is kept: "
+            "start again, with fewer --jobs"
         )
-        killed = False
-        try:
-            with _one_thread_each(), interrupts_held():
-                futures: dict[Future[Outcome], Episode] = {pool.submit(run_episode, e): e for e in episodes}
-            for future in as_completed(futures):
-                if isinstance(future.exception(), BrokenExecutor):
-                    killed = True
-                else:
-                    yield futures.pop(future), future.result()
-        except BaseException:
-            for process in set(active_children()) - others:
-                process.terminate()
-            raise
-        finally:
-            pool.shutdown(cancel_futures=True)
-        if killed:
-            raise CaryatidError(
-                "a process was killed, perhaps for want of memory; what is done is kept: "
-                "start again, with fewer --jobs"
-            )
 
 
-def run_all(
-    store: ResultStore,
+def run_on_cluster(
     episodes: Sequence[Episode],
-    executor: Executor,
-    done: Callable[[Episode, Outcome], None] = lambda episode, outcome: None,
-) -> None:
-    """Run episodes and keep what each gives as soon as it is there.
+    address: str,
+    tell: Callable[[str], None] = lambda text: None,
+    patience: float = PATIENCE,
+) -> Outcomes:
+    """Run episodes on a cluster; those whose worker dies are run again on another.
 
     Args:
-        store: Where to.
-        episodes: What to run.
-        executor: Runs them.
-        done: Told of each that is kept.
+        episodes: What to run; scene folders must be readable on the workers.
+        address: Of the scheduler, say `tcp://10.0.0.5:8786`.
+        tell: Called with what the user should know while waiting.
+        patience: How long the scheduler may take to answer [s].
+
+    Raises:
+        InputError: dask.distributed is not installed, or no scheduler answers.
+        CaryatidError: A worker runs other code than this process, or the scheduler is gone.
     """
-    if not episodes:
-        return
-    with closing(executor.run(episodes)) as outcomes:
-        for episode, outcome in outcomes:
-            store.add(episode, outcome)
-            done(episode, outcome)
+    with connect(address, patience) as client:
+        for worker, code in client.run(fingerprint, on_error="return").items():
+            if code != fingerprint() and not isinstance(code, OSError):
+                raise _other_code(f"worker {worker}", str(code))
+        pool = client.get_executor(pure=False)
+        futures = {pool.submit(run_on_worker, _absolute(e), fingerprint()): e for e in episodes}
+        waiting, told = set(futures), False
+        while waiting:
+            done, waiting = wait(waiting, timeout=patience, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield futures.pop(future), _cluster_outcome(future, address)
+            if not done and not told and (told := _has_no_workers(client)):
+                tell(f"no workers; waiting for some: dask worker {address} --nthreads 1 --nworkers N")
+
+
+def connect(address: str, patience: float = PATIENCE) -> Client:
+    """Connect to a scheduler of dask.distributed.
+
+    Raises:
+        InputError: dask.distributed is not installed, or no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise InputError("--scheduler", "needs dask.distributed", 'pip install "caryatid[cluster]"') from None
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are reported here
+    try:
+        if not address:
+            raise ValueError("the address is empty")
+        return Client(address, timeout=patience, set_as_default=False)
+    except (OSError, ImportError, ValueError, TypeError, RuntimeError, MemoryError) as error:
+        raise InputError(
+            f"--scheduler {address}",
+            f"no scheduler answers ({' '.join(str(error).split()) or 'it is silent'})",
+            "start one with `dask scheduler` and give its address, such as tcp://10.0.0.5:8786",
+        ) from None
+
+
+def run_on_worker(episode: Episode, code: str) -> Outcome:
+    """Run an episode on a worker, one at a time and on one thread, however many threads the worker has.
+
+    Args:
+        episode: What to run; a scene folder must be readable here.
+        code: Fingerprint the worker's code must have.
+
+    Raises:
+        CaryatidError: It has another, or another package that offers the planner.
+    """
+    from numba import set_num_threads
+
+    if fingerprint() != code:
+        raise _other_code("a worker", fingerprint())
+    if plugin_of(episode.planner) != episode.plugin:
+        raise CaryatidError(
+            f"a worker has not the same package that offers the planner {episode.planner}; "
+            "install it there and start the worker again"
+        )
+    with _one_at_a_time:
+        set_num_threads(1)
+        return one_blas_thread(run_episode)(episode)
+
+
+def _cluster_outcome(future: Future[Outcome], address: str) -> Outcome:
+    from distributed import KilledWorker
+
+    try:
+        return future.result()
+    except KilledWorker as error:
+        died = error.allowed_failures + 1
+        return Outcome((), f"{died} workers died running it, perhaps for want of memory")
+    except CaryatidError:
+        raise
+    except (CancelledError, OSError):
+        raise CaryatidError(
+            f"the scheduler at {address} is gone; what is done is kept: start again"
+        ) from None
+    except Exception as error:
+        raise _other_code("a worker", f"{type(error).__name__}: {error}") from None
+
+
+def _has_no_workers(client: Client) -> bool:
+    try:
+        return not client.nthreads()
+    except OSError:
+        return False
+
+
+def _other_code(worker: str, found: str) -> CaryatidError:
+    return CaryatidError(
+        f"{worker} runs other code ({found}) than this process ({fingerprint()}); "
+        "install the same caryatid and the same libraries there and start it again"
+    )
+
+
+def _absolute(episode: Episode) -> Episode:
+    """The episode with the full path of its scene folder: workers have other current folders."""
+    return replace(episode, scene=os.path.abspath(episode.scene)) if episode.content else episode
 
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Have processes started meanwhile compute on one thread; this one, whose threads may run, goes on."""
+    """Have processes started meanwhile compute on one thread; this process keeps its own."""
     added = [name for name in THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))
     try:

@@ -1,72 +1,75 @@
-"""Results on disk: an SQLite file that takes one finished episode a transaction."""
+"""Results on disk: one JSON line per finished episode, appended and synced; and which code made them."""
 
 from __future__ import annotations
 
 import json
-import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, fields
-from os import PathLike
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
-from caryatid.benchmark.records import MEASURES, Episode, Member, Outcome, Record, ViewRow
+from filelock import FileLock, Timeout
+
+from caryatid.benchmark.episodes import MEASURES, Episode, Outcome
 from caryatid.errors import InputError
 
-FORMAT = "2"
-"""Version of the tables below."""
+if TYPE_CHECKING:
+    import pandas as pd
 
-_TABLES = f"""
-CREATE TABLE about (name TEXT PRIMARY KEY, value TEXT NOT NULL);
-CREATE TABLE episodes (key TEXT PRIMARY KEY, episode TEXT NOT NULL, error TEXT);
-CREATE TABLE views (
-    key TEXT NOT NULL REFERENCES episodes, view INTEGER NOT NULL,
-    {", ".join(f"{name} REAL NOT NULL" for name in MEASURES)}, PRIMARY KEY (key, view)
-);
-CREATE TABLE members (
-    suite TEXT NOT NULL, position INTEGER NOT NULL, key TEXT NOT NULL, episode TEXT NOT NULL,
-    method TEXT NOT NULL, condition TEXT NOT NULL, family TEXT NOT NULL, PRIMARY KEY (suite, position)
-);
-"""
+RESULTS = "results.jsonl"
+"""Name of the result file in the folder of a benchmark."""
+FORMAT = "3"
+LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx")
+"""Libraries whose versions figures may depend on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """An episode of a suite: the method and condition it is compared as, and the kind of its scene."""
+
+    episode: Episode
+    method: str
+    condition: str
+    family: str
 
 
 class ResultStore:
-    """What was asked for and what is done, safe at any moment: what is being run is either whole or absent.
+    """What was asked for and what is done. A line is either whole or, torn by a kill, ignored.
 
     Args:
-        path: SQLite file; made if missing.
-        fingerprint: Of the code that adds episodes; None reads only.
-        about: What is told of the code and machine beside, kept where the file is new.
+        path: File of JSON lines; created by a writer.
+        fingerprint: Of the code that adds episodes; None only reads. There is one writer at a time.
+        about: Further facts on code and machine, kept where the file is new.
 
     Raises:
-        InputError: The file is missing, no result store, or was made by another version.
+        InputError: The file is missing or no result file, other code made it, or another run is under way.
     """
 
     def __init__(
-        self,
-        path: str | PathLike[str],
-        fingerprint: str | None = None,
-        about: Mapping[str, str] | None = None,
+        self, path: Path, fingerprint: str | None = None, about: Mapping[str, str] | None = None
     ) -> None:
-        self.path = Path(path)
-        if fingerprint is None and not self.path.is_file():
-            raise InputError(self.path, "there is no result store", "run a suite first: --suite NAME")
+        self.path = path
+        self.about: dict[str, str] = {}
+        self.suites: dict[str, list[Member]] = {}
+        self.outcomes: dict[str, Outcome] = {}
+        self._file: BinaryIO | None = None
+        self._lock = FileLock(f"{path}.lock", timeout=0)
+        if fingerprint is None and not path.is_file():
+            raise InputError(path, "there is no result file", "run a suite first: --suite NAME")
+        if fingerprint is not None:
+            self._lock_for_writing()
         try:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._database = sqlite3.connect(self.path, isolation_level=None, timeout=30.0)
-        except (OSError, sqlite3.Error) as error:
-            raise InputError(self.path, f"cannot be opened ({error})", "choose another folder") from None
-        try:
-            self._prepare(fingerprint, about or {})
-        except sqlite3.DatabaseError as error:
-            self._database.close()
-            raise InputError(self.path, f"is no result store ({error})", "choose another folder") from None
-        except InputError:
-            self._database.close()
+            self._read()
+            if fingerprint is not None:
+                self._begin({**(about or {}), "format": FORMAT, "fingerprint": fingerprint})
+        except BaseException:
+            self.close()
             raise
-        self._fingerprint = fingerprint or self.about()["fingerprint"]
 
     def __enter__(self) -> Self:
         return self
@@ -77,153 +80,188 @@ class ResultStore:
         self.close()
 
     def close(self) -> None:
-        """Close the file."""
-        self._database.close()
+        """Close the file and let others write."""
+        if self._file is not None:
+            self._file.close()
+        self._lock.release()
 
-    @contextmanager
-    def alone(self) -> Iterator[None]:
-        """Be the only run on this file, till the end or till death; others may read it meanwhile.
-
-        Raises:
-            InputError: Another run is on it.
-        """
-        path = self.path.with_name(f"{self.path.name}-run")
-        lock = sqlite3.connect(path, isolation_level=None, timeout=0.0)
-        try:
-            try:
-                lock.execute("BEGIN EXCLUSIVE")
-            except sqlite3.OperationalError as error:
-                busy = error.sqlite_errorcode == sqlite3.SQLITE_BUSY
-                reason = "another run is under way" if busy else f"cannot be locked ({error})"
-                raise InputError(self.path, reason, "wait for its end, or choose another --out") from None
-            try:
-                yield
-            finally:
-                path.unlink(missing_ok=True)
-        finally:
-            lock.close()
-
-    def about(self) -> dict[str, str]:
-        """Fingerprint, format and what else was told of code and machine."""
-        return dict(self._database.execute("SELECT name, value FROM about ORDER BY name"))
-
-    def suites(self) -> list[str]:
-        """Names of the suites that were asked for."""
-        rows = self._database.execute("SELECT suite FROM members GROUP BY suite ORDER BY min(rowid)")
-        return [name for (name,) in rows]
-
-    def plan(self, suite: str, members: Sequence[Member]) -> list[Episode]:
-        """Remember what a suite consists of, in place of what it consisted of before.
+    def plan(self, suite: str, members: Sequence[Member], *, retry: bool = False) -> list[Episode]:
+        """Record what a suite consists of, in place of an earlier plan.
 
         Args:
             suite: Its name.
             members: Its episodes.
+            retry: Run failed episodes again.
 
         Returns:
-            Those that are not done, each once, in order.
+            The episodes that are missing, each once, in order.
         """
-        rows = [
-            (suite, i, m.episode.key(self._fingerprint), _dump(m.episode), m.method, m.condition, m.family)
-            for i, m in enumerate(members)
-        ]
-        with _transaction(self._database):
-            self._database.execute("DELETE FROM members WHERE suite = ?", (suite,))
-            self._database.executemany("INSERT INTO members VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
-        done = {key for (key,) in self._database.execute("SELECT key FROM episodes")}
-        wanted = {row[2]: m.episode for row, m in zip(rows, members, strict=True)}
-        return [episode for key, episode in wanted.items() if key not in done]
+        if self.suites.get(suite) != list(members):
+            self._append({"suite": suite, "members": [asdict(m) for m in members]})
+            self.suites[suite] = list(members)
+        wanted = {self._key(m.episode): m.episode for m in members}
+        failed = {key for key, outcome in self.outcomes.items() if retry and outcome.error is not None}
+        return [episode for key, episode in wanted.items() if key not in self.outcomes or key in failed]
 
     def add(self, episode: Episode, outcome: Outcome) -> None:
-        """Keep what an episode gave, in one transaction; one that is there already stays as it is."""
-        key = episode.key(self._fingerprint)
-        with _transaction(self._database):
-            row = (key, _dump(episode), outcome.error)
-            if self._database.execute("INSERT OR IGNORE INTO episodes VALUES (?, ?, ?)", row).rowcount == 0:
-                return
-            places = ", ".join("?" * (2 + len(MEASURES)))
-            views = [(key, r.view, *(getattr(r, name) for name in MEASURES)) for r in outcome.rows]
-            self._database.executemany(f"INSERT INTO views VALUES ({places})", views)
+        """Append what an episode gave; a success that is there already stays."""
+        key = self._key(episode)
+        self._append({"key": key, "episode": asdict(episode), "rows": outcome.rows, "error": outcome.error})
+        self._keep(key, outcome)
 
-    def forget_failures(self) -> None:
-        """Forget the episodes that failed, so that they are run again."""
-        with _transaction(self._database):
-            self._database.execute("DELETE FROM episodes WHERE error IS NOT NULL")
+    def table(self, suite: str) -> pd.DataFrame:
+        """What is done of a suite: a row per view, in its order; a failed episode has one row with its error.
 
-    def records(self, suite: str) -> list[Record]:
-        """What is done of a suite, in its order."""
-        errors = dict(self._database.execute("SELECT key, error FROM episodes"))
-        rows: dict[str, list[ViewRow]] = {}
-        for key, *values in self._database.execute("SELECT * FROM views ORDER BY key, view"):
-            rows.setdefault(key, []).append(ViewRow(*values))
-        members = self._database.execute(
-            "SELECT key, episode, method, condition, family FROM members WHERE suite = ? ORDER BY position",
-            (suite,),
-        )
-        return [
-            Record(
-                Member(_load(episode), method, condition, family),
-                Outcome(tuple(rows.get(key, ())), errors[key]),
-            )
-            for key, episode, method, condition, family in members
-            if key in errors
-        ]
+        Raises:
+            InputError: pandas is not installed.
+        """
+        pandas = import_pandas()
+        rows: list[dict[str, Any]] = []
+        for member in self.suites.get(suite, ()):
+            outcome = self.outcomes.get(self._key(member.episode))
+            if outcome is None:
+                continue
+            known: dict[str, Any] = {n: getattr(member, n) for n in ("method", "condition", "family")}
+            known |= asdict(member.episode)
+            known["settings"] = json.dumps(member.episode.settings, ensure_ascii=False)
+            rows += [known | row | {"error": outcome.error} for row in outcome.rows or ({},)]
+        columns = ["method", "condition", "family", *Episode.__slots__, "view", *MEASURES, "error"]
+        table = pandas.DataFrame(rows, columns=columns)
+        return table.astype({"view": "Int64", "error": "string", **dict.fromkeys(MEASURES, "float64")})
 
-    def planned(self, suite: str) -> int:
-        """How many episodes a suite consists of."""
-        counted = self._database.execute("SELECT count(*) FROM members WHERE suite = ?", (suite,))
-        (count,) = counted.fetchone()
-        return int(count)
+    def _key(self, episode: Episode) -> str:
+        return episode.key(self.about["fingerprint"])
 
-    def _prepare(self, fingerprint: str | None, about: Mapping[str, str]) -> None:
-        """Make the tables where there are none; refuse those of another version."""
-        with _transaction(self._database):
-            tables = {
-                name
-                for (name,) in self._database.execute("SELECT name FROM sqlite_master WHERE type='table'")
-            }
-            if not tables and fingerprint is not None:
-                for statement in _TABLES.split(";"):
-                    self._database.execute(statement)
-                told = {**about, "format": FORMAT, "fingerprint": fingerprint}
-                self._database.executemany("INSERT INTO about VALUES (?, ?)", told.items())
-            elif "about" not in tables:
-                raise InputError(self.path, "is no result store", "choose another folder")
-        told = self.about()
-        if told.get("format") != FORMAT:
+    def _keep(self, key: str, outcome: Outcome) -> None:
+        if key not in self.outcomes or self.outcomes[key].error is not None:
+            self.outcomes[key] = outcome
+
+    def _lock_for_writing(self) -> None:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._lock.acquire()
+            self._file = self.path.open("ab")
+        except Timeout:
+            raise InputError(
+                self.path, "another run is under way", "wait for its end, or choose another --out"
+            ) from None
+        except OSError as error:
+            self._lock.release()
+            raise InputError(self.path, f"cannot be opened ({error})", "choose another folder") from None
+
+    def _read(self) -> None:
+        content = self.path.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        try:
+            lines = [json.loads(line) for line in whole.splitlines()]
+            if lines:
+                self.about = lines[0]["about"]
+            for line in lines[1:]:
+                if "suite" in line:
+                    self.suites[line["suite"]] = [
+                        Member(**m | {"episode": _episode(m["episode"])}) for m in line["members"]
+                    ]
+                else:
+                    self._keep(line["key"], Outcome(tuple(line["rows"]), line["error"]))
+        except (ValueError, KeyError, TypeError):
+            raise InputError(self.path, "is no result file", "choose another folder") from None
+        if not lines and (self._file is None or not b'{"about"'.startswith(content[:8])):
+            raise InputError(self.path, "is no result file", "choose another folder")
+        if self._file is not None and len(whole) < len(content):
+            self._file.truncate(len(whole))
+
+    def _begin(self, about: dict[str, str]) -> None:
+        """Write the first line, or refuse to add to what other code made."""
+        if not self.about:
+            self._append({"about": about})
+            self.about = about
+        elif self.about.get("format") != FORMAT or self.about["fingerprint"] != about["fingerprint"]:
+            names = " ".join(self.about[n] for n in ("version", "commit", "fingerprint") if n in self.about)
             raise InputError(
                 self.path,
-                f"has format {told.get('format')}, this caryatid reads {FORMAT}",
-                "choose another folder, or use the caryatid that made it",
-            )
-        if fingerprint not in (None, told["fingerprint"]):
-            raise InputError(
-                self.path,
-                f"was made by other code ({_named(told)}), whose figures do not compare with this one's",
+                f"was made by other code ({names}), whose figures do not compare with this one's",
                 "choose another --out; leave --suite out to draw what it holds",
             )
 
+    def _append(self, line: dict[str, Any]) -> None:
+        assert self._file is not None, "this store was opened for reading"
+        self._file.write(json.dumps(line, ensure_ascii=False).encode() + b"\n")
+        self._file.flush()
+        os.fsync(self._file.fileno())
 
-@contextmanager
-def _transaction(database: sqlite3.Connection) -> Iterator[None]:
-    """A transaction that is written whole or not at all."""
-    database.execute("BEGIN IMMEDIATE")
+
+def import_pandas() -> Any:
+    """Import pandas.
+
+    Raises:
+        InputError: It is not installed.
+    """
     try:
-        yield
-    except BaseException:
-        database.execute("ROLLBACK")
-        raise
-    database.execute("COMMIT")
+        import pandas
+    except ImportError:
+        raise InputError(
+            "benchmark", "tables and figures need pandas", 'pip install "caryatid[benchmark]"'
+        ) from None
+    return pandas
 
 
-def _named(about: Mapping[str, str]) -> str:
-    return " ".join(about[name] for name in ("caryatid", "commit", "fingerprint") if name in about)
+def collect_provenance() -> dict[str, str]:
+    """Which code on which machine: version, commit, libraries, processor; nothing of who ran it or where."""
+    package = Path(__file__).parents[1]
+    tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py")
+    commit = _git(package, "rev-parse", "HEAD") if tracked else ""
+    changed = _git(package, "status", "--porcelain", "--", ".") if commit else ""
+    return {
+        "version": _version("caryatid"),
+        "commit": commit or "unknown",
+        "dirty": str(bool(changed)),
+        "python": platform.python_version(),
+        "platform": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": str(os.cpu_count() or "unknown"),
+        "libraries": ", ".join(f"{name} {_version(name)}" for name in LIBRARIES),
+    }
 
 
-def _dump(episode: Episode) -> str:
-    return json.dumps(asdict(episode), sort_keys=True, ensure_ascii=False)
+def describe_provenance(about: Mapping[str, str]) -> str:
+    """Code and machine in one sentence."""
+    known = {
+        n: about.get(n, "unknown") for n in ("version", "commit", "processor", "cores", "platform", "python")
+    }
+    changed = ", with changes that are in no commit" if about.get("dirty") == "True" else ""
+    return (
+        f"caryatid {known['version']}, commit {known['commit'][:12]}{changed}, on {known['processor']}, "
+        f"{known['cores']} cores, {known['platform']}, Python {known['python']}; {about.get('libraries', '')}"
+    )
 
 
-def _load(text: str) -> Episode:
-    values: dict[str, Any] = json.loads(text)
-    values["settings"] = tuple(values["settings"])
-    return Episode(**{f.name: values[f.name] for f in fields(Episode)})
+def _episode(known: dict[str, Any]) -> Episode:
+    return Episode(**known | {"settings": tuple(known["settings"])})
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    """What git says; nothing where there is no git or it refuses."""
+    command = ["git", "-C", str(folder), *arguments]
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return answer.stdout.strip()
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            name, _, value = line.partition(":")
+            if name.strip() == "model name":
+                return " ".join(value.split())
+    except OSError:
+        pass
+    return platform.processor() or "unknown"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 
-from caryatid.benchmark.plugins import plugin_of
-from caryatid.benchmark.records import ORDERS, Episode, Member, OrderName
+from caryatid.benchmark.episodes import ORDERS, Episode, OrderName, content_of, family, plugin_of
+from caryatid.benchmark.store import Member
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config.settings import read_settings
 from caryatid.errors import InputError
 from caryatid.planning.planners import VOLUMETRIC
 
@@ -50,7 +52,7 @@ class Condition:
     Attributes:
         label: Its name; figures are drawn for each.
         noise: Noise model of the camera.
-        segmentation: Where parts come from.
+        segmentation: Where segments come from.
         settings: Changes of the default settings.
     """
 
@@ -71,9 +73,9 @@ class Suite:
         scenes: Names of built-in scenes, or scene folders.
         conditions: What the camera gives.
         seeds: Seeds 0…n−1.
-        views: Views an episode, the first one too.
+        views: Views an episode, including the first.
         reference: Method the others are compared with; None for the first.
-        gap: Two methods of which is told how much of the way between them each other one goes.
+        gap: Two methods, such as random choice and the oracle: how much of their gap each other one closes.
     """
 
     name: str
@@ -88,8 +90,6 @@ class Suite:
 
     def members(self) -> list[Member]:
         """All episodes, those of a scene one after the other."""
-        from caryatid.benchmark.scenes import content_of, family
-
         content = {scene: content_of(scene) for scene in self.scenes}
         plugins = {method.planner: plugin_of(method.planner) for method in self.methods}
         cross = product(self.scenes, range(self.seeds), self.conditions, self.methods)
@@ -125,6 +125,67 @@ def find_suite(name: str) -> Suite:
     if name in SUITES:
         return SUITES[name]
     raise InputError("--suite", f"there is no suite '{name}'", f"choose one of {', '.join(SUITES)}")
+
+
+EPISODE_OPTIONS = {"fusion.method": "--fusion", "active.max_views": "--views"}
+"""Settings every episode has of its own → the option that changes them."""
+
+
+def with_planners(suite: Suite, planners: Sequence[str]) -> Suite:
+    """Return the suite with these planners in place of its methods, each with the default fusion."""
+    return replace(suite, methods=tuple(Method(name, name) for name in dict.fromkeys(planners)))
+
+
+def with_fusions(suite: Suite, fusions: Sequence[FusionMethod]) -> Suite:
+    """Return the suite with each of its planners fusing in these ways.
+
+    Methods that differ in their fusion alone become one for each way. One that stands alone keeps its
+    label; with several ways the label tells which.
+    """
+    alike = Counter((method.planner, method.settings) for method in suite.methods)
+    methods: dict[str, Method] = {}
+    for method in suite.methods:
+        alone = alike[method.planner, method.settings] == 1
+        name = method.label if alone else ", ".join((method.planner, *method.settings))
+        for fusion in dict.fromkeys(fusions):
+            label = f"{name} {fusion.upper()}" if len(set(fusions)) > 1 else name
+            methods.setdefault(label, replace(method, label=label, fusion=fusion))
+    return replace(suite, methods=tuple(methods.values()))
+
+
+def with_conditions(
+    suite: Suite, segmentations: Sequence[SegmentationMethod], noises: Sequence[NoiseModel]
+) -> Suite:
+    """Return the suite with these in place of its conditions, every segmentation under every noise."""
+    parts = {"labels": "labels", "auto": "automatic segments"}
+    cameras = {"none": "no noise", "carmine": "Carmine noise"}
+    return replace(
+        suite,
+        conditions=tuple(
+            Condition(f"{parts[segmentation]}, {cameras[noise]}", noise, segmentation)
+            for segmentation in dict.fromkeys(segmentations)
+            for noise in dict.fromkeys(noises)
+        ),
+    )
+
+
+def with_settings(suite: Suite, settings: Sequence[str]) -> Suite:
+    """Return the suite with settings changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
+
+    Raises:
+        InputError: A setting does not exist, its value is not valid, or an option changes it.
+    """
+    for setting in settings:
+        if option := EPISODE_OPTIONS.get(setting.partition("=")[0].strip()):
+            raise InputError(f"--set {setting}", "every episode has its own", f"use {option}")
+    read_settings(None, settings)
+    return replace(
+        suite,
+        conditions=tuple(
+            replace(c, label=", ".join((c.label, *settings)), settings=(*c.settings, *settings))
+            for c in suite.conditions
+        ),
+    )
 
 
 def _depth_noise(factor: float) -> tuple[str, ...]:
@@ -186,7 +247,7 @@ _REGISTRATION = {
 _NOISE = tuple(
     Condition(f"depth noise ×{factor:g}", settings=_depth_noise(factor)) for factor in (0.0, 1.0, 2.0, 4.0)
 ) + tuple(Condition(label, settings=settings) for label, settings in _REGISTRATION.items())
-_AUTO = Condition("automatic parts, Carmine noise", segmentation="auto")
+_AUTO = Condition("automatic segments, Carmine noise", segmentation="auto")
 
 SUITES: Mapping[str, Suite] = {
     suite.name: suite
@@ -261,7 +322,7 @@ SUITES: Mapping[str, Suite] = {
         ),
         Suite(
             "noise",
-            "What depth noise, wrong poses and automatic parts cost.",
+            "What depth noise, wrong poses and automatic segments cost.",
             (Method("support"), Method("random", "random")),
             (*DESIGNED, *PILES[2::2], *DENSE[:8]),
             (*_NOISE, _AUTO),

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from caryatid.benchmark.cluster import ClusterExecutor
-from caryatid.benchmark.provenance import collect_provenance
-from caryatid.benchmark.records import Episode, Outcome
-from caryatid.benchmark.running import Executor, LocalExecutor, run_all
-from caryatid.benchmark.scenes import find_scenes, short_name
-from caryatid.benchmark.sections import SuiteReport
-from caryatid.benchmark.store import ResultStore
-from caryatid.benchmark.suites import Suite, find_suite
-from caryatid.benchmark.telling import (
+from caryatid.benchmark.episodes import Episode, find_scenes, short_name
+from caryatid.benchmark.report import (
     check_reference,
-    read_results,
-    report_all,
-    write_docs,
+    summarise_store,
+    write_document,
     write_page,
+    write_results,
     write_tables,
 )
-from caryatid.benchmark.variants import with_conditions, with_fusions, with_planners, with_settings
+from caryatid.benchmark.running import Outcomes, connect, run_locally, run_on_cluster
+from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
+from caryatid.benchmark.suites import (
+    Suite,
+    find_suite,
+    with_conditions,
+    with_fusions,
+    with_planners,
+    with_settings,
+)
 from caryatid.cli.benchmark import CORES, Benchmark
 from caryatid.cli.consoles import news_console
 from caryatid.cli.episode_bar import EpisodeBar
@@ -37,26 +38,27 @@ from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.fingerprint import fingerprint
 from caryatid.runtime.interrupts import Interrupted, interruptible
 
-RESULTS = "results.sqlite"
-"""Name of the result store in the folder."""
+SUMMARY = "summary.json.gz"
+"""What figures are made of, without the episodes; the documentation is built from such files."""
 
 
 @interruptible()
 def run_benchmark(options: Benchmark) -> int:
     """Run the episodes that are missing and write the figures; Ctrl-C ends it, and what is done is kept."""
     console = news_console(options.general.quiet or options.general.json)
-    suite = None if options.suite is None else _suite(options, options.suite)
-    executor = _executor(options, lambda text: console.print(text, markup=False))
-    code = None if suite is None else fingerprint()
+    import_pandas()
     path = options.out / RESULTS
+    suite = None if options.suite is None else _suite(options, options.suite)
+    if options.scheduler is not None and options.jobs is not None:
+        raise InputError("--jobs", "a cluster has the workers it has", "leave --jobs or --scheduler out")
     if suite is not None:
-        _check(options, suite, path, executor)
-    with ResultStore(path, code, collect_provenance().as_strings()) as store:
+        _check(options, suite, path)
+    about = collect_provenance()
+    with ResultStore(path, None if suite is None else fingerprint(), about) as store:
         try:
             if suite is not None:
-                with store.alone():
-                    _run(options, suite, store, console, executor)
-            return _tell(options, store, console)
+                _run(options, suite, store, console)
+            return _report(options, store, console)
         except KeyboardInterrupt:
             raise Interrupted("what is done is kept, start again to go on") from None
 
@@ -77,79 +79,71 @@ def _suite(options: Benchmark, name: str) -> Suite:
     return replace(suite, seeds=options.seeds or suite.seeds, views=options.views or suite.views)
 
 
-def _check(options: Benchmark, suite: Suite, path: Path, executor: Executor) -> None:
+def _check(options: Benchmark, suite: Suite, path: Path) -> None:
     """Refuse before anything is written or run what would come to nothing.
 
     Raises:
         InputError: There is no such method to compare with, or nobody to run episodes.
     """
     methods = {member.method: None for member in suite.members()}
-    if path.is_file():
+    if path.is_file() and path.stat().st_size:
         with ResultStore(path) as store:
-            methods |= {r.member.method: None for result in read_results(store) for r in result.records}
-    elif isinstance(executor, ClusterExecutor):
-        executor.check()
+            methods |= {member.method: None for members in store.suites.values() for member in members}
+    elif options.scheduler is not None:
+        connect(options.scheduler).close()
     check_reference(options.reference, methods)
 
 
-def _run(options: Benchmark, suite: Suite, store: ResultStore, console: Console, executor: Executor) -> None:
+def _run(options: Benchmark, suite: Suite, store: ResultStore, console: Console) -> None:
     """Run what is not done, with a bar."""
-    if options.retry:
-        store.forget_failures()
-    missing = store.plan(suite.name, suite.members())
-    total = store.planned(suite.name)
+    missing = store.plan(suite.name, suite.members(), retry=options.retry)
+    total = len({member.episode for member in store.suites[suite.name]})
     if missing and options.scheduler is None:
         compile_kernels(console.print)
-    with EpisodeBar(console, suite.name, total, total - len(missing)) as bar:
-
-        def done(episode: Episode, outcome: Outcome) -> None:
+    with (
+        EpisodeBar(console, suite.name, total, total - len(missing)) as bar,
+        closing(_outcomes(options, missing, console)) as outcomes,
+    ):
+        for episode, outcome in outcomes:
+            store.add(episode, outcome)
             bar.advance()
             if outcome.error is not None:
                 name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
                 bar.say(f"failed: {name}: {outcome.error}")
 
-        run_all(store, missing, executor, done)
+
+def _outcomes(options: Benchmark, missing: list[Episode], console: Console) -> Outcomes:
+    if missing and options.scheduler is not None:
+        yield from run_on_cluster(missing, options.scheduler, lambda text: console.print(text, markup=False))
+    elif missing:
+        yield from run_locally(missing, options.jobs or CORES)
 
 
-def _executor(options: Benchmark, say: Callable[[str], None]) -> Executor:
-    if options.scheduler is None:
-        return LocalExecutor(options.jobs or CORES)
-    if options.jobs is not None:
-        raise InputError("--jobs", "a cluster has the workers it has", "leave --jobs or --scheduler out")
-    return ClusterExecutor(options.scheduler, say)
-
-
-def _tell(options: Benchmark, store: ResultStore, console: Console) -> int:
+def _report(options: Benchmark, store: ResultStore, console: Console) -> int:
     """Write tables, figures and pages; say what there is."""
-    results = read_results(store)
-    reports = report_all(results, options.reference)
-    for line in [result.said() for result in results] + write_tables(results, options.out):
+    results = summarise_store(store, options.reference)
+    for result in results:
+        failed = f", {len(result.failures)} failed" if result.failures else ""
+        console.print(f"{result.name}: {result.episodes} of {result.planned} episodes{failed}", markup=False)
+    for line in write_tables(store, options.out):
         console.print(line, markup=False)
-    if reports:
+    if results:
         command = f"caryatid benchmark --out {options.out.name}"
         if options.reference is not None:
             command += f" --reference {shlex.quote(options.reference)}"
-        page = write_page(reports, store, options.out, command)
-        console.print(f"figures: {page}", markup=False)
+        write_results(results, store.about, options.out / SUMMARY)
+        console.print(f"figures: {write_page(results, store.about, options.out, command)}", markup=False)
         if options.docs is not None:
-            write_docs(reports, store, options.docs, f"{command} --docs {options.docs.name}")
+            write_document(results, store.about, options.docs, f"{command} --docs {options.docs.name}")
     if options.general.json:
-        sys.stdout.write(json_text({"results": str(options.out), "suites": figures(reports)}))
-    return 0
-
-
-def figures(reports: Sequence[SuiteReport]) -> dict[str, Any]:
-    """Mean F1 by view of each suite, condition and method, for other programs."""
-    return {
-        report.name: {
-            "planned": report.planned,
-            "done": report.summary.episodes,
-            "failed": len(report.summary.failures),
-            "f1": {
-                group.condition: {m.method: [e.value for e in m.curves["f1"]] for m in group.methods}
-                for group in report.summary.groups
-                if not group.family
-            },
+        suites = {
+            result.name: {
+                "planned": result.planned,
+                "done": result.episodes,
+                "failed": len(result.failures),
+                "f1": result.f1(),
+            }
+            for result in results
         }
-        for report in reports
-    }
+        sys.stdout.write(json_text({"results": str(options.out), "suites": suites}))
+    return 0

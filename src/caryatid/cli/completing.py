@@ -17,7 +17,7 @@ from caryatid.planning.planners import BUILT_IN, ORACLE
 from caryatid.planning.planners import offered as offered_planners
 from caryatid.robots.registry import HUMANOID
 from caryatid.robots.registry import offered as offered_robots
-from caryatid.simulation.designed import DESIGNED
+from caryatid.simulation.scenes import DESIGNED
 
 SCENES = [*DESIGNED, "pile-8-0", "dense-12-0", "packed-20-0"]
 """Names of scenes: all that are designed, and one of each generator."""

@@ -14,7 +14,7 @@ from caryatid.evaluation.overlaps import TrueObject
 from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
 from caryatid.io.bop import Frame, Recording, read_recording
 from caryatid.io.runs import Run, RunView, read_run
-from caryatid.simulation import solids
+from caryatid.simulation import world
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import GroundTruth, read_truth
 from caryatid.simulation.world import SimulatedScene
@@ -75,14 +75,14 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth) -> Tru
         objects=tuple(
             TrueObject(
                 name,
-                partial(solids.contains, scene, labels[name]),
-                np.stack(solids.bounds(scene, labels[name])),
+                partial(world.contains, scene, labels[name]),
+                np.stack(world.bounds(scene, labels[name])),
             )
             for name in truth.vertices
             if name in labels
         ),
         table=scene.table if scene.table in truth.vertices else None,
-        table_top=solids.table_top(scene).height,
+        table_top=world.table_top(scene).height,
     )
 
 

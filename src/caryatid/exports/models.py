@@ -15,8 +15,7 @@ from caryatid.errors import InputError
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
-from caryatid.simulation.mjcf import Solid, add_solid, quaternion
-from caryatid.simulation.world import TABLE
+from caryatid.simulation.world import TABLE, Solid, add_solid, quaternion
 from caryatid.viz.colours import object_colour, rgb
 
 WORLD = "world"

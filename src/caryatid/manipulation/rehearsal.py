@@ -22,8 +22,7 @@ from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
-from caryatid.simulation.mjcf import Solid, add_solid, quaternion
-from caryatid.simulation.world import TABLE
+from caryatid.simulation.world import TABLE, Solid, add_solid, quaternion
 from caryatid.support.plausibility import drawn, reconcile
 
 TIME_STEP = 0.004

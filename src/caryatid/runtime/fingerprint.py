@@ -15,7 +15,7 @@ BYSTANDERS = frozenset(
 )
 """Parts of caryatid that only arrange, hand on, draw or tell what others found, but for `DECIDING`."""
 
-DECIDING = frozenset({"benchmark/episodes.py", "benchmark/records.py", "benchmark/scenes.py"})
+DECIDING = frozenset({"benchmark/episodes.py"})
 """Modules in these parts that decide figures."""
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.generate import generate_dense, generate_pile
-from caryatid.simulation.packed import generate_packed
+from caryatid.simulation.generation import generate_dense, generate_packed, generate_pile
 from caryatid.simulation.scenes import is_builtin, list_scenes, load_scene, write_scene
-from caryatid.simulation.solids import bounds, contains, static_boxes, table_top, true_shapes
 from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, read_truth, write_truth
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, bounds, contains, static_boxes, table_top, true_shapes
 
 __all__ = [
     "GroundTruth",

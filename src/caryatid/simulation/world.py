@@ -1,18 +1,22 @@
-"""A table with free bodies on it in MuJoCo: which body is the table, which are objects, and their rest."""
+"""A simulated scene: its model in physics, the table and solids it is built of, and its true shapes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import colorsys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import SUPPORT_LABEL
 
@@ -247,3 +251,385 @@ def _check_stable(data: Any, source: str) -> None:
         raise InputError(
             source, "its simulation is unstable", "shorten the time step or mend overlapping bodies"
         )
+
+
+TABLE_HEIGHT = 0.75
+"""Height of the table tops built here [m]."""
+
+TABLE_SIZE = (0.6, 0.9)
+"""Depth (along world x, towards the robot) and width (along y) of the usual table top [m]."""
+
+Side = Literal["+x", "+y", "-y"]
+"""Where a wall may stand; the robot comes from -x."""
+
+_TOP_THICKNESS = 0.04
+_LEG = 0.04
+_WALL_THICKNESS = 0.06
+_WALL_LENGTH = 3.2
+_WALL_HEIGHT = 2.0
+_WALL_GAP = {"+x": 0.24, "+y": 0.32, "-y": 0.32}
+_WOOD, _DARK_WOOD, _PLASTER = (0.72, 0.58, 0.42, 1.0), (0.6, 0.48, 0.35, 1.0), (0.85, 0.85, 0.82, 1.0)
+_GOLDEN_RATIO = 0.618034
+_ROLLING = {"box": (4, 0.005, 0.001), "cylinder": (6, 0.005, 0.001), "sphere": (6, 0.01, 0.01)}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Solid:
+    """A free body of one primitive.
+
+    Attributes:
+        shape: Where it is set down and how large it is, in the world.
+        density: [kg/m³].
+        friction: Sliding friction [1]; the larger one of two bodies in contact counts.
+    """
+
+    shape: Box | Cylinder | Sphere
+    density: float = 600.0
+    friction: float = 0.8
+
+
+def box(
+    size: tuple[float, float, float],
+    at: tuple[float, float, float],
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    density: float = 600.0,
+    friction: float = 0.8,
+) -> Solid:
+    """A cuboid.
+
+    Args:
+        size: Full edge lengths [m].
+        at: Centre in x and y, and the height of the centre over the table top in z [m].
+        turn: Rotation vector [deg].
+        density: [kg/m³].
+        friction: Sliding friction [1].
+    """
+    return Solid(Box(_placed(at, turn), np.array(size)), density, friction)
+
+
+def cylinder(
+    radius: float,
+    height: float,
+    at: tuple[float, float, float],
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    density: float = 600.0,
+) -> Solid:
+    """A cylinder [m], upright unless turned; the other arguments are as in `box`.
+
+    Args:
+        radius: Of its ends [m].
+        height: Along its axis [m].
+        at: As in `box`.
+        turn: As in `box`.
+        density: As in `box`.
+    """
+    return Solid(Cylinder(_placed(at, turn), radius, height), density)
+
+
+def sphere(radius: float, at: tuple[float, float, float], density: float = 600.0) -> Solid:
+    """A ball [m]; the other arguments are as in `box`."""
+    return Solid(Sphere(_placed(at, (0.0, 0.0, 0.0)), radius), density)
+
+
+def build_spec(
+    solids: Sequence[Solid],
+    name: str,
+    table_size: tuple[float, float] = TABLE_SIZE,
+    walls: Sequence[Side] = (),
+) -> Any:
+    """Build a floor, a table with legs, walls beside it and free bodies `object0`, `object1`, … on it.
+
+    Args:
+        solids: The free bodies, in order.
+        name: Name of the model.
+        table_size: Depth along x and width along y of the top [m].
+        walls: Sides of the table where a wall stands.
+
+    Returns:
+        The `mujoco.MjSpec`.
+    """
+    spec = mujoco.MjSpec()
+    spec.modelname = name
+    spec.option.impratio = 10.0
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
+    for index, side in enumerate(walls):
+        centre, half = _wall(side, table_size)
+        _add_box(spec.worldbody, f"wall{index}", centre, half, _PLASTER)
+    _add_table(spec.worldbody.add_body(name=TABLE), table_size)
+    for index, solid in enumerate(solids):
+        add_solid(spec, f"object{index}", solid, palette(index))
+    return spec
+
+
+def palette(index: int) -> tuple[float, float, float, float]:
+    """Colour of the object with this number; neighbours in number differ widely in hue."""
+    hue = (0.02 + index * _GOLDEN_RATIO) % 1.0
+    value = (0.88, 0.7, 0.55)[(index // 7) % 3]
+    return (*colorsys.hsv_to_rgb(hue, 0.75, value), 1.0)
+
+
+def quaternion(R: Array) -> Array:
+    """Unit quaternion (4,), w first as MuJoCo wants it, of a rotation (3, 3)."""
+    wxyz = np.zeros(4)
+    mujoco.mju_mat2Quat(wxyz, np.ascontiguousarray(R).reshape(-1))
+    return wxyz
+
+
+def _placed(at: tuple[float, float, float], turn: tuple[float, float, float]) -> Array:
+    R = transforms.rotation_from_vector(np.deg2rad(turn))
+    return transforms.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
+
+
+def _add_table(table: Any, size: tuple[float, float]) -> None:
+    x, y = size[0] / 2.0, size[1] / 2.0
+    under = TABLE_HEIGHT - _TOP_THICKNESS
+    _add_box(
+        table,
+        "table_top",
+        (0.0, 0.0, TABLE_HEIGHT - _TOP_THICKNESS / 2.0),
+        (x, y, _TOP_THICKNESS / 2.0),
+        _WOOD,
+    )
+    inset, half = 0.75 * _LEG, (_LEG / 2.0, _LEG / 2.0, under / 2.0)
+    for index, (sign_x, sign_y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        centre = (sign_x * (x - inset), sign_y * (y - inset), under / 2.0)
+        _add_box(table, f"table_leg{index}", centre, half, _DARK_WOOD)
+
+
+def _wall(
+    side: Side, table_size: tuple[float, float]
+) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    """Centre and half sizes [m] of a wall on one side of the table."""
+    thick, long, high = _WALL_THICKNESS / 2.0, _WALL_LENGTH / 2.0, _WALL_HEIGHT / 2.0
+    sign = 1.0 if side[0] == "+" else -1.0
+    match side[1]:
+        case "x":
+            return (sign * (table_size[0] / 2.0 + _WALL_GAP[side] + thick), 0.0, high), (thick, long, high)
+        case _:
+            return (0.0, sign * (table_size[1] / 2.0 + _WALL_GAP[side] + thick), high), (long, thick, high)
+
+
+def _add_box(
+    body: Any,
+    name: str,
+    centre: tuple[float, float, float],
+    half: tuple[float, float, float],
+    rgba: tuple[float, float, float, float],
+) -> None:
+    body.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(half), rgba=list(rgba)
+    )
+
+
+def add_solid(
+    spec: Any, name: str, solid: Solid, rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+) -> None:
+    """Add a free body of one primitive to a MuJoCo spec.
+
+    Args:
+        spec: `mujoco.MjSpec`, changed in place.
+        name: Of the body.
+        solid: What it is and where.
+        rgba: Its colour.
+    """
+    shape = solid.shape
+    T_world_body = shape.T_world_object
+    body = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
+    body.add_freejoint()
+    match shape:
+        case Box():
+            kind, size = mujoco.mjtGeom.mjGEOM_BOX, shape.extents / 2.0
+        case Cylinder():
+            kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([shape.radius, shape.height / 2.0, 0.0])
+        case Sphere():
+            kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.array([shape.radius, 0.0, 0.0])
+    condim, torsional, rolling = _ROLLING[shape.kind]
+    body.add_geom(
+        type=kind,
+        size=size,
+        condim=condim,
+        friction=[solid.friction, torsional, rolling],
+        density=solid.density,
+        rgba=rgba,
+    )
+
+
+_GEOM = mujoco.mjtGeom
+_FLAT = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TableTop:
+    """Where things stand.
+
+    Attributes:
+        height: Of the top over the world's origin [m].
+        corners_world: The rectangle (4, 3) [m], anticlockwise from above.
+        shape: The geom as a box.
+    """
+
+    height: float
+    corners_world: Array
+    shape: Box
+
+
+def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[np.bool_]:
+    """Which points lie inside an object's true solid.
+
+    Primitives are tested as what they are, meshes as the convex hulls they collide as; an object of several
+    colliding geoms is their union.
+
+    Args:
+        scene: The scene.
+        label: The object, or 0 for the table.
+        points_world: (N, 3) [m].
+
+    Returns:
+        (N,) bool.
+    """
+    inside = np.zeros(len(points_world), dtype=bool)
+    for geom in solid_geoms(scene, label):
+        T_geom_world = transforms.invert(_geom_pose(scene, geom))
+        inside |= _inside_geom(scene.model, geom, transforms.transform(T_geom_world, points_world))
+    return inside
+
+
+def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
+    """Lowest and highest corner, (3,) each [m], of the world-aligned box around an object (0: the table)."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for geom in solid_geoms(scene, label):
+        T_world_geom = _geom_pose(scene, geom)
+        if scene.model.geom_type[geom] == _GEOM.mjGEOM_MESH:
+            corners = transforms.transform(T_world_geom, _mesh_vertices(scene.model, geom))
+            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+        else:
+            reach = _reach(scene.model, geom, T_world_geom[:3, :3])
+            low = np.minimum(low, T_world_geom[:3, 3] - reach)
+            high = np.maximum(high, T_world_geom[:3, 3] + reach)
+    return low, high
+
+
+def true_shapes(scene: SimulatedScene) -> dict[int, Box | Cylinder | Sphere]:
+    """Shape of every object, by label, that is a single box, cylinder or sphere; others are left out."""
+    shapes: dict[int, Box | Cylinder | Sphere] = {}
+    for label in scene.object_bodies:
+        geoms = solid_geoms(scene, label)
+        shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
+        if shape is not None:
+            shapes[label] = shape
+    return shapes
+
+
+def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
+    """Oriented boxes around the geoms that belong to no object, the table's first; planes are no obstacle."""
+    table = scene.geoms(0)
+    others = [g for g in np.flatnonzero(scene.geom_labels == 0).tolist() if g not in table]
+    solid = [g for g in (*table, *others) if int(scene.model.geom_type[g]) not in _FLAT]
+    return tuple(_geom_box(scene, g) for g in solid)
+
+
+def table_top(scene: SimulatedScene) -> TableTop:
+    """The table geom with the largest area seen from above, as a level box."""
+    boxes = [_level(_geom_box(scene, g)) for g in scene.geoms(0)]
+    top = max(boxes, key=lambda box: box.extents[0] * box.extents[1])
+    height = top.T_world_object[2, 3] + top.extents[2] / 2.0
+    signs = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
+    corners_world = transforms.transform(top.T_world_object, signs * top.extents / 2.0)
+    return TableTop(float(height), corners_world, top)
+
+
+def solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
+    """Geoms that make up the solid of an object (0 = table): those that collide, or all if none does."""
+    geoms = scene.geoms(label)
+    model = scene.model
+    colliding = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
+    return colliding or geoms
+
+
+def _geom_pose(scene: SimulatedScene, geom: int) -> Array:
+    return transforms.rigid(scene.data.geom_xmat[geom].reshape(3, 3), scene.data.geom_xpos[geom])
+
+
+def _primitive(scene: SimulatedScene, geom: int) -> Box | Cylinder | Sphere | None:
+    size, T_world_geom = scene.model.geom_size[geom], _geom_pose(scene, geom)
+    match scene.model.geom_type[geom]:
+        case _GEOM.mjGEOM_BOX:
+            return Box(T_world_geom, 2.0 * size)
+        case _GEOM.mjGEOM_CYLINDER:
+            return Cylinder(T_world_geom, float(size[0]), 2.0 * float(size[1]))
+        case _GEOM.mjGEOM_SPHERE:
+            return Sphere(T_world_geom, float(size[0]))
+    return None
+
+
+def _geom_box(scene: SimulatedScene, geom: int) -> Box:
+    """Return the box around a geom along the geom's own axes."""
+    centre, half = scene.model.geom_aabb[geom, :3], scene.model.geom_aabb[geom, 3:]
+    T_world_geom = _geom_pose(scene, geom)
+    return Box(T_world_geom @ transforms.rigid(np.eye(3), centre), 2.0 * half)
+
+
+def _level(box: Box) -> Box:
+    """Turn a box's axes so that its third is up; a box askew becomes the world-aligned one around it."""
+    R = box.T_world_object[:3, :3]
+    upright = int(np.argmax(np.abs(R[2])))
+    if abs(R[2, upright]) < np.cos(np.deg2rad(1.0)):
+        half = np.abs(R) @ (box.extents / 2.0)
+        return Box(transforms.rigid(np.eye(3), box.T_world_object[:3, 3]), 2.0 * half)
+    first, second = (upright + 1) % 3, (upright + 2) % 3
+    x = R[:, first] * (1.0, 1.0, 0.0)
+    x = x / np.linalg.norm(x)
+    R_level = np.stack([x, np.cross((0.0, 0.0, 1.0), x), (0.0, 0.0, 1.0)], axis=1)
+    return Box(transforms.rigid(R_level, box.T_world_object[:3, 3]), box.extents[[first, second, upright]])
+
+
+def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:
+    """Test points (N, 3) in the geom's own frame."""
+    size = model.geom_size[geom]
+    match model.geom_type[geom]:
+        case _GEOM.mjGEOM_BOX:
+            return (np.abs(points) <= size).all(axis=-1)
+        case _GEOM.mjGEOM_SPHERE:
+            return np.linalg.norm(points, axis=-1) <= size[0]
+        case _GEOM.mjGEOM_ELLIPSOID:
+            return np.linalg.norm(points / size, axis=-1) <= 1.0
+        case _GEOM.mjGEOM_CYLINDER:
+            return (np.hypot(points[:, 0], points[:, 1]) <= size[0]) & (np.abs(points[:, 2]) <= size[1])
+        case _GEOM.mjGEOM_CAPSULE:
+            along = np.clip(points[:, 2], -size[1], size[1])
+            return np.linalg.norm(points - along[:, None] * (0.0, 0.0, 1.0), axis=-1) <= size[0]
+        case _GEOM.mjGEOM_MESH:
+            faces = ConvexHull(_mesh_vertices(model, geom)).equations
+            return (points @ faces[:, :3].T + faces[:, 3] <= 1e-9).all(axis=-1)
+    raise _unsupported(model, geom)
+
+
+def _reach(model: Any, geom: int, R_world_geom: Array) -> Array:
+    """How far (3,) [m] a primitive reaches from its centre along the world's axes."""
+    size, axis = model.geom_size[geom], np.abs(R_world_geom[:, 2])
+    match model.geom_type[geom]:
+        case _GEOM.mjGEOM_BOX:
+            return np.abs(R_world_geom) @ size
+        case _GEOM.mjGEOM_SPHERE:
+            return np.full(3, size[0])
+        case _GEOM.mjGEOM_ELLIPSOID:
+            return np.linalg.norm(R_world_geom * size, axis=1)
+        case _GEOM.mjGEOM_CYLINDER:
+            return size[1] * axis + size[0] * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
+        case _GEOM.mjGEOM_CAPSULE:
+            return size[1] * axis + size[0]
+    raise _unsupported(model, geom)
+
+
+def _mesh_vertices(model: Any, geom: int) -> Array:
+    mesh = model.geom_dataid[geom]
+    first = model.mesh_vertadr[mesh]
+    return model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(np.float64)
+
+
+def _unsupported(model: Any, geom: int) -> InputError:
+    body = model.body(model.geom_bodyid[geom]).name
+    kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+    return InputError(f"body '{body}'", f"a {kind} geom is no solid shape", "use primitives or meshes")

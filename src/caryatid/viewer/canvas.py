@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from caryatid.geometry.transforms import Array
-from caryatid.simulation.mjcf import quaternion
+from caryatid.simulation.world import quaternion
 from caryatid.viewer.marks import Copies, Drawing, Frustum, Label, Lines, Mark, Mesh, Points
 
 

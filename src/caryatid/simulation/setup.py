@@ -12,12 +12,11 @@ from caryatid.robots.humanoid import Robot, home_view
 from caryatid.robots.registry import HUMANOID, RobotMaker, Surroundings, find_robot
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.solids import static_boxes, table_top
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, static_boxes, table_top
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Stage:
+class Simulation:
     """What `explore` needs of a simulation.
 
     Attributes:
@@ -31,14 +30,14 @@ class Stage:
     robot: Robot
 
 
-def set_stage(
+def make_simulation(
     scene: SimulatedScene,
     config: Config,
     *,
     noise: NoiseModel,
     seed: int,
     robot: RobotMaker | str = HUMANOID,
-) -> Stage:
+) -> Simulation:
     """Put a robot before the table, at its home view, with the furniture on its floor map.
 
     Args:
@@ -66,4 +65,4 @@ def set_stage(
     made = make(Surroundings(centre, floor, config))
     made.move_to(home_view(made, ViewSphere.around(centre, config.active), config.robot))
     camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor)
-    return Stage(scene, camera, made)
+    return Simulation(scene, camera, made)

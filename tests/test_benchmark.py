@@ -1,0 +1,385 @@
+"""The benchmark: suites, scenes, episodes, the result file, statistics and the report."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+import pandas as pd
+import pytest
+from conftest import SMALL, run_command
+
+from caryatid.benchmark.episodes import (
+    MEASURES,
+    TIMES,
+    Episode,
+    Outcome,
+    content_of,
+    family,
+    find_scenes,
+    plugin_of,
+    run_episode,
+    settings_of,
+)
+from caryatid.benchmark.report import read_results, summarise_store, write_document, write_page, write_results
+from caryatid.benchmark.statistics import area_over_path, first_reach, summarise
+from caryatid.benchmark.store import RESULTS, Member, ResultStore, collect_provenance
+from caryatid.benchmark.suites import (
+    SUITES,
+    find_suite,
+    with_conditions,
+    with_fusions,
+    with_planners,
+    with_settings,
+)
+from caryatid.errors import InputError
+from caryatid.simulation.scenes import is_builtin, load_scene, write_scene
+
+QUICK = tuple(flag.removeprefix("--set=") for flag in SMALL)
+
+
+def without_times(outcome: Outcome) -> Outcome:
+    return replace(outcome, rows=tuple(row | dict.fromkeys(TIMES, 0.0) for row in outcome.rows))
+
+
+def row(view: int, f1: float, path: float = 0.0) -> dict[str, float]:
+    return {"view": view, **dict.fromkeys(MEASURES, f1), "path": path, "lifts": 0.0, "unharmed": 0.0}
+
+
+def member(scene: str = "tower", method: str = "support", seed: int = 0, kind: str = "designed") -> Member:
+    return Member(Episode(scene, planner=method, seed=seed, views=3), method, "labels, Carmine noise", kind)
+
+
+def fill(path, methods=("support", "random", "oracle"), scenes=6) -> None:
+    """A result file of episodes that never ran; the last one failed."""
+    rng = np.random.default_rng(1)
+    members = [
+        member(f"{kind}-5-{scene}", method, seed, kind)
+        for method, scene, seed in product(methods, range(scenes), range(2))
+        for kind in ["dense" if scene % 2 else "pile"]
+    ]
+    with ResultStore(path, "code", collect_provenance()) as store:
+        store.plan("planners", members)
+        for m in members[:-1]:
+            rise = 0.6 + 0.1 * methods.index(m.method)
+            f1 = np.clip(rise + 0.1 * np.arange(3) + rng.normal(0.0, 0.03, 3), 0.0, 1.0)
+            store.add(m.episode, Outcome(tuple(row(v, f1[v - 1], 0.5 * v - 0.5) for v in (1, 2, 3))))
+        store.add(members[-1].episode, Outcome((), f"{members[-1].episode.scene}: fell <over>"))
+
+
+# Suites and scenes
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
+    suite = find_suite(name)
+    assert all(is_builtin(scene) for scene in suite.scenes)
+    few = replace(suite, scenes=suite.scenes[:1], seeds=1)
+    changed = with_fusions(few, ["pc", "sg"])
+    changed = with_conditions(changed, ["auto", "labels"], ["none", "carmine"])
+    changed = with_settings(changed, ["noise.translation=0.02"])
+    for one in (few, changed):
+        members = one.members()
+        assert len(members) == len(one.conditions) * len(one.methods)
+        assert len({m.episode for m in members}) == len(members)
+        assert len({(m.condition, m.method) for m in members}) == len(members)
+        for m in members:
+            settings_of(m.episode)
+    assert {(m.episode.segmentation, m.episode.noise, m.episode.fusion) for m in changed.members()} == set(
+        product(("labels", "auto"), ("none", "carmine"), ("pc", "sg"))
+    )
+    assert all(settings_of(m.episode).noise.translation == 0.02 for m in changed.members())
+
+
+def test_planners_can_take_the_place_of_the_methods():
+    suite = with_planners(find_suite("smoke"), ["random", "paper", "random"])
+    assert [(m.label, m.planner, m.fusion) for m in suite.methods] == [
+        ("random", "random", "pc+sg"),
+        ("paper", "paper", "pc+sg"),
+    ]
+
+
+def test_what_cannot_be_changed_or_does_not_exist_is_refused():
+    suite = find_suite("smoke")
+    with pytest.raises(InputError, match=r"fusion\.method=pc: every episode has its own; use --fusion"):
+        with_settings(suite, ["fusion.method=pc"])
+    with pytest.raises(InputError, match="no suite 'fig6'; choose one of smoke, fig5, planners"):
+        find_suite("fig6")
+
+
+def test_folders_of_scenes_are_found(tmp_path):
+    for name in ("tower", "bridge"):
+        write_scene(load_scene(name), tmp_path / name)
+    folders = [str(tmp_path / "bridge"), str(tmp_path / "tower")]
+    assert find_scenes([str(tmp_path), str(tmp_path / "tower"), "shelf"]) == [*folders, "shelf"]
+    assert [family(s) for s in ("tower", "pile-4-1", "a/ycb4_8")] == ["designed", "pile", "ycb"]
+    before = content_of(folders[0])
+    assert before != content_of(folders[1])
+    (tmp_path / "bridge" / "gt.json").unlink()
+    assert content_of(folders[0]) != before
+    with pytest.raises(InputError, match=r"bridge: has no gt\.json"):
+        find_scenes([str(tmp_path)])
+    with pytest.raises(InputError, match=r"neither a built-in scene nor a folder; give .* tower"):
+        find_scenes(["castle"])
+
+
+# Episodes
+
+
+def test_an_episode_is_scored_view_by_view():
+    outcome = run_episode(Episode("tower", settings=QUICK, views=2))
+    assert outcome.error is None
+    first, second = outcome.rows
+    assert (first["view"], second["view"]) == (1, 2)
+    assert first["angle"] == first["path"] == first["planning_seconds"] == 0.0
+    assert second["angle"] > 0.0
+    assert second["path"] > 0.0
+    assert 0.5 < second["f1"] <= 1.0
+
+
+def test_what_fails_is_an_outcome_that_says_why():
+    outcome = run_episode(Episode("dense-99-1", settings=QUICK, views=2))
+    assert outcome.rows == ()
+    assert outcome.error is not None
+    assert "dense-99-1: 99 objects cannot be set up" in outcome.error
+    assert "\n" not in outcome.error
+
+
+def test_built_in_planners_have_no_package():
+    assert plugin_of("support") == plugin_of("no such planner") == ""
+
+
+# The result file
+
+
+def test_what_is_added_comes_back_and_only_what_is_missing_is_asked_for(tmp_path):
+    members = [member(seed=s) for s in range(3)]
+    twice = [*members, replace(members[0], method="the same")]
+    path = tmp_path / RESULTS
+    with ResultStore(path, "code") as store:
+        assert store.plan("smoke", twice) == [m.episode for m in members]
+        store.add(members[0].episode, Outcome((row(1, 0.1 + 0.2),)))
+        store.add(members[1].episode, Outcome((), "no luck"))
+    with ResultStore(path, "code") as store:
+        assert store.plan("smoke", twice) == [members[2].episode]
+        assert store.plan("smoke", twice, retry=True) == [members[1].episode, members[2].episode]
+        assert store.plan("other", members[1:]) == [members[2].episode]
+        store.add(members[1].episode, Outcome((row(1, 0.5),)))
+        store.add(members[1].episode, Outcome((row(1, 0.7),)))
+    with ResultStore(path) as store:
+        assert store.suites == {"smoke": twice, "other": members[1:]}
+        assert store.table("smoke")["f1"].tolist() == [0.1 + 0.2, 0.5, 0.1 + 0.2]
+
+
+@pytest.mark.parametrize("torn", range(0, 400, 37))
+def test_a_torn_last_line_is_ignored(tmp_path, torn):
+    path = tmp_path / RESULTS
+    members = [member(seed=s) for s in range(2)]
+    with ResultStore(path, "code") as store:
+        store.plan("a", members)
+        store.add(members[0].episode, Outcome((row(1, 0.5),)))
+        whole = path.stat().st_size
+        store.add(members[1].episode, Outcome((row(1, 0.7),)))
+    path.write_bytes(path.read_bytes()[: whole + torn])
+    with ResultStore(path) as store:
+        assert store.table("a")["f1"].tolist() == [0.5]
+    with ResultStore(path, "code") as store:
+        assert store.plan("a", members) == [members[1].episode]
+        store.add(members[1].episode, Outcome((row(1, 0.7),)))
+        assert store.table("a")["f1"].tolist() == [0.5, 0.7]
+    with ResultStore(path) as store:
+        assert store.table("a")["f1"].tolist() == [0.5, 0.7]
+
+
+def test_a_file_torn_in_its_first_line_is_begun_again(tmp_path):
+    path = tmp_path / RESULTS
+    path.write_bytes(b'{"about": {"ver')
+    with ResultStore(path, "code") as store:
+        store.plan("a", [member()])
+    with ResultStore(path) as store:
+        assert store.suites == {"a": [member()]}
+
+
+def test_one_writes_and_others_read(tmp_path):
+    with ResultStore(tmp_path / RESULTS, "code") as store:
+        store.plan("a", [member()])
+        with pytest.raises(InputError, match="another run is under way; wait for its end"):
+            ResultStore(tmp_path / RESULTS, "code")
+        with ResultStore(tmp_path / RESULTS) as reading:
+            assert list(reading.suites) == ["a"]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"scene": "bridge"}, {"seed": 1}, {"views": 6}, {"planner": "random"}, {"fusion": "pc"},
+     {"segmentation": "auto"}, {"noise": "none"}, {"settings": ("a.b=1",)}, {"content": "abc"},
+     {"plugin": "abc"}, {"order": "random"}],
+)  # fmt: skip
+def test_everything_that_decides_an_episode_is_in_its_key(other):
+    episode = member().episode
+    assert replace(episode, **other).key("code") != episode.key("code")
+    assert episode.key("other code") != episode.key("code")
+    here, there = (Episode(f"{place}/pile", content="abc") for place in ("here", "there"))
+    assert here.key("code") == there.key("code")
+
+
+def test_what_is_no_result_of_this_code_is_refused_and_left_as_it_is(tmp_path):
+    path = tmp_path / RESULTS
+    with pytest.raises(InputError, match="no result file; run a suite first"):
+        ResultStore(path)
+    with ResultStore(path, "code", {"version": "0.1"}):
+        pass
+    with pytest.raises(InputError, match=r"made by other code \(0.1 code\).*another --out"):
+        ResultStore(path, "newer")
+    for content in (b"not JSON, not at all", b"no\nlines\n", b'{"cakes": 1}\n'):
+        path.write_bytes(content)
+        for code in (None, "code"):
+            with pytest.raises(InputError, match="is no result file"):
+                ResultStore(path, code)
+        assert path.read_bytes() == content
+
+
+# Statistics
+
+
+def table(curves: dict[str, list[tuple[str, list[float]]]]) -> pd.DataFrame:
+    """A row per view: method → (scene, F1 by view); half a metre per view."""
+    rows = [
+        {"method": method, "condition": "c", "family": "pile", "scene": scene, "seed": 0, "error": None}
+        | row(v, f1, 0.5 * v - 0.5)
+        for method, episodes in curves.items()
+        for scene, values in episodes
+        for v, f1 in enumerate(values, start=1)
+    ]
+    return pd.DataFrame(rows)
+
+
+def figure(summary: pd.DataFrame, method: str, quantity: str, at: float = 0) -> pd.Series:
+    chosen = (summary["method"] == method) & (summary["quantity"] == quantity) & (summary["at"] == at)
+    (found,) = summary[chosen].itertuples()
+    return found
+
+
+def test_figures_by_hand():
+    curves = {
+        "one": [("a", [0.5, 0.9, 1.0]), ("b", [0.5, 0.7, 1.0])],
+        "two": [("a", [0.5, 0.6, 0.7]), ("b", [0.5, 0.6, 0.9]), ("c", [0.0, 0.0, 0.0])],
+        "best": [("a", [0.5, 1.0, 1.0]), ("b", [0.5, 1.0, 1.0])],
+    }
+    summary = summarise(table(curves), reference="two", gap=("two", "best"))
+    assert figure(summary, "one", "f1", 2).value == pytest.approx(0.8)
+    assert (figure(summary, "one", "f1", 2).low, figure(summary, "one", "f1", 2).high) == pytest.approx(
+        (0.7, 0.9)
+    )
+    assert figure(summary, "one", "f1 difference", 3).value == pytest.approx(0.2)
+    assert figure(summary, "one", "paired scenes").value == 2
+    assert figure(summary, "one", "gap", 2).value == pytest.approx(0.5)
+    assert figure(summary, "one", "share", 0.9).value == 1.0
+    assert figure(summary, "one", "median views", 0.9).value == 2.5
+    assert figure(summary, "one", "mean path", 0.9).value == pytest.approx(0.75)
+    assert figure(summary, "two", "share", 0.9).value == pytest.approx(1.0 / 3.0)
+    assert figure(summary, "two", "median path", 0.9).value == np.inf
+    assert figure(summary, "best", "area").value == pytest.approx(0.75)
+
+
+def test_seeds_of_a_scene_count_as_one_and_failures_not_at_all(tmp_path):
+    path = tmp_path / RESULTS
+    members = [member("a", seed=0), member("a", seed=1), member("b"), member("b", seed=1)]
+    with ResultStore(path, "code") as store:
+        store.plan("x", members)
+        for m, f1 in zip(members, (0.2, 0.4, 0.9, None), strict=True):
+            rows = () if f1 is None else (row(1, f1),)
+            store.add(m.episode, Outcome(rows, "fell" if f1 is None else None))
+        (result,) = summarise_store(store)
+    assert figure(result.summary, "support", "f1", 1).value == pytest.approx(0.6)
+    assert figure(result.summary, "support", "failed").value == 1
+    assert result.failures == [["support", "labels, Carmine noise", "b", "1", "fell"]]
+
+
+def test_an_interval_covers_the_mean_as_often_as_it_says():
+    rng, covered = np.random.default_rng(5), 0
+    for _ in range(40):
+        values = rng.normal(0.5, 0.1, 30)
+        one = figure(
+            summarise(table({"m": [(f"s{i}", [f]) for i, f in enumerate(values)]}), reference="m"),
+            "m",
+            "f1",
+            1,
+        )
+        covered += one.low < 0.5 < one.high
+    assert 33 <= covered <= 40
+
+
+def test_thresholds_and_areas_over_the_path():
+    f1, path = np.array([[0.5, 0.7, 0.95]]), np.array([[0.0, 1.0, 3.0]])
+    assert [a.tolist() for a in first_reach(f1, path, 0.9, straight=False)] == [[3.0], [3.0]]
+    assert first_reach(f1, path, 0.9, straight=True)[1] == pytest.approx([2.6])
+    assert first_reach(f1, path, 0.99, straight=True)[1].tolist() == [np.inf]
+    assert area_over_path(f1, path, 4.0) == pytest.approx([(0.5 + 2 * 0.7 + 0.95) / 4.0])
+    assert area_over_path(f1, path, 2.0) == pytest.approx([(0.5 + 0.7) / 2.0])
+
+
+# The report
+
+
+def test_the_command_writes_tables_figures_and_pages_of_what_there_is(tmp_path, capsys):
+    out = tmp_path / "bench"
+    fill(out / RESULTS)
+    command = ("benchmark", "--out", out, "--docs", tmp_path / "page.md", "--reference", "support", "--json")
+    assert run_command(*command) == 0
+    said = json.loads(capsys.readouterr().out)["suites"]["planners"]
+    assert (said["planned"], said["done"], said["failed"]) == (36, 36, 1)
+    page, document = (out / "index.html").read_text(), (tmp_path / "page.md").read_text()
+    for text in (page, document):
+        for part in ("planners", "random", "oracle", "Until F1 reaches a threshold", "dense scenes only"):
+            assert part in text
+    assert "fell &lt;over&gt;" in page
+    assert not [link for link in ("http://", "<script", "<link") if link in page]
+    shown = {line.split("(")[1].rstrip(")") for line in document.splitlines() if line.startswith("![")}
+    assert shown == {f"page/{file.name}" for file in (tmp_path / "page").iterdir()}
+    assert (out / "planners" / "f1-over-views.png").read_bytes().startswith(b"\x89PNG")
+    f1 = said["f1"]["labels, Carmine noise"]["random"]
+    assert f"| random | {f1[0]:.3f} [" in document
+    before = page
+    assert run_command(*command) == 0
+    assert (out / "index.html").read_text() == before
+    assert run_command("benchmark", "--out", out, "--reference", "nobody") == 1
+    assert "no such method; choose one of support, random, oracle" in capsys.readouterr().err
+
+
+def test_csv_and_parquet_hold_every_digit(tmp_path):
+    out = tmp_path / "bench"
+    fill(out / RESULTS)
+    assert run_command("benchmark", "--out", out, "--quiet") == 0
+    with ResultStore(out / RESULTS) as store:
+        known = [row for outcome in store.outcomes.values() for row in outcome.rows]
+    with (out / "planners.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["f1"]) for line in lines if line["f1"]] == [row["f1"] for row in known]
+    assert lines[-1]["error"].endswith("fell <over>")
+    parquet = pd.read_parquet(out / "planners.parquet")
+    assert list(parquet.columns) == list(lines[0])
+    assert parquet["f1"].dropna().tolist() == [row["f1"] for row in known]
+
+
+def test_a_document_can_be_made_again_of_the_summary(tmp_path):
+    fill(tmp_path / RESULTS)
+    with ResultStore(tmp_path / RESULTS) as store:
+        results, about = summarise_store(store), store.about
+    write_results(results, about, tmp_path / "s.json.gz")
+    for name, made in (("a", (results, about)), ("b", read_results(tmp_path / "s.json.gz"))):
+        (tmp_path / name).mkdir()
+        write_document(*made, tmp_path / name / "page.md", "command")
+        write_page(*made, tmp_path / name, "command")
+    one, other = ((tmp_path / name / "page.md").read_text() for name in "ab")
+    assert one == other
+
+
+def test_without_pandas_the_remedy_is_told(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    assert run_command("benchmark", "--out", tmp_path) == 1
+    assert 'pip install "caryatid[benchmark]"' in capsys.readouterr().err

@@ -1,0 +1,362 @@
+"""Runs of the benchmark that are interrupted, killed or lose workers: nothing is lost, nothing done twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+from conftest import run_command
+from distributed import Client
+from test_benchmark import QUICK, without_times
+
+import caryatid
+from caryatid.benchmark.episodes import Episode, Outcome, content_of, run_episode
+from caryatid.benchmark.running import connect, run_locally, run_on_cluster, run_on_worker
+from caryatid.benchmark.store import RESULTS, ResultStore
+from caryatid.benchmark.suites import find_suite, with_planners
+from caryatid.errors import CaryatidError, InputError
+from caryatid.runtime.fingerprint import fingerprint
+
+pytestmark = pytest.mark.slow
+
+SEEDS = 8
+COMMAND = ["benchmark", "--suite", "smoke", "--scenes", "tower", "--planner", "random", "--views", "2"]
+COMMAND += ["--jobs", "2"]
+
+
+@pytest.fixture
+def started(tmp_path):
+    """Start the command on a folder, as a terminal would: all its processes get what is typed.
+
+    Ctrl-C is not ignored there, even where it is here, in the background of a shell.
+    """
+    runs: list[subprocess.Popen[str]] = []
+
+    def start(seeds: int = SEEDS) -> subprocess.Popen[str]:
+        options = [*COMMAND, f"--seeds={seeds}", f"--out={tmp_path / 'out'}"]
+        command = [sys.executable, "-m", "caryatid", *options]
+        run = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        )
+        runs.append(run)
+        return run
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield start
+    signal.signal(signal.SIGINT, before)
+    for run in runs:
+        with suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
+        run.communicate()
+
+
+def all_rows(folder):
+    """What is stored, times too, by episode."""
+    path = folder / RESULTS
+    if not path.is_file() or not path.read_bytes().count(b"\n"):
+        return {}
+    with ResultStore(path) as store:
+        return {key: outcome.rows for key, outcome in store.outcomes.items()}
+
+
+def wait_for_more(run, folder, known):
+    """Wait until an episode is done that was not."""
+    while len(found := all_rows(folder)) == len(known):
+        assert run.poll() is None, run.communicate()[0]
+        time.sleep(0.02)
+    return found
+
+
+def end(run, processes):
+    """Wait until a run and all its processes have ended; return its exit status and what it said."""
+    said, _ = run.communicate(timeout=60)
+    _, alive = psutil.wait_procs(processes, timeout=30)
+    assert not alive
+    assert "Traceback" not in said
+    return run.returncode, said
+
+
+def workers(run):
+    """The processes of a run that run episodes; others come and go."""
+    found = []
+    for process in psutil.Process(run.pid).children():
+        with suppress(psutil.NoSuchProcess):
+            if "spawn_main" in " ".join(process.cmdline()):
+                found.append(process)
+    return found
+
+
+def interrupt(run, processes):
+    os.killpg(run.pid, signal.SIGINT)
+    assert end(run, processes) == (130, "interrupted: what is done is kept, start again to go on\n")
+
+
+def kill_worker(run, processes):
+    workers(run)[0].kill()
+    status, said = end(run, processes)
+    assert status == 1
+    assert said.startswith("error: a process was killed, perhaps for want of memory; what is done is kept:")
+    assert said.count("\n") == 1
+
+
+def kill(run, processes):
+    run.kill()
+    assert end(run, processes)[0] == -signal.SIGKILL
+
+
+def test_however_a_run_ends_the_next_one_goes_on(started, tmp_path):
+    out = tmp_path / "out"
+    known = {}
+    for stop in (interrupt, kill_worker, kill):
+        run = started()
+        assert known.items() < wait_for_more(run, out, known).items()
+        stop(run, psutil.Process(run.pid).children(recursive=True))
+        found = all_rows(out)
+        assert known.items() < found.items()
+        known = found
+    assert all(len(rows) == 2 for rows in known.values())
+    assert len(known) < SEEDS
+    status, said = end(started(), ())
+    assert status == 0
+    assert said.startswith(f"smoke: {SEEDS} of {SEEDS} episodes\n")
+    assert known.items() < all_rows(out).items()
+    with ResultStore(out / RESULTS) as store:
+        assert len(store.outcomes) == len(store.suites["smoke"]) == SEEDS
+        for member in store.suites["smoke"][::3]:
+            stored = store.outcomes[member.episode.key(store.about["fingerprint"])]
+            assert without_times(stored) == without_times(run_episode(member.episode))
+
+
+def test_a_run_interrupted_as_it_starts_leaves_quietly(started):
+    run = started()
+    while len(workers(run)) < 2:
+        assert run.poll() is None
+        time.sleep(0.01)
+    interrupt(run, psutil.Process(run.pid).children(recursive=True))
+
+
+def test_a_second_run_on_a_folder_is_refused_and_reading_is_not(started, tmp_path, capsys):
+    out = tmp_path / "out"
+    run = started(seeds=200)
+    done = len(wait_for_more(run, out, {}))
+    assert run_command(*COMMAND, "--out", out) == 1
+    assert "results.jsonl: another run is under way; wait for its end, or" in capsys.readouterr().err
+    assert run_command("benchmark", "--out", out, "--json") == 0
+    told = json.loads(capsys.readouterr().out)["suites"]["smoke"]
+    assert done <= told["done"] < told["planned"] == 200
+    assert run.poll() is None
+    interrupt(run, psutil.Process(run.pid).children(recursive=True))
+
+
+# Processes of this machine
+
+
+def test_rows_are_the_same_on_any_number_of_processes(monkeypatch):
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    before = dict(os.environ)
+    suite = with_planners(find_suite("smoke"), ["support", "random"])
+    suite = replace(suite, scenes=("tower", "dense-99-1"), seeds=1, views=2)
+    episodes = [replace(m.episode, settings=QUICK) for m in suite.members()]
+    found = [{e: without_times(o) for e, o in run_locally(episodes, jobs)} for jobs in (1, 2)]
+    assert found[0] == found[1]
+    assert [found[0][e].error is None for e in episodes] == [True, True, False, False]
+    assert dict(os.environ) == before
+
+
+class Interrupting(list):
+    """Episodes at whose beginning Ctrl-C is pressed; they count how many were taken."""
+
+    taken = 0
+
+    def __iter__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        for episode in super().__iter__():
+            yield episode
+            self.taken += 1
+
+
+def test_an_interrupt_waits_until_all_processes_are_started():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    episodes = Interrupting(Episode("tower", settings=QUICK, views=1, seed=seed) for seed in range(3))
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            next(run_locally(episodes, 2))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert episodes.taken == len(episodes)
+
+
+# Workers of a cluster
+
+LOCAL = ["--host", "127.0.0.1", "--no-dashboard"]
+
+
+class Cluster:
+    """A scheduler of dask.distributed on a free port, with workers that can be killed."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        folder.mkdir()
+        self._processes: list[subprocess.Popen[bytes]] = []
+        self.scheduler = self._start(
+            "scheduler", *LOCAL, "--port=0", f"--scheduler-file={folder / 'address'}"
+        )
+        self.address = ""
+
+    def wait_for_scheduler(self) -> None:
+        file = self._folder / "address"
+        while not self.address:
+            assert self.scheduler.poll() is None, (self._folder / "0.log").read_text()
+            time.sleep(0.05)
+            with suppress(FileNotFoundError, json.JSONDecodeError):
+                self.address = json.loads(file.read_text())["address"]
+
+    def add_worker(self, threads: int = 1, code: Path | None = None) -> subprocess.Popen[bytes]:
+        options = [*LOCAL, "--no-nanny", f"--nthreads={threads}"]
+        return self._start("worker", self.address, *options, code=code)
+
+    def end(self) -> None:
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.wait()
+
+    def _start(self, what: str, *options: str, code: Path | None = None) -> subprocess.Popen[bytes]:
+        source = code or Path(caryatid.__file__).parents[1]
+        environment = {"PYTHONPATH": str(source), "DASK_TEMPORARY_DIRECTORY": str(self._folder)}
+        with (self._folder / f"{len(self._processes)}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", f"distributed.cli.dask_{what}", *options],
+                stdout=log, stderr=log, cwd=self._folder, env={**os.environ, **environment},
+            )  # fmt: skip
+        self._processes.append(process)
+        return process
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    started = Cluster(tmp_path / "cluster")
+    try:
+        started.wait_for_scheduler()
+        yield started
+    finally:
+        started.end()
+
+
+def test_a_run_that_loses_a_worker_is_complete_and_the_same(cluster, tmp_path, scene_file, monkeypatch):
+    monkeypatch.chdir(scene_file.parents[1])
+    folder = scene_file.parent.name
+    suite = with_planners(find_suite("smoke"), ["support", "random"])
+    suite = replace(suite, scenes=("tower", folder, "dense-99-1"), seeds=2, views=2)
+    members = [replace(m, episode=replace(m.episode, settings=QUICK)) for m in suite.members()]
+    cluster.add_worker(threads=2)
+    victim = cluster.add_worker()
+    lost: list[str] = []
+    found: dict[Episode, Outcome] = {}
+    with Client(cluster.address, set_as_default=False) as watch:
+        watch.wait_for_workers(2)
+        (name,) = (worker for worker, threads in watch.nthreads().items() if threads == 1)
+        for episode, outcome in run_on_cluster([m.episode for m in members], cluster.address):
+            assert episode not in found
+            found[episode] = without_times(outcome)
+            if not lost:
+                lost.extend(watch.processing([name])[name])
+                if lost:
+                    victim.kill()
+    assert lost
+    assert victim.wait() < 0
+    assert len(found) == len(members) == 12
+    assert found == {m.episode: without_times(run_episode(m.episode)) for m in members}
+    assert {e.scene for e, outcome in found.items() if outcome.error is not None} == {"dense-99-1"}
+
+
+def test_the_command_runs_on_a_cluster(cluster, tmp_path, capsys):
+    cluster.add_worker()
+    command = ["benchmark", "--suite", "smoke", "--scenes", "tower", "--planner", "random", "--views", "1"]
+    assert run_command(*command, "--scheduler", cluster.address, "--out", tmp_path / "out", "--json") == 0
+    captured = capsys.readouterr()
+    told = json.loads(captured.out)["suites"]["smoke"]
+    assert (told["planned"], told["done"], told["failed"]) == (1, 1, 0)
+    assert captured.err == ""
+
+
+def test_workers_with_other_code_are_refused(cluster, tmp_path):
+    other = shutil.copytree(
+        Path(caryatid.__file__).parent, tmp_path / "other/caryatid", ignore=shutil.ignore_patterns("*.nb*")
+    )
+    with (other / "scene.py").open("a") as file:
+        file.write("CHANGED = True\n")
+    told: list[str] = []
+
+    def tell(text: str) -> None:
+        told.append(text)
+        cluster.add_worker(code=other.parent)
+
+    late, early = r"a worker runs other code \(\w+\) than", r"worker tcp://\S+ runs other code \(\w+\) than"
+    for who in (late, early):
+        with pytest.raises(CaryatidError, match=rf"^{who} this process .* install the same caryatid"):
+            list(run_on_cluster([Episode("tower", settings=QUICK, views=1)], cluster.address, tell, 1.0))
+    assert len(told) == 1
+    assert told[0] == f"no workers; waiting for some: dask worker {cluster.address} --nthreads 1 --nworkers N"
+
+
+def test_a_worker_without_the_planner_is_refused():
+    episode = Episode("tower", planner="above-first", plugin="abc", settings=QUICK, views=1)
+    with pytest.raises(CaryatidError, match="not the same package that offers the planner above-first; inst"):
+        run_on_worker(episode, fingerprint())
+
+
+def test_a_scheduler_that_goes_ends_the_run(cluster):
+    episodes = [Episode("tower", settings=QUICK)]
+    with pytest.raises(CaryatidError, match=r"the scheduler at tcp://\S+ is gone; what is done is kept"):
+        list(run_on_cluster(episodes, cluster.address, lambda text: cluster.scheduler.kill(), 1.0))
+
+
+def test_an_address_where_nobody_answers_says_what_to_do():
+    with socket.socket() as silent:
+        silent.bind(("127.0.0.1", 0))
+        for listening in (False, True):
+            if listening:
+                silent.listen()
+            address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+            with pytest.raises(InputError, match=rf"{address}: no scheduler answers .* start one with"):
+                connect(address, 0.5)
+    for address in ("nowhere", "", "ftp://127.0.0.1:1"):
+        with pytest.raises(InputError, match="no scheduler answers"):
+            connect(address, 0.5)
+
+
+def test_without_dask_the_remedy_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r'needs dask\.distributed; pip install "caryatid\[cluster\]"'):
+        connect("tcp://127.0.0.1:1")
+
+
+def test_a_cluster_has_the_processes_it_has(tmp_path, capsys):
+    command = ["benchmark", "--suite", "smoke", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"]
+    assert run_command(*command, "--out", tmp_path / "out") == 1
+    assert "--jobs: a cluster has the workers it has; leave --jobs or" in capsys.readouterr().err
+
+
+def test_a_scene_folder_must_be_the_same_on_the_worker(scene_file, tmp_path):
+    folder = Path(shutil.copytree(scene_file.parent, tmp_path / "two"))
+    episode = Episode(str(folder), content=content_of(str(folder)), settings=QUICK, views=1)
+    assert run_on_worker(episode, fingerprint()).error is None
+    (folder / "scene.xml").write_text((folder / "scene.xml").read_text().replace("0.85", "0.86"))
+    again = replace(episode, scene=f"{folder}/.")
+    assert "its files are not those this run was planned with" in str(
+        run_on_worker(again, fingerprint()).error
+    )
+    away = replace(episode, scene=str(tmp_path / "away"))
+    assert str(tmp_path / "away") in str(run_on_worker(away, fingerprint()).error)
