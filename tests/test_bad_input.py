@@ -395,7 +395,7 @@ def test_a_full_disk(recording, refused, monkeypatch, command, after):
 def test_a_file_in_the_place_of_the_run(tmp_path, recording, capsys, leftovers):
     (tmp_path / "run").write_text("mine")
     assert run_command("extract", recording, "--out", tmp_path / "run") == 1
-    assert f"{tmp_path / 'run'}: is there already and is no folder" in capsys.readouterr().err
+    assert f"{tmp_path / 'run'}: already exists and is not a folder" in capsys.readouterr().err
     assert run_command("extract", recording, "--out", tmp_path / "run/below") == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert leftovers() <= {"run"}

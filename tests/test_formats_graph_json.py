@@ -220,7 +220,7 @@ def change(document, *path_and_value):
         (("objects", 1, "uncertainty", [0.1]), "uncertainty"),
         (("objects", 1, "uncertainty", {"position": [0.1, 0.1, 0.1]}), "'rotation' is missing"),
         (("objects", 1, "uncertainty", {"position": [0.1]}), "3 finite numbers"),
-        (("objects", 1, 7), "no JSON object"),
+        (("objects", 1, 7), "must be an object"),
         (("supports", 0, "supporter", "o99"), "o99"),
         (("supports", 0, "supported", "o0"), "o0"),
         (("supports", 0, "kind", "glue"), "glue"),

@@ -180,7 +180,7 @@ def test_what_is_no_run_is_never_touched(tmp_path, content):
 
 def test_files_and_empty_folders_in_the_way(tmp_path):
     (tmp_path / "file").write_text("kept")
-    with pytest.raises(InputError, match="no folder"):
+    with pytest.raises(InputError, match="not a folder"):
         RunWriter(tmp_path / "file")
     with pytest.raises(InputError, match="file/RUN"):
         RunWriter(tmp_path / "file" / "RUN")

@@ -21,7 +21,7 @@ from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import png
 from caryatid.scene import Scene
 from caryatid.service.app import make_app
-from caryatid.service.desk import Desk
+from caryatid.service.pool import SessionPool
 from caryatid.service.serving import check_token, is_local
 from caryatid.sessions import Session
 
@@ -50,11 +50,11 @@ async def serving(
     folder, *, token=None, max_request=1_000_000, open_sessions=2, waiting=8, base=None, **more
 ):
     """A client of the application in this process."""
-    desk = Desk(folder, Config(), open_sessions, waiting)
-    app = make_app(desk, token=token, max_request=max_request, **more)
+    pool = SessionPool(folder, Config(), open_sessions, waiting)
+    app = make_app(pool, token=token, max_request=max_request, **more)
     transport = httpx.ASGITransport(app=app)
     client = httpx.AsyncClient(transport=transport, base_url=base or "http://127.0.0.1")
-    client.desk = desk
+    client.pool = pool
     async with app.router.lifespan_context(app), client:
         yield client
 
@@ -284,7 +284,7 @@ def test_sessions_that_are_closed_for_want_of_room_are_the_same_afterwards(tmp_p
             for name in names:
                 answer = await client.post(f"/sessions/{name}/views", json=body(view))
                 graphs.append(answer.json()["graph"])
-                assert len(client.desk._open) <= 1
+                assert len(client.pool._open) <= 1
         return graphs
 
     graphs = served(talk, tmp_path, open_sessions=1)
@@ -295,7 +295,7 @@ def test_when_too_much_waits_more_is_refused_and_nothing_is_lost(tmp_path, views
     async def talk(client):
         await client.post("/sessions", json={"name": "a", "segmentation": "labels"})
         gate = threading.Event()
-        blocked = asyncio.ensure_future(client.desk.do(gate.wait))
+        blocked = asyncio.ensure_future(client.pool.do(gate.wait))
         await asyncio.sleep(0)
         sent = [client.post("/sessions/a/views", json=body(views[0])) for _ in range(6)]
         tasks = [asyncio.ensure_future(one) for one in sent]

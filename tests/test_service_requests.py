@@ -22,7 +22,7 @@ from test_service import TOKEN, body, npy, text
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.service.app import make_app
-from caryatid.service.desk import Desk
+from caryatid.service.pool import SessionPool
 from caryatid.sessions import Session
 
 EXAMPLES = 12
@@ -50,7 +50,7 @@ def app(tmp_path_factory, views):
     with Session.begin(folder / "table") as session:
         for view in views[:2]:
             session.add(view)
-    return make_app(Desk(folder, Config(), 2, 8), token=TOKEN, max_request=1_000_000)
+    return make_app(SessionPool(folder, Config(), 2, 8), token=TOKEN, max_request=1_000_000)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def odd_views(draw, view):
 
 def test_views_with_odd_cameras_are_taken_or_refused(tmp_path, views):
     async def run():
-        app = make_app(Desk(tmp_path, Config(), 2, 8), token=None, max_request=1_000_000)
+        app = make_app(SessionPool(tmp_path, Config(), 2, 8), token=None, max_request=1_000_000)
         client = httpx.AsyncClient(transport=httpx.ASGITransport(app=app), base_url="http://127.0.0.1")
         async with app.router.lifespan_context(app), client:
             for name, first in (("new", None), ("begun", views[0])):

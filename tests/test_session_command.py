@@ -100,10 +100,13 @@ def test_a_view_is_told_in_a_line(folder, files, capsys):
 
 
 BAD = {
-    "no pose": ({"T_world_camera": None}, "camera.json: has no camera pose; give T_world_camera"),
+    "no pose": (
+        {"T_world_camera": None},
+        "camera.json: 'T_world_camera' is null: must be 4×4 finite numbers; give K",
+    ),
     "a short pose": ({"T_world_camera": [[1, 0], [0, 1]]}, "4×4 finite numbers"),
     "no rotation": ({"T_world_camera": [[2 * (i == j) for i in range(4)] for j in range(4)]}, "camera.json"),
-    "no K": ({"K": "wide"}, "'K' is"),
+    "no K": ({"K": "wide"}, "3×3 finite numbers"),
     "scale": ({"depth_scale": 0}, "'depth_scale' is 0"),
     "a scale that is no number": ({"depth_scale": "mm"}, "'depth_scale' is"),
 }

@@ -3,22 +3,111 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field, fields
 from math import inf, isfinite
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Annotated, Any, Final
+
+from annotated_types import Ge, Le
 
 from caryatid.errors import InputError
 from caryatid.fitting.uncertainty import Uncertainty
-from caryatid.geometry.shapes import Box, Cylinder, Sphere, from_size
+from caryatid.geometry.shapes import from_size
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind, Role, SceneObject, Stability, Support, SupportGraph
-from caryatid.io.json_files import field, json_text, number, numbers, plain, read_json, rigid_transform
+from caryatid.io.json_files import Numbers, json_text, parse_json, plain, read_json
 from caryatid.sensing.views import SUPPORT_LABEL
 
 FORMAT: Final = "caryatid/graph"
 VERSION: Final = 1
 """What graph.json says it is."""
+
+
+Count = Annotated[int, Ge(0)]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Uncertainty:
+    position: Annotated[Array, Numbers(3)]
+    rotation: Annotated[Array, Numbers(3)]
+    sizes: Annotated[Array, Numbers(3)]
+    sides: Annotated[Array, Numbers(6)]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Object:
+    id: str
+    role: Role
+    label: Annotated[int, Ge(0), Le(SUPPORT_LABEL)]
+    shape: str
+    T_world_object: Annotated[Array, Numbers(4, 4, rigid=True)]
+    size: dict[str, float] | list[float]
+    occurrences: Count = 1
+    opportunities: Count = 1
+    residual: float = 0.0
+    poor_fit: bool = False
+    seen: tuple[bool, bool, bool, bool, bool, bool] = (True,) * 6
+    why: str = ""
+    doubt: str = ""
+    uncertainty: _Uncertainty | None = None
+
+    def made(self, source: str) -> SceneObject:
+        u, source = self.uncertainty, f"{source} ('{self.id}')"
+        lengths = self.size.values() if isinstance(self.size, dict) else self.size
+        if not all(length > 0.0 for length in lengths):
+            raise InputError(source, f"size {self.size} is not positive", "give sizes in metres")
+        return SceneObject(
+            id=self.id,
+            label=self.label,
+            shape=from_size(self.shape, self.T_world_object, self.size, source),
+            role=self.role,
+            occurrences=self.occurrences,
+            opportunities=self.opportunities,
+            residual=self.residual,
+            poor_fit=self.poor_fit,
+            seen=self.seen,
+            why=self.why,
+            doubt=self.doubt,
+            uncertainty=None if u is None else Uncertainty(u.position, u.rotation, u.sizes, u.sides),
+        )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Support:
+    supporter: str
+    supported: str
+    kind: Kind
+    certain: bool = True
+    occurrences: Count = 1
+    opportunities: Count = 1
+    contact: Annotated[Array, Numbers(3)] | None = None
+    normal: Annotated[Array, Numbers(3)] | None = None
+    why: str = ""
+
+    def made(self) -> Support:
+        return Support(*(getattr(self, f.name) for f in fields(self)))
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Stability:
+    ratio: float
+    small_area: bool
+    tips: bool
+    overhang: float | None
+
+    def made(self) -> Stability:
+        overhang = inf if self.overhang is None else self.overhang
+        return Stability(ratio=self.ratio, overhang=overhang, small_area=self.small_area, tips=self.tips)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Graph:
+    """What is read of graph.json."""
+
+    version: int
+    objects: list[_Object]
+    supports: list[_Support]
+    stability: dict[str, _Stability] = field(default_factory=dict)
 
 
 def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
@@ -60,14 +149,14 @@ def graph_text(graph: SupportGraph) -> str:
 
 
 def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportGraph:
-    """Read a graph from the document of graph.json; keys that are not known are passed over.
+    """Read a graph from the document of graph.json; keys that are not known are ignored.
 
     Args:
         document: The parsed JSON object.
         source: The file, for errors.
 
     Raises:
-        InputError: Another format or version, a missing key, an edge to an object that is not there, a
+        InputError: Another format or version, a missing key, an edge to an object that does not exist, a
             transform that is not rigid, or sizes that are not positive.
     """
     name = str(source)
@@ -75,38 +164,33 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
         raise InputError(
             name, f"no '{FORMAT}' file (format: {document.get('format')!r})", "give a graph.json"
         )
-    version = field(document, "version", int, name)
-    if version != VERSION:
+    given = parse_json(_Graph, document, name)
+    if given.version != VERSION:
         raise InputError(
             name,
-            f"version {version} of the format is not known",
+            f"version {given.version} of the format is not known",
             f"read it with the caryatid that wrote it, or write version {VERSION}",
         )
-    objects: list[SceneObject] = []
-    ids: set[str] = set()
-    for index, item in enumerate(field(document, "objects", list, name)):
-        scene_object = _object_from_json(item, f"{name}: objects[{index}]")
-        if scene_object.id in ids:
-            raise InputError(name, f"two objects are called '{scene_object.id}'", "give each its own id")
-        ids.add(scene_object.id)
-        objects.append(scene_object)
-    if sum(o.role == "support_surface" for o in objects) > 1:
+    ids = [o.id for o in given.objects]
+    pairs = [(s.supporter, s.supported) for s in given.supports]
+    for twice in {i for i in ids if ids.count(i) > 1}:
+        raise InputError(name, f"two objects are called '{twice}'", "give each its own id")
+    if sum(o.role == "support_surface" for o in given.objects) > 1:
         raise InputError(name, "has two support surfaces", "keep one; the others are objects")
-    supports: list[Support] = []
-    pairs: set[tuple[str, str]] = set()
-    for index, item in enumerate(field(document, "supports", list, name)):
-        support = _support_from_json(item, ids, f"{name}: supports[{index}]")
-        if support.pair in pairs:
+    for one, other in pairs:
+        if one == other:
+            raise InputError(name, f"'{one}' supports itself", "remove the edge")
+        if pairs.count((one, other)) > 1:
+            raise InputError(name, f"the edge {one} → {other} is there twice", "keep one of them")
+    for known in [*(i for pair in pairs for i in pair), *given.stability]:
+        if known not in ids:
             raise InputError(
-                name, f"the edge {support.supporter} → {support.supported} is there twice", "keep one of them"
+                name, f"no object is called '{known}'", f"the objects are {', '.join(ids) or 'none'}"
             )
-        pairs.add(support.pair)
-        supports.append(support)
-    stability = field(document, "stability", dict, name, default={})
     return SupportGraph(
-        tuple(objects),
-        tuple(supports),
-        {id_: _stability_from_json(id_, item, ids, f"{name}: stability") for id_, item in stability.items()},
+        tuple(o.made(name) for o in given.objects),
+        tuple(s.made() for s in given.supports),
+        {id_: item.made() for id_, item in given.stability.items()},
     )
 
 
@@ -143,57 +227,6 @@ def _object_to_json(o: SceneObject) -> dict[str, Any]:
     return item
 
 
-def _object_from_json(item: Any, source: str) -> SceneObject:
-    _must_be_object(item, source)
-    id_ = field(item, "id", str, source)
-    source = f"{source} ('{id_}')"
-    role: Role = _one_of(item, "role", get_args(Role), source)
-    label = _count(item, "label", source)
-    if label > SUPPORT_LABEL:
-        raise InputError(source, f"label {label} leaves 16 bits", f"use 0…{SUPPORT_LABEL}")
-    seen = field(item, "seen", list, source, default=[True] * 6)
-    if len(seen) != 6 or not all(isinstance(side, bool) for side in seen):
-        raise InputError(source, "'seen' is not six times true or false", "give one for each side")
-    return SceneObject(
-        id=id_,
-        label=label,
-        shape=_shape_from_json(item, source),
-        role=role,
-        occurrences=_count(item, "occurrences", source, default=1),
-        opportunities=_count(item, "opportunities", source, default=1),
-        residual=number(item, "residual", source, default=0.0),
-        poor_fit=field(item, "poor_fit", bool, source, default=False),
-        seen=tuple(seen),
-        why=field(item, "why", str, source, default=""),
-        doubt=field(item, "doubt", str, source, default=""),
-        uncertainty=_uncertainty_from_json(item, source),
-    )
-
-
-def _uncertainty_from_json(item: Mapping[str, Any], source: str) -> Uncertainty | None:
-    document = field(item, "uncertainty", (dict, type(None)), source, default=None)
-    if document is None:
-        return None
-    source = f"{source}: uncertainty"
-    counts = {"position": 3, "rotation": 3, "sizes": 3, "sides": 6}
-    return Uncertainty(
-        **{
-            name: numbers(field(document, name, list, source), (count,), f"{source}: {name}")
-            for name, count in counts.items()
-        }
-    )
-
-
-def _shape_from_json(item: Mapping[str, Any], source: str) -> Box | Cylinder | Sphere:
-    T_world_object = rigid_transform(field(item, "T_world_object", list, source), f"{source}: T_world_object")
-    size = field(item, "size", (dict, list), source)
-    values = list(size.values()) if isinstance(size, dict) else size
-    lengths = numbers(values, (len(values),), f"{source}: size")
-    if not (lengths > 0.0).all():
-        raise InputError(source, f"size {size} is not positive", "give sizes in metres")
-    return from_size(field(item, "shape", str, source), T_world_object, size, source)
-
-
 def _support_to_json(s: Support) -> dict[str, Any]:
     item: dict[str, Any] = {
         "supporter": s.supporter,
@@ -209,66 +242,3 @@ def _support_to_json(s: Support) -> dict[str, Any]:
         item["normal"] = s.normal_world
     item["why"] = s.why
     return item
-
-
-def _support_from_json(item: Any, ids: set[str], source: str) -> Support:
-    _must_be_object(item, source)
-    supporter, supported = (_known(item, key, ids, source) for key in ("supporter", "supported"))
-    if supporter == supported:
-        raise InputError(source, f"'{supporter}' supports itself", "remove the edge")
-    kind: Kind = _one_of(item, "kind", get_args(Kind), source)
-    return Support(
-        supporter=supporter,
-        supported=supported,
-        kind=kind,
-        certain=field(item, "certain", bool, source, default=True),
-        occurrences=_count(item, "occurrences", source, default=1),
-        opportunities=_count(item, "opportunities", source, default=1),
-        contact_world=_vector(item, "contact", source),
-        normal_world=_vector(item, "normal", source),
-        why=field(item, "why", str, source, default=""),
-    )
-
-
-def _stability_from_json(id_: str, item: Any, ids: set[str], source: str) -> Stability:
-    if id_ not in ids:
-        raise InputError(source, f"no object is called '{id_}'", "remove it, or add the object")
-    _must_be_object(item, source)
-    return Stability(
-        ratio=number(item, "ratio", source),
-        overhang=inf if item.get("overhang", 0.0) is None else number(item, "overhang", source),
-        small_area=field(item, "small_area", bool, source),
-        tips=field(item, "tips", bool, source),
-    )
-
-
-def _known(item: Mapping[str, Any], key: str, ids: set[str], source: str) -> str:
-    id_: str = field(item, key, str, source)
-    if id_ not in ids:
-        known = ", ".join(sorted(ids)) or "none"
-        raise InputError(source, f"'{key}' is '{id_}', which is no object", f"the objects are {known}")
-    return id_
-
-
-def _one_of(item: Mapping[str, Any], key: str, choices: tuple[str, ...], source: str) -> Any:
-    value = field(item, key, str, source)
-    if value not in choices:
-        raise InputError(source, f"'{key}' is '{value}'", f"use {', '.join(choices)}")
-    return value
-
-
-def _count(item: Mapping[str, Any], key: str, source: str, **default: int) -> int:
-    value: int = field(item, key, int, source, **default)
-    if value < 0:
-        raise InputError(source, f"'{key}' is {value}", "give 0 or more")
-    return value
-
-
-def _vector(item: Mapping[str, Any], key: str, source: str) -> Array | None:
-    value = field(item, key, (list, type(None)), source, default=None)
-    return None if value is None else numbers(value, (3,), f"{source}: {key}")
-
-
-def _must_be_object(item: Any, source: str) -> None:
-    if not isinstance(item, dict):
-        raise InputError(source, "is no JSON object", "give one object for each entry")

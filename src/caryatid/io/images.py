@@ -1,4 +1,4 @@
-"""Image files: checked without decoding them where possible, decoded strictly."""
+"""Image files, decoded strictly."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import io
 import struct
 import warnings
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,10 +20,12 @@ from caryatid.errors import InputError
 DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
+UNREADABLE: Final = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error)
+"""What Pillow raises on a damaged image."""
 
 
 def check_image(path: Path, modes: tuple[str, ...] | None = None, what: str = "") -> tuple[int, int]:
-    """Check that an image is whole and of the right kind, decoding it only where nothing less will do.
+    """Check that an image is whole and of the right kind; a PNG is not decoded for that.
 
     Args:
         path: A PNG or JPEG.
@@ -34,14 +38,13 @@ def check_image(path: Path, modes: tuple[str, ...] | None = None, what: str = ""
     Raises:
         InputError: The file is missing, truncated, no image, or of another mode.
     """
-    with _clearly(path), Image.open(path) as image:
+    with _errors(path), Image.open(path) as image:
         size, mode = image.size, image.mode
         if image.format == "PNG":
             image.verify()
-        elif image.format != "JPEG" or not _ends_as_jpeg(path):
+        else:
             image.load()
-    if modes is not None and mode not in modes:
-        raise InputError(path, f"has pixels of mode {mode}, not {what}", f"save it as {what}")
+    _check_mode(mode, modes, what, path)
     return size
 
 
@@ -70,7 +73,7 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     Raises:
         InputError: Missing, truncated or no image.
     """
-    with _clearly(path), Image.open(path) as image:
+    with _errors(path), Image.open(path) as image:
         return np.array(image.convert("RGB"))
 
 
@@ -80,9 +83,16 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises:
         InputError: Missing, truncated, or not of one channel.
     """
-    check_image(path, MASK_MODES, "a grey PNG")
-    with _clearly(path), Image.open(path) as image:
-        return np.asarray(image) > 0
+    return _read(path, MASK_MODES, "a grey PNG") > 0
+
+
+def read_units(path: Path) -> NDArray[np.int32]:
+    """Read a 16-bit grey PNG (H, W) as it is: depth in units of its own, or labels.
+
+    Raises:
+        InputError: Missing, truncated or not 16 bit.
+    """
+    return _read(path, DEPTH_MODES, "a 16-bit grey PNG").astype(np.int32)
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
@@ -92,67 +102,53 @@ def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     return buffer.getvalue()
 
 
-def read_units(path: Path) -> NDArray[np.int32]:
-    """Read a 16-bit grey PNG (H, W) as it is: depth in units of its own, or labels.
-
-    Raises:
-        InputError: Missing, truncated or not 16 bit.
-    """
-    check_image(path, DEPTH_MODES, "a 16-bit grey PNG")
-    with _clearly(path), Image.open(path) as image:
-        return np.asarray(image).astype(np.int32)
-
-
 def decode_image(content: bytes, name: str, modes: tuple[str, ...], what: str, most: int) -> NDArray[Any]:
-    """Decode a PNG or JPEG that came from elsewhere: (H, W), or (H, W, 3) where it is in colour.
+    """Decode a PNG or JPEG that came from elsewhere: (H, W), or (H, W, C) where it is in colour.
 
     Args:
         content: The file.
         name: What to call it in errors.
         modes: Pillow modes allowed.
         what: What the image ought to be, for the error where the mode is another.
-        most: Pixels it may have; of one that has more nothing is decoded.
+        most: Pixels it may have; a larger one is not decoded.
 
     Raises:
         InputError: It is broken, larger, or no such image.
     """
-    with _clearly(Path(name)), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
-        width, height = image.size
-        if width * height <= most and image.mode in modes:
+    with _errors(name), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
+        (width, height), mode = image.size, image.mode
+        if width * height <= most and mode in modes:
             return np.array(image)
-        mode = image.mode
-    if mode not in modes:
-        raise InputError(name, f"has pixels of mode {mode}, not {what}", f"save it as {what}")
+    _check_mode(mode, modes, what, name)
     raise InputError(name, f"has {width}×{height} pixels, {most} are allowed", "give a smaller image")
 
 
-class _clearly:  # noqa: N801
+def _read(path: Path, modes: tuple[str, ...], what: str) -> NDArray[Any]:
+    check_image(path, modes, what)
+    with _errors(path), Image.open(path) as image:
+        return np.asarray(image)
+
+
+def _check_mode(mode: str, modes: tuple[str, ...] | None, what: str, source: str | Path) -> None:
+    if modes is not None and mode not in modes:
+        raise InputError(source, f"has pixels of mode {mode}, not {what}", f"save it as {what}")
+
+
+@contextmanager
+def _errors(path: str | Path) -> Iterator[None]:
     """Turn what Pillow raises on a bad file into one sentence."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self._warnings = warnings.catch_warnings()
-
-    def __enter__(self) -> None:
-        self._warnings.__enter__()
-        warnings.simplefilter("error", Image.DecompressionBombWarning)
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        self._warnings.__exit__(None, None, None)
-        remedy = "copy or record the file again"
-        if isinstance(error, FileNotFoundError):
-            raise InputError(self.path, "the file is missing", remedy) from None
-        if isinstance(error, Image.DecompressionBombError | Image.DecompressionBombWarning):
-            raise InputError(self.path, "says it is larger than any camera's image", remedy) from error
-        if isinstance(error, UnidentifiedImageError):
-            raise InputError(self.path, "is no image", remedy) from error
-        if isinstance(error, PermissionError | IsADirectoryError):
-            raise InputError(self.path, f"cannot be read ({error.strerror})", remedy) from error
-        if isinstance(error, OSError | SyntaxError | ValueError | EOFError | struct.error | zlib.error):
-            raise InputError(self.path, f"the image is truncated or broken ({error})", remedy) from error
-
-
-def _ends_as_jpeg(path: Path) -> bool:
-    with path.open("rb") as file:
-        file.seek(-2, io.SEEK_END)
-        return file.read() == b"\xff\xd9"
+    remedy = "copy or record the file again"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            yield
+    except FileNotFoundError:
+        raise InputError(path, "the file is missing", remedy) from None
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise InputError(path, "says it is larger than any camera's image", remedy) from error
+    except UnidentifiedImageError as error:
+        raise InputError(path, "is no image", remedy) from error
+    except (PermissionError, IsADirectoryError) as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
+    except UNREADABLE as error:
+        raise InputError(path, f"the image is truncated or broken ({error})", remedy) from error

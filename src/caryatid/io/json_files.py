@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 
@@ -14,8 +15,79 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+T = TypeVar("T")
+
 DECIMALS: Final = 9
 """Decimals floats are written with: a nanometre, far below the sensor's noise, far above rounding errors."""
+
+
+class Numbers:
+    """Marks a field that holds nested lists of finite numbers: `Annotated[Array, Numbers(4, 4)]`.
+
+    Args:
+        *shape: Sizes; -1 = any.
+        rigid: Whether they must be a rigid transform.
+    """
+
+    def __init__(self, *shape: int, rigid: bool = False) -> None:
+        self.shape = shape
+        self.rigid = rigid
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        """Read the field with `read`."""
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_plain_validator_function(self.read)
+
+    def read(self, value: Any) -> Array:
+        """Turn nested lists into an array.
+
+        Raises:
+            ValueError: They have another shape, hold something else than finite numbers, or are not rigid.
+        """
+        expected = "×".join("N" if n < 0 else str(n) for n in self.shape) + " finite numbers"
+        try:
+            array = np.array(value, dtype=np.float64) if _all_numbers(value) else np.array(np.nan)
+        except (ValueError, OverflowError):
+            array = np.array(np.nan)
+        if array.size == 0 and self.shape[0] < 0:
+            array = array.reshape(0, *self.shape[1:])
+        fits = len(array.shape) == len(self.shape)
+        fits = fits and all(wanted in (-1, n) for wanted, n in zip(self.shape, array.shape, strict=True))
+        if not fits or not np.isfinite(array).all():
+            raise ValueError(f"must be {expected}")
+        try:
+            return transforms.as_rigid(array, "") if self.rigid else array
+        except InputError as error:
+            raise ValueError(error.reason) from None
+
+
+def parse_json(
+    kind: Callable[..., T], document: Mapping[str, Any], source: str | Path, remedy: str = "correct it"
+) -> T:
+    """Read a JSON object into a dataclass; other keys are ignored.
+
+    Args:
+        kind: A dataclass whose fields are the keys, with their types and defaults.
+        document: The parsed object.
+        source: What to call it in the error.
+        remedy: What the user can do about an error.
+
+    Raises:
+        InputError: A key is missing, or a value is of another type; the sentence names the key.
+    """
+    from pydantic import ValidationError
+
+    try:
+        read: T = _adapter(kind).validate_json(json.dumps(document, allow_nan=False), strict=True)
+    except ValidationError as error:
+        raise InputError(str(source), _sentence(error.errors()[0]), remedy) from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(str(source), f"cannot be read ({error})", remedy) from None
+    return read
 
 
 def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any]:
@@ -72,6 +144,26 @@ def plain(value: Any) -> Any:
         case Path():
             return str(value)
     return value
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
+
+
+def _sentence(error: Any) -> str:
+    """One sentence of what pydantic found first."""
+    *above, last = error["loc"] or ("it",)
+    where = f"{'.'.join(map(str, above))}: " if above else ""
+    if error["type"] == "missing":
+        return f"{where}the key '{last}' is missing"
+    message = str(error.get("ctx", {}).get("error") or error["msg"])
+    message = message.replace("Input should be", "must be").replace(
+        "a dictionary or an instance of", "the object"
+    )
+    return f"{where}'{last}' is {_shown(error['input'])}: {message}"
 
 
 def field(
@@ -166,7 +258,7 @@ def _refuse_constant(constant: str) -> float:
 
 
 def _shown(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False)
+    text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= 40 else text[:37] + "…"
 
 

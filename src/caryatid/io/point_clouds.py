@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import re
+import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +16,13 @@ from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.pcd import read_pcd
 from caryatid.sensing.clouds import estimate_normals
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+
+REMEDY: Final = "export the cloud again"
+MISSING: Final = "give a .pcd or .ply file"
+MAX_COMPRESSION: Final = 100
+"""Bytes of points one byte of a file can hold: LZF writes at most 264 for 3."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -110,9 +117,7 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
         raise InputError("label_divisor", f"is {label_divisor}", "give 1 or more")
     match path.suffix.lower():
         case ".pcd":
-            header, columns = read_pcd(path)
-            viewpoint = np.array(header.viewpoint[:3], dtype=np.float64)
-            size = (header.width, header.height) if header.height > 1 else None
+            columns, viewpoint, size = _read_pcd(path)
         case ".ply":
             columns, viewpoint, size = _read_ply(path), np.zeros(3), None
         case _:
@@ -131,33 +136,96 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     return stored
 
 
+def _read_pcd(path: Path) -> tuple[dict[str, NDArray[Any]], Array, tuple[int, int] | None]:
+    """Fields of one value per point (N,), viewpoint (3,), and width and height of an organised cloud."""
+    from pypcd4.pypcd4 import MetaData, PointCloud
+
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(path, "the file is missing", MISSING) from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", MISSING) from error
+    end = re.search(rb"^DATA\b[^\n]*\n", content[:65536], re.MULTILINE)
+    if end is None:
+        raise InputError(path, "is no PCD: its header has no DATA line", REMEDY)
+    lines = content[: end.end()].decode("ascii", errors="replace").splitlines()
+    if not any(line.startswith("COUNT") for line in lines):
+        fields = next((line.split()[1:] for line in lines if line.startswith("FIELDS")), [])
+        lines.insert(0, f"COUNT {' '.join('1' for _ in fields)}")
+    try:
+        header = MetaData.parse_header(lines)
+        dtype = header.build_dtype()
+    except Exception as error:
+        raise InputError(path, f"the header is not valid ({_reason(error)})", REMEDY) from None
+    if not len(header.fields) == len(header.size) == len(header.type) == len(header.count):
+        raise InputError(path, "the header's FIELDS, SIZE, TYPE and COUNT do not agree", REMEDY)
+    names = dtype.names or ()
+    if any(axis not in names or dtype[axis].kind != "f" for axis in "xyz"):
+        raise InputError(path, "has no fields x y z of floating point numbers", REMEDY)
+    if header.points == 0:
+        raise InputError(path, "holds no points", "give a cloud with points")
+    if header.width * header.height != header.points:
+        size = f"WIDTH {header.width} × HEIGHT {header.height}"
+        raise InputError(path, f"the header lies: {size} is not POINTS {header.points}", REMEDY)
+    body, needed = content[end.end() :], header.points * dtype.itemsize
+    if header.data.value == "ascii":
+        body = b"\n".join(b" ".join(row) for line in body.splitlines() if (row := line.split())) + b"\n"
+    compressed = header.data.value == "binary_compressed"
+    promised = struct.unpack("<II", body[:8])[1] if compressed and len(body) >= 8 else needed
+    rest = body[needed:] if header.data.value == "binary" else b""
+    try:
+        if promised != needed or needed > MAX_COMPRESSION * len(body.strip()):
+            raise ValueError(f"they take {needed} bytes, {len(body)} bytes follow")
+        if len(rest) >= dtype.itemsize and any(rest):
+            raise ValueError("more data follows")
+        text = header.compose_header().encode()
+        data = np.atleast_1d(PointCloud.from_fileobj(io.BytesIO(text + body)).pc_data)
+        if len(data) != header.points:
+            raise ValueError(f"data of {len(data)} points follows")
+    except Exception as error:
+        reason = f"the header lies or the file is truncated: POINTS {header.points}, but {_reason(error)}"
+        raise InputError(path, reason, REMEDY) from None
+    viewpoint = np.array(header.viewpoint[:3], dtype=np.float64)
+    if not np.isfinite(viewpoint).all():
+        raise InputError(path, "VIEWPOINT is not finite", REMEDY)
+    size_px = (header.width, header.height) if header.height > 1 else None
+    return {name: data[name] for name in header.fields if name in names}, viewpoint, size_px
+
+
 def _read_ply(path: Path) -> dict[str, NDArray[Any]]:
     from trimesh.exchange.ply import load_ply
 
-    remedy = "export the cloud again"
     try:
         with path.open("rb") as file:
             vertex = load_ply(file, fix_texture=False, skip_materials=True)["metadata"]["_ply_raw"]["vertex"]
     except FileNotFoundError:
-        raise InputError(path, "the file is missing", "give a .pcd or .ply file") from None
+        raise InputError(path, "the file is missing", MISSING) from None
     except KeyError as error:
-        raise InputError(path, f"has no vertices with x y z ({error})", remedy) from error
+        raise InputError(path, f"has no vertices with x y z ({error})", REMEDY) from error
     except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(path, f"is no PLY, is truncated or its header lies ({reason})", remedy) from error
+        reason = f"is no PLY, is truncated or its header lies ({_reason(error)})"
+        raise InputError(path, reason, REMEDY) from error
     data = vertex.get("data")
     if data is None:
         raise InputError(path, "holds no points", "give a cloud with points")
     names = data.keys() if isinstance(data, dict) else data.dtype.names
     columns = {name: np.asarray(data[name]).reshape(len(data[name]), -1)[:, 0] for name in names}
     if not {"x", "y", "z"} <= columns.keys():
-        raise InputError(path, "has no vertices with x y z", remedy)
+        raise InputError(path, "has no vertices with x y z", REMEDY)
     lengths = {len(column) for column in columns.values()}
     if lengths != {vertex["length"]}:
-        raise InputError(
-            path, f"the header lies: {vertex['length']} points said, {min(lengths)} there", remedy
-        )
+        reason = f"the header lies: {vertex['length']} points said, {min(lengths)} there"
+        raise InputError(path, reason, REMEDY)
     return {name.lower(): column for name, column in columns.items()}
+
+
+def _reason(error: Exception) -> str:
+    """One line of what a library says."""
+    if hasattr(error, "errors"):
+        first = error.errors()[0]
+        return f"{str(first['loc'][0]).upper()}: {first['msg'].lower()}"
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _stack(columns: dict[str, NDArray[Any]], names: tuple[str, ...]) -> Array:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from caryatid.errors import InputError
-from caryatid.io.staging import said_clearly
+from caryatid.io.staging import write_errors
 from caryatid.robots.reachability import ReachabilityMap
 
 FORMAT, VERSION = "caryatid/reachability", 1
@@ -49,7 +49,7 @@ def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityM
     )
     partial = file.with_name(f".{file.name}.partial-{secrets.token_hex(4)}")
     try:
-        with said_clearly(file):
+        with write_errors(file):
             partial.write_bytes(buffer.getvalue())
             partial.replace(file)
     finally:

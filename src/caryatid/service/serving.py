@@ -13,11 +13,11 @@ import uvicorn
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.io.json_files import json_text
-from caryatid.io.staging import said_clearly
+from caryatid.io.staging import write_errors
 from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.interrupts import interruptible
 from caryatid.service.app import make_app
-from caryatid.service.desk import Desk
+from caryatid.service.pool import SessionPool
 
 CONNECTIONS = 64
 """Connections at the most [1]; with the size of a request they bound what is held in memory."""
@@ -79,12 +79,12 @@ def run_service(
         InputError: A token is missing, the address is taken, or the folder cannot be written.
     """
     check_token(host, token)
-    with said_clearly(folder):
+    with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     listener = _listen(host, port)
     compile_kernels(lambda line: None if quiet or json else _say(line))
     app = make_app(
-        Desk(folder, config, open_sessions, waiting), token=token, max_request=max_request, host=host
+        SessionPool(folder, config, open_sessions, waiting), token=token, max_request=max_request, host=host
     )
     server = uvicorn.Server(
         uvicorn.Config(

@@ -1,4 +1,4 @@
-"""Sessions: a scene model that grows view by view as a robot's own software gives them, kept in a folder."""
+"""Sessions: a scene model in a folder, updated view by view with what a robot's own software hands in."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import next_best_view
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.json_files import field, numbers
+from caryatid.io.json_files import Numbers, parse_json
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.planners import Decision
 from caryatid.robots.floor import FloorGrid
@@ -94,23 +94,26 @@ def plan_next(
     return NextView(len(T_world_cameras), decision, posture if isinstance(posture, Posture) else None, stop)
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Reachable:
+    """What a robot says it reaches."""
+
+    T_world_camera: Annotated[Array, Numbers(-1, 4, 4)]
+    path_length: Annotated[Array, Numbers(-1)] | None = None
+
+
 def candidates_from(document: Mapping[str, Any], source: str) -> tuple[Array, Array | None]:
-    """Read poses (N, 4, 4) a robot reaches and the way (N,) [m] to each, None where it is left out.
+    """Read poses (N, 4, 4) a robot reaches and the path length (N,) [m] to each, None where it is missing.
 
     Args:
-        document: The JSON object.
+        document: The parsed JSON object.
         source: What to call it in errors.
 
     Raises:
         InputError: A key is missing, or not a list of poses, or of lengths.
     """
-    listed = field(document, "T_world_camera", list, source)
-    poses = (
-        numbers(listed, (len(listed), 4, 4), f"{source}: T_world_camera") if listed else np.zeros((0, 4, 4))
-    )
-    ways = field(document, "path_length", (list, type(None)), source, default=None)
-    poses = poses[: len(listed)]
-    return poses, None if ways is None else numbers(ways, (len(ways),), f"{source}: path_length")
+    given = parse_json(_Reachable, document, source)
+    return given.T_world_camera, given.path_length
 
 
 def table_floor(scene: Scene, config: Config) -> FloorGrid:

@@ -1,45 +1,162 @@
-"""A session: views are added one by one, and after each of them graph and next view can be had."""
+"""A session: a scene model in a folder, to which views are added one by one.
+
+    DIR/session.json           settings, seed, planner and robot
+    DIR/views/NNNNNN/          one view: its images, and camera.json; the record
+    DIR/state/NNNNNN.pickle    the scene after so many views; a cache, which may go at any time
+    DIR/lock                   locked by the process that writes
+
+A view's folder appears whole, once it is on the disk, by a rename, and goes by one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import hashlib
+import io
+import json
+import pickle
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Final, Self, get_args
 
 import numpy as np
+from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import Config, SegmentationMethod
+from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
-from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
+from caryatid.io.graph_json import graph_text
+from caryatid.io.json_files import field, read_json
+from caryatid.io.staging import (
+    StagedFolder,
+    clear_partials,
+    remove_folder,
+    sync,
+    write_errors,
+    write_file,
+)
 from caryatid.objects.change import changed
 from caryatid.planning.planners import make_planner
 from caryatid.robots.registry import HUMANOID, find_robot
+from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import Capture, Entry
-from caryatid.sessions.checks import check_camera, check_labels, check_pose, check_same_camera
-from caryatid.sessions.durable import clear_partials
-from caryatid.sessions.folder import Beginning, SessionFolder, begin, chain
-from caryatid.sessions.lock import FolderLock
+from caryatid.sessions.captures import Capture, Entry, read_entry
+from caryatid.sessions.checks import check_view
 from caryatid.sessions.next_view import NextView, plan_next
-from caryatid.sessions.snapshots import Snapshots, State
+
+FORMAT: Final = "caryatid/session"
+VERSION: Final = 1
+"""Format of session.json."""
+FIRST_RELEASE: Final = "0.1.0"
+"""Its sessions do not name the release they were begun with; later ones do."""
+STATE_FORMAT: Final = "2"
+"""Part of every snapshot's digest; to be raised when this module stores something else."""
+STEPS: Final = (1, 8, 64)
+"""The newest snapshot after a multiple of each of these numbers of views is kept [1], for undo."""
+ARRAYS: Final = {
+    ("builtins", "set"),
+    ("collections", "Counter"),
+    ("numpy", "dtype"),
+    ("numpy", "ndarray"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
+}
+"""What a snapshot may name besides classes of caryatid: a session that came from elsewhere runs no code."""
+
+
+class TakenError(InputError):
+    """The folder of a new session holds something already."""
+
+
+class SessionBusyError(InputError):
+    """Another process writes to the session."""
 
 
 class WrongNumberError(InputError):
-    """A view was to be another one than the next."""
+    """A view has another number than the next one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """What a session was begun with.
+
+    Attributes:
+        config: All settings.
+        segmentation: `labels`, `auto`, or None to use labels where the first view has them.
+        seed: Seed of every random choice.
+        planner: Name of the planner that chooses the next view.
+        robot: Name of the robot that takes it.
+    """
+
+    config: Config
+    segmentation: SegmentationMethod | None
+    seed: int
+    planner: str
+    robot: str = HUMANOID
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document of session.json."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "caryatid": version("caryatid"),
+            "segmentation": self.segmentation,
+            "seed": self.seed,
+            "planner": self.planner,
+            "robot": self.robot,
+            "settings": asdict(self.config),
+        }
+
+    @property
+    def digest(self) -> str:
+        """Digest of everything but the release."""
+        return hashlib.sha256(json.dumps(self.to_json() | {"caryatid": ""}).encode()).hexdigest()
+
+    @classmethod
+    def read(cls, path: Path) -> Beginning:
+        """Read session.json.
+
+        Raises:
+            InputError: It is missing, of another format, or its settings are not those of this release.
+        """
+        if not path.is_file():
+            raise InputError(path.parent, "holds no session", "begin one with `caryatid session new`")
+        document, where = read_json(path), str(path)
+        release = field(document, "caryatid", str, where, default=FIRST_RELEASE)
+        if document.get("format") != FORMAT or document.get("version") != VERSION:
+            reason = f"is no '{FORMAT}' of version {VERSION}; caryatid {release} wrote it"
+            raise InputError(path, reason, "use the release that wrote it")
+        segmentation = field(document, "segmentation", (str, type(None)), where)
+        if segmentation not in (None, *get_args(SegmentationMethod)):
+            raise InputError(path, f"'segmentation' is '{segmentation}'", "use labels, auto or null")
+        seed = field(document, "seed", int, where)
+        if seed < 0:
+            raise InputError(path, f"'seed' is {seed}", "give 0 or more")
+        try:
+            settings = changed_settings(Config(), field(document, "settings", dict, where), where)
+        except InputError as error:
+            reason = f"was begun with caryatid {release}, whose settings this release does not take"
+            raise InputError(
+                path, f"{reason} ({error})", "open it with that release, or add its views to a new session"
+            ) from None
+        planner, robot = (field(document, key, str, where) for key in ("planner", "robot"))
+        return cls(settings, segmentation, seed, planner, robot)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Added:
-    """What came of a view.
+    """Result of adding a view.
 
     Attributes:
-        number: Which view it is, 0 the first.
+        number: Number of the view, 0 the first.
         graph: The fused support graph with it.
         changed: Whether it changed the graph.
     """
@@ -50,36 +167,35 @@ class Added:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Camera:
-    """What all views of a session share: pinhole matrix, size [px], and whether they have labels."""
+class _State:
+    """The scene after some views, and whether the last of them changed the graph."""
 
-    K: Array
-    size: tuple[int, int]
-    labelled: bool
+    scene: Scene
+    changed: bool
 
-    @classmethod
-    def of(cls, view: View) -> _Camera:
-        height, width = view.depth.shape
-        return cls(view.K, (height, width), view.labels is not None)
+    def after(self, view: View) -> _State:
+        """Return the state with one more view; this one stays as it is."""
+        scene = self.scene.copy()
+        before = scene.graph
+        return _State(scene, changed(before, scene.update(view), scene.config.fusion))
 
 
 class Session:
     """A scene model in a folder; `begin` or `open` one.
 
     A view that has been added stays, whatever happens to this process, the machine or its power: it is on
-    the disk before `add` returns. Whoever writes is alone; others may read meanwhile.
+    the disk before `add` returns. There is one writer at a time; others may read meanwhile.
     """
 
-    def __init__(self, folder: SessionFolder, lock: FolderLock | None) -> None:
-        self._folder = folder
+    def __init__(self, path: Path, beginning: Beginning, lock: FileLock | None) -> None:
+        self.path = path
+        self.beginning = beginning
         self._lock = lock
-        b = folder.beginning
         if lock is not None:
-            for place in (folder.path, folder.views, folder.state):
-                clear_partials(place)
-        self._views = folder.entries()
-        self._snapshots = Snapshots(folder.state, b.digest, b.config, b.segmentation, b.seed)
-        self._camera = _Camera.of(self._decoded(0)) if self._views else None
+            for folder in (path, path / "views", path / "state"):
+                clear_partials(folder)
+        self._views = self._entries()
+        self._first = self._decoded(0) if self._views else None
         self._state = self._restored(self._views)
 
     @classmethod
@@ -101,18 +217,31 @@ class Session:
             segmentation: `labels` demands them of every view, `auto` ignores them, None takes them where the
                 first view has them.
             seed: Seed of every random choice.
-            planner: Name of who chooses the next view.
-            robot: Name of who takes it, as `find_robot` knows it; it stands by the table, and there is
+            planner: Name of the planner that chooses the next view.
+            robot: Name of the robot that takes it, as `find_robot` knows it; it stands by the table, with
                 nothing else on its floor.
 
         Raises:
-            InputError: The place is taken, there is no such planner or robot, or nothing can be written
-                there.
+            InputError: The folder holds something, there is no such planner or robot, or nothing can be
+                written there.
         """
         make_planner(planner)
         find_robot(robot)
-        folder = begin(Path(path), Beginning(config or Config(), segmentation, seed, planner, robot))
-        return cls(folder, FolderLock(folder.lock))
+        folder = Path(path)
+        with write_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            if (folder / "session.json").exists():
+                raise TakenError(folder, "holds a session already", "use that one, or give another folder")
+            others = [p for p in folder.iterdir() if p.name not in ("views", "state", "lock")]
+            if any(not p.name.startswith(".") for p in others):
+                raise TakenError(folder, "already exists and holds other files", "give a new folder")
+            for name in ("views", "state"):
+                (folder / name).mkdir(exist_ok=True)
+        beginning = Beginning(config or Config(), segmentation, seed, planner, robot)
+        text = json.dumps(beginning.to_json(), indent=1) + "\n"
+        write_file(folder / "session.json", text.encode(), durable=True)
+        sync(folder.resolve().parent)
+        return cls.open(folder)
 
     @classmethod
     def open(cls, path: str | PathLike[str], *, read_only: bool = False) -> Session:
@@ -120,16 +249,17 @@ class Session:
 
         Args:
             path: Its folder.
-            read_only: Leave the folder as it is, and do not mind who else has it open.
+            read_only: Leave the folder as it is; another process may be writing to it.
 
         Raises:
             SessionBusyError: Another writer has it open.
             InputError: It is no session, or a view is broken.
         """
-        folder = SessionFolder(Path(path))
-        lock = None if read_only else FolderLock(folder.lock)
+        folder = Path(path)
+        beginning = Beginning.read(folder / "session.json")
+        lock = None if read_only else _locked(folder / "lock")
         try:
-            return cls(folder, lock)
+            return cls(folder, beginning, lock)
         except BaseException:
             if lock is not None:
                 lock.release()
@@ -150,18 +280,8 @@ class Session:
             self._lock = None
 
     @property
-    def path(self) -> Path:
-        """Its folder."""
-        return self._folder.path
-
-    @property
-    def beginning(self) -> Beginning:
-        """What it was begun with."""
-        return self._folder.beginning
-
-    @property
     def views(self) -> int:
-        """How many views it has."""
+        """Number of views."""
         return len(self._views)
 
     @property
@@ -175,36 +295,37 @@ class Session:
         return self._state.scene.graph
 
     def add(self, view: View | Capture, number: int | None = None) -> Added:
-        """Take in a view; when this returns, it is on the disk.
+        """Add a view; when this returns, it is on the disk.
 
         Args:
             view: A view with a pose, or one that is not decoded yet.
-            number: Which view it is to be, 0 the first. A view that is the last one already is not added
-                again, so that whoever did not hear the answer can ask again. None = the next one.
+            number: Number the view is meant to have, 0 the first. The last view is not added a second time,
+                so a client that missed the answer can send it again. None = the next one.
 
         Raises:
-            WrongNumberError: It would not be that one.
+            WrongNumberError: It would have another number.
             InputError: The view cannot be used; the session is as it was.
-            PerceptionError: There is nothing to be seen in it; the session is as it was.
+            PerceptionError: Nothing can be perceived in it; the session is as it was.
         """
-        self._writing()
+        self._check_writable()
         capture = Capture.of(view) if isinstance(view, View) else view
         if number is not None and number != self.views:
             if number == self.views - 1 and capture.digest == self._views[-1].digest:
                 return Added(number, self.graph, self._state.changed)
             raise WrongNumberError(capture.name, f"is to be view {number}, the next one is view {self.views}")
         decoded = capture.decode(self.beginning.config.session)
-        self._check(decoded)
-        scene = self._state.scene.copy()
-        before = scene.graph
-        graph = scene.update(decoded)
-        state = State(scene, changed(before, graph, scene.config.fusion))
-        self._folder.append(self.views, capture)
+        check_view(decoded, self.scene, self._first)
+        state = self._state.after(decoded)
+        graph_text(state.scene.graph)  # a view whose graph cannot be written is refused, and not kept
+        folder = StagedFolder(self._folder(self.views), durable=True)
+        for name, content in capture.files().items():
+            folder.write(name, content)
+        folder.publish()
         self._views.append(capture.entry)
-        self._camera = self._camera or _Camera.of(decoded)
+        self._first = self._first or decoded
         self._state = state
-        self._snapshots.write(state, chain([v.digest for v in self._views]))
-        return Added(self.views - 1, graph, state.changed)
+        self._write_snapshot(state, self._views)
+        return Added(self.views - 1, state.scene.graph, state.changed)
 
     def next(
         self,
@@ -216,14 +337,13 @@ class Session:
         Args:
             candidates: Camera poses (N, 4, 4) that can be reached; None = those the session's robot reaches,
                 on a floor with nothing but the table on it.
-            path_length: Way (N,) [m] to each candidate; None = straight lines.
+            path_length: Path length (N,) [m] to each candidate; None = straight lines.
 
         Raises:
             PlanningError: There is no view yet, or none can be reached.
             InputError: Candidates are no poses.
         """
-        begun = self.beginning
-        config = begun.config
+        config = self.beginning.config
         stop = None
         if self.views >= config.active.max_views:
             stop = f"{config.active.max_views} views were asked for"
@@ -234,56 +354,116 @@ class Session:
             poses = np.asarray(candidates, dtype=np.float64).reshape(-1, 4, 4)
             reach = poses, None if path_length is None else np.asarray(path_length, dtype=np.float64)
         poses_so_far = [v.T_world_camera for v in self._views]
-        return plan_next(self.scene, poses_so_far, begun.planner, reach, stop, begun.robot)
+        return plan_next(self.scene, poses_so_far, self.beginning.planner, reach, stop, self.beginning.robot)
 
     def undo(self) -> int:
-        """Take the last view back; returns how many are left.
+        """Remove the last view.
+
+        Returns:
+            How many views are left.
 
         Raises:
             InputError: There is none, or an earlier one is broken; the session is as it was.
         """
-        self._writing()
+        self._check_writable()
         if not self._views:
             raise InputError(self.path, "has no views to take back", "add one first")
         left = self._views[:-1]
         state = self._restored(left)
-        self._folder.drop(len(left))
+        remove_folder(self._folder(len(left)))
         self._views, self._state = left, state
-        self._camera = self._camera if left else None
+        self._first = self._first if left else None
         return len(left)
 
-    def _writing(self) -> None:
+    def _check_writable(self) -> None:
         if self._lock is None:
             raise InputError(self.path, "is closed, or open to be read only", "open it again to change it")
 
-    def _check(self, view: View) -> None:
-        """Refuse what cannot be a view of this session."""
-        check_camera(view, self.beginning.config)
-        camera = self._camera
-        if camera is not None:
-            check_same_camera(view, camera.K, camera.size)
-        check_labels(view, self.beginning.segmentation, None if camera is None else camera.labelled)
-        check_pose(view, self.scene)
+    def _folder(self, number: int) -> Path:
+        return self.path / "views" / f"{number:06d}"
+
+    def _entries(self) -> list[Entry]:
+        """What is known of each view without decoding it, in order."""
+        names = sorted(path.name for path in (self.path / "views").glob("[0-9]*"))
+        for number, name in enumerate(names):
+            if name != f"{number:06d}":
+                raise InputError(
+                    self.path / "views",
+                    f"holds no view {number:06d}",
+                    "put it back, or take the later ones out",
+                )
+        return [read_entry(self._folder(number)) for number in range(len(names))]
 
     def _decoded(self, number: int) -> View:
-        return Capture.read(self._folder.view(number)).decode(self.beginning.config.session)
+        return Capture.read(self._folder(number)).decode(self.beginning.config.session)
 
-    def _restored(self, views: Sequence[Entry]) -> State:
-        """What is known after some views, from the last snapshot that can be trusted and those after it."""
-        digests = [v.digest for v in views]
-        state = None
-        for number in self._snapshots.numbers():
-            if number <= len(digests):
-                state = self._snapshots.read(number, chain(digests[:number]))
-                if state is not None:
-                    break
+    def _restored(self, views: Sequence[Entry]) -> _State:
+        """The state after some views, from the newest usable snapshot and the views after it."""
+        state = next(self._read_snapshots(views), None)
         if state is None:
             b = self.beginning
-            state = State(Scene(b.config, segmentation=b.segmentation, seed=b.seed), changed=False)
-        scene, before = state.scene, state.scene.views
-        for number in range(before, len(digests)):
-            graph = scene.graph
-            state = State(scene, changed(graph, scene.update(self._decoded(number)), scene.config.fusion))
-            if self._lock is not None and number + 2 >= len(digests):
-                self._snapshots.write(state, chain(digests[: number + 1]))
+            state = _State(Scene(b.config, segmentation=b.segmentation, seed=b.seed), changed=False)
+        for number in range(state.scene.views, len(views)):
+            state = state.after(self._decoded(number))
+            if self._lock is not None and number + 2 >= len(views):
+                self._write_snapshot(state, views[: number + 1])
         return state
+
+    def _read_snapshots(self, views: Sequence[Entry]) -> Iterator[_State]:
+        """Snapshots that this code made of the first of these views, the newest first."""
+        for number in sorted(self._snapshots(), reverse=True):
+            if number <= len(views):
+                with suppress(Exception):  # whatever a damaged file leads to: the views are still there
+                    content = self._snapshot(number).read_bytes()
+                    seal, payload = content[:32], content[32:]
+                    if seal == self._seal(views[:number], payload):
+                        state = _Unpickler(io.BytesIO(payload)).load()
+                        if isinstance(state, _State) and state.scene.views == number:
+                            yield state
+
+    def _write_snapshot(self, state: _State, views: Sequence[Entry]) -> None:
+        """Keep a state, and remove snapshots that are not needed any more; a failure costs only time."""
+        with suppress(Exception):
+            payload = pickle.dumps(state, protocol=5)
+            write_file(self._snapshot(len(views)), self._seal(views, payload) + payload)
+            kept = {n - n % step for n in (len(views), len(views) - 1) for step in STEPS}
+            for path in (self.path / "state").iterdir():
+                if path.name not in {self._snapshot(n).name for n in kept}:
+                    path.unlink()
+
+    def _seal(self, views: Sequence[Entry], payload: bytes) -> bytes:
+        """Digest of the code, the settings and the views that made a snapshot, and of the snapshot itself."""
+        made_of = [STATE_FORMAT, fingerprint(), self.beginning.digest, *(v.digest for v in views)]
+        return hashlib.sha256(" ".join(made_of).encode() + b"\0" + payload).digest()
+
+    def _snapshot(self, views: int) -> Path:
+        return self.path / "state" / f"{views:06d}.pickle"
+
+    def _snapshots(self) -> list[int]:
+        return [int(p.stem) for p in (self.path / "state").glob("*.pickle") if p.stem.isdecimal()]
+
+
+class _Unpickler(pickle.Unpickler):
+    """Makes nothing but arrays and objects of caryatid."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = (module, name) in ARRAYS
+        if known or (module.split(".")[0] == "caryatid" and "." not in name):
+            found = super().find_class(module, name)
+            if known or isinstance(found, type):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is not part of a scene")
+
+
+def _locked(path: Path) -> FileLock:
+    """Become the only writer, until the lock is released or this process ends."""
+    lock = FileLock(path, timeout=0, thread_local=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        remedy = "wait until it is done, or stop it"
+        raise SessionBusyError(path.parent, "another writer has this session open", remedy) from None
+    except OSError as error:
+        reason = f"cannot be locked ({error.strerror or error})"
+        raise InputError(path, reason, "give a folder you may write to") from None
+    return lock
