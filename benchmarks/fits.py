@@ -35,7 +35,7 @@ from scipy.spatial import cKDTree
 from caryatid.config import FitConfig
 from caryatid.fitting.primitives import Fit, fit
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.objects.sightings import axes_rotation
 
@@ -97,7 +97,7 @@ class Trial:
     note: str
 
 
-def random_shape(kind: str, rng: np.random.Generator) -> Box | Cylinder | Sphere:
+def random_shape(kind: str, rng: np.random.Generator) -> Shape:
     """A shape of table-top size in any pose."""
     T = transforms.rigid(transforms.random_rotation(rng), rng.uniform(-0.3, 0.3, 3))
     if kind == "box":
@@ -107,9 +107,7 @@ def random_shape(kind: str, rng: np.random.Generator) -> Box | Cylinder | Sphere
     return Sphere(T, float(rng.uniform(0.02, 0.08)))
 
 
-def half_view(
-    shape: Box | Cylinder | Sphere, count: int, sigma: float, rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
+def half_view(shape: Shape, count: int, sigma: float, rng: np.random.Generator) -> tuple[Array, Array, Array]:
     """Points (N, 3) [m] and normals (N, 3) of a view along a random direction, and that direction (3,)."""
     view = transforms.random_rotation(rng)[:, 2]
     dense, outward = dense_surface(shape, 40 * count, rng)
@@ -123,9 +121,7 @@ def half_view(
     return points, np.where((normals @ view < 0.0)[:, None], -normals, normals), view
 
 
-def dense_surface(
-    shape: Box | Cylinder | Sphere, count: int, rng: np.random.Generator
-) -> tuple[Array, Array]:
+def dense_surface(shape: Shape, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Points (N, 3) [m] drawn evenly over the whole surface, and outward normals (N, 3)."""
     if isinstance(shape, Sphere):
         outward = transforms.unit(rng.normal(size=(count, 3)))
@@ -139,6 +135,7 @@ def dense_surface(
         outward[np.arange(count), side // 2] = 2.0 * (side % 2) - 1.0
         local = np.where(outward != 0.0, outward * e / 2.0, local)
     else:
+        assert isinstance(shape, Cylinder)
         areas = np.array([2.0 * shape.radius * shape.height, shape.radius**2, shape.radius**2])
         side = rng.choice(3, count, p=areas / areas.sum())
         angle = rng.uniform(0.0, 2.0 * np.pi, count)
@@ -166,7 +163,7 @@ def run_trial(task: tuple[str, int, float, int]) -> Trial:
     return Trial(kind, kind, tuple(errors_of(result, shape, view)), note)
 
 
-def errors_of(result: Fit, shape: Box | Cylinder | Sphere, view: Array) -> list[tuple[str, float, float]]:
+def errors_of(result: Fit, shape: Shape, view: Array) -> list[tuple[str, float, float]]:
     """Signed errors of what a view can tell, and what the fit claims for them: lengths [mm], angles [deg]."""
     assert result.uncertainty is not None
     found, claimed = result.shape, result.uncertainty

@@ -8,8 +8,7 @@ import pytest
 
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.shape_arrays import shape_arrays
-from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Primitives, Shape, Sphere
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.support.contacts import find_contacts, find_gap, local_frames
 
@@ -169,7 +168,7 @@ def test_contacts_in_the_frames_of_both_shapes() -> None:
     shapes = random_shapes(12, rng, 0.1)
     contacts = find_contacts(shapes, 0.02)
     points, outward = local_frames(
-        shape_arrays(shapes),
+        Primitives.of(shapes),
         np.array([(c.a, c.b) for c in contacts]),
         np.array([c.point_world for c in contacts]),
         np.array([c.normal_world for c in contacts]),

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import reference_fits as reference
-from synthetic import box, cylinder, random_motion, sphere, surface_points
+from synthetic import box, cylinder, sphere, surface_points
 from test_degenerate_fits import POINTS, UP
 
-from caryatid.config import ExplanationConfig, FitConfig, SplitConfig, VoxelConfig
+from caryatid.config import ExplanationConfig, FitConfig, SplitConfig
 from caryatid.geometry import transforms
 from caryatid.objects.description_length import (
     Evidence,
@@ -18,7 +17,6 @@ from caryatid.objects.description_length import (
     border_cost,
     explain,
     explained_by,
-    free_cost,
     gather,
     joined,
     lies_on,
@@ -27,7 +25,6 @@ from caryatid.objects.description_length import (
 )
 from caryatid.objects.model_split import split
 from caryatid.sensing.views import Cloud
-from caryatid.sensing.voxel_map import VoxelMap
 
 COSTS, FIT = ExplanationConfig(), FitConfig()
 EYE = (-1.2, -0.6, 1.0)
@@ -47,46 +44,12 @@ def evidence_of(shape, seed=0, sigma=0.002, turned=0.2, voxels=None) -> Evidence
     return gather(Cloud(points, normals), 0.003, voxels, COSTS)
 
 
-@each
-def test_the_costs_of_points_are_those_of_the_reference(shape):
-    moved = shape.moved(random_motion(np.random.default_rng(1), 0.3))
-    points, normals = surface_points(moved, np.random.default_rng(0), sigma=0.008)
-    normals = transforms.unit(normals + 0.5 * np.random.default_rng(2).normal(size=normals.shape))
-    evidence = Evidence(points, normals, np.ones(len(points)), 0.004, None)
-    found = point_costs(moved, evidence, COSTS)
-    expected = reference.point_costs(moved, points, normals, 0.004, COSTS)
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-    assert 0.1 < (found < COSTS.outlier).mean() < 0.9
-
-
 def test_a_point_costs_by_its_distance_over_the_noise_and_by_its_turn():
     ball = sphere((0.0, 0.0, 0.0), 0.05)
     points = np.array([[0.05, 0.0, 0.0], [0.053, 0.0, 0.0], [0.05, 0.0, 0.0], [0.2, 0.0, 0.0]])
     normals = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, np.sqrt(0.75), 0.0], [1.0, 0.0, 0.0]])
     cost = point_costs(ball, Evidence(points, normals, np.ones(4), 0.003, None), COSTS)
     np.testing.assert_allclose(cost, (0.0, 0.5, 0.5 * COSTS.normal_weight, COSTS.outlier), atol=1e-9)
-
-
-@each
-def test_space_seen_free_costs_by_the_voxel(shape):
-    nothing = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
-    seen = replace(nothing, passes=np.ones_like(nothing.passes))
-    assert free_cost(shape, evidence_of(shape), COSTS) == 0.0
-    assert free_cost(shape, evidence_of(shape, voxels=nothing), COSTS) == 0.0
-    inset = max(COSTS.inset * seen.config.size, 0.009)
-    inside, free = reference.free_inside(shape, seen, inset)
-    assert inside == free > 50
-    assert free_cost(shape, evidence_of(shape, voxels=seen), COSTS) == pytest.approx(COSTS.free_cost * free)
-
-
-@each
-def test_points_are_explained_by_the_shape_they_were_taken_from(shape):
-    (best,) = explain([evidence_of(shape)], COSTS, FIT, [np.random.default_rng(0)])
-    assert best.shape.kind == shape.kind
-    evidence = evidence_of(shape)
-    assert best.cost == pytest.approx(explained_by(best.shape, evidence, COSTS).cost)
-    of_points = reference.point_costs(best.shape, evidence.points, evidence.normals, evidence.noise, COSTS)
-    assert best.cost == pytest.approx(of_points @ evidence.weights + price(best.shape, COSTS))
 
 
 def test_points_of_no_shape_are_left_without_one():

@@ -4,13 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import reference_fits as reference
-from synthetic import box, cylinder, random_motion, sphere, surface_points
+from synthetic import box, cylinder, sphere, surface_points
 
 from caryatid.config import FitConfig, VoxelConfig
 from caryatid.fitting.free_space import free_inside, free_share
 from caryatid.fitting.primitives import Oriented, candidates, fit
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.sensing.voxel_map import VoxelMap
 
 INSET = 0.012
@@ -45,30 +43,6 @@ def test_the_surface_says_nothing():
     assert free == 0
     assert free_inside(box((0.0, 0.0, 0.2), (0.2, 0.2, 0.02)), skin, INSET) == (0, 0)
     assert free_share(box((0.0, 0.0, 0.2), (0.2, 0.2, 0.02)), skin, INSET) == 0.0
-
-
-@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
-def test_the_compiled_count_is_that_of_the_reference(kind):
-    """In any attitude, thinner than a voxel and partly outside the map."""
-    rng = np.random.default_rng(0)
-    nothing = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
-    hits, passes = rng.integers(0, 2, (2, *nothing.hits.shape)).astype(np.uint8)
-    known = replace(nothing, hits=hits, passes=passes)
-    edge = nothing.origin_world[0]
-    counts = []
-    for at in (0.0, edge, edge - 1.0, *rng.uniform(-0.2, 0.2, 8)):
-        pose = random_motion(rng, 0.05)
-        pose[:3, 3] += (at, 0.0, 0.2)
-        least = rng.uniform(0.025, 0.04)
-        shape = {
-            "box": Box(pose, np.array([least, *rng.uniform(0.02, 0.15, 2)])),
-            "cylinder": Cylinder(pose, rng.uniform(0.02, 0.06), least),
-            "sphere": Sphere(pose, rng.uniform(0.02, 0.06)),
-        }[kind]
-        counts.append(free_inside(shape, known, INSET))
-        assert counts[-1] == reference.free_inside(shape, known, INSET)
-    assert min(inside for inside, _ in counts) < max(inside for inside, _ in counts)
-    assert counts[2][1] == 0 < max(free for _, free in counts)
 
 
 def test_of_shapes_that_explain_the_points_the_one_that_fills_no_space_seen_free():

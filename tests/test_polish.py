@@ -4,14 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import reference_fits as reference
-from scipy.special import ndtr
-from synthetic import box, cylinder, hausdorff, random_motion, sphere
+from synthetic import box, cylinder, hausdorff, sphere
 
 from caryatid.config import FitConfig
 from caryatid.fitting.edge_likelihood import likeliest_end
 from caryatid.fitting.hidden_faces import Polish, polish
-from caryatid.fitting.least_squares import distances
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
 
@@ -48,29 +45,6 @@ def mantle_points(shape, count, rng, sigma):
     return transforms.transform(shape.T_world_object, local) + sigma * rng.normal(size=(count, 3))
 
 
-def end_reference(coordinates, start, sigma, window, growing, stray):
-    """The end where the likelihood of an even density blurred by noise is greatest, on a fine grid."""
-    ends = np.linspace(start - 3.0 * sigma, start + 3.0 * sigma, 3001)
-    end = start
-    for _ in range(6):
-        top = end - 2.0 * sigma
-        density = np.sum((coordinates > top - window) & (coordinates <= top)) / window
-        density *= end / (top - window / 2.0) if growing else 1.0
-        z = (ends[:, None] - coordinates) / sigma
-        slope = (np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi) / (ndtr(z) + stray)).sum(axis=1)
-        end = float(np.interp(density * sigma, slope[::-1], ends[::-1]))
-    return end, np.sqrt(sigma / (0.9 * density))
-
-
-@pytest.mark.parametrize("growing", [False, True])
-def test_the_compiled_end_is_that_of_the_reference(growing):
-    rng = np.random.default_rng(0)
-    spread = rng.uniform(size=800)
-    points = 0.1 * (np.sqrt(spread) if growing else spread) + 0.002 * rng.normal(size=800)
-    arguments = (points, 0.099, 0.002, 0.01, growing, 1e-3)
-    np.testing.assert_allclose(likeliest_end(*arguments), end_reference(*arguments), atol=1e-4)
-
-
 @pytest.mark.parametrize("sigma", [0.0005, 0.002, 0.004])
 def test_the_end_of_points_is_not_biased_by_their_noise(sigma):
     ends = []
@@ -98,17 +72,6 @@ def test_unseen_sides_of_a_box_lie_where_its_faces_end(seed):
     start = box((0.002, -0.001, 0.0), (0.09, 0.13, 0.055), turn_deg=24.0)
     found, _ = polished(start, TWO_FACES, two_faces(seed))
     assert hausdorff(found, BOX) < 0.002
-
-
-def test_the_pull_of_the_search_is_gone():
-    points = two_faces(0, sigma=0.0005)
-    options = {"steps": 25, "min_extent": 0.008, "shrink": 2e-4}
-    pulled = reference.refined(BOX, points, **options)
-    assert BOX.extents.sum() - pulled.extents.sum() > 0.002
-    found, _ = polished(pulled, TWO_FACES, points)
-    unpulled, _ = polished(BOX, TWO_FACES, points)
-    np.testing.assert_allclose(found.extents, unpulled.extents, atol=2e-4)
-    np.testing.assert_allclose(found.extents, BOX.extents, atol=0.0015)
 
 
 def test_the_height_of_a_can_is_that_of_its_mantle():
@@ -203,91 +166,6 @@ def half_view(shape, seed, count=700, sigma=0.002):
         points = [mantle_points(shape, count, rng, sigma), end]
     stray = rng.uniform(-0.1, 0.1, (20, 3)) + shape.T_world_object[:3, 3]
     return np.concatenate([*points, stray])
-
-
-def assert_polished_as_the_reference(shape, seen, points, config):
-    (last,) = polish([Polish(shape, tuple(seen), points)], config)
-    expected, uncertainty = reference.polish(shape, tuple(seen), points, config)
-    assert last.shape.kind == expected.kind
-    assert hausdorff(last.shape, expected) < 1e-7
-    for name in ("position", "rotation", "sizes", "sides"):
-        np.testing.assert_allclose(
-            getattr(last.uncertainty, name), getattr(uncertainty, name), rtol=1e-5, err_msg=name
-        )
-    looked_at = points
-    if len(points) > config.final_points:
-        looked_at = points[np.linspace(0, len(points) - 1, config.final_points).astype(np.intp)]
-    absolute = np.abs(distances(expected, looked_at)[0])
-    assert last.residual == pytest.approx(np.minimum(absolute, config.threshold).mean(), abs=1e-8)
-    assert last.inliers == pytest.approx((absolute < config.threshold).mean(), abs=2.0 / len(looked_at))
-    return last
-
-
-@pytest.mark.parametrize("kind", ["box", "cylinder"])
-@pytest.mark.parametrize("seed", range(8))
-def test_polished_shapes_are_those_of_the_reference_whatever_was_seen(kind, seed):
-    rng = np.random.default_rng(seed)
-    pose = random_motion(rng, 0.3)
-    shape = Box(pose, np.array([0.08, 0.12, 0.1])) if kind == "box" else Cylinder(pose, 0.045, 0.11)
-    points = half_view(shape, seed)
-    start = shape.moved(transforms.rigid(np.eye(3), 0.002 * rng.normal(size=3)))
-    seen = rng.random(6) < 0.5
-    if kind == "cylinder" and seed < 4:
-        seen[:4] = False
-    last = assert_polished_as_the_reference(start, seen, points, FitConfig())
-    assert last.inliers > 0.8
-
-
-def test_a_polished_ball_is_that_of_the_reference():
-    rng = np.random.default_rng(0)
-    normals = transforms.unit(rng.normal(size=(2000, 3)))
-    points = 0.04 * normals[normals[:, 0] > 0.0] + 0.002 * rng.normal(size=(np.sum(normals[:, 0] > 0.0), 3))
-    start = sphere((0.002, 0.001, 0.0), 0.043)
-    assert_polished_as_the_reference(start, np.arange(6) == 1, points, FitConfig())
-
-
-def test_of_many_points_some_are_looked_at_evenly():
-    points = np.repeat(two_faces(0), 3, axis=0) + 0.001 * np.random.default_rng(1).normal(size=(6000, 3))
-    few = replace(FitConfig(), final_points=500)
-    last = assert_polished_as_the_reference(BOX, TWO_FACES, points, few)
-    chosen = points[np.linspace(0, 5999, 500).astype(np.intp)]
-    (same,) = polish([Polish(BOX, tuple(TWO_FACES), chosen)], few)
-    np.testing.assert_array_equal(same.shape.extents, last.shape.extents)
-
-
-def test_what_would_become_too_long_stays_as_it_was():
-    """The points go on where the shape was drawn in: the end found is beyond the limit."""
-    long = box((0.0, 0.0, 0.0), (0.1, 0.5, 0.06))
-    rng = np.random.default_rng(0)
-    points = np.concatenate([face_points(long, a, 1.0, 1500, rng, 0.001) for a in (0, 2)])
-    start = box((0.0, 0.0, 0.0), (0.1, 0.3, 0.06))
-    limited = replace(FitConfig(), max_extent=0.4)
-    seen = (False, True, False, False, False, True)
-    last = assert_polished_as_the_reference(start, seen, points, limited)
-    np.testing.assert_array_equal(last.shape.extents, start.extents)
-    free = assert_polished_as_the_reference(start, seen, points, replace(FitConfig(), max_extent=0.6))
-    assert free.shape.extents[1] == pytest.approx(0.5, abs=0.004)
-
-
-def test_a_shape_that_is_near_none_of_the_points_stays_as_it_was():
-    points = two_faces(0) + (3.0, 0.0, 0.0)
-    one_step = replace(FitConfig(), steps=1)
-    last = assert_polished_as_the_reference(BOX, TWO_FACES, points, one_step)
-    np.testing.assert_array_equal(last.shape.extents, BOX.extents)
-    assert (last.inliers, last.residual) == (0.0, pytest.approx(FitConfig().threshold))
-
-
-def test_no_polished_extent_is_below_the_least():
-    rng = np.random.default_rng(0)
-    plate = box((0.0, 0.0, 0.0), (0.1, 0.12, 0.002))
-    points = np.concatenate(
-        [face_points(plate, 2, 1.0, 800, rng, 0.0005), face_points(plate, 0, 1.0, 40, rng, 0.0005)]
-    )
-    seen = np.arange(6) == 5
-    last = assert_polished_as_the_reference(
-        box((0.0, 0.0, -0.003), (0.1, 0.12, 0.008)), seen, points, FitConfig()
-    )
-    assert last.shape.extents.min() == pytest.approx(FitConfig().min_extent)
 
 
 def test_shapes_polished_together_are_as_polished_alone():

@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import reference_fits as reference
 from synthetic import box, cylinder, hausdorff, random_motion, sphere, surface_points
 
 from caryatid.config import FitConfig
@@ -145,26 +144,6 @@ def test_the_candidates_are_one_of_each_kind_the_cheapest_first():
     assert fits[0].shape.kind == "box"
 
 
-@each
-def test_model_choice_weighs_distance_normals_size_and_bareness(shape):
-    """As the references do, of the shapes that were found."""
-    rng = np.random.default_rng(0)
-    points, normals = surface_points(shape, rng, eye=EYE, spacing=0.007, sigma=0.002)
-    assert CONFIG.search_points < len(points) < CONFIG.max_points or shape.extents.max() < 0.1
-    normals = noisy_normals(normals, rng)
-    bare = []
-    for f in candidates_of(points, normals):
-        residual, turned, inliers = reference.misfit(f.shape, points, normals, CONFIG)
-        assert f.residual == pytest.approx(residual, rel=1e-9)
-        assert f.inliers == pytest.approx(inliers, rel=1e-9)
-        size = float(np.mean(f.shape.extents**2))
-        expected = residual + CONFIG.normal_weight * turned + CONFIG.size_penalty * size
-        bare.append((f.cost - expected) / CONFIG.bare_weight)
-        assert bare[-1] == pytest.approx(reference.bare_share(f.shape, f.seen, points, CONFIG), abs=0.06)
-    assert len(bare) == 3
-    assert max(bare) > 0.1
-
-
 def test_what_is_no_single_shape_is_called_a_poor_fit():
     rng = np.random.default_rng(0)
     bars = [box((0.0, 0.0, 0.0), (0.2, 0.02, 0.02)), box((0.09, 0.09, 0.06), (0.02, 0.2, 0.02))]
@@ -218,40 +197,6 @@ def test_points_handed_in_stay_as_they_are():
 
 
 # The compiled fit beside its reference
-
-
-@each
-@pytest.mark.parametrize("spacing", [0.004, 0.012])
-def test_candidates_are_those_of_the_reference(shape, spacing):
-    """With more points than are judged and with few, in any frame; the search takes the same samples."""
-    rng = np.random.default_rng(0)
-    shape = shape.moved(random_motion(rng, 2.0))
-    eye = shape.T_world_object[:3, 3] + rng.normal(size=3)
-    points, normals = surface_points(shape, rng, eye=eye, spacing=spacing, sigma=0.002)
-    normals = noisy_normals(normals, rng)
-    found = {f.shape.kind: f for f in candidates_of(points, normals, seed=3)}
-    expected = reference.candidates(points, normals, CONFIG, np.random.default_rng(3))
-    assert found.keys() == expected.keys()
-    assert shape.kind in found
-    for kind, (cost, theirs, seen) in expected.items():
-        mine = found[kind]
-        assert hausdorff(mine.shape, theirs) < 1e-6
-        assert mine.seen == tuple(bool(s) for s in seen)
-        assert 0.0 <= mine.cost - cost + 1e-7 < CONFIG.bare_weight
-
-
-@each
-def test_the_chosen_shape_is_polished_on_all_the_points(shape):
-    rng = np.random.default_rng(0)
-    points, normals = surface_points(shape, rng, eye=EYE, spacing=0.003, sigma=0.002)
-    best = candidates_of(points, normals)[0]
-    result = fit_of(points, normals)
-    expected, uncertainty = reference.polish(best.shape, best.seen, points, CONFIG)
-    assert hausdorff(result.shape, expected) < 1e-7
-    assert result.seen == best.seen
-    np.testing.assert_allclose(result.uncertainty.sides, uncertainty.sides, rtol=1e-4)
-    distance = np.abs(expected.signed_distance(points))
-    assert result.residual == pytest.approx(np.minimum(distance, CONFIG.threshold).mean(), abs=1e-8)
 
 
 # Many objects at once

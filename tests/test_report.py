@@ -23,7 +23,7 @@ from caryatid.viz.graphs import draw_graph
 from caryatid.viz.images import draw_image
 from caryatid.viz.layout import arrange, layers
 from caryatid.viz.svg import keep_apart
-from caryatid.viz.wireframes import Projection, wireframe
+from caryatid.viz.wireframes import Projection
 
 VOID = {"meta", "input", "br", "link", "img", "hr"}
 
@@ -318,7 +318,7 @@ def test_colours_depend_on_the_label_alone_and_differ() -> None:
     ],
 )
 def test_wireframes_lie_on_the_surface(shape: Box | Cylinder | Sphere) -> None:
-    lines = wireframe(shape, np.array([1.0, -0.5, 1.2]))
+    lines = shape.lines(np.array([1.0, -0.5, 1.2]))
     points = np.concatenate(lines)
     assert np.abs(shape.signed_distance(points)).max() < 1e-9
 
@@ -328,7 +328,7 @@ def test_round_shapes_are_outlined_by_their_silhouette(shape: Cylinder | Sphere)
     eye = np.array([0.9, 0.3, 0.6])
     T_world_camera = transforms.look_at(eye, (0.0, 0.0, 0.1))
     projection = Projection(T_world_camera, K, np.zeros((1, 1), dtype=np.float32))
-    drawn, _ = projection.project(np.concatenate(wireframe(shape, eye)))
+    drawn, _ = projection.project(np.concatenate(shape.lines(eye)))
     solid, _ = projection.project(shape.surface(0.001)[0])
     assert np.allclose(drawn.min(axis=0), solid.min(axis=0), atol=0.3)
     assert np.allclose(drawn.max(axis=0), solid.max(axis=0), atol=0.3)

@@ -2,11 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import shapely
-from synthetic import box, cylinder, sphere
 
 from caryatid.geometry import transforms
-from caryatid.geometry.sampling import sample_surfaces
-from caryatid.geometry.shape_arrays import shape_arrays
 from caryatid.planning.unseen_space import unseen_space, unseen_space_reference
 from caryatid.sensing.visibility import shown, shown_reference
 
@@ -43,22 +40,6 @@ def test_without_anything_solid_nothing_is_hidden():
     np.testing.assert_array_equal(shown(*nothing), shown(np.zeros_like(args[0]), *args[1:]))
     assert shown(*(a[:0] if n in (3, 4, 5, 6) else a for n, a in enumerate(args))).shape == (0, 20)
     assert shown(*(a[:, :0].copy() if n in (7, 8) else a for n, a in enumerate(args))).shape == (10, 0)
-
-
-def test_points_on_many_surfaces_are_those_of_each():
-    rng = np.random.default_rng(2)
-    shapes = [
-        shape.moved(transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3)))
-        for size in rng.uniform(0.02, 0.2, (6, 3))
-        for shape in (box((0, 0, 0), size), cylinder((0, 0, 0), *size[:2]), sphere((0, 0, 0), size[0]))
-    ]
-    spacings = rng.uniform(0.008, 0.06, len(shapes))
-    points, normals, counts = sample_surfaces(*shape_arrays(shapes), spacings)
-    apart = [shape.surface(float(s)) for shape, s in zip(shapes, spacings, strict=True)]
-    assert counts.tolist() == [len(p) for p, _ in apart]
-    np.testing.assert_allclose(points, np.concatenate([p for p, _ in apart]), atol=1e-12)
-    np.testing.assert_allclose(normals, np.concatenate([n for _, n in apart]), atol=1e-12)
-    assert len(sample_surfaces(*shape_arrays([]), np.zeros(0))[0]) == 0
 
 
 def test_the_unseen_space_over_a_table_agrees_with_its_reference():

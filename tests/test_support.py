@@ -12,8 +12,7 @@ from caryatid.errors import InputError
 from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import area, hull
-from caryatid.geometry.shape_arrays import shape_arrays
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Primitives, Sphere
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.support.relations import explain, infer
@@ -366,7 +365,7 @@ def test_what_a_falling_shape_meets_lies_beneath_it() -> None:
             for k in range(8)
         ]
         for k, shape in enumerate(shapes):
-            below = beneath(shape_arrays(shapes), k, 0.05)
+            below = beneath(Primitives.of(shapes), k, 0.05)
             assert k not in below
             for m, other in enumerate(shapes):
                 if m != k and np.isfinite(drop_distance(shape, other, 0.05)):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from synthetic import box, cylinder, random_motion, sphere
 
-from caryatid.geometry.shape_arrays import shape_arrays
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Primitives, Sphere
 from caryatid.objects.sweeps import way_to_shapes
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -14,7 +13,7 @@ OVERLAP, LEAST = 0.004, 0.0005
 
 def way(points, direction, limit, shapes, near=None):
     near = np.arange(len(shapes)) if near is None else np.asarray(near, dtype=np.intp)
-    return way_to_shapes(points, direction, limit, OVERLAP, LEAST, near, *shape_arrays(shapes))
+    return way_to_shapes(points, direction, limit, OVERLAP, LEAST, near, *Primitives.of(shapes))
 
 
 def way_reference(points, direction, limit, shapes):

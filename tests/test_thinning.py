@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from caryatid.geometry.thinning import last_in_voxels, most_central, most_central_reference
+from caryatid.geometry.points import last_in_voxels, most_central
 
 EDGES = np.array([0.0, 0.02, 0.05])
 
@@ -14,14 +14,6 @@ EDGES = np.array([0.0, 0.02, 0.05])
 def points():
     rng = np.random.default_rng(0)
     return rng.uniform(-0.15, 0.15, size=(4000, 3)) * (1.0, 1.0, 0.2)
-
-
-def test_each_groups_voxels_keep_their_most_central_point(points):
-    groups = np.random.default_rng(1).integers(0, 3, size=len(points)).astype(np.int32)
-    kept = most_central(points, groups, EDGES)
-    np.testing.assert_array_equal(kept, most_central_reference(points, groups, EDGES))
-    assert set(groups[kept]) == {1, 2}
-    assert 50 < (groups[kept] == 2).sum() < (groups[kept] == 1).sum() < len(points) / 2
 
 
 def test_of_points_as_near_to_the_mean_the_first_is_kept():

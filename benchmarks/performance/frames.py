@@ -9,7 +9,7 @@ import numpy as np
 
 from caryatid.config import Config, SensorConfig
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.robots.humanoid import Robot
 from caryatid.sensing.view_sphere import ViewSphere, direction
@@ -113,9 +113,7 @@ def table_of(count: int, seed: int = 0) -> SimulatedScene:
     return scene_from_spec(spec, f"table-of-{count}", f"table-of-{count}")
 
 
-def _standing(
-    xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False
-) -> Box | Cylinder | Sphere:
+def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False) -> Shape:
     """A shape that stands over the table at a height [m]; with `flat` one that others can stand on."""
     turn = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
     kind = rng.choice(["box", "cylinder"] if flat else ["box", "cylinder", "sphere"])

@@ -29,7 +29,6 @@ from panels import (
     MISSED,
     RIGHT,
     SIZE,
-    Shape,
     arrow,
     best_eye,
     png,
@@ -44,6 +43,7 @@ from caryatid.evaluation.scores import TABLE, Score, score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Step, explore
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation

@@ -14,10 +14,10 @@ from PIL import Image
 from solids import Eye, draw_solids
 
 from caryatid.exploration import Step
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 
-Shape = Box | Cylinder | Sphere
+Shape = Shape
 Colour = tuple[float, float, float]
 
 SIZE = (430, 360)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
 
@@ -44,7 +44,7 @@ class SceneObject(Pictured):
 
     id: str
     label: int
-    shape: Box | Cylinder | Sphere
+    shape: Shape
     role: Role = "object"
     occurrences: int = 1
     opportunities: int = 1

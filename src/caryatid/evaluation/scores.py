@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import EvaluationConfig
 from caryatid.evaluation.overlaps import TrueObject, assign, mask_ious, volume_ious
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Shape
 from caryatid.graph import SupportGraph
 
 TABLE: Final = "table"
@@ -201,7 +201,7 @@ def as_scene(graph: SupportGraph) -> TrueScene:
     )
 
 
-def top_height(shape: Box | Cylinder | Sphere) -> float:
+def top_height(shape: Shape) -> float:
     """Height [m] of the middle of a shape's top; of a box, of its most level upper face."""
     T_world_object = shape.T_world_object
     if isinstance(shape, Box):
@@ -211,7 +211,7 @@ def top_height(shape: Box | Cylinder | Sphere) -> float:
     return float(T_world_object[2, 3] + shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
 
 
-def _solid(name: str, shape: Box | Cylinder | Sphere) -> TrueObject:
+def _solid(name: str, shape: Shape) -> TrueObject:
     reach = shape.support(np.eye(3))
     centre = shape.T_world_object[:3, 3]
     return TrueObject(

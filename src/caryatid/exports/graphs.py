@@ -60,7 +60,7 @@ def to_dot(graph: SupportGraph) -> str:
         colour = object_colour(item.label)
         attributes: dict[str, Any] = {
             "label": item.id if item.role == "object" else f"{item.id} · support surface",
-            "shape": {"box": "box", "cylinder": "cylinder", "sphere": "circle"}[item.shape.kind],
+            "shape": {"cylinder": "cylinder", "sphere": "circle"}.get(item.shape.kind, "box"),
             "fillcolor": colour,
             "fontcolor": ink_on(colour),
             "tooltip": f"{item.shape.kind}, found in {item.occurrences} of {item.opportunities} views",

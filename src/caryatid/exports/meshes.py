@@ -8,15 +8,12 @@ from trimesh.exchange.gltf import export_glb, export_gltf
 from trimesh.visual.material import PBRMaterial
 
 from caryatid.config import ExportConfig
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.viz.colours import object_colour, rgb
 
 WORLD = "z_up"
 """Name of the node whose frame is caryatid's world; the file itself has y up, as glTF wants."""
 _T_FILE_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-_ROUNDS = 3
-"""How often the faces of an icosahedron are divided for a ball: its radius is then right to 1 %."""
 
 
 def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -> bytes:
@@ -32,7 +29,7 @@ def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -
     scene = trimesh.Scene(base_frame="file")
     scene.graph.update(frame_from="file", frame_to=WORLD, matrix=_T_FILE_WORLD)
     for item in graph.objects:
-        mesh = _mesh(item.shape, config)
+        mesh = item.shape.mesh(config.corners)
         mesh.visual = trimesh.visual.TextureVisuals(material=_material(item))
         mesh.metadata = {"role": item.role, "shape": item.shape.kind, "size": item.shape.size}
         T_world_object = item.shape.T_world_object
@@ -45,16 +42,6 @@ def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -
     files = export_gltf(scene, embed_buffers=True)
     text: bytes = files["model.gltf"]
     return text
-
-
-def _mesh(shape: Box | Cylinder | Sphere, config: ExportConfig) -> trimesh.Trimesh:
-    match shape:
-        case Box():
-            return trimesh.creation.box(extents=shape.extents)
-        case Cylinder():
-            return trimesh.creation.cylinder(shape.radius, shape.height, sections=config.corners)
-        case Sphere():
-            return trimesh.creation.icosphere(subdivisions=_ROUNDS, radius=shape.radius)
 
 
 def _material(item: SceneObject) -> PBRMaterial:

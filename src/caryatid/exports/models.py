@@ -7,12 +7,11 @@ from collections.abc import Mapping
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import mujoco
-import numpy as np
 from scipy.spatial.transform import Rotation
 
 from caryatid.config import ExportConfig
 from caryatid.errors import InputError
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.simulation.world import TABLE, Solid, add_solid, quaternion
@@ -94,30 +93,20 @@ def _add_surface(spec: mujoco.MjSpec, item: SceneObject) -> None:
     table.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=item.shape.extents / 2.0, rgba=_rgba(item))
 
 
-def _urdf_shape(shape: Box | Cylinder | Sphere) -> tuple[str, dict[str, str]]:
+def _urdf_shape(shape: Shape) -> tuple[str, dict[str, str]]:
     match shape:
-        case Box():
-            return "box", {"size": _numbers(shape.extents)}
         case Cylinder():
             return "cylinder", {"radius": f"{shape.radius:.9g}", "length": f"{shape.height:.9g}"}
         case Sphere():
             return "sphere", {"radius": f"{shape.radius:.9g}"}
+    return "box", {"size": _numbers(shape.extents)}
 
 
-def _add_inertia(link: Element, shape: Box | Cylinder | Sphere, density: float) -> None:
+def _add_inertia(link: Element, shape: Shape, density: float) -> None:
     mass = density * shape.volume
-    x, y, z = shape.extents
-    match shape:
-        case Box():
-            moments = mass / 12.0 * np.array([y * y + z * z, x * x + z * z, x * x + y * y])
-        case Cylinder():
-            aside = mass * (shape.radius**2 / 4.0 + shape.height**2 / 12.0)
-            moments = np.array([aside, aside, mass * shape.radius**2 / 2.0])
-        case Sphere():
-            moments = np.full(3, 0.4 * mass * shape.radius**2)
     inertial = SubElement(link, "inertial")
     SubElement(inertial, "mass", value=f"{mass:.9g}")
-    diagonal = dict(zip(("ixx", "iyy", "izz"), (f"{m:.9g}" for m in moments), strict=True))
+    diagonal = dict(zip(("ixx", "iyy", "izz"), (f"{mass * m:.9g}" for m in shape.moments), strict=True))
     aside_of: Mapping[str, str] = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
     SubElement(inertial, "inertia", {**diagonal, **aside_of})
 

@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.geometry.signed_distance import BOX, CYLINDER, gradient
+from caryatid.geometry import BOX, CYLINDER
+from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import Array
 
 
@@ -41,10 +42,7 @@ def point_costs(
     costs = np.empty(len(points))
     hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
-        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
-        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
-        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        x, y, z = local(R, centre, points, i)
         d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
         cosine = 0.0
         for a in range(3):

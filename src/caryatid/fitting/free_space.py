@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from caryatid.fitting.explaining import count_inside
-from caryatid.fitting.least_squares import arrays
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 
-def free_inside(shape: Box | Cylinder | Sphere, voxels: VoxelMap, inset: float) -> tuple[int, int]:
+def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]:
     """Of the space well inside a shape, how much there is and how much was seen free [voxels].
 
     Args:
@@ -19,14 +18,14 @@ def free_inside(shape: Box | Cylinder | Sphere, voxels: VoxelMap, inset: float) 
     Returns:
         Cubes of a voxel's size in all, none where the shape is too thin, and those in voxels seen free.
     """
-    kind, R, centre, half = arrays(shape)
+    kind, R, centre, half = Primitives.of([shape]).row(0)
     inside, free = count_inside(
         kind, R, centre, half - inset, voxels.states, voxels.origin_world, voxels.config.size, FREE
     )
     return int(inside), int(free)
 
 
-def free_share(shape: Box | Cylinder | Sphere, voxels: VoxelMap, inset: float) -> float:
+def free_share(shape: Shape, voxels: VoxelMap, inset: float) -> float:
     """Share of a shape's inside that was seen free; 0 where it is too thin to have one."""
     inside, free = free_inside(shape, voxels, inset)
     return free / inside if inside else 0.0

@@ -12,8 +12,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.fitting.edge_likelihood import likeliest_end
-from caryatid.geometry.ranks import quantile
-from caryatid.geometry.signed_distance import CYLINDER, SPHERE, normal_equations, write_distances
+from caryatid.fitting.least_squares import normal_equations
+from caryatid.geometry import CYLINDER, SPHERE
+from caryatid.geometry.points import quantile
+from caryatid.geometry.signed_distance import write_distances
 
 
 class Polished(NamedTuple):

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from caryatid.config import FitConfig
 from caryatid.fitting.hidden_face_kernels import Polished, PolishJob, polish_one
 from caryatid.fitting.jobs import RefineJob, refine_one
-from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH, arrays, from_arrays
+from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, RIDGE, ROBUST_WIDTH
 from caryatid.fitting.uncertainty import Uncertainty, estimate
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
-from caryatid.geometry.signed_distance import BOX, CYLINDER
-from caryatid.geometry.transforms import Array
+from caryatid.geometry import BOX, CYLINDER
+from caryatid.geometry.shapes import Primitives, Shape
+from caryatid.geometry.transforms import Array, rigid
 from caryatid.runtime.parallel import for_each
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
@@ -32,7 +32,7 @@ class Polish:
         points: (N, 3) [m], all finite.
     """
 
-    shape: Box | Cylinder | Sphere
+    shape: Shape
     seen: Seen
     points: Array
 
@@ -48,7 +48,7 @@ class Refined:
         uncertainty: How far off it may be.
     """
 
-    shape: Box | Cylinder | Sphere
+    shape: Shape
     residual: float
     inliers: float
     uncertainty: Uncertainty
@@ -70,15 +70,15 @@ def polish(found: Sequence[Polish], config: FitConfig) -> list[Refined]:
         return []
     points = [_some(one.points, config.final_points) for one in found]
     origins = [p.mean(axis=0) for p in points]
-    posed = [arrays(one.shape) for one in found]
+    posed = Primitives.of([one.shape for one in found])
     count = len(found)
-    kinds = np.array([kind for kind, *_ in posed])
+    kinds = posed.kinds
     first = np.cumsum([0, *(len(p) for p in points)])
     together = np.concatenate([p - origin for p, origin in zip(points, origins, strict=True)])
     rows = Polished(
-        np.stack([R for _, R, _, _ in posed]),
-        np.stack([centre - origin for (_, _, centre, _), origin in zip(posed, origins, strict=True)]),
-        np.stack([half for _, _, _, half in posed]),
+        posed.R,
+        posed.centres - np.stack(origins),
+        posed.half,
         np.empty((count, 6)),
         np.empty(count),
         np.empty((count, 9, 9)),
@@ -113,7 +113,7 @@ def polish(found: Sequence[Polish], config: FitConfig) -> list[Refined]:
     uncertainties = estimate(kinds, seen, rows.hidden, information, rows.sigma, config)
     return [
         Refined(
-            from_arrays(one.shape.kind, rows.R[k], rows.centre[k] + origins[k], rows.half[k]),
+            type(one.shape).from_extents(rigid(rows.R[k], rows.centre[k] + origins[k]), 2.0 * rows.half[k]),
             float(rows.residual[k]),
             float(rows.inliers[k]),
             uncertainties[k],

@@ -11,10 +11,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from caryatid.fitting.least_squares import levenberg_marquardt
 from caryatid.fitting.ransac import search
 from caryatid.fitting.scoring import bare_share, draw_in, misfit
 from caryatid.fitting.single_face import of_one_face
-from caryatid.geometry.signed_distance import SPHERE, levenberg_marquardt
+from caryatid.geometry import SPHERE
 
 
 class FitJob(NamedTuple):

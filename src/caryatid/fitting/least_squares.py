@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 
-from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
-from caryatid.geometry.signed_distance import (
-    BOX,
-    CYLINDER,
-    SPHERE,
-    distances_and_gradients,
-)
-from caryatid.geometry.transforms import Array
+from caryatid.geometry import BOX, CYLINDER, SPHERE
+from caryatid.geometry.points import quantile, solve_positive
+from caryatid.geometry.signed_distance import gradient, local, write_distances
 
 ROBUST_WIDTH = 2.5
 """Residuals beyond this many robust standard deviations lose most of their weight (Geman–McClure)."""
@@ -26,152 +22,191 @@ CONVERGED = 1e-4
 ROUGHLY = 1e-3
 """The same where another refinement follows."""
 
-CODES = {"sphere": SPHERE, "cylinder": CYLINDER, "box": BOX}
-"""Codes of the shapes, as the kernels take them."""
 
-
-def linearise(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Array, Array]:
-    """Signed distances (N,) [m] of points (N, 3) and their derivatives (N, 6 + sizes).
-
-    The columns are a translation [m] and a rotation [rad] of the shape in its own frame, then its sizes [m]:
-    three half extents of a box, radius and half height of a cylinder, the radius of a sphere.
-    """
-    T = shape.T_world_object
-    p = (points_world - T[:3, 3]) @ T[:3, :3]
-    if isinstance(shape, Sphere):
-        length = np.linalg.norm(p, axis=1)
-        gradient = p / np.maximum(length, 1e-12)[:, None]
-        return length - shape.radius, _jacobian(p, gradient, -np.ones((len(p), 1)))
-    if isinstance(shape, Cylinder):
-        ring = np.hypot(p[:, 0], p[:, 1])
-        q = np.stack([ring - shape.radius, np.abs(p[:, 2]) - shape.height / 2.0], axis=1)
-        distance, share = _corner_distance(q)
-        outward = p[:, :2] / np.maximum(ring, 1e-12)[:, None]
-        gradient = np.concatenate([share[:, :1] * outward, share[:, 1:] * np.sign(p[:, 2:])], axis=1)
-        return distance, _jacobian(p, gradient, -share)
-    distance, share = _corner_distance(np.abs(p) - shape.extents / 2.0)
-    return distance, _jacobian(p, share * np.sign(p), -share)
-
-
-def stepped(shape: Box | Cylinder | Sphere, step: Array, min_extent: float) -> Box | Cylinder | Sphere:
-    """Change a shape by a step (6 + sizes,), ordered as by `linearise`, no size below `min_extent`."""
-    T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(step[3:6]), step[:3])
-    if isinstance(shape, Sphere):
-        return Sphere(T, max(shape.radius + float(step[6]), min_extent / 2.0))
-    if isinstance(shape, Cylinder):
-        radius = max(shape.radius + float(step[6]), min_extent / 2.0)
-        return Cylinder(T, radius, max(shape.height + 2.0 * float(step[7]), min_extent))
-    return Box(T, np.maximum(shape.extents + 2.0 * step[6:9], min_extent))
-
-
-def refine_reference(
-    shape: Box | Cylinder | Sphere,
-    points_world: Array,
-    *,
+@njit(cache=True, error_model="numpy")
+def levenberg_marquardt(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
     steps: int,
     min_extent: float,
     shrink: float,
-) -> Box | Cylinder | Sphere:
-    """Minimise robust squared signed distances by Levenberg–Marquardt with Geman–McClure weights.
-
-    Does in NumPy, step by step, what `kernels.fitting.levenberg_marquardt` does.
+    robust_width: float,
+    noise_floor: float,
+    ridge: NDArray[np.float64],
+    converged: float,
+) -> None:
+    """Minimise the Geman–McClure cost of signed distances; of points to a shape.
 
     Args:
-        shape: Where to start.
-        points_world: (N, 3) [m].
+        kind: Code of the shape.
+        R: Axes (3, 3) at the start; replaced by those of the least cost.
+        centre: (3,) [m] at the start; replaced.
+        half: Half extents (3,) [m] at the start; replaced.
+        points: (N, 3) [m].
         steps: Steps at the most.
         min_extent: Least extent [m].
-        shrink: Gradient [m] that pulls every half extent inwards, so that sides nobody saw stay small. A face
-            that holds a share s of the points is moved by shrink / (2·s) only.
+        shrink: Pull on the extents [m].
+        robust_width: Residuals beyond this many robust standard deviations lose most of their weight.
+        noise_floor: Least standard deviation the weights assume [m].
+        ridge: Added to the diagonal (9,), times the damping.
+        converged: Share of the cost that the last step lowers it by at the most.
     """
+    columns, size = np.empty(9, np.intp), 0
+    for a in range(9):
+        if a < 7 or kind == BOX or (kind == CYLINDER and a == 8):
+            columns[size] = a
+            size += 1
     damping = 1e-3
-    best = shape
-    distance, J = linearise(best, points_world)
+    H_all, g_all = np.empty((9, 9)), np.empty(9)
+    H, g = np.empty((size, size)), np.empty(size)
+    R_trial, centre_trial, half_trial = np.empty((3, 3)), np.empty(3), np.empty(3)
+    distance, absolute = np.empty(len(points)), np.empty(len(points))
+    write_distances(kind, R, centre, half, points, distance)
     for _ in range(steps):
-        scale = ROBUST_WIDTH * max(1.4826 * float(np.median(np.abs(distance))), NOISE_FLOOR)
-        weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2 / len(distance)
-        H, gradient = J.T @ (weight[:, None] * J), J.T @ (weight * distance)
-        gradient[6:] += shrink / 2.0
-        cost = _cost(distance, scale) + shrink * _sizes(best)
-        ridge = np.diag(H) + RIDGE[: len(H)]
+        for i in range(len(points)):
+            absolute[i] = abs(distance[i])
+        scale = robust_width * max(1.4826 * quantile(absolute, 0.5), noise_floor)
+        normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
+        cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
+        improved = False
+        trial_cost = cost
         for _ in range(6):
-            step = np.linalg.solve(H + np.diag(damping * ridge), gradient)
-            trial = stepped(best, _limited(-np.asarray(step, dtype=np.float64)), min_extent)
-            trial_distance, trial_J = linearise(trial, points_world)
-            trial_cost = _cost(trial_distance, scale) + shrink * _sizes(trial)
+            for a in range(size):
+                g[a] = -(g_all[columns[a]] + (shrink / 2.0 if a >= 6 else 0.0))
+                for b in range(size):
+                    H[a, b] = H_all[columns[a], columns[b]]
+                H[a, a] += damping * (H[a, a] + ridge[a])
+            step = solve_positive(H, g)
+            _stepped(kind, R, centre, half, step, columns, min_extent, R_trial, centre_trial, half_trial)
+            write_distances(kind, R_trial, centre_trial, half_trial, points, distance)
+            trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half_trial)
             if trial_cost < cost:
+                improved = True
+                for a in range(3):
+                    centre[a], half[a] = centre_trial[a], half_trial[a]
+                    for b in range(3):
+                        R[a, b] = R_trial[a, b]
                 break
             damping *= 6.0
-        else:
-            return best
-        best, distance, J = trial, trial_distance, trial_J
-        damping = max(damping / 10.0, 1e-7)
-        if cost - trial_cost < CONVERGED * cost:
+        if not improved:
             break
-    return best
+        damping = max(damping / 10.0, 1e-7)
+        if cost - trial_cost < converged * cost:
+            break
 
 
-def distances(shape: Box | Cylinder | Sphere, points_world: Array) -> tuple[Array, Array]:
-    """Signed distances (N,) [m] of points (N, 3) and the outward directions (N, 3) there, object frame."""
-    return distances_and_gradients(*arrays(shape), np.ascontiguousarray(points_world))
+@njit(cache=True, error_model="numpy")
+def normal_equations(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    points: NDArray[np.float64],
+    scale: float,
+    H: NDArray[np.float64],
+    g: NDArray[np.float64],
+) -> None:
+    """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
 
-
-def arrays(shape: Box | Cylinder | Sphere) -> tuple[int, Array, Array, Array]:
-    """Code, axes (3, 3), centre (3,) [m] and half extents (3,) [m], as the kernels take them."""
-    T = shape.T_world_object
-    return CODES[shape.kind], np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), shape.extents / 2.0
-
-
-def from_arrays(kind: str, R: Array, centre: Array, half: Array) -> Box | Cylinder | Sphere:
-    """The shape with these axes (3, 3), centre (3,) [m] and half extents (3,) [m].
+    Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
+    x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6).
 
     Args:
-        kind: Name of the shape.
+        kind: Code of the shape.
         R: Its axes (3, 3).
         centre: Its centre (3,) [m].
         half: Its half extents (3,) [m].
+        points: (N, 3) [m].
+        scale: Width of the cost [m]: a point at this distance weighs a quarter.
+        H: Written to (9, 9).
+        g: Written to (9,).
     """
-    T = transforms.rigid(R, centre)
-    if kind == "sphere":
-        return Sphere(T, float(half[0]))
-    if kind == "cylinder":
-        return Cylinder(T, float(half[0]), 2.0 * float(half[2]))
-    return Box(T, 2.0 * half)
+    J = np.empty(9)
+    for a in range(9):
+        g[a] = J[a] = 0.0
+        for b in range(9):
+            H[a, b] = 0.0
+    share = 1.0 / len(points)
+    hx, hy, hz = half[0], half[1], half[2]
+    for i in range(len(points)):
+        x, y, z = local(R, centre, points, i)
+        d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
+        weight = share / (1.0 + (d / scale) ** 2) ** 2
+        J[0], J[1], J[2] = -gx, -gy, -gz
+        J[3], J[4], J[5] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
+        if kind == BOX:
+            J[6], J[7], J[8] = -abs(gx), -abs(gy), -abs(gz)
+        elif kind == CYLINDER:
+            J[6], J[8] = -np.sqrt(gx * gx + gy * gy), -abs(gz)
+        else:
+            J[6] = -1.0
+        for a in range(9):
+            if J[a] != 0.0:
+                weighted = weight * J[a]
+                g[a] += weighted * d
+                for b in range(a + 1):
+                    H[a, b] += weighted * J[b]
+    for a in range(9):
+        for b in range(a):
+            H[b, a] = H[a, b]
 
 
-def _jacobian(p: Array, gradient: Array, sizes: Array) -> Array:
-    return np.concatenate([-gradient, -np.cross(p, gradient), sizes], axis=1)
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _stepped(
+    kind: int,
+    R: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    half: NDArray[np.float64],
+    step: NDArray[np.float64],
+    columns: NDArray[np.intp],
+    min_extent: float,
+    turned: NDArray[np.float64],
+    moved: NDArray[np.float64],
+    grown: NDArray[np.float64],
+) -> None:
+    """Write the shape after a step in its own frame, shortened to 3 cm and 0.3 rad, no extent too short."""
+    longest = 1.0
+    for a in range(len(step)):
+        longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
+    for a in range(3):
+        grown[a], moved[a] = half[a], centre[a]
+    for a in range(6, len(step)):
+        grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
+    if kind == SPHERE:
+        grown[1] = grown[2] = grown[0]
+    elif kind == CYLINDER:
+        grown[1] = grown[0]
+    x, y, z = step[3] / longest, step[4] / longest, step[5] / longest
+    angle = np.sqrt(x * x + y * y + z * z)
+    # Rodrigues' formula for the rows of R: v cos + (v × k) sin + k (k · v)(1 − cos).
+    sine = np.sin(angle) / angle if angle >= 1e-12 else 1.0
+    rest = (1.0 - np.cos(angle)) / (angle * angle) if angle >= 1e-12 else 0.0
+    for i in range(3):
+        u, v, w = R[i, 0], R[i, 1], R[i, 2]
+        moved[i] += (u * step[0] + v * step[1] + w * step[2]) / longest
+        along = rest * (u * x + v * y + w * z)
+        cosine = np.cos(angle) if angle >= 1e-12 else 1.0
+        turned[i, 0] = cosine * u + sine * (v * z - w * y) + along * x
+        turned[i, 1] = cosine * v + sine * (w * x - u * z) + along * y
+        turned[i, 2] = cosine * w + sine * (u * y - v * x) + along * z
 
 
-def _corner_distance(q: Array) -> tuple[Array, Array]:
-    """Distance (N,) for the signed gaps q (N, k) to each pair of faces, and each gap's share (N, k) in it."""
-    outside = np.maximum(q, 0.0)
-    length = np.linalg.norm(outside, axis=1)
-    nearest = np.argmax(q, axis=1)
-    rows = np.arange(len(q))
-    share = np.zeros_like(q)
-    share[rows, nearest] = 1.0
-    far = length > 1e-9
-    share[far] = outside[far] / length[far, None]
-    return np.where(far, length, q[rows, nearest]), share
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
+    total = 0.0
+    for d in distance:
+        squared = (d / scale) ** 2
+        total += squared / (1.0 + squared)
+    return total / len(distance) * scale**2
 
 
-def _cost(distance: Array, scale: float) -> float:
-    squared = (distance / scale) ** 2
-    return float(np.mean(squared / (1.0 + squared))) * scale**2
-
-
-def _sizes(shape: Box | Cylinder | Sphere) -> float:
-    if isinstance(shape, Sphere):
-        return shape.radius
-    if isinstance(shape, Cylinder):
-        return shape.radius + shape.height / 2.0
-    return float(np.sum(shape.extents)) / 2.0
-
-
-def _limited(step: Array) -> Array:
-    """Shorten a step to 3 cm and 0.3 rad, over which the linearisation means something."""
-    longest = max(
-        float(np.abs(np.delete(step, [3, 4, 5])).max()) / 0.03, float(np.abs(step[3:6]).max()) / 0.3, 1.0
-    )
-    return step / longest
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _sum_of_sizes(kind: int, half: NDArray[np.float64]) -> float:
+    if kind == SPHERE:
+        return half[0]
+    if kind == CYLINDER:
+        return half[0] + half[2]
+    return half[0] + half[1] + half[2]

@@ -13,17 +13,15 @@ from caryatid.fitting.free_space import free_share
 from caryatid.fitting.hidden_faces import Polish, polish
 from caryatid.fitting.jobs import FitJob, RefineJob, bare_one, judge_one, refine_one, search_one
 from caryatid.fitting.least_squares import (
-    CODES,
     CONVERGED,
     NOISE_FLOOR,
     RIDGE,
     ROBUST_WIDTH,
     ROUGHLY,
-    from_arrays,
 )
 from caryatid.fitting.uncertainty import Uncertainty
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.shapes import KINDS, Shape
+from caryatid.geometry.transforms import Array, rigid
 from caryatid.runtime.parallel import for_each
 from caryatid.sensing.voxel_map import VoxelMap
 
@@ -47,7 +45,7 @@ class Fit:
         uncertainty: How far off it may be; of the fit that was chosen only.
     """
 
-    shape: Box | Cylinder | Sphere
+    shape: Shape
     residual: float
     inliers: float
     seen: Seen
@@ -189,7 +187,7 @@ def _candidates(
     found: list[list[Fit]] = [[] for _ in objects]
     if not large:
         return found
-    kinds = np.array([CODES[kind] for kind in config.shapes])
+    kinds = np.array([KINDS[kind].code for kind in config.shapes])
     parts, every, samples = [], [], []
     for k in large:
         part, rng = objects[k], rngs[k]
@@ -341,7 +339,7 @@ def _row(job: FitJob, row: tuple[int, int], kind: str, origin: Array, config: Fi
     s = [bool(b) for b in job.seen[row]]
     residual = float(job.residual[row])
     return Fit(
-        from_arrays(kind, job.R[row], job.centre[row] + origin, job.half[row]),
+        KINDS[kind].from_extents(rigid(job.R[row], job.centre[row] + origin), 2.0 * job.half[row]),
         residual,
         float(job.inliers[row]),
         (s[0], s[1], s[2], s[3], s[4], s[5]),

@@ -9,8 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.geometry.ranks import quantile
-from caryatid.geometry.signed_distance import BOX, CYLINDER, SPHERE, gradient
+from caryatid.geometry import BOX, CYLINDER, SPHERE
+from caryatid.geometry.points import quantile
+from caryatid.geometry.signed_distance import gradient, local
 
 FACING = 0.7
 """A point bears out the side whose outward normal its own gradient follows with this cosine [1]; 45°."""
@@ -49,17 +50,14 @@ def draw_in(
     """
     hx, hy, hz = half[0], half[1], half[2]
     counts = np.zeros(6, np.intp)
-    local = np.empty((3, len(points)))
+    near_points = np.empty((3, len(points)))
     near = 0
     for i in range(len(points)):
-        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
-        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
-        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        x, y, z = local(R, centre, points, i)
         d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
         if not abs(d) < threshold:
             continue
-        local[0, near], local[1, near], local[2, near] = x, y, z
+        near_points[0, near], near_points[1, near], near_points[2, near] = x, y, z
         near += 1
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         wx = R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz
@@ -80,14 +78,14 @@ def draw_in(
         near = len(points)
         for i in range(near):
             for a in range(3):
-                local[a, i] = 0.0
+                near_points[a, i] = 0.0
                 for b in range(3):
-                    local[a, i] += R[b, a] * (points[i, b] - centre[b])
+                    near_points[a, i] += R[b, a] * (points[i, b] - centre[b])
     shift = np.zeros(3)
     for axis in range(3):
         if (kind == CYLINDER and axis < 2) or (seen[2 * axis] and seen[2 * axis + 1]):
             continue
-        reach = local[axis, :near]
+        reach = near_points[axis, :near]
         low, high = -half[axis], half[axis]
         if not seen[2 * axis]:
             low = min(max(low, quantile(reach, trim)), high - min_extent)
@@ -127,10 +125,7 @@ def misfit(
     away = turned = 0.0
     inliers = 0
     for i in range(len(points)):
-        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
-        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
-        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        x, y, z = local(R, centre, points, i)
         d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
         nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
         mx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
@@ -164,12 +159,12 @@ def bare_share(
         points: (N, 3) [m].
         spacing: Of the samples on the surface [m]; a point within twice that is near.
     """
-    local = np.empty((len(points), 3))
+    own = np.empty((len(points), 3))
     for i in range(len(points)):
         for a in range(3):
-            local[i, a] = 0.0
+            own[i, a] = 0.0
             for b in range(3):
-                local[i, a] += R[b, a] * (points[i, b] - centre[b])
+                own[i, a] += R[b, a] * (points[i, b] - centre[b])
     squared = 4.0 * spacing * spacing
     samples = bare = last = 0
     for side in range(6):
@@ -181,9 +176,9 @@ def bare_share(
         for k in range(len(places)):
             u, v, w = places[k, 0], places[k, 1], places[k, 2]
             found = False
-            for n in range(-1, len(local)):
+            for n in range(-1, len(own)):
                 i = last if n < 0 else n
-                x, y, z = local[i, 0] - u, local[i, 1] - v, local[i, 2] - w
+                x, y, z = own[i, 0] - u, own[i, 1] - v, own[i, 2] - w
                 if x * x + y * y + z * z <= squared:
                     found = True
                     last = i

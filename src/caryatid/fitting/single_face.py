@@ -10,8 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.fitting.ransac import LEAST_RADIUS, set_axes, trimmed_range
-from caryatid.geometry.ranks import quantile
-from caryatid.geometry.signed_distance import BOX
+from caryatid.geometry import BOX
+from caryatid.geometry.points import quantile
 
 Direction = tuple[float, float, float]
 """Unit vector."""

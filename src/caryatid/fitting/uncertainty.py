@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
-from caryatid.geometry.signed_distance import BOX, CYLINDER, SPHERE
+from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.transforms import Array
 
 _SIZE_COLUMNS = np.zeros((3, 3), dtype=np.intp)

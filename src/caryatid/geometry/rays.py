@@ -1,4 +1,4 @@
-"""Compiled ways of a ray through a voxel grid, beside the plain NumPy reference they are tested against.
+"""Compiled paths of rays through a voxel grid.
 
 A ray is the part t ∈ [t_from, t_to] of the segment start + t · (end − start), t from 0 at the start to 1
 at the end. `traverse` finds all its voxels at once; with `enter` and `advance` it goes from one voxel to the

@@ -1,73 +1,151 @@
-"""Box, Cylinder and Sphere: a pose and named sizes, with what geometry asks of them."""
+"""Box, Cylinder and Sphere: a pose and named sizes, with what geometry asks of them; many shapes as arrays.
+
+A new kind of shape derives from `Shape`; from then on `from_size` knows it by its name.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Protocol, Self
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.errors import InputError
-from caryatid.geometry import transforms
+from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
 
+LINE_POINTS = 33
+"""Points of a straight line that draws a shape [1]; a circle has nearly twice as many."""
+CREASE = 20.0
+"""Turn between two faces of a mesh from which on their common edge is drawn [deg]."""
 
-class Shape(Protocol):
-    """A convex solid whose pose is at its centre.
+KINDS: dict[str, type[Shape]] = {}
+"""Every kind of shape by its name, as in graph.json."""
+
+
+class Shape(Pictured):
+    """A convex solid whose pose is at its centre: a frozen dataclass of `T_world_object` and named sizes.
+
+    A kind has to give its `kind`, `extents` and `from_extents`, and an `outline` that spans it. Everything
+    else follows; what compiled kernels, MuJoCo or URDF do not know by its `code` is the box around it there.
 
     Attributes:
-        kind: `box`, `cylinder` or `sphere`, as in graph.json.
+        kind: Name of the kind, as in graph.json.
+        code: What the compiled kernels take it for.
+        ties: Which of the extents along x, y, z are one number: equal entries are.
+        parameters: Numbers that determine the shape.
         T_world_object: Pose (4, 4) of the centre.
     """
 
+    __slots__ = ()
+
     kind: ClassVar[str]
+    code: ClassVar[int] = BOX
+    ties: ClassVar[tuple[int, int, int]] = (0, 1, 2)
+    parameters: ClassVar[int] = 9
+    T_world_object: Array
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        KINDS[cls.kind] = cls
 
     @property
-    def T_world_object(self) -> Array:
-        """Pose (4, 4) of the centre."""
-        ...
-
-    @property
+    @abstractmethod
     def extents(self) -> Array:
         """Full extents (3,) [m] along the object's own axes."""
-        ...
 
-    @property
-    def volume(self) -> float:
-        """Volume [m³]."""
-        ...
+    @classmethod
+    @abstractmethod
+    def from_extents(cls, T_world_object: Array, extents: Array) -> Self:
+        """Build the shape with a pose (4, 4) and full extents (3,) [m]; of tied ones the first counts."""
+
+    @abstractmethod
+    def outline(self) -> Array:
+        """Points (N, 3) [m] whose convex hull is the shape (to 1 % for round ones)."""
+
+    @classmethod
+    def from_size(cls, T_world_object: Array, size: Any) -> Self:
+        """Build the shape with a pose (4, 4) and sizes [m] as graph.json writes them.
+
+        Raises:
+            TypeError, ValueError, KeyError: The sizes do not fit the kind.
+        """
+        return cls(T_world_object, *(float(size[name]) for name in cls._size_names()))  # type: ignore[call-arg]
+
+    @classmethod
+    def _size_names(cls) -> list[str]:
+        return [field.name for field in fields(cls) if field.name != "T_world_object"]  # type: ignore[arg-type]
+
+    @classmethod
+    def _size_format(cls) -> str:
+        return f"{{{', '.join(cls._size_names())}}}"
 
     @property
     def size(self) -> dict[str, float] | list[float]:
         """Sizes [m] as graph.json writes them."""
-        ...
+        return {name: float(getattr(self, name)) for name in self._size_names()}
+
+    @property
+    def volume(self) -> float:
+        """Volume [m³]."""
+        return float(self.mesh().volume)
+
+    @property
+    def moments(self) -> Array:
+        """Moments of inertia (3,) [m²] about the object's axes, per mass; of the box around it by default."""
+        x, y, z = self.extents**2
+        return np.array([y + z, x + z, x + y]) / 12.0
 
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
-        ...
+        return Primitives.of([self]).signed_distance(0, points_world)
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3): the shape's support function."""
-        ...
+        reach: Array = directions_world @ (self.outline() - self.T_world_object[:3, 3]).T
+        return reach.max(axis=1)
 
     def surface(self, spacing: float) -> tuple[Array, Array]:
         """Points (N, 3) [m] about `spacing` metres apart all over the surface, and outward normals (N, 3)."""
-        ...
+        points, normals, _ = Primitives.of([self]).surface(np.array([spacing]))
+        return points, normals
 
-    def outline(self) -> Array:
-        """Points (N, 3) [m] whose convex hull is the shape (to 1 % for round ones)."""
-        ...
+    def mesh(self, corners: int = 48) -> Any:
+        """The shape as a `trimesh.Trimesh` in the object's frame.
+
+        Args:
+            corners: Corners that stand for a circle [1].
+        """
+        import trimesh
+
+        T_object_world = transforms.invert(self.T_world_object)
+        return trimesh.convex.convex_hull(transforms.transform(T_object_world, self.outline()))
+
+    def lines(self, eye_world: Array) -> list[Array]:
+        """Lines (M, 3) [m] that draw the shape: edges, rims, and the silhouette seen from a point (3,)."""
+        mesh, T = self.mesh(), self.T_world_object
+        eye = transforms.transform(transforms.invert(T), eye_world)
+        faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
+        drawn = mesh.face_adjacency_angles > np.radians(CREASE)
+        drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
+        edges = mesh.vertices[mesh.face_adjacency_edges[drawn]]
+        return [transforms.transform(T, np.linspace(a, b, LINE_POINTS)) for a, b in edges]
 
     def moved(self, T: Array) -> Self:
         """Return the shape moved by a rigid transform (4, 4) of the world: T @ T_world_object."""
-        ...
+        return replace(self, T_world_object=T @ self.T_world_object)  # type: ignore[type-var]
+
+    def __repr__(self) -> str:
+        sizes = ", ".join(f"{name} {getattr(self, name):.3f} m" for name in self._size_names())
+        return f"{type(self).__name__}({sizes} at {_place(self)})"
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Box(Pictured):
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class Box(Shape):
     """A cuboid.
 
     Attributes:
@@ -80,58 +158,55 @@ class Box(Pictured):
     extents: Array
     kind: ClassVar[str] = "box"
 
-    @property
-    def volume(self) -> float:
-        """Volume [m³]."""
-        return float(np.prod(self.extents))
+    @classmethod
+    def from_extents(cls, T_world_object: Array, extents: Array) -> Box:
+        """Build a box with a pose (4, 4) and edge lengths (3,) [m]."""
+        return cls(T_world_object, extents)
+
+    @classmethod
+    def from_size(cls, T_world_object: Array, size: Any) -> Box:
+        """Build a box with a pose (4, 4) and edge lengths [x, y, z] [m]."""
+        if isinstance(size, Mapping):
+            raise TypeError
+        x, y, z = size
+        return cls(T_world_object, np.array([float(x), float(y), float(z)]))
+
+    @classmethod
+    def _size_format(cls) -> str:
+        return "[x, y, z]"
 
     @property
     def size(self) -> list[float]:
         """Edge lengths [x, y, z] [m]."""
         return [float(e) for e in self.extents]
 
-    def signed_distance(self, points_world: Array) -> Array:
-        """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
-        q = np.abs(_local(self, points_world)) - self.extents / 2.0
-        outside = np.linalg.norm(np.maximum(q, 0.0), axis=-1)
-        return outside + np.minimum(q.max(axis=-1), 0.0)
+    @property
+    def volume(self) -> float:
+        """Volume [m³]."""
+        return float(np.prod(self.extents))
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3)."""
         return np.abs(directions_world @ self.T_world_object[:3, :3]) @ (self.extents / 2.0)
-
-    def surface(self, spacing: float) -> tuple[Array, Array]:
-        """Points (N, 3) [m] about `spacing` apart on all six faces, and outward normals (N, 3)."""
-        points, normals = [], []
-        half = self.extents / 2.0
-        for axis in range(3):
-            u, v = (axis + 1) % 3, (axis + 2) % 3
-            grid_u, grid_v = np.meshgrid(_cells(half[u], spacing), _cells(half[v], spacing), indexing="ij")
-            for sign in (-1.0, 1.0):
-                face = np.zeros((grid_u.size, 3))
-                face[:, axis], face[:, u], face[:, v] = sign * half[axis], grid_u.ravel(), grid_v.ravel()
-                normal = np.zeros((grid_u.size, 3))
-                normal[:, axis] = sign
-                points.append(face)
-                normals.append(normal)
-        return _to_world(self, np.concatenate(points), np.concatenate(normals))
 
     def outline(self) -> Array:
         """The eight corners (8, 3) [m]."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
         return transforms.transform(self.T_world_object, signs * self.extents / 2.0)
 
-    def moved(self, T: Array) -> Box:
-        """Return the box moved by a rigid transform (4, 4) of the world."""
-        return Box(T @ self.T_world_object, self.extents)
+    def mesh(self, corners: int = 48) -> Any:
+        """The box as a `trimesh.Trimesh` in its own frame."""
+        import trimesh
+
+        return trimesh.creation.box(extents=self.extents)
 
     def __repr__(self) -> str:
         x, y, z = self.extents
         return f"Box({x:.3f} × {y:.3f} × {z:.3f} m at {_place(self)})"
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Cylinder(Pictured):
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class Cylinder(Shape):
     """A straight circular cylinder.
 
     Attributes:
@@ -145,11 +220,19 @@ class Cylinder(Pictured):
     radius: float
     height: float
     kind: ClassVar[str] = "cylinder"
+    code: ClassVar[int] = CYLINDER
+    ties: ClassVar[tuple[int, int, int]] = (0, 0, 2)
+    parameters: ClassVar[int] = 7
 
     @property
     def extents(self) -> Array:
         """Full extents (3,) [m] along the object's own axes."""
         return np.array([2.0 * self.radius, 2.0 * self.radius, self.height])
+
+    @classmethod
+    def from_extents(cls, T_world_object: Array, extents: Array) -> Cylinder:
+        """Build a cylinder with a pose (4, 4) and full extents (3,) [m]: the first is its diameter."""
+        return cls(T_world_object, float(extents[0]) / 2.0, float(extents[2]))
 
     @property
     def volume(self) -> float:
@@ -157,37 +240,15 @@ class Cylinder(Pictured):
         return float(np.pi * self.radius**2 * self.height)
 
     @property
-    def size(self) -> dict[str, float]:
-        """Radius and height [m]."""
-        return {"radius": float(self.radius), "height": float(self.height)}
-
-    def signed_distance(self, points_world: Array) -> Array:
-        """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
-        p = _local(self, points_world)
-        q = np.stack([np.hypot(p[:, 0], p[:, 1]) - self.radius, np.abs(p[:, 2]) - self.height / 2.0], axis=-1)
-        return np.linalg.norm(np.maximum(q, 0.0), axis=-1) + np.minimum(q.max(axis=-1), 0.0)
+    def moments(self) -> Array:
+        """Moments of inertia (3,) [m²] about the object's axes, per mass."""
+        aside = self.radius**2 / 4.0 + self.height**2 / 12.0
+        return np.array([aside, aside, self.radius**2 / 2.0])
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3)."""
         d = directions_world @ self.T_world_object[:3, :3]
         return self.radius * np.hypot(d[:, 0], d[:, 1]) + self.height / 2.0 * np.abs(d[:, 2])
-
-    def surface(self, spacing: float) -> tuple[Array, Array]:
-        """Points (N, 3) [m] about `spacing` apart on mantle and both ends, and outward normals (N, 3)."""
-        count = max(8, round(2.0 * np.pi * self.radius / spacing))
-        angle = 2.0 * np.pi * (np.arange(count) + 0.5) / count
-        z = _cells(self.height / 2.0, spacing)
-        ring = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=-1)
-        mantle_normals = np.tile(ring, (len(z), 1))
-        mantle = self.radius * mantle_normals
-        mantle[:, 2] = np.repeat(z, count)
-        grid = _cells(self.radius, spacing)
-        x, y = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
-        inside = np.hypot(x, y) <= self.radius
-        cap = np.stack([x[inside], y[inside], np.full(inside.sum(), self.height / 2.0)], axis=-1)
-        up = np.tile((0.0, 0.0, 1.0), (len(cap), 1))
-        points = np.concatenate([mantle, cap, cap * (1.0, 1.0, -1.0)])
-        return _to_world(self, points, np.concatenate([mantle_normals, up, -up]))
 
     def outline(self) -> Array:
         """Two regular 24-gons (48, 3) [m] around the ends."""
@@ -196,16 +257,29 @@ class Cylinder(Pictured):
         end = np.array([0.0, 0.0, self.height / 2.0])
         return transforms.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
 
-    def moved(self, T: Array) -> Cylinder:
-        """Return the cylinder moved by a rigid transform (4, 4) of the world."""
-        return Cylinder(T @ self.T_world_object, self.radius, self.height)
+    def mesh(self, corners: int = 48) -> Any:
+        """The cylinder as a `trimesh.Trimesh` in its own frame."""
+        import trimesh
 
-    def __repr__(self) -> str:
-        return f"Cylinder(radius {self.radius:.3f} m, height {self.height:.3f} m at {_place(self)})"
+        return trimesh.creation.cylinder(self.radius, self.height, sections=corners)
+
+    def lines(self, eye_world: Array) -> list[Array]:
+        """Lines (M, 3) [m] that draw the cylinder: both rims, and the sides of the mantle."""
+        T = self.T_world_object
+        eye = transforms.transform(transforms.invert(T), eye_world)
+        ends = np.array([[0.0, 0.0, -self.height / 2.0], [0.0, 0.0, self.height / 2.0]])
+        found = [_circle(end, np.array([0.0, 0.0, 1.0]), self.radius) for end in ends]
+        distance = float(np.hypot(eye[0], eye[1]))
+        if distance > self.radius:
+            towards, reach = np.arctan2(eye[1], eye[0]), np.arccos(self.radius / distance)
+            for angle in (towards - reach, towards + reach):
+                foot = self.radius * np.array([np.cos(angle), np.sin(angle), 0.0])
+                found.append(np.linspace(ends[0] + foot, ends[1] + foot, LINE_POINTS))
+        return [transforms.transform(T, line) for line in found]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Sphere(Pictured):
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class Sphere(Shape):
     """A ball.
 
     Attributes:
@@ -217,11 +291,19 @@ class Sphere(Pictured):
     T_world_object: Array
     radius: float
     kind: ClassVar[str] = "sphere"
+    code: ClassVar[int] = SPHERE
+    ties: ClassVar[tuple[int, int, int]] = (0, 0, 0)
+    parameters: ClassVar[int] = 4
 
     @property
     def extents(self) -> Array:
         """Full extents (3,) [m] along the object's own axes."""
         return np.full(3, 2.0 * self.radius)
+
+    @classmethod
+    def from_extents(cls, T_world_object: Array, extents: Array) -> Sphere:
+        """Build a ball with a pose (4, 4) and full extents (3,) [m]: the first is its diameter."""
+        return cls(T_world_object, float(extents[0]) / 2.0)
 
     @property
     def volume(self) -> float:
@@ -229,66 +311,123 @@ class Sphere(Pictured):
         return float(4.0 / 3.0 * np.pi * self.radius**3)
 
     @property
-    def size(self) -> dict[str, float]:
-        """Radius [m]."""
-        return {"radius": float(self.radius)}
-
-    def signed_distance(self, points_world: Array) -> Array:
-        """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
-        return np.linalg.norm(points_world - self.T_world_object[:3, 3], axis=-1) - self.radius
+    def moments(self) -> Array:
+        """Moments of inertia (3,) [m²] about the object's axes, per mass."""
+        return np.full(3, 0.4 * self.radius**2)
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3)."""
         return np.full(len(directions_world), self.radius)
 
-    def surface(self, spacing: float) -> tuple[Array, Array]:
-        """Points (N, 3) [m] about `spacing` apart, and outward normals (N, 3)."""
-        count = max(20, round(4.0 * np.pi * (self.radius / spacing) ** 2))
-        normals = fibonacci_sphere(count)
-        return _to_world(self, self.radius * normals, normals)
-
     def outline(self) -> Array:
         """Points (400, 3) [m] on the sphere."""
         return self.T_world_object[:3, 3] + self.radius * fibonacci_sphere(400)
 
-    def moved(self, T: Array) -> Sphere:
-        """Return the sphere moved by a rigid transform (4, 4) of the world."""
-        return Sphere(T @ self.T_world_object, self.radius)
+    def mesh(self, corners: int = 48) -> Any:
+        """The ball as a `trimesh.Trimesh` in its own frame; its radius is right to 1 %."""
+        import trimesh
 
-    def __repr__(self) -> str:
-        return f"Sphere(radius {self.radius:.3f} m at {_place(self)})"
+        return trimesh.creation.icosphere(subdivisions=3, radius=self.radius)
+
+    def lines(self, eye_world: Array) -> list[Array]:
+        """Lines (M, 3) [m] that draw the ball: three great circles and the silhouette."""
+        T = self.T_world_object
+        found = [_circle(np.zeros(3), axis, self.radius) for axis in np.eye(3)]
+        eye = transforms.transform(transforms.invert(T), eye_world)
+        distance = float(np.linalg.norm(eye))
+        if distance > self.radius:
+            share = self.radius / distance
+            rim = self.radius * np.sqrt(1.0 - share**2)
+            found.append(_circle(self.radius * share * eye / distance, eye / distance, rim))
+        return [transforms.transform(T, line) for line in found]
 
 
-def from_size(
-    kind: str, T_world_object: Array, size: Mapping[str, float] | list[float], source: str
-) -> Box | Cylinder | Sphere:
+class Primitives(NamedTuple):
+    """N shapes in the world frame, as the compiled kernels take them.
+
+    Attributes:
+        kinds: Codes (N,).
+        R: Axes (N, 3, 3), columns = x, y, z of the object.
+        centres: (N, 3) [m].
+        half: Half extents (N, 3) [m] along the axes.
+    """
+
+    kinds: NDArray[np.int64]
+    R: Array
+    centres: Array
+    half: Array
+
+    @classmethod
+    def of(cls, shapes: Sequence[Shape]) -> Primitives:
+        """Gather shapes into arrays."""
+        T = np.array([s.T_world_object for s in shapes]).reshape(-1, 4, 4)
+        return cls(
+            np.array([s.code for s in shapes], dtype=np.int64),
+            np.ascontiguousarray(T[:, :3, :3]),
+            np.ascontiguousarray(T[:, :3, 3]),
+            np.array([s.extents for s in shapes]).reshape(-1, 3) / 2.0,
+        )
+
+    def bounds(self) -> tuple[Array, Array]:
+        """Lowest and highest corner (N, 3) [m] of the upright box around each shape."""
+        along = np.abs(self.R) * self.half[:, None]
+        reach = along.sum(axis=2)
+        round_, balls = self.kinds == CYLINDER, self.kinds == SPHERE
+        reach[round_] = np.hypot(along[round_, :, 0], along[round_, :, 1]) + along[round_, :, 2]
+        reach[balls] = self.half[balls]
+        return self.centres - reach, self.centres + reach
+
+    def signed_distance(self, index: int, points_world: Array) -> Array:
+        """Distance (M,) [m] of points (M, 3) to the surface of one shape, negative inside."""
+        from caryatid.geometry.signed_distance import signed_distances
+
+        distances: Array = signed_distances(*self.row(index), np.ascontiguousarray(points_world, np.float64))
+        return distances
+
+    def gradient(self, index: int, points_world: Array) -> tuple[Array, Array]:
+        """Signed distances (M,) [m] of points (M, 3) to one shape, and their outward directions (M, 3)."""
+        from caryatid.geometry.signed_distance import distances_and_gradients
+
+        distances, outward = distances_and_gradients(
+            *self.row(index), np.ascontiguousarray(points_world, np.float64)
+        )
+        return distances, outward @ self.R[index].T
+
+    def surface(self, spacings: NDArray[np.float64]) -> tuple[Array, Array, NDArray[np.intp]]:
+        """Spread points over the surfaces, about as far apart on each as `spacings` (N,) [m] says.
+
+        Returns:
+            Points (M, 3) [m], one shape after the other, outward unit normals (M, 3), and how many are on
+            each shape (N,).
+        """
+        from caryatid.geometry.signed_distance import sample_surfaces
+
+        points, normals, counts = sample_surfaces(*self, spacings)
+        return points, normals, counts
+
+    def row(self, index: int) -> tuple[int, Array, Array, Array]:
+        """Code, axes (3, 3), centre (3,) [m] and half extents (3,) [m] of one shape."""
+        return int(self.kinds[index]), self.R[index], self.centres[index], self.half[index]
+
+
+def from_size(kind: str, T_world_object: Array, size: Any, source: str) -> Shape:
     """Build a shape from its name and sizes [m] as graph.json writes them.
 
     Args:
-        kind: `box`, `cylinder` or `sphere`.
+        kind: Name of a kind of shape: `box`, `cylinder`, `sphere`.
         T_world_object: Pose (4, 4) of its centre.
         size: Full extents of a box, radius and height of a cylinder, radius of a sphere.
         source: What to call it in the error.
 
     Raises:
-        InputError: The name is not one of the three, or the sizes do not fit it.
+        InputError: There is no kind of that name, or the sizes do not fit it.
     """
     T = transforms.as_rigid(T_world_object, f"{source}: T_world_object")
     try:
-        match kind, size:
-            case "box", [x, y, z]:
-                return Box(T, np.array([float(x), float(y), float(z)]))
-            case "cylinder", {"radius": radius, "height": height}:
-                return Cylinder(T, float(radius), float(height))
-            case "sphere", {"radius": radius}:
-                return Sphere(T, float(radius))
-    except (TypeError, ValueError):
-        pass
-    raise InputError(
-        source,
-        f"no shape '{kind}' with size {size}",
-        "a box has [x, y, z], a cylinder {radius, height}, a sphere {radius}",
-    )
+        return KINDS[kind].from_size(T, size)
+    except (TypeError, ValueError, KeyError):
+        known = ", ".join(f"a {name} {one._size_format()}" for name, one in KINDS.items())
+        raise InputError(source, f"no shape '{kind}' with size {size}", f"sizes are: {known}") from None
 
 
 def fibonacci_sphere(count: int) -> Array:
@@ -304,17 +443,8 @@ def _place(shape: Shape) -> str:
     return f"({x:.3f}, {y:.3f}, {z:.3f})"
 
 
-def _local(shape: Shape, points_world: Array) -> Array:
-    T = shape.T_world_object
-    return (points_world - T[:3, 3]) @ T[:3, :3]
-
-
-def _to_world(shape: Shape, points: Array, normals: Array) -> tuple[Array, Array]:
-    T = shape.T_world_object
-    return transforms.transform(T, points), transforms.rotate(T, normals)
-
-
-def _cells(half: float, spacing: float) -> NDArray[np.float64]:
-    """Centres of equal cells that cover [-half, half]."""
-    count = max(2, int(np.ceil(2.0 * half / spacing)))
-    return half * (2.0 * (np.arange(count) + 0.5) / count - 1.0)
+def _circle(centre: Array, axis: Array, radius: float) -> Array:
+    u = transforms.perpendicular(axis)
+    v = np.cross(axis, u)
+    angle = np.linspace(0.0, 2.0 * np.pi, 2 * LINE_POINTS - 1)[:, None]
+    return centre + radius * (np.cos(angle) * u + np.sin(angle) * v)

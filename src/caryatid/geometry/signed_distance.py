@@ -1,6 +1,7 @@
-"""Compiled kernels of the shape fits: signed distances, and least squares on them from start to end.
+"""Compiled kernels of shapes: signed distances, their gradients, and points spread over surfaces.
 
-`refine.linearise` and `refine.refine_reference` are the NumPy references the tests compare them with.
+A shape is a code, its axes R (3, 3), columns = x, y, z of the object, its centre (3,) and its half
+extents (3,) along the axes [m].
 """
 
 from __future__ import annotations
@@ -9,12 +10,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.geometry.linear import solve_positive
-from caryatid.geometry.ranks import quantile
+from caryatid.geometry import CYLINDER, SPHERE
 from caryatid.geometry.transforms import Array
 
-SPHERE, CYLINDER, BOX = 0, 1, 2
-"""Codes of the shapes."""
+GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+"""Angle by which one point of a ball is turned against the last [rad]."""
+
+
+@njit(cache=True, inline="always")
+def local(R, centre, points, i):  # type: ignore[no-untyped-def]
+    """Coordinates in the object's frame of one of the points (N, 3)."""
+    u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+    x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
+    y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
+    z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+    return x, y, z
 
 
 @njit(cache=True, error_model="numpy")
@@ -52,10 +62,7 @@ def write_distances(
     """
     hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
-        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
-        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
-        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        x, y, z = local(R, centre, points, i)
         distance[i] = signed_distance(kind, x, y, z, hx, hy, hz)
 
 
@@ -108,146 +115,9 @@ def distances_and_gradients(
     gradients = np.empty((len(points), 3))
     hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
-        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
-        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
-        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
+        x, y, z = local(R, centre, points, i)
         distance[i], gradients[i, 0], gradients[i, 1], gradients[i, 2] = gradient(kind, x, y, z, hx, hy, hz)
     return distance, gradients
-
-
-@njit(cache=True, error_model="numpy")
-def levenberg_marquardt(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-    steps: int,
-    min_extent: float,
-    shrink: float,
-    robust_width: float,
-    noise_floor: float,
-    ridge: NDArray[np.float64],
-    converged: float,
-) -> None:
-    """Minimise the Geman–McClure cost of signed distances; arguments as of `refine.refine_reference`.
-
-    Args:
-        kind: Code of the shape.
-        R: Axes (3, 3) at the start; replaced by those of the least cost.
-        centre: (3,) [m] at the start; replaced.
-        half: Half extents (3,) [m] at the start; replaced.
-        points: (N, 3) [m].
-        steps: Steps at the most.
-        min_extent: Least extent [m].
-        shrink: Pull on the extents [m].
-        robust_width: Residuals beyond this many robust standard deviations lose most of their weight.
-        noise_floor: Least standard deviation the weights assume [m].
-        ridge: Added to the diagonal (9,), times the damping.
-        converged: Share of the cost that the last step lowers it by at the most.
-    """
-    columns, size = np.empty(9, np.intp), 0
-    for a in range(9):
-        if a < 7 or kind == BOX or (kind == CYLINDER and a == 8):
-            columns[size] = a
-            size += 1
-    damping = 1e-3
-    H_all, g_all = np.empty((9, 9)), np.empty(9)
-    H, g = np.empty((size, size)), np.empty(size)
-    R_trial, centre_trial, half_trial = np.empty((3, 3)), np.empty(3), np.empty(3)
-    distance, absolute = np.empty(len(points)), np.empty(len(points))
-    write_distances(kind, R, centre, half, points, distance)
-    for _ in range(steps):
-        for i in range(len(points)):
-            absolute[i] = abs(distance[i])
-        scale = robust_width * max(1.4826 * quantile(absolute, 0.5), noise_floor)
-        normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
-        cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
-        improved = False
-        trial_cost = cost
-        for _ in range(6):
-            for a in range(size):
-                g[a] = -(g_all[columns[a]] + (shrink / 2.0 if a >= 6 else 0.0))
-                for b in range(size):
-                    H[a, b] = H_all[columns[a], columns[b]]
-                H[a, a] += damping * (H[a, a] + ridge[a])
-            step = solve_positive(H, g)
-            _stepped(kind, R, centre, half, step, columns, min_extent, R_trial, centre_trial, half_trial)
-            write_distances(kind, R_trial, centre_trial, half_trial, points, distance)
-            trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half_trial)
-            if trial_cost < cost:
-                improved = True
-                for a in range(3):
-                    centre[a], half[a] = centre_trial[a], half_trial[a]
-                    for b in range(3):
-                        R[a, b] = R_trial[a, b]
-                break
-            damping *= 6.0
-        if not improved:
-            break
-        damping = max(damping / 10.0, 1e-7)
-        if cost - trial_cost < converged * cost:
-            break
-
-
-@njit(cache=True, error_model="numpy")
-def normal_equations(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-    scale: float,
-    H: NDArray[np.float64],
-    g: NDArray[np.float64],
-) -> None:
-    """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
-
-    Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
-    x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6).
-
-    Args:
-        kind: Code of the shape.
-        R: Its axes (3, 3).
-        centre: Its centre (3,) [m].
-        half: Its half extents (3,) [m].
-        points: (N, 3) [m].
-        scale: Width of the cost [m]: a point at this distance weighs a quarter.
-        H: Written to (9, 9).
-        g: Written to (9,).
-    """
-    J = np.empty(9)
-    for a in range(9):
-        g[a] = J[a] = 0.0
-        for b in range(9):
-            H[a, b] = 0.0
-    share = 1.0 / len(points)
-    hx, hy, hz = half[0], half[1], half[2]
-    for i in range(len(points)):
-        u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-        x = R[0, 0] * u + R[1, 0] * v + R[2, 0] * w
-        y = R[0, 1] * u + R[1, 1] * v + R[2, 1] * w
-        z = R[0, 2] * u + R[1, 2] * v + R[2, 2] * w
-        d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
-        weight = share / (1.0 + (d / scale) ** 2) ** 2
-        J[0], J[1], J[2] = -gx, -gy, -gz
-        J[3], J[4], J[5] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
-        if kind == BOX:
-            J[6], J[7], J[8] = -abs(gx), -abs(gy), -abs(gz)
-        elif kind == CYLINDER:
-            J[6], J[8] = -np.sqrt(gx * gx + gy * gy), -abs(gz)
-        else:
-            J[6] = -1.0
-        for a in range(9):
-            if J[a] != 0.0:
-                weighted = weight * J[a]
-                g[a] += weighted * d
-                for b in range(a + 1):
-                    H[a, b] += weighted * J[b]
-    for a in range(9):
-        for b in range(a):
-            H[b, a] = H[a, b]
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
@@ -293,59 +163,116 @@ def gradient(
     return qz, 0.0, 0.0, np.sign(z)
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _stepped(
-    kind: int,
+@njit(cache=True, error_model="numpy")
+def sample_surfaces(
+    kinds: NDArray[np.int64],
     R: NDArray[np.float64],
-    centre: NDArray[np.float64],
+    centres: Array,
+    half: Array,
+    spacings: NDArray[np.float64],
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Spread points over the surfaces of S shapes, one after the other, as each one's `surface` does.
+
+    Args:
+        kinds: Codes (S,).
+        R: Axes (S, 3, 3), columns = x, y, z of the object.
+        centres: (S, 3) [m].
+        half: Half extents (S, 3) [m] along the axes.
+        spacings: About how far apart on each (S,) [m].
+
+    Returns:
+        Points (N, 3) [m], outward unit normals (N, 3), and how many are on each shape (S,).
+    """
+    most = 0
+    for s in range(len(kinds)):
+        # A box has the most points of all shapes with its extents.
+        i, j = _cells(half[s, 0], spacings[s]), _cells(half[s, 1], spacings[s])
+        k = _cells(half[s, 2], spacings[s])
+        most += 2 * (i * j + j * k + k * i)
+    points, normals = np.empty((most, 3)), np.empty((most, 3))
+    ends = np.zeros(len(kinds) + 1, dtype=np.intp)
+    for s in range(len(kinds)):
+        start = ends[s]
+        end = start
+        round_ = kinds[s] == CYLINDER
+        if kinds[s] == SPHERE:
+            end = _ball(points, normals, start, half[s, 0], spacings[s])
+        elif round_:
+            end = _mantle(points, normals, start, half[s, 0], half[s, 2], spacings[s])
+            for face in range(5, 3, -1):
+                end = _face(points, normals, end, half[s], face, spacings[s], round_)
+        else:
+            for face in range(6):
+                end = _face(points, normals, end, half[s], face, spacings[s], round_)
+        for n in range(start, end):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            u, v, w = normals[n, 0], normals[n, 1], normals[n, 2]
+            for axis in range(3):
+                a, b, c = R[s, axis, 0], R[s, axis, 1], R[s, axis, 2]
+                points[n, axis] = a * x + b * y + c * z + centres[s, axis]
+                normals[n, axis] = a * u + b * v + c * w
+        ends[s + 1] = end
+    return points[: ends[-1]], normals[: ends[-1]], ends[1:] - ends[:-1]
+
+
+@njit(cache=True, error_model="numpy")
+def _cells(half: float, spacing: float) -> int:
+    """How many equal cells cover [−half, half]."""
+    return max(2, int(np.ceil(2.0 * half / spacing)))
+
+
+@njit(cache=True, error_model="numpy")
+def _face(
+    points: Array,
+    normals: Array,
+    start: int,
     half: NDArray[np.float64],
-    step: NDArray[np.float64],
-    columns: NDArray[np.intp],
-    min_extent: float,
-    turned: NDArray[np.float64],
-    moved: NDArray[np.float64],
-    grown: NDArray[np.float64],
-) -> None:
-    """Write the shape after a step in its own frame, shortened to 3 cm and 0.3 rad, no extent too short."""
-    longest = 1.0
-    for a in range(len(step)):
-        longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
-    for a in range(3):
-        grown[a], moved[a] = half[a], centre[a]
-    for a in range(6, len(step)):
-        grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
-    if kind == SPHERE:
-        grown[1] = grown[2] = grown[0]
-    elif kind == CYLINDER:
-        grown[1] = grown[0]
-    x, y, z = step[3] / longest, step[4] / longest, step[5] / longest
-    angle = np.sqrt(x * x + y * y + z * z)
-    # Rodrigues' formula for the rows of R: v cos + (v × k) sin + k (k · v)(1 − cos).
-    sine = np.sin(angle) / angle if angle >= 1e-12 else 1.0
-    rest = (1.0 - np.cos(angle)) / (angle * angle) if angle >= 1e-12 else 0.0
-    for i in range(3):
-        u, v, w = R[i, 0], R[i, 1], R[i, 2]
-        moved[i] += (u * step[0] + v * step[1] + w * step[2]) / longest
-        along = rest * (u * x + v * y + w * z)
-        cosine = np.cos(angle) if angle >= 1e-12 else 1.0
-        turned[i, 0] = cosine * u + sine * (v * z - w * y) + along * x
-        turned[i, 1] = cosine * v + sine * (w * x - u * z) + along * y
-        turned[i, 2] = cosine * w + sine * (u * y - v * x) + along * z
+    face: int,
+    spacing: float,
+    disc: bool,
+) -> int:
+    """Write the points of face −x, +x, −y, …, or of the disc within it, and return the row after the last."""
+    axis, sign = face // 2, 2.0 * (face % 2) - 1.0
+    n, u, v = start, (axis + 1) % 3, (axis + 2) % 3
+    along_u, along_v = _cells(half[u], spacing), _cells(half[v], spacing)
+    for i in range(along_u):
+        x = half[u] * (2.0 * (i + 0.5) / along_u - 1.0)
+        for j in range(along_v):
+            y = half[v] * (2.0 * (j + 0.5) / along_v - 1.0)
+            if disc and x * x + y * y > half[u] * half[u]:
+                continue
+            normals[n, axis], normals[n, u], normals[n, v] = sign, 0.0, 0.0
+            points[n, axis], points[n, u], points[n, v] = sign * half[axis], x, y
+            n += 1
+    return n
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
-    total = 0.0
-    for d in distance:
-        squared = (d / scale) ** 2
-        total += squared / (1.0 + squared)
-    return total / len(distance) * scale**2
+@njit(cache=True, error_model="numpy")
+def _mantle(
+    points: Array, normals: Array, start: int, radius: float, half_height: float, spacing: float
+) -> int:
+    """Write the points of a cylinder's mantle and return the row after the last."""
+    n, around = start, max(8, int(np.rint(2.0 * np.pi * radius / spacing)))
+    up = _cells(half_height, spacing)
+    for k in range(up):
+        z = half_height * (2.0 * (k + 0.5) / up - 1.0)
+        for i in range(around):
+            angle = 2.0 * np.pi * (i + 0.5) / around
+            x, y = np.cos(angle), np.sin(angle)
+            normals[n, 0], normals[n, 1], normals[n, 2] = x, y, 0.0
+            points[n, 0], points[n, 1], points[n, 2] = radius * x, radius * y, z
+            n += 1
+    return n
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _sum_of_sizes(kind: int, half: NDArray[np.float64]) -> float:
-    if kind == SPHERE:
-        return half[0]
-    if kind == CYLINDER:
-        return half[0] + half[2]
-    return half[0] + half[1] + half[2]
+@njit(cache=True, error_model="numpy")
+def _ball(points: Array, normals: Array, start: int, radius: float, spacing: float) -> int:
+    """Write the points of a ball from a row on and return the row after the last."""
+    count = max(20, int(np.rint(4.0 * np.pi * (radius / spacing) ** 2)))
+    for n in range(count):
+        z = 1.0 - (2.0 * n + 1.0) / count
+        ring = np.sqrt(1.0 - z * z)
+        x, y = ring * np.cos(GOLDEN * n), ring * np.sin(GOLDEN * n)
+        normals[start + n, 0], normals[start + n, 1], normals[start + n, 2] = x, y, z
+        points[start + n, 0], points[start + n, 1], points[start + n, 2] = radius * x, radius * y, radius * z
+    return start + count

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from caryatid.config import SegmentationConfig
+from caryatid.geometry.points import most_central
 from caryatid.geometry.shapes import Shape
-from caryatid.geometry.thinning import most_central
 from caryatid.geometry.transforms import Array
 from caryatid.objects.object_distance import KnownObjects, gaps_to_objects
 

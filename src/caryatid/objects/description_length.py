@@ -7,23 +7,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from caryatid.config import ExplanationConfig, FitConfig
 from caryatid.fitting import explaining as kernels
 from caryatid.fitting.free_space import free_inside
-from caryatid.fitting.least_squares import arrays
 from caryatid.fitting.primitives import Oriented, candidates
-from caryatid.geometry.neighbours import nearest_neighbours
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import Cloud
 from caryatid.sensing.voxel_map import VoxelMap
-
-Solid = Box | Cylinder | Sphere
-
-PARAMETERS = {"box": 9, "cylinder": 7, "sphere": 4}
-"""Numbers that determine a shape."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,20 +77,20 @@ class Explanation:
         cost: Cost of all the points and of the object itself [nats].
     """
 
-    shape: Solid | None
+    shape: Shape | None
     cost: float
 
 
-def price(shape: Solid | None, config: ExplanationConfig) -> float:
+def price(shape: Shape | None, config: ExplanationConfig) -> float:
     """Price [nats] of an object: of the parameters of its shape; an irregular one has as many as a box."""
-    return config.parameter_cost * (9 if shape is None else PARAMETERS[shape.kind])
+    return config.parameter_cost * (9 if shape is None else shape.parameters)
 
 
-def point_costs(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> Array:
+def point_costs(shape: Shape, evidence: Evidence, config: ExplanationConfig) -> Array:
     """Cost (N,) [nats] of each point as one of a shape's surface, before its weight."""
     return np.asarray(
         kernels.point_costs(
-            *arrays(shape),
+            *Primitives.of([shape]).row(0),
             evidence.points,
             evidence.normals,
             evidence.noise,
@@ -106,7 +100,7 @@ def point_costs(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> 
     )
 
 
-def free_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> float:
+def free_cost(shape: Shape, evidence: Evidence, config: ExplanationConfig) -> float:
     """Cost [nats] of the space seen free that a shape fills."""
     if evidence.voxels is None:
         return 0.0
@@ -114,13 +108,13 @@ def free_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> fl
     return config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
 
 
-def shape_cost(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> float:
+def shape_cost(shape: Shape, evidence: Evidence, config: ExplanationConfig) -> float:
     """Cost [nats] of points explained by one shape, without the price of an object."""
     costs = point_costs(shape, evidence, config)
     return float(costs @ evidence.weights) + free_cost(shape, evidence, config)
 
 
-def explained_by(shape: Solid, evidence: Evidence, config: ExplanationConfig) -> Explanation:
+def explained_by(shape: Shape, evidence: Evidence, config: ExplanationConfig) -> Explanation:
     """Explain points by a given shape, or as an irregular object where that costs less."""
     irregular = config.irregular * float(evidence.weights.sum())
     cost = shape_cost(shape, evidence, config)
@@ -178,7 +172,10 @@ def joined(a: Evidence, b: Evidence) -> Evidence:
 
 def around(points: Array, neighbours: int) -> NDArray[np.intp]:
     """Indices (N, K) of each point's nearest neighbours among points (N, 3), itself among them."""
-    return nearest_neighbours(points, min(neighbours, len(points)))
+    count = min(neighbours, len(points))
+    if not count:
+        return np.zeros((len(points), 0), dtype=np.intp)
+    return np.asarray(cKDTree(points).query(points, np.arange(1, count + 1))[1])
 
 
 def border_cost(
@@ -208,7 +205,7 @@ def border_cost(
     return config.border * smooth, smooth / max(float(length.sum()), 1e-12)
 
 
-def lies_on(shape: Solid, points: Array, config: ExplanationConfig) -> bool:
+def lies_on(shape: Shape, points: Array, config: ExplanationConfig) -> bool:
     """Whether most points (N, 3) lie so near a shape's surface [m], or in it, that they may be of it."""
     near = shape.signed_distance(points) < config.layer
     return float(near.mean()) >= config.layer_share

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from caryatid.config import FusionConfig
-from caryatid.geometry.shapes import Cylinder, Shape, Sphere
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
 from caryatid.objects.sightings import axes_rotation, merge
@@ -214,9 +214,8 @@ def _sizes(o: SceneObject) -> Array:
 
 def _is_round(shape: Shape) -> bool:
     """Orientation says nothing of a sphere, nor of a cylinder about as high as wide."""
-    if isinstance(shape, Cylinder):
-        return abs(shape.height - 2.0 * shape.radius) < 0.2 * shape.height
-    return isinstance(shape, Sphere)
+    across, along = shape.extents[[0, 2]]
+    return len(set(shape.ties)) < 3 and bool(abs(along - across) < 0.2 * along)
 
 
 def _vertex(seen: Mapping[int, SceneObject], config: FusionConfig) -> SceneObject:

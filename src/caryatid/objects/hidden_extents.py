@@ -9,8 +9,7 @@ import numpy as np
 
 from caryatid.config import CompletionConfig
 from caryatid.geometry import transforms
-from caryatid.geometry.shape_arrays import ShapeArrays, boxes_around, shape_arrays
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
 from caryatid.objects.sweeps import way_to_shapes
@@ -53,8 +52,8 @@ def complete(
         config: Steps and tolerances.
     """
     done = list(objects)
-    shapes = shape_arrays([o.shape for o in objects])
-    lowest = boxes_around(shapes)[0][:, 2]
+    shapes = Primitives.of([o.shape for o in objects])
+    lowest = shapes.bounds()[0][:, 2]
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
         done[k] = _extended(done[k], k, shapes, surface, voxels, config)
         shapes.centres[k], shapes.half[k] = done[k].centre_world, done[k].shape.extents / 2.0
@@ -64,7 +63,7 @@ def complete(
 def _extended(
     candidate: SceneObject,
     index: int,
-    shapes: ShapeArrays,
+    shapes: Primitives,
     surface: SupportSurface,
     voxels: VoxelMap,
     config: CompletionConfig,
@@ -100,7 +99,7 @@ def _moved_out(
     limit: float,
     aim: str,
     index: int,
-    shapes: ShapeArrays,
+    shapes: Primitives,
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
@@ -136,7 +135,7 @@ def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, 
 
 
 def _way_to_others(
-    face: _Face, limit: float, index: int, shapes: ShapeArrays, config: CompletionConfig
+    face: _Face, limit: float, index: int, shapes: Primitives, config: CompletionConfig
 ) -> float:
     """How far [m] the face of one of the shapes can move before it meets another one, by sphere tracing."""
     points, outward = face.points_world, face.outward_world
@@ -162,13 +161,13 @@ def _free_before(face: _Face, limit: float, voxels: VoxelMap, config: Completion
     return float(lengths[stops[0]]) if len(stops) else limit
 
 
-def _downward_side(shape: Box | Cylinder) -> tuple[int, float]:
+def _downward_side(shape: Shape) -> tuple[int, float]:
     down = -shape.T_world_object[2, :3]
     axis = 2 if isinstance(shape, Cylinder) else int(np.argmax(np.abs(down)))
     return axis, 1.0 if down[axis] >= 0.0 else -1.0
 
 
-def _face(shape: Box | Cylinder, axis: int, sign: float, config: CompletionConfig) -> _Face:
+def _face(shape: Shape, axis: int, sign: float, config: CompletionConfig) -> _Face:
     across = [(axis + 1) % 3, (axis + 2) % 3]
     half = shape.extents / 2.0
     u, v = (_ticks(half[k], config.spacing) for k in across)
@@ -194,14 +193,12 @@ def _ticks(half: float, spacing: float) -> Array:
     return half * (2.0 * np.arange(count + 1) / count - 1.0)
 
 
-def _lengthened(shape: Box | Cylinder, axis: int, sign: float, length: float) -> Box | Cylinder:
+def _lengthened(shape: Shape, axis: int, sign: float, length: float) -> Shape:
     extents = shape.extents
     length = max(length, -0.8 * float(extents[axis]))
     shift = np.zeros(3)
     shift[axis] = sign * length / 2.0
     T = transforms.rigid(shape.T_world_object[:3, :3], transforms.transform(shape.T_world_object, shift))
-    if isinstance(shape, Cylinder):
-        return Cylinder(T, shape.radius, shape.height + length)
     grown = extents.copy()
     grown[axis] += length
-    return Box(T, grown)
+    return shape.from_extents(T, grown)

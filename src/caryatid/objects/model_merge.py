@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from caryatid.config import ExplanationConfig, FitConfig
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.objects.description_length import (
     Evidence,
     Explanation,
-    Solid,
     around,
     border_cost,
     explain,
@@ -90,7 +90,7 @@ class _Two:
 
     both: Evidence
     second: NDArray[np.bool_]
-    shapes: list[Solid]
+    shapes: list[Shape]
     smooth: float
     cost: float
     one_lies_on_the_other: bool

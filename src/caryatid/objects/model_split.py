@@ -14,9 +14,9 @@ from scipy.spatial import cKDTree
 
 from caryatid.config import ExplanationConfig, FitConfig, SplitConfig
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import KINDS
 from caryatid.geometry.transforms import Array
 from caryatid.objects.description_length import (
-    PARAMETERS,
     Evidence,
     Explanation,
     around,
@@ -136,7 +136,7 @@ def _best_pair(
     bad = unexplained(evidence, whole, near, costs)
     excess = float(np.maximum(bad - costs.usual, 0.0) @ evidence.weights)
     free = whole.cost - price(whole.shape, costs) - float(_costs(whole, evidence, costs) @ evidence.weights)
-    if excess + free < costs.parameter_cost * min(PARAMETERS.values()):
+    if excess + free < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
         return None
     starts = list(_starts(evidence, bad, hints(), up, config, costs))
     quick = first_look(fit_config, costs)

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from caryatid.config import Config
 from caryatid.fitting.primitives import FitFailure, Oriented, fit_many
-from caryatid.geometry.thinning import most_central
+from caryatid.geometry.points import most_central
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.objects import association

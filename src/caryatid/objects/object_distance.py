@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.geometry.shape_arrays import SHAPE_CODES
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.signed_distance import signed_distance
 from caryatid.geometry.transforms import Array
@@ -44,7 +43,7 @@ class KnownObjects:
         return cls(
             np.concatenate([np.zeros((0, 3)), *points]),
             np.repeat(np.arange(len(points)), [len(p) for p in points]),
-            np.array([-1 if s is None else SHAPE_CODES[s.kind] for s in shapes], dtype=np.intp),
+            np.array([-1 if s is None else s.code for s in shapes], dtype=np.intp),
             np.array([np.eye(4) if s is None else s.T_world_object for s in shapes]).reshape(-1, 4, 4),
             np.array([np.zeros(3) if s is None else s.extents / 2.0 for s in shapes]).reshape(-1, 3),
         )

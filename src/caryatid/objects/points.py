@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.geometry import points as kernels
-from caryatid.geometry.thinning import last_in_voxels, most_central
+from caryatid.geometry.points import last_in_voxels, most_central
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry.polygons import hull
-from caryatid.geometry.sampling import sample_surfaces
-from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
@@ -72,7 +71,7 @@ def surface_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfi
     size = solid.voxels.config.size
     areas = np.array([_area(o) for o in objects])
     spacings = np.maximum(np.sqrt(areas * len(objects) / config.surface_samples), size)
-    points, normals, counts = sample_surfaces(*shape_arrays([o.shape for o in objects]), spacings)
+    points, normals, counts = Primitives.of([o.shape for o in objects]).surface(spacings)
     subjects = np.repeat(np.arange(len(objects)), counts)
     open_ = np.flatnonzero(~solid.holds(points + 1.5 * size * normals))
     subjects = subjects[open_]

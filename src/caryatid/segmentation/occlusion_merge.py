@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from caryatid.config import FitConfig, SegmentationConfig
-from caryatid.fitting.least_squares import linearise
 from caryatid.fitting.primitives import Fit, Oriented, candidates
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.colour_cut import two_colours
 from caryatid.segmentation.concavity import hollowness
@@ -172,17 +171,14 @@ def _is_one(
     )
 
 
-def _explained(
-    shape: Box | Cylinder | Sphere, samples: Samples, own: Mask, config: SegmentationConfig
-) -> float:
+def _explained(shape: Shape, samples: Samples, own: Mask, config: SegmentationConfig) -> float:
     """Share of a part's samples that lie at a shape and face as it does."""
-    distance, J = linearise(shape, samples.points_camera[own])
-    outward = -J[:, :3] @ shape.T_world_object[:3, :3].T
+    distance, outward = Primitives.of([shape]).gradient(0, samples.points_camera[own])
     cosine = np.sum(outward * samples.normals_camera[own], axis=1)
     return float(((np.abs(distance) < config.rejoin_distance) & (cosine > config.rejoin_cosine)).mean())
 
 
-def _seen_empty(shape: Box | Cylinder | Sphere, samples: Samples) -> float:
+def _seen_empty(shape: Shape, samples: Samples) -> float:
     """Share of the shape's faces towards the camera behind which the camera saw something."""
     points, outward = shape.surface(0.01)
     facing = np.einsum("ij,ij->i", points, outward) < 0.0

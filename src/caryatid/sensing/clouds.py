@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.thinning import most_central
+from caryatid.geometry.points import most_central
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.local_planes import LocalSurface, local_surface
 from caryatid.sensing.views import View

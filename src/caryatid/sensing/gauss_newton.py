@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.geometry.linear import solve_positive
+from caryatid.geometry.points import solve_positive
 from caryatid.geometry.transforms import Array
 
 SUMS = 29

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import VoxelConfig
-from caryatid.geometry.shape_arrays import boxes_around, shape_arrays
-from caryatid.geometry.shapes import Shape
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import for_each
 from caryatid.sensing.solids import Filling, fill_layer
@@ -122,8 +121,8 @@ class VoxelMap:
         Args:
             shapes: Fitted shapes in the world frame: what is hidden of them hides what is behind.
         """
-        arrays, size = shape_arrays(shapes), self.config.size
-        low, high = ((corner - self.origin_world) / size for corner in boxes_around(arrays))
+        arrays, size = Primitives.of(shapes), self.config.size
+        low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
         low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
         high = np.clip(np.ceil(high).astype(np.int64), 0, self.hits.shape)
         some = (low < high).all(axis=1)

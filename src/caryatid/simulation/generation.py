@@ -12,7 +12,7 @@ import numpy as np
 from caryatid.config import GenerationConfig, PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.simulation.world import (
     TABLE_HEIGHT,
@@ -233,9 +233,7 @@ def _is_raised(scene: SimulatedScene, habits: GenerationConfig) -> bool:
     return bool(bounds(scene, len(scene.object_bodies))[0][2] > TABLE_HEIGHT + habits.gap)
 
 
-def let_go(
-    shape: Box | Cylinder | Sphere, xy: Array, scene: SimulatedScene | None, habits: GenerationConfig
-) -> Solid:
+def let_go(shape: Shape, xy: Array, scene: SimulatedScene | None, habits: GenerationConfig) -> Solid:
     """Put a shape a little over whatever the boxes around objects say is below it.
 
     Args:
@@ -253,7 +251,7 @@ def let_go(
     return Solid(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
 
 
-def _over(shape: Box | Cylinder | Sphere, others: Sequence[Box | Cylinder | Sphere]) -> bool:
+def _over(shape: Shape, others: Sequence[Shape]) -> bool:
     """Whether the level boxes around two shapes overlap seen from above."""
     return any(
         (
@@ -264,7 +262,7 @@ def _over(shape: Box | Cylinder | Sphere, others: Sequence[Box | Cylinder | Sphe
     )
 
 
-def upright(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
+def upright(rng: np.random.Generator, habits: GenerationConfig) -> Shape:
     """Draw a shape at the origin with one axis vertical: a box on any face, a cylinder on an end or lying.
 
     Args:
@@ -276,11 +274,11 @@ def upright(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinde
     return _shape(rng, R, habits)
 
 
-def _tilted(rng: np.random.Generator, habits: GenerationConfig) -> Box | Cylinder | Sphere:
+def _tilted(rng: np.random.Generator, habits: GenerationConfig) -> Shape:
     return _shape(rng, transforms.random_rotation(rng), habits)
 
 
-def _shape(rng: np.random.Generator, R: Array, habits: GenerationConfig) -> Box | Cylinder | Sphere:
+def _shape(rng: np.random.Generator, R: Array, habits: GenerationConfig) -> Shape:
     T = transforms.rigid(R, np.zeros(3))
     kind = rng.choice(3, p=habits.mixture)
     radius = float(rng.uniform(*habits.radius))
@@ -377,7 +375,7 @@ def generate_packed(
     return set_down(name, [], [draw] * size, rng, Place(TABLE_SIZE, ()), habits, physics)
 
 
-def _turned(shape: Box | Cylinder | Sphere, turn: Array) -> Box | Cylinder | Sphere:
+def _turned(shape: Shape, turn: Array) -> Shape:
     """Turn a shape at the origin so that its level axes are those of the pack."""
     R = shape.T_world_object[:3, :3]
     level = int(np.argmin(np.abs(R[2])))
@@ -387,11 +385,11 @@ def _turned(shape: Box | Cylinder | Sphere, turn: Array) -> Box | Cylinder | Sph
 
 
 def _pushed(
-    shape: Box | Cylinder | Sphere,
+    shape: Shape,
     outward_world: Array,
-    others: Sequence[Box | Cylinder | Sphere],
+    others: Sequence[Shape],
     habits: GenerationConfig,
-) -> Box | Cylinder | Sphere:
+) -> Shape:
     """Push a shape over the table from outside towards the middle until it touches another."""
     z = TABLE_HEIGHT + float(shape.support(DOWN)[0]) + habits.packed_gap
     distance = float(np.hypot(*TABLE_SIZE))
@@ -404,7 +402,7 @@ def _pushed(
     return at
 
 
-def _gap(a: Box | Cylinder | Sphere, b: Box | Cylinder | Sphere) -> float:
+def _gap(a: Shape, b: Shape) -> float:
     """Distance [m] between two shapes, from samples on both surfaces."""
     return min(
         float(a.signed_distance(b.surface(_SPACING)[0]).min()),

@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import SUPPORT_LABEL
 
@@ -283,7 +283,7 @@ class Solid:
         friction: Sliding friction [1]; the larger one of two bodies in contact counts.
     """
 
-    shape: Box | Cylinder | Sphere
+    shape: Shape
     density: float = 600.0
     friction: float = 0.8
 
@@ -438,14 +438,13 @@ def add_solid(
     T_world_body = shape.T_world_object
     body = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
     body.add_freejoint()
+    kind, size = mujoco.mjtGeom.mjGEOM_BOX, shape.extents / 2.0
     match shape:
-        case Box():
-            kind, size = mujoco.mjtGeom.mjGEOM_BOX, shape.extents / 2.0
         case Cylinder():
             kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([shape.radius, shape.height / 2.0, 0.0])
         case Sphere():
             kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.array([shape.radius, 0.0, 0.0])
-    condim, torsional, rolling = _ROLLING[shape.kind]
+    condim, torsional, rolling = _ROLLING.get(shape.kind, _ROLLING["box"])
     body.add_geom(
         type=kind,
         size=size,
@@ -511,9 +510,9 @@ def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
     return low, high
 
 
-def true_shapes(scene: SimulatedScene) -> dict[int, Box | Cylinder | Sphere]:
+def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
     """Shape of every object, by label, that is a single box, cylinder or sphere; others are left out."""
-    shapes: dict[int, Box | Cylinder | Sphere] = {}
+    shapes: dict[int, Shape] = {}
     for label in scene.object_bodies:
         geoms = solid_geoms(scene, label)
         shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
@@ -552,7 +551,7 @@ def _geom_pose(scene: SimulatedScene, geom: int) -> Array:
     return transforms.rigid(scene.data.geom_xmat[geom].reshape(3, 3), scene.data.geom_xpos[geom])
 
 
-def _primitive(scene: SimulatedScene, geom: int) -> Box | Cylinder | Sphere | None:
+def _primitive(scene: SimulatedScene, geom: int) -> Shape | None:
     size, T_world_geom = scene.model.geom_size[geom], _geom_pose(scene, geom)
     match scene.model.geom_type[geom]:
         case _GEOM.mjGEOM_BOX:

@@ -12,10 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.errors import InputError
-from caryatid.geometry import transforms
-from caryatid.geometry.shape_arrays import SHAPE_CODES, ShapeArrays, shape_arrays
-from caryatid.geometry.shapes import Shape
-from caryatid.geometry.signed_distance import BOX, CYLINDER, SPHERE
+from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 
 _GEOM_TYPES = np.zeros(3, dtype=np.int32)
@@ -54,14 +52,14 @@ def find_contacts(shapes: Sequence[Shape], margin: float | Sequence[float]) -> l
     """Find every pair of shapes whose gap is at most the margin.
 
     Args:
-        shapes: Boxes, cylinders and spheres in the world frame.
+        shapes: In the world frame.
         margin: Largest gap [m]; one for each shape counts by the mean of the pair.
 
     Returns:
         One contact a pair, sorted by (a, b).
 
     Raises:
-        InputError: A margin is negative, there is not one for each shape, or a shape is of no known kind.
+        InputError: A margin is negative, or there is not one for each shape.
     """
     margins = np.asarray(margin, dtype=np.float64)
     if margins.ndim and margins.shape != (len(shapes),):
@@ -96,7 +94,7 @@ def find_contacts(shapes: Sequence[Shape], margin: float | Sequence[float]) -> l
 
 
 def local_frames(
-    shapes: ShapeArrays, pairs: NDArray[np.intp], points_world: Array, normals_world: Array
+    shapes: Primitives, pairs: NDArray[np.intp], points_world: Array, normals_world: Array
 ) -> tuple[Array, Array]:
     """Contacts in the frames of both shapes they are between.
 
@@ -147,7 +145,7 @@ class _Engine:
         self.model = spec.compile()
         self.data = mujoco.MjData(self.model)
 
-    def collide(self, shapes: ShapeArrays, margins: Array) -> mujoco.MjData:
+    def collide(self, shapes: Primitives, margins: Array) -> mujoco.MjData:
         """Find all contacts of shapes with margins (N,) [m]; N is at most the capacity."""
         model, data, count = self.model, self.data, len(shapes.kinds)
         size = shapes.half.copy()
@@ -175,11 +173,8 @@ def _collide(shapes: Sequence[Shape], margins: Array) -> mujoco.MjData:
 
     The result holds until the next call in the same thread.
     """
-    unknown = [s.kind for s in shapes if s.kind not in SHAPE_CODES]
-    if unknown:
-        raise InputError("shapes", f"no shape '{unknown[0]}'", f"there are {', '.join(SHAPE_CODES)}")
     capacity = max(_LEAST_CAPACITY, 1 << (len(shapes) - 1).bit_length())
-    return _engine(capacity, threading.get_ident()).collide(shape_arrays(shapes), margins)
+    return _engine(capacity, threading.get_ident()).collide(Primitives.of(shapes), margins)
 
 
 @lru_cache(maxsize=8)

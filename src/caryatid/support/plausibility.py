@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,7 @@ from scipy.sparse.linalg import spsolve
 
 from caryatid.config import PlausibilityConfig
 from caryatid.geometry import transforms
-from caryatid.geometry.shape_arrays import shape_arrays
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
 from caryatid.support.contacts import Contact, find_contacts, local_frames
@@ -58,7 +58,7 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
         change = closing(pairs[explained], rows[explained], variance, gaps[explained], config.touch**2)
         for k in np.flatnonzero(change.any(axis=1)):
             shape = done[k].shape
-            done[k] = replace(done[k], shape=_changed(shape, _EFFECT[shape.kind] @ change[k], config))
+            done[k] = replace(done[k], shape=_changed(shape, change[k], config))
     said = [doubts.get(k, "") for k in range(len(done))]
     return [o if o.doubt == doubt else replace(o, doubt=doubt) for o, doubt in zip(done, said, strict=True)]
 
@@ -72,10 +72,11 @@ def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) 
         config: Least extent, and how many standard deviations uncertainty can explain.
     """
     change = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas) * _sigma(o)
-    return replace(o, shape=_changed(o.shape, _EFFECT[o.shape.kind] @ change, config))
+    return replace(o, shape=_changed(o.shape, change, config))
 
 
-def _effect(kind: str) -> Array:
+@cache
+def _effect(ties: tuple[int, int, int]) -> Array:
     """What each of an object's independent variables (9,) does to it.
 
     Returns:
@@ -83,21 +84,21 @@ def _effect(kind: str) -> Array:
     """
     effect = np.zeros((9, 9))
     effect[3:6, 3:6] = np.eye(3)
-    for axis, round_ in enumerate(_ROUND[kind]):
+    for axis, round_ in enumerate(_round(ties)):
         if round_:
             # What is round moves as a whole, and its radius is one number.
             effect[axis, axis] = 1.0
         else:
             effect[[axis, 6 + axis], axis] = -0.5, 0.5
             effect[[axis, 6 + axis], 6 + axis] = 0.5, 0.5
-    if _ROUND[kind][0]:
-        effect[6:9, 6] = _ROUND[kind]
+    if _round(ties)[0]:
+        effect[6:9, 6] = _round(ties)
     return effect
 
 
-_ROUND = {"box": (False, False, False), "cylinder": (True, True, False), "sphere": (True, True, True)}
-"""Along which axes a shape's two sides are one round surface."""
-_EFFECT = {kind: _effect(kind) for kind in _ROUND}
+def _round(ties: tuple[int, int, int]) -> list[bool]:
+    """Along which axes (3,) a shape's two sides are one round surface."""
+    return [ties.count(tie) > 1 for tie in ties]
 
 
 def _sigma(o: SceneObject) -> Array:
@@ -107,7 +108,7 @@ def _sigma(o: SceneObject) -> Array:
     if known is None or o.role == "support_surface":
         return sigma
     sigma[0:3], sigma[3:6], sigma[6:9] = known.sides[0::2], known.rotation, known.sides[1::2]
-    round_ = sum(_ROUND[o.shape.kind])
+    round_ = sum(_round(o.shape.ties))
     if round_:
         sigma[:round_], sigma[6 : 6 + round_] = known.position[:round_], 0.0
         sigma[6] = known.sizes[0] / 2.0
@@ -133,11 +134,11 @@ def _rows(objects: Sequence[SceneObject], contacts: Sequence[Contact], pairs: ND
     points_world = np.array([c.point_world for c in contacts])
     normals_world = np.array([c.normal_world for c in contacts])
     shapes = [o.shape for o in objects]
-    p, u = local_frames(shape_arrays(shapes), pairs, points_world, normals_world)
-    round_ = np.array([_ROUND[s.kind] for s in shapes])[pairs]
+    p, u = local_frames(Primitives.of(shapes), pairs, points_world, normals_world)
+    round_ = np.array([_round(s.ties) for s in shapes])[pairs]
     sizes = np.where(round_, 0.0, np.abs(u))
     sizes[..., 0] += np.linalg.norm(np.where(round_, u, 0.0), axis=-1)
-    effects = np.array([_EFFECT[s.kind] for s in shapes])[pairs]
+    effects = np.array([_effect(s.ties) for s in shapes])[pairs]
     rows: Array = np.einsum("kpi,kpij->kpj", np.concatenate([u, np.cross(p, u), sizes], axis=-1), effects)
     return rows
 
@@ -176,17 +177,12 @@ def _ends(rows: Array) -> Array:
     return rows.reshape(-1, rows.shape[-1])
 
 
-def _changed(
-    shape: Box | Cylinder | Sphere, change: Array, config: PlausibilityConfig
-) -> Box | Cylinder | Sphere:
-    """Apply a translation, a rotation and a change of the half extents (9,) in the shape's own frame."""
+def _changed(shape: Shape, change: Array, config: PlausibilityConfig) -> Shape:
+    """Change a shape's independent variables (9,)."""
+    change = _effect(shape.ties) @ change
     T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(change[3:6]), change[:3])
     extents = np.maximum(shape.extents + 2.0 * change[6:9], config.min_extent)
-    if isinstance(shape, Sphere):
-        return Sphere(T, float(extents[0]) / 2.0)
-    if isinstance(shape, Cylinder):
-        return Cylinder(T, float(extents[0]) / 2.0, float(extents[2]))
-    return Box(T, extents)
+    return shape.from_extents(T, extents)
 
 
 def _doubts(objects: Sequence[SceneObject], contacts: Sequence[Contact]) -> dict[int, str]:

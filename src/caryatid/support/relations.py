@@ -10,7 +10,7 @@ import numpy as np
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.shape_arrays import shape_arrays
+from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_contacts, find_gap, local_frames
@@ -70,7 +70,7 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
     if len({o.id for o in objects}) < len(objects):
         raise InputError("objects", "two of them have the same id", "give every object an id of its own")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
-    shapes = shape_arrays([o.shape for o in ordered])
+    shapes = Primitives.of([o.shape for o in ordered])
     touches = _find_touches(ordered, config)
     supported = [o for o in ordered if o.role != "support_surface"]
     carried: dict[str, tuple[list[Support], Tipping]] = {}
@@ -180,7 +180,7 @@ def _margins(
     pairs = np.array([(c.a, c.b) for c in contacts], dtype=np.intp).reshape(-1, 2)
     points_world = np.array([c.point_world for c in contacts]).reshape(-1, 3)
     normals = np.array(normals_world).reshape(-1, 3)
-    points, outward = local_frames(shape_arrays([o.shape for o in objects]), pairs, points_world, normals)
+    points, outward = local_frames(Primitives.of([o.shape for o in objects]), pairs, points_world, normals)
     facing = np.where(outward > 0.0, sides[pairs, :, 1], sides[pairs, :, 0])
     spread = (outward * facing) ** 2 + (np.cross(points, outward) * rotation[pairs]) ** 2
     margins = config.margin_sigma * np.sqrt(spread.sum(axis=(1, 2)))

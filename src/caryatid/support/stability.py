@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import SupportConfig
 from caryatid.geometry import polygons, transforms
-from caryatid.geometry.shape_arrays import ShapeArrays, boxes_around, shape_arrays
-from caryatid.geometry.shapes import Shape
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.signed_distance import signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Stability
@@ -108,9 +107,9 @@ def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
     return min(_march(shape, other, -_UP, limit), _march(other, shape, _UP, limit))
 
 
-def beneath(shapes: ShapeArrays, index: int, limit: float) -> list[int]:
+def beneath(shapes: Primitives, index: int, limit: float) -> list[int]:
     """Indices of the shapes that one could meet, by their boxes, when it falls down by a limit [m]."""
-    low, high = boxes_around(shapes)
+    low, high = shapes.bounds()
     near = 2.0 * _MARCH_HIT
     below = (low[index, 2] - limit <= high[:, 2] + near) & (high[index, 2] >= low[:, 2] - near)
     apart = np.maximum(low[:, :2] - high[index, :2], low[index, :2] - high[:, :2]).max(axis=1)
@@ -167,7 +166,7 @@ def _touching_depth(shape: Shape, config: SupportConfig) -> float:
 
 def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) -> float:
     """Way [m] until the first surface point meets the target; what touches at once lies beside it."""
-    own, aim = zip(*shape_arrays([shape, target]), strict=True)
+    own, aim = zip(*Primitives.of([shape, target]), strict=True)
     spacing = float(shape.extents.max()) / _MARCH_POINTS
     corners_world = shape.outline() if shape.kind != "sphere" else np.empty((0, 3))
     points_world = np.concatenate([shape.surface(spacing)[0], corners_world])

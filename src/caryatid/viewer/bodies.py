@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Support, SupportGraph
 from caryatid.viewer.marks import Copies, Drawing, Label, Lines, Mesh
@@ -177,21 +177,9 @@ def _unit(body: str) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.uint32)
 
 
-@cache
-def _round(kind: str) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    match kind:
-        case "box":
-            mesh = trimesh.creation.box(extents=(1.0, 1.0, 1.0))
-        case "cylinder":
-            mesh = trimesh.creation.cylinder(0.5, 1.0, sections=ROUND)
-        case _:
-            mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+def _mesh(shape: Shape) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    mesh = shape.mesh(ROUND)
     return np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.faces, dtype=np.uint32)
-
-
-def _mesh(shape: Box | Cylinder | Sphere) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    vertices, faces = _round(shape.kind)
-    return vertices * shape.extents.astype(np.float32), faces
 
 
 @cache
@@ -209,5 +197,5 @@ def _unit_outline(kind: str) -> Array:
     return np.concatenate([circle, np.roll(circle, 1, axis=-1), np.roll(circle, 2, axis=-1)])
 
 
-def _outline(shape: Box | Cylinder | Sphere) -> Array:
+def _outline(shape: Shape) -> Array:
     return _unit_outline(shape.kind) * shape.extents

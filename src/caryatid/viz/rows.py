@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Cylinder, Shape, Sphere
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.viz import colours
 
@@ -181,12 +181,11 @@ def _whole(value: float) -> str:
     return f"{value:.0f}".replace("-", "−") if np.isfinite(value) else "–"
 
 
-def _size(shape: Box | Cylinder | Sphere) -> str:
+def _size(shape: Shape) -> str:
     """Sizes in millimetres."""
     match shape:
-        case Box():
-            return " × ".join(f"{1e3 * e:.0f}" for e in shape.extents)
         case Cylinder():
             return f"⌀ {2e3 * shape.radius:.0f}, {1e3 * shape.height:.0f} long"
         case Sphere():
             return f"⌀ {2e3 * shape.radius:.0f}"
+    return " × ".join(f"{1e3 * e:.0f}" for e in shape.extents)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,15 +51,15 @@ def cards(report: Report) -> list[tuple[str, str, str]]:
     pages, scores = report.pages, report.scores
     last = pages[-1]
     objects = [o for o in last.objects if not o.surface]
-    kinds = [(kind, sum(o.shape == kind for o in objects)) for kind in ("box", "cylinder", "sphere")]
-    plural = {"box": "boxes", "cylinder": "cylinders", "sphere": "spheres"}
+    kinds = sorted(Counter(o.shape for o in objects).items())
     uncertain = sum(not s.certain for s in last.supports)
     seconds = [sum(page.timings.values()) for page in pages]
     figures = [
         (
             "objects",
             str(len(objects)),
-            ", ".join(f"{n} {k if n == 1 else plural[k]}" for k, n in kinds if n) or "none found",
+            ", ".join(f"{n} {k}{'' if n == 1 else 'es' if k == 'box' else 's'}" for k, n in kinds)
+            or "none found",
         ),
         (
             "supports",

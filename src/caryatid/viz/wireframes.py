@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
 from caryatid.viz.colours import object_colour
 from caryatid.viz.svg import element, path, tooltip
 
-SAMPLES = 33
-"""Points along each line of a wireframe."""
 NEAR = 0.05
 """Lines nearer to the camera than this are left out [m]."""
 FLAT = 0.4
@@ -55,22 +53,6 @@ class Projection:
         return (shown > 0.0) & (z > shown + margin)
 
 
-def wireframe(shape: Box | Cylinder | Sphere, eye_world: Array) -> list[Array]:
-    """Return lines (M, 3) [m] that draw a shape: edges, rims, and the silhouette seen from `eye` (3,)."""
-    match shape:
-        case Box():
-            lines = _box_edges(shape.extents / 2.0)
-        case Cylinder():
-            lines = _cylinder_lines(
-                shape, transforms.transform(transforms.invert(shape.T_world_object), eye_world)
-            )
-        case Sphere():
-            lines = _sphere_lines(
-                shape, transforms.transform(transforms.invert(shape.T_world_object), eye_world)
-            )
-    return [transforms.transform(shape.T_world_object, line) for line in lines]
-
-
 def draw_shapes(objects: Sequence[SceneObject], projection: Projection, margin: float) -> str:
     """Draw fitted shapes as lines in their objects' colours; hidden ones (by `margin` [m]) thin and faint."""
     groups = []
@@ -91,12 +73,12 @@ def draw_shapes(objects: Sequence[SceneObject], projection: Projection, margin: 
     return "".join(groups)
 
 
-def _runs(shape: Box | Cylinder | Sphere, projection: Projection, margin: float) -> tuple[str, str]:
+def _runs(shape: Shape, projection: Projection, margin: float) -> tuple[str, str]:
     """Path data of what can be seen of a shape's lines, and of what is hidden."""
     from scipy.ndimage import median_filter
 
     data: dict[bool, list[str]] = {False: [], True: []}
-    for line in wireframe(shape, projection.T_world_camera[:3, 3]):
+    for line in shape.lines(projection.T_world_camera[:3, 3]):
         pixels, z = projection.project(line)
         hidden = median_filter(projection.hidden(pixels, z, margin), size=5, mode="nearest")
         cuts = np.flatnonzero(np.diff(hidden)) + 1
@@ -114,46 +96,3 @@ def _thinned(pixels: Array) -> Array:
     bend = np.abs(offset[:, 0] * along[1] - offset[:, 1] * along[0])
     closed = np.allclose(pixels[0], pixels[-1], atol=FLAT)
     return pixels if closed or bend.max() > FLAT else pixels[[0, -1]]
-
-
-def _box_edges(half: Array) -> list[Array]:
-    lines = []
-    for axis in range(3):
-        for a in (-1.0, 1.0):
-            for b in (-1.0, 1.0):
-                line = np.empty((SAMPLES, 3))
-                line[:, axis] = np.linspace(-half[axis], half[axis], SAMPLES)
-                line[:, (axis + 1) % 3] = a * half[(axis + 1) % 3]
-                line[:, (axis + 2) % 3] = b * half[(axis + 2) % 3]
-                lines.append(line)
-    return lines
-
-
-def _cylinder_lines(shape: Cylinder, eye: Array) -> list[Array]:
-    ends = np.array([[0.0, 0.0, -shape.height / 2.0], [0.0, 0.0, shape.height / 2.0]])
-    lines = [_circle(end, np.array([0.0, 0.0, 1.0]), shape.radius) for end in ends]
-    distance = float(np.hypot(eye[0], eye[1]))
-    if distance > shape.radius:
-        towards, reach = np.arctan2(eye[1], eye[0]), np.arccos(shape.radius / distance)
-        for angle in (towards - reach, towards + reach):
-            foot = shape.radius * np.array([np.cos(angle), np.sin(angle), 0.0])
-            lines.append(np.linspace(ends[0] + foot, ends[1] + foot, SAMPLES))
-    return lines
-
-
-def _sphere_lines(shape: Sphere, eye: Array) -> list[Array]:
-    upright = shape.T_world_object[:3, :3].T
-    lines = [_circle(np.zeros(3), axis, shape.radius) for axis in upright.T]
-    distance = float(np.linalg.norm(eye))
-    if distance > shape.radius:
-        towards = eye / distance
-        share = shape.radius / distance
-        lines.append(_circle(shape.radius * share * towards, towards, shape.radius * np.sqrt(1.0 - share**2)))
-    return lines
-
-
-def _circle(centre: Array, axis: Array, radius: float) -> Array:
-    u = transforms.perpendicular(axis)
-    v = np.cross(axis, u)
-    angle = np.linspace(0.0, 2.0 * np.pi, 2 * SAMPLES - 1)[:, None]
-    return centre + radius * (np.cos(angle) * u + np.sin(angle) * v)

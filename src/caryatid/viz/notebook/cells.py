@@ -11,7 +11,7 @@ from PIL import Image
 
 from caryatid.config import ReportConfig
 from caryatid.exploration import Step
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Shape, Sphere
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
@@ -98,10 +98,8 @@ def _of_object(item: SceneObject) -> Cell:
     )
 
 
-@_cell.register(Box)
-@_cell.register(Cylinder)
-@_cell.register(Sphere)
-def _of_shape(shape: Box | Cylinder | Sphere) -> Cell:
+@_cell.register(Shape)
+def _of_shape(shape: Shape) -> Cell:
     x, y, z = shape.T_world_object[:3, 3]
     facts = [("size", tables.size_of(shape)), ("centre", f"{x:.3f}, {y:.3f}, {z:.3f} m")]
     if not isinstance(shape, Sphere):
@@ -196,5 +194,5 @@ def _cloud(cloud: Cloud, graph: SupportGraph, T_world_camera: Array | None) -> F
     )
 
 
-def _solid(shape: Box | Cylinder | Sphere, colour: str) -> Figure:
+def _solid(shape: Shape, colour: str) -> Figure:
     return Figure(draw_solid(shape, colour), SOLID)

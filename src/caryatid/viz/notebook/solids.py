@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.viz import svg
-from caryatid.viz.wireframes import Projection, wireframe
+from caryatid.viz.wireframes import Projection
 
 SIDE = 150.0
 """Width and height of the drawing [px]."""
@@ -22,7 +22,7 @@ NUDGE = 1e-3
 """Step towards the eye that tells the near side from the far one, in shares of the shape's reach."""
 
 
-def draw_solid(shape: Box | Cylinder | Sphere, colour: str) -> str:
+def draw_solid(shape: Shape, colour: str) -> str:
     """Draw one shape as SVG, as it stands in the world, filling the picture.
 
     Args:
@@ -39,7 +39,7 @@ def draw_solid(shape: Box | Cylinder | Sphere, colour: str) -> str:
         transforms.look_at(eye_world, centre_world), K, np.zeros((1, 1), np.float32), parallel=True
     )
     data: dict[bool, list[str]] = {True: [], False: []}
-    for line in wireframe(shape, eye_world):
+    for line in shape.lines(eye_world):
         pixels, _ = view.project(line)
         # From a point on the near side of a convex solid a step towards the eye leads out of it.
         near = shape.signed_distance(line + NUDGE * reach * TOWARDS_EYE) > 0.0

@@ -11,7 +11,7 @@ from caryatid.viz.notebook.cell import Entry, Table
 from caryatid.viz.rows import object_rows, point_rows, support_rows
 
 if TYPE_CHECKING:
-    from caryatid.geometry.shapes import Box, Cylinder, Sphere
+    from caryatid.geometry.shapes import Shape
     from caryatid.geometry.transforms import Array
     from caryatid.graph import SupportGraph
     from caryatid.manipulation.order import Order
@@ -101,14 +101,14 @@ def pose_of(T_world_camera: Array | None) -> str:
     return f"at {x:.2f}, {y:.2f}, {z:.2f} m, looking {down:.0f}° down".replace("-", "−")
 
 
-def lean_of(shape: Box | Cylinder) -> str:
+def lean_of(shape: Shape) -> str:
     """Say by what angle the nearest to vertical of its axes leans; for a cylinder, its own axis."""
     vertical = np.abs(shape.T_world_object[2, :3])
     upright = vertical[2] if shape.kind == "cylinder" else vertical.max()
     return f"{np.degrees(np.arccos(np.clip(upright, 0.0, 1.0))):.0f}° off the vertical"
 
 
-def size_of(shape: Box | Cylinder | Sphere) -> str:
+def size_of(shape: Shape) -> str:
     """Say the sizes of a shape in millimetres."""
     match shape.size:
         case [x, y, z]:
