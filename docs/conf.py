@@ -18,6 +18,7 @@ import results  # noqa: E402
 from gallery import RUN, copy_examples  # noqa: E402
 
 import caryatid  # noqa: E402
+from caryatid.benchmark.report import read_results, write_document  # noqa: E402
 
 results.watch()
 
@@ -63,6 +64,10 @@ nitpick_ignore_regex = [
         r"caryatid\.(kernels|shape_arrays|recordings\.sources|sessions\.(lock|folder)|simulation\.lifting)\..*",
     ),
 ]
+
+for page in ("benchmark", "benchmark-dismantle"):
+    command = f"caryatid benchmark --out results --docs {page}.md"
+    write_document(*read_results(DOCS / "results" / f"{page}.json.gz"), DOCS / f"{page}.md", command)
 
 copy_examples(DOCS.parent / "examples", DOCS / "_build" / "examples")
 sphinx_gallery_conf = {

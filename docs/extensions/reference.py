@@ -1,4 +1,4 @@
-"""Directives that write the reference from the code: `every-command` and `settings-of`."""
+"""Directives that write the reference from the code: `every-command` and `every-setting`."""
 
 from __future__ import annotations
 
@@ -134,20 +134,27 @@ def _allowed(kind: Any) -> str:
     return {bool: "`true`, `false`"}.get(kind, "")
 
 
-class SettingsOf(SphinxDirective):
-    """A table of the settings of a stage."""
+def settings_page() -> str:
+    """Return the tables of all stages as Markdown; first those a file of settings holds."""
+    held = [field.name for field in fields(config.Config)]
+    own = {type(getattr(config.Config(), stage)).__name__ for stage in held}
+    others = [name for name in config.__all__ if name.endswith("Config") and name not in {"Config", *own}]
+    return "\n\n".join(f"## {stage}\n\n{table_of(stage)}" for stage in [*held, *others])
 
-    required_arguments = 1
+
+class EverySetting(SphinxDirective):
+    """Tables of all settings, a section for each stage."""
 
     def run(self) -> list[nodes.Node]:
-        """Write the table."""
-        kind = kind_of(self.arguments[0])
-        self.env.note_dependency(sys.modules[kind.__module__].__file__ or "")
-        return list(self.parse_text_to_nodes(table_of(self.arguments[0])))
+        """Write the tables."""
+        for name, module in sys.modules.items():
+            if name.startswith("caryatid.config"):
+                self.env.note_dependency(module.__file__ or "")
+        return list(self.parse_text_to_nodes(settings_page(), allow_section_headings=True))
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directives."""
     app.add_directive("every-command", EveryCommand)
-    app.add_directive("settings-of", SettingsOf)
+    app.add_directive("every-setting", EverySetting)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -222,7 +222,7 @@ def _rows(episode: Episode) -> list[Row]:
         if episode.order and row["view"] in REMOVAL_VIEWS:
             taken = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
         rows.append(row | {"unharmed": taken[0], "lifts": taken[1]})
-        planning = step.timings["plan"]
+        planning = step.timings.get("plan", 0.0)
     missing = range(int(rows[-1]["view"]) + 1, episode.views + 1)
     return rows + [rows[-1] | dict.fromkeys(TIMES, 0.0) | {"view": view} for view in missing]
 

@@ -44,7 +44,12 @@ SUMMARY = "summary.json.gz"
 
 @interruptible()
 def run_benchmark(options: Benchmark) -> int:
-    """Run the episodes that are missing and write the figures; Ctrl-C ends it, and what is done is kept."""
+    """Run the episodes that are missing and write the figures; Ctrl-C ends it, and what is done is kept.
+
+    Raises:
+        InputError: Options contradict each other, or pandas is not installed.
+        Interrupted: Ctrl-C was pressed.
+    """
     console = news_console(options.general.quiet or options.general.json)
     import_pandas()
     path = options.out / RESULTS

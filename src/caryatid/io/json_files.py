@@ -43,7 +43,7 @@ class Numbers:
         return core_schema.no_info_plain_validator_function(self.read)
 
     def read(self, value: Any) -> Array:
-        """Turn nested lists into an array.
+        """Turn nested lists into an array (...) of this shape.
 
         Raises:
             ValueError: They have another shape, hold something else than finite numbers, or are not rigid.
