@@ -34,7 +34,7 @@ from suites import BUILT_IN
 from caryatid.config import Config, NoiseModel
 from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
-from caryatid.evaluation.overlaps import assign, mask_ious
+from caryatid.evaluation.scores import assign, mask_ious
 from caryatid.sensing.views import View
 
 BASELINE = Path(__file__).with_name("segmentation_baseline.json")

@@ -2,7 +2,7 @@
 
 To use it on the command line as `--planner opposite`, a package offers it as an entry point:
 
-    [project.entry-points."caryatid.planning.planners"]
+    [project.entry-points."caryatid.planners"]
     opposite = "my_package:OppositePlanner"
 
 `planner_package/` beside this file is such a package.
@@ -12,8 +12,7 @@ import numpy as np
 
 import caryatid as ct
 from caryatid.geometry import transforms
-from caryatid.planning.decision import check_candidates, path_cost
-from caryatid.planning.planners import Decision, PlanningState
+from caryatid.planning.decision import Decision, PlanningState, check_candidates, path_cost
 from caryatid.simulation import load_scene
 from caryatid.simulation.setup import make_simulation
 

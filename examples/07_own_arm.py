@@ -8,9 +8,9 @@ import numpy as np
 import caryatid as ct
 from caryatid.evaluation import score, true_scene_from_simulation
 from caryatid.geometry.transforms import Array
+from caryatid.robots import Surroundings
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.reachability import sample_reachability
-from caryatid.robots.registry import Surroundings
 from caryatid.simulation import ground_truth, load_scene
 from caryatid.simulation.setup import make_simulation
 

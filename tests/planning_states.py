@@ -11,7 +11,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.planners import PlanningState
+from caryatid.planning.decision import PlanningState
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction

@@ -11,7 +11,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.planners import Decision
+from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View

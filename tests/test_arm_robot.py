@@ -13,9 +13,10 @@ from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import explore, next_best_view
 from caryatid.geometry import transforms
+from caryatid.robots import Posture, Unreachable, home_view, view_sphere_of
 from caryatid.robots.arm import REASONS, UNCONFIRMED, ArmRobot
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.humanoid import HumanoidRobot, Posture, Unreachable, home_view, view_sphere_of
+from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.reachability import sample_reachability
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere

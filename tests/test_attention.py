@@ -12,7 +12,7 @@ from test_planners import CONFIG, CUBE, HOME, OPEN, SPHERE, TABLE, box, known, s
 
 from caryatid.geometry import transforms
 from caryatid.graph import Support, SupportGraph
-from caryatid.planning.hidden_surface import surface_samples, visibility
+from caryatid.planning.expected_visibility import surface_samples, visibility
 from caryatid.planning.planners import make_planner
 from caryatid.sensing.view_sphere import direction
 

@@ -19,7 +19,8 @@ from PIL import Image
 from caryatid.config import Config
 from caryatid.io import read_run
 from caryatid.io.bop import read_recording
-from caryatid.planning.planners import BUILT_IN, SupportPlanner
+from caryatid.planning.planners import BUILT_IN
+from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene

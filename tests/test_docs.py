@@ -23,8 +23,7 @@ from conftest import SMALL, run_command, without_labels
 import caryatid as ct
 from caryatid.config.settings import write_settings
 from caryatid.io.images import png
-from caryatid.robots.reachability import sample_reachability
-from caryatid.robots.reachability_files import write_reachability
+from caryatid.robots.reachability import sample_reachability, write_reachability
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -14,7 +14,7 @@ from caryatid.exploration import Explorer, Step, explore, next_best_view
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.io.runs import RunWriter, read_run
-from caryatid.planning.planners import RandomPlanner
+from caryatid.planning.planners.baselines import RandomPlanner
 from caryatid.robots.recording import RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation

@@ -16,8 +16,7 @@ from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.manipulation.rehearsal import Rehearsal
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import TABLE_HEIGHT, Solid, build_spec, scene_from_spec
-from caryatid.support.relations import infer
-from caryatid.support.removal import predict_removal
+from caryatid.support.relations import infer, predict_removal
 
 CONFIG = replace(Config(), rehearsal=RehearsalConfig(draws=2), lift=LiftConfig(watch=1.0))
 TOP = TABLE_HEIGHT

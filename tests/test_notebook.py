@@ -18,7 +18,7 @@ from caryatid.geometry.transforms import look_at
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.manipulation.order import Order, TakeStep
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.planners import Decision
+from caryatid.planning.decision import Decision
 from caryatid.runtime.display import Pictured
 from caryatid.sensing.views import Cloud, View
 from caryatid.simulation import load_scene

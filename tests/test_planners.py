@@ -13,8 +13,15 @@ from caryatid.geometry import transforms
 from caryatid.graph import Support, SupportGraph
 from caryatid.planning import planners
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.hidden_surface import SPACE, space_samples, surface_samples, unseen_shares, visibility
+from caryatid.planning.expected_visibility import (
+    SPACE,
+    space_samples,
+    surface_samples,
+    unseen_shares,
+    visibility,
+)
 from caryatid.planning.planners import BUILT_IN, make_planner
+from caryatid.planning.planners.baselines import RandomPlanner
 from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import direction
 from caryatid.sensing.voxel_map import VoxelMap
@@ -73,9 +80,9 @@ def test_an_unknown_planner_lists_those_there_are():
 
 
 def test_other_packages_offer_planners_by_entry_point(monkeypatch: pytest.MonkeyPatch):
-    offer = EntryPoint("mine", "caryatid.planning.planners.random:RandomPlanner", planners.ENTRY_POINTS)
+    offer = EntryPoint("mine", "caryatid.planning.planners.baselines:RandomPlanner", planners.ENTRY_POINTS)
     monkeypatch.setattr(planners, "entry_points", lambda group: [offer] if group == offer.group else [])
-    assert isinstance(make_planner("mine"), planners.RandomPlanner)
+    assert isinstance(make_planner("mine"), RandomPlanner)
     with pytest.raises(InputError, match=f"{', '.join(BUILT_IN)}, mine"):
         make_planner("best")
 

@@ -12,10 +12,10 @@ from planning_states import CONFIG, CUBE, HOME, ON_TABLE, OPEN, TABLE, box, cand
 
 from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
-from caryatid.planning.hidden_surface import space_above
-from caryatid.planning.information import gather, gather_reference
-from caryatid.planning.planners import PlanningState, make_planner
-from caryatid.planning.planners.volumetric import FORMULATIONS, image_rays, layers, ray_information
+from caryatid.planning.decision import PlanningState
+from caryatid.planning.expected_visibility import space_above
+from caryatid.planning.planners import VOLUMETRIC, make_planner
+from caryatid.planning.planners.volumetric import gather, image_rays, layers, ray_information
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
 SIZE = 0.01
@@ -47,7 +47,7 @@ def along(voxels: VoxelMap, proximity: float = 0.1, backwards: bool = False) -> 
     gathered = gather(
         voxels.states, layers(voxels, proximity), T_world_camera[None], STRAIGHT, np.zeros(3), SIZE
     )
-    return dict(zip(FORMULATIONS, gathered[0], strict=True))
+    return dict(zip(VOLUMETRIC, gathered[0], strict=True))
 
 
 class TestFormulas:
@@ -97,31 +97,9 @@ class TestFormulas:
         poses = np.stack([transforms.look_at(middle + (x, 0.0, 0.0), middle) for x in (-1.0, 1.0)])
         found = gather(voxels.states, layers(voxels, 0.1), poses, image_rays(CONFIG), np.zeros(3), SIZE)
         for name in SHOWN:
-            front, back = found[:, FORMULATIONS.index(name)]
+            front, back = found[:, VOLUMETRIC.index(name)]
             assert front == 0.0
             assert back > 100.0 * (SIZE if name == "proximity-count" else 1.0)
-
-
-def random_map(rng: np.random.Generator) -> VoxelMap:
-    hits = rng.integers(0, 3, (13, 17, 11)) * (rng.random((13, 17, 11)) < 0.1)
-    passes = rng.integers(0, 3, hits.shape)
-    config = VoxelConfig(size=0.05, readings=1)
-    return VoxelMap(np.array([-0.3, -0.4, -0.2]), hits.astype(np.uint8), passes.astype(np.uint8), config)
-
-
-def test_the_kernel_agrees_with_its_reference():
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        voxels = random_map(rng)
-        assert {UNKNOWN, FREE, OCCUPIED} == set(np.unique(voxels.states))
-        eyes = rng.uniform(-1.5, 1.5, (4, 3))
-        eyes[0] = (0.01, 0.02, 0.03)
-        poses = np.stack([transforms.look_at(eye, rng.uniform(-0.2, 0.2, 3)) for eye in eyes])
-        rays_camera = transforms.unit(rng.normal(size=(150, 3)) * (0.3, 0.3, 0.0) + (0.0, 0.0, 1.0))
-        args = (voxels.states, layers(voxels, 0.2), poses, rays_camera, voxels.origin_world, 0.05)
-        compiled, reference = gather(*args), gather_reference(*args)
-        assert (reference > 1.0).all()
-        np.testing.assert_allclose(compiled, reference, rtol=1e-9)
 
 
 THREADED = """
@@ -178,7 +156,7 @@ def beside_screen(side: float, **settings: object) -> PlanningState:
     return replace(state([SCREEN], (ON_TABLE,), **settings), voxels=unseen_beside_screen(side))
 
 
-SHOWN = [name for name in FORMULATIONS if name != "occlusion-aware"]
+SHOWN = [name for name in VOLUMETRIC if name != "occlusion-aware"]
 """Those that count nothing of what has been seen free."""
 
 
@@ -190,7 +168,7 @@ def test_it_goes_to_the_side_that_shows_unknown_space(name: str, side: float):
     assert decision.saliency == 1.0
 
 
-@pytest.mark.parametrize("name", FORMULATIONS)
+@pytest.mark.parametrize("name", VOLUMETRIC)
 class TestPlanner:
     def test_its_score_is_the_utility(self, name: str):
         situation = beside_screen(1.0, cost_weight=0.7, path_cost="angle")
@@ -264,6 +242,6 @@ def test_occupancy_follows_the_evidence_within_the_clamp():
 def test_nearness_is_reckoned_for_those_who_ask_for_it():
     situation, poses = beside_screen(1.0), OPEN.T_world_camera[::300]
     near, asked = ray_information(situation, poses, 0.1), ray_information(situation, poses)
-    column = FORMULATIONS.index("proximity-count")
+    column = VOLUMETRIC.index("proximity-count")
     np.testing.assert_array_equal(np.delete(near, column, axis=1), np.delete(asked, column, axis=1))
     assert near[:, column].max() > 0.0 == asked[:, column].max()

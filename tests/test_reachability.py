@@ -6,9 +6,13 @@ from arms import HIGH, LIMITS, LOW, PITCH, gantry
 
 from caryatid.config import ArmConfig
 from caryatid.errors import InputError
-from caryatid.robots import reachability_files as reachability_npz
-from caryatid.robots.reachability import ReachabilityMap, sample_reachability
-from caryatid.robots.reachability_files import read_reachability, write_reachability
+from caryatid.robots import reachability as reachability_npz
+from caryatid.robots.reachability import (
+    ReachabilityMap,
+    read_reachability,
+    sample_reachability,
+    write_reachability,
+)
 
 CONFIG = ArmConfig(cell=0.1, view_directions=60)
 BIN = np.deg2rad(35.0)

@@ -8,8 +8,9 @@ import pytest
 from caryatid.config import ActiveVisionConfig, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
+from caryatid.robots import Posture, Unreachable, home_view
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.humanoid import HumanoidRobot, Posture, Unreachable, home_view
+from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 

@@ -10,15 +10,14 @@ import pytest
 from arms import SLIDES, gantry, within_arms_length
 from conftest import SMALL, run_command
 
+from caryatid import robots
 from caryatid.config import ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError
-from caryatid.robots import registry as robots
+from caryatid.robots import Posture, Surroundings, find_robot
 from caryatid.robots.arm import ArmRobot
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.humanoid import HumanoidRobot, Posture
-from caryatid.robots.reachability import sample_reachability
-from caryatid.robots.reachability_files import write_reachability
-from caryatid.robots.registry import Surroundings, find_robot
+from caryatid.robots.humanoid import HumanoidRobot
+from caryatid.robots.reachability import sample_reachability, write_reachability
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sessions import Session
 from caryatid.sessions.next_view import table_floor

@@ -19,8 +19,15 @@ from caryatid.evaluation import (
     score_masks,
     score_scenes,
 )
-from caryatid.evaluation.overlaps import TrueObject, assign, mask_ious, volume_ious
-from caryatid.evaluation.scores import TrueScene, score_matches, top_height
+from caryatid.evaluation.scores import (
+    TrueObject,
+    TrueScene,
+    assign,
+    mask_ious,
+    score_matches,
+    top_height,
+    volume_ious,
+)
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph

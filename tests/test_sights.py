@@ -4,7 +4,7 @@ import numpy as np
 import shapely
 
 from caryatid.geometry import transforms
-from caryatid.planning.unseen_space import unseen_space, unseen_space_reference
+from caryatid.planning.expected_visibility import unseen_space, unseen_space_reference
 from caryatid.sensing.visibility import shown, shown_reference
 
 

@@ -14,8 +14,6 @@ import pytest
 import caryatid
 import caryatid.exports
 import caryatid.io.recordings
-import caryatid.planning.planners
-from caryatid.planning.information import FORMULATIONS
 
 HEAVY = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx", "matplotlib", "trimesh", "PIL", "jinja2")
 
@@ -90,9 +88,7 @@ def declared(package):
     return {alias.name: node.module for node in imports for alias in node.names}
 
 
-@pytest.mark.parametrize(
-    "package", [caryatid, caryatid.planning.planners, caryatid.io.recordings, caryatid.exports]
-)
+@pytest.mark.parametrize("package", [caryatid, caryatid.io.recordings, caryatid.exports])
 def test_names_come_from_where_type_checkers_are_told(package):
     names = declared(package)
     assert names
@@ -103,7 +99,7 @@ def test_names_come_from_where_type_checkers_are_told(package):
 
 
 def test_a_package_has_its_modules_and_nothing_else():
-    done = python("import caryatid; caryatid.planning.planners.ring.RingPlanner; caryatid.frame")
+    done = python("import caryatid; caryatid.planning.planners.baselines.RingPlanner; caryatid.frame")
     assert done.returncode == 1
     assert "AttributeError: module 'caryatid' has no attribute 'frame'" in done.stderr
 
@@ -113,10 +109,6 @@ def test_what_is_missing_in_a_module_of_ours_is_said_as_it_is():
     done = python("import sys; sys.modules['numpy'] = None; import caryatid; caryatid.geometry.transforms")
     assert done.returncode == 1
     assert "ModuleNotFoundError: import of numpy halted" in done.stderr
-
-
-def test_the_volumetric_planners_are_those_there_are_formulations_of():
-    assert caryatid.planning.planners.VOLUMETRIC == FORMULATIONS
 
 
 INTERRUPTED = """

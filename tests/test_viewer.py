@@ -18,7 +18,7 @@ from caryatid.io.graph_json import graph_text
 from caryatid.io.runs import read_run
 from caryatid.manipulation.order import TakeStep
 from caryatid.sources import open_recording, open_source
-from caryatid.support.removal import Effect, predict_removal
+from caryatid.support.relations import Effect, predict_removal
 from caryatid.viewer import words
 from caryatid.viewer.apart import PageApart
 from caryatid.viewer.canvas import same

@@ -11,7 +11,7 @@ from caryatid.config import Config, SensorConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
-from caryatid.robots.humanoid import Robot
+from caryatid.robots import Robot
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.views import View
 from caryatid.simulation.scenes import load_scene

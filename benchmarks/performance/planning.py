@@ -11,7 +11,8 @@ import numpy as np
 from caryatid import Config, Scene, SceneObject, Support, SupportGraph
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.planners import Decision, PlanningState, make_planner
+from caryatid.planning.decision import Decision, PlanningState
+from caryatid.planning.planners import make_planner
 from caryatid.planning.points_of_interest import points_of_interest
 from caryatid.runtime.threads import one_blas_thread
 from caryatid.sensing.view_sphere import ViewSphere

@@ -37,7 +37,8 @@ from caryatid.config import Config
 from caryatid.exploration import Step, explore
 from caryatid.geometry.transforms import Array
 from caryatid.manipulation.order import plan_order
-from caryatid.planning.planners import Decision, PlanningState, make_planner
+from caryatid.planning.decision import Decision, PlanningState
+from caryatid.planning.planners import make_planner
 from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.setup import make_simulation

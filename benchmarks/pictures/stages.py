@@ -15,7 +15,7 @@ from solids import Eye, draw_solids
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.planning.planners import Decision
+from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud

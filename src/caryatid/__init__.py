@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from caryatid.fitting.primitives import fit
     from caryatid.geometry.shapes import Box, Cylinder, Sphere
     from caryatid.graph import SceneObject, Support, SupportGraph
-    from caryatid.planning.planners import Planner
-    from caryatid.robots.humanoid import Robot
+    from caryatid.planning.decision import Planner
+    from caryatid.robots import Robot
     from caryatid.scene import Scene
     from caryatid.sensing.views import Camera, Cloud, View
     from caryatid.sessions.session import Session
@@ -58,7 +58,7 @@ if not TYPE_CHECKING:
             "graph": ["SceneObject", "Support", "SupportGraph"],
             "planning.decision": ["Planner"],
             "fitting.primitives": ["fit"],
-            "robots.humanoid": ["Robot"],
+            "robots": ["Robot"],
             "scene": ["Scene"],
             "sessions.session": ["Session"],
             "geometry.shapes": ["Box", "Cylinder", "Sphere"],

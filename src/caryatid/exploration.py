@@ -15,10 +15,10 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.objects.change import changed
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.decision import path_cost
-from caryatid.planning.planners import Decision, Planner, PlanningState, make_planner
+from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
+from caryatid.planning.planners import make_planner
+from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.robots.arm import ArmRobot
-from caryatid.robots.humanoid import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.runtime.display import Pictured
 from caryatid.runtime.stopwatch import Stopwatch
 from caryatid.runtime.threads import one_blas_thread

@@ -28,8 +28,7 @@ from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.plausibility import reconcile
-from caryatid.support.relations import explain, infer
-from caryatid.support.removal import Effect, predict_removal
+from caryatid.support.relations import Effect, explain, infer, predict_removal
 
 if TYPE_CHECKING:
     import networkx as nx

@@ -14,10 +14,8 @@ from caryatid.errors import InputError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.io.bop import Recording, read_recording
-from caryatid.robots.humanoid import Robot
-from caryatid.robots.recording import RecordingRobot
-from caryatid.robots.recording_camera import RecordingCamera
-from caryatid.robots.registry import HUMANOID, find_robot
+from caryatid.robots import HUMANOID, Robot, find_robot
+from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.sensing.views import Camera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation

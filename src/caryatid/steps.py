@@ -20,7 +20,7 @@ from caryatid.io.runs import Run, RunWriter
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.robots.humanoid import Posture
+from caryatid.robots import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
 

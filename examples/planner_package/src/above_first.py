@@ -3,8 +3,7 @@
 import numpy as np
 
 from caryatid.geometry import transforms
-from caryatid.planning.decision import check_candidates, path_cost
-from caryatid.planning.planners import Decision, PlanningState
+from caryatid.planning.decision import Decision, PlanningState, check_candidates, path_cost
 
 
 class AboveFirst:

@@ -15,8 +15,8 @@ from caryatid.cli.completion import Shell
 from caryatid.cli.reading import MARKERS, one_of_commands
 from caryatid.planning.planners import BUILT_IN, ORACLE
 from caryatid.planning.planners import offered as offered_planners
-from caryatid.robots.registry import HUMANOID
-from caryatid.robots.registry import offered as offered_robots
+from caryatid.robots import HUMANOID
+from caryatid.robots import offered as offered_robots
 from caryatid.simulation.scenes import DESIGNED
 
 SCENES = [*DESIGNED, "pile-8-0", "dense-12-0", "packed-20-0"]

@@ -15,8 +15,7 @@ from caryatid.errors import InputError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.io.json_files import json_text
 from caryatid.io.runs import RunWriter
-from caryatid.manipulation.dismantling import Taken, bodies_of, dismantle
-from caryatid.manipulation.documents import dismantling_record
+from caryatid.manipulation.dismantling import Taken, bodies_of, dismantle, dismantling_record
 from caryatid.manipulation.order import Order, plan_order
 from caryatid.runtime.interrupts import NOTHING, Interrupted, interrupted, interruptible
 from caryatid.runtime.threads import cores

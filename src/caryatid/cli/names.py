@@ -10,7 +10,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from caryatid.benchmark.suites import SUITES, find_suite
 from caryatid.errors import InputError
 from caryatid.planning.planners import BUILT_IN, ORACLE, make_planner
-from caryatid.robots.registry import ARM, HUMANOID, find_robot
+from caryatid.robots import ARM, HUMANOID, find_robot
 
 
 def name_of(find: Callable[[str], object], metavar: Iterable[str]) -> PrimitiveConstructorSpec[str]:

@@ -37,8 +37,7 @@ class Order(ModellingCommand):
         from caryatid.cli.taking import print_order
         from caryatid.io.json_files import json_text
         from caryatid.io.runs import read_run
-        from caryatid.manipulation.documents import order_record
-        from caryatid.manipulation.order import plan_order
+        from caryatid.manipulation.order import order_record, plan_order
         from caryatid.runtime.interrupts import interruptible
         from caryatid.runtime.threads import cores
 

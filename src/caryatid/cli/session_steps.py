@@ -13,7 +13,7 @@ from caryatid.cli.session import Add, Graph, New, Next, Undo
 from caryatid.config import Config
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.json_files import json_text, read_json
-from caryatid.robots.registry import located
+from caryatid.robots import located
 from caryatid.runtime.interrupts import Interrupted, interruptible
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.next_view import candidates_from

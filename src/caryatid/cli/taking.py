@@ -8,8 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from caryatid.cli.consoles import result_console
-from caryatid.manipulation.dismantling import Taken
-from caryatid.manipulation.documents import succeeded
+from caryatid.manipulation.dismantling import Taken, succeeded
 from caryatid.manipulation.order import Order
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from caryatid.evaluation.overlaps import TrueObject
 from caryatid.evaluation.scores import (
     Score,
+    TrueObject,
     TrueScene,
     as_scene,
     score,

@@ -18,8 +18,9 @@ from caryatid.evaluation.truths import SEED
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text
-from caryatid.planning.decision import check_candidates, path_cost
-from caryatid.planning.planners import ORACLE, Decision, Planner, PlanningState, SupportPlanner, make_planner
+from caryatid.planning.decision import Decision, Planner, PlanningState, check_candidates, path_cost
+from caryatid.planning.planners import ORACLE, make_planner
+from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.scene import Scene
 from caryatid.sensing.views import Camera, View
 from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render

@@ -10,8 +10,7 @@ import numpy as np
 
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
-from caryatid.evaluation.overlaps import TrueObject
-from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
+from caryatid.evaluation.scores import Score, TrueObject, TrueScene, score, score_masks
 from caryatid.io.bop import Frame, Recording, read_recording
 from caryatid.io.runs import Run, RunView, read_run
 from caryatid.simulation import world

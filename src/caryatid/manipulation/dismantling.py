@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,7 +13,7 @@ from caryatid.config import Config, EvaluationConfig
 from caryatid.evaluation.scores import TrueScene, score
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.manipulation.order import TakeStep
+from caryatid.manipulation.order import Order, TakeStep
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.world import SimulatedScene
 
@@ -86,6 +87,32 @@ def dismantle(
         state = lift.state
         gone.add(body)
         yield Taken(step, body, held, disturbed, lift.film)
+
+
+def dismantling_record(order: Order, taken: Sequence[Taken], left: Sequence[str]) -> dict[str, Any]:
+    """What came of an order.
+
+    Args:
+        order: The order.
+        taken: Each of its steps, done.
+        left: Names of the bodies that nobody took.
+    """
+    steps = [
+        t.step.to_json() | {"body": t.body, "held": list(t.held), "ok": t.ok, "disturbed": list(t.disturbed)}
+        for t in taken
+    ]
+    return {
+        "success": succeeded(taken, left),
+        "steps": steps,
+        "left": list(left),
+        "safe": order.safe,
+        "refusal": order.refusal or None,
+    }
+
+
+def succeeded(taken: Sequence[Taken], left: Sequence[str]) -> bool:
+    """Everything was taken and nothing disturbed."""
+    return not left and all(t.ok for t in taken)
 
 
 def poses_of(scene: SimulatedScene) -> Array:

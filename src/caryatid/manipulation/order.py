@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import networkx as nx
 import numpy as np
@@ -32,6 +33,16 @@ class TakeStep:
     safe: bool
     risk: float
     why: str
+
+    def to_json(self) -> dict[str, Any]:
+        """One entry of `steps` in what `--json` writes."""
+        return {
+            "object": self.object_id,
+            "hold": list(self.hold),
+            "safe": self.safe,
+            "risk": self.risk,
+            "why": self.why,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +119,15 @@ def plan_order(
         steps.append(_step(graph, option, rehearsal))
         rehearsal.take(option.object_id, option.trial)
     return Order(tuple(steps), refusal)
+
+
+def order_record(order: Order) -> dict[str, Any]:
+    """An order: its steps, whether it is safe, and why not."""
+    return {
+        "steps": [step.to_json() for step in order.steps],
+        "safe": order.safe,
+        "refusal": order.refusal or None,
+    }
 
 
 def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:

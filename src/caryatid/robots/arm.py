@@ -14,8 +14,8 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
+from caryatid.robots import OwnViews, Posture, Unreachable
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.humanoid import OwnViews, Posture, Unreachable
 from caryatid.sensing.view_sphere import ViewSphere
 
 Reachable = Callable[[Array], NDArray[np.bool_]]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +12,9 @@ from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
+from caryatid.robots import Posture, Unreachable
 from caryatid.robots.floor import FloorGrid
-from caryatid.sensing.view_sphere import ViewSphere, direction
+from caryatid.sensing.view_sphere import ViewSphere
 
 REASONS = (
     "the camera would be too low",
@@ -27,95 +27,6 @@ REASONS = (
     "a wall stands in the line of sight",
 )
 """Why a view is refused; the first that applies counts."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Posture:
-    """How the robot holds its camera at a pose.
-
-    Attributes:
-        platform_world: Platform (3,): x, y, yaw [m, m, rad].
-        camera_height: Height of the camera centre over the floor [m], set by the torso lift.
-        head_yaw: Against the platform, to the left [rad].
-        head_pitch: Upwards [rad].
-    """
-
-    platform_world: Array
-    camera_height: float
-    head_yaw: float
-    head_pitch: float
-
-
-@dataclass(frozen=True, slots=True)
-class Unreachable:
-    """No posture.
-
-    Attributes:
-        reason: Why, for a person to read.
-    """
-
-    reason: str
-
-
-class Robot(Protocol):
-    """What carries the camera; one with views of its own is an `OwnViews` too."""
-
-    @property
-    def T_world_camera(self) -> Array:
-        """Where the camera is now (4, 4)."""
-        ...
-
-    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot.
-
-        Args:
-            T_world_camera: Pose of its camera (4, 4).
-        """
-        ...
-
-    def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Return the views of the sphere that can be reached.
-
-        Args:
-            sphere: The view sphere.
-        """
-        ...
-
-    def move_to(self, T_world_camera: Array) -> float:
-        """Go there and return the length of the way [m].
-
-        Args:
-            T_world_camera: Pose of its camera (4, 4).
-
-        Raises:
-            PlanningError: The pose cannot be reached.
-        """
-        ...
-
-
-class OwnViews:
-    """What a robot may say beyond `Robot`: one that inherits this is asked, another is not."""
-
-    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
-        """Say on which sphere this robot's views lie: radius, centre and points.
-
-        What is asked twice, also about its own answer, is answered with the same sphere.
-
-        Args:
-            proposed: The sphere of the settings around the middle of the table top.
-
-        Returns:
-            The proposed one, unless a robot says otherwise.
-        """
-        return proposed
-
-    def confirm(self, T_world_camera: Array) -> Unreachable | None:
-        """Say why a candidate (4, 4) that was chosen cannot be taken after all; then another one is chosen.
-
-        Returns:
-            None, go ahead, unless a robot says otherwise.
-        """
-        return None
 
 
 class HumanoidRobot:
@@ -303,51 +214,6 @@ class _Offer:
     led_to: NDArray[np.bool_]
     candidates: Candidates
     cells: NDArray[np.intp]
-
-
-def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
-    """Return the sphere a robot's views lie on: its own where it has one, else the proposed.
-
-    Args:
-        robot: Is asked where it inherits `OwnViews`.
-        proposed: The sphere of the settings around the middle of the table top.
-    """
-    return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
-
-
-def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
-    """Why a robot, looking closer where it can, does not take a candidate (4, 4), or None.
-
-    Args:
-        robot: Is asked where it inherits `OwnViews`.
-        T_world_camera: The candidate (4, 4).
-    """
-    return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
-
-
-def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
-    """Pick the first view: the reachable candidate (4, 4) nearest to `config.home` on its view sphere.
-
-    Args:
-        robot: Says what it can reach.
-        sphere: What it is proposed.
-        config: Where the first view is to be.
-
-    Raises:
-        PlanningError: No view of the sphere can be reached.
-    """
-    candidates = robot.candidates(view_sphere_of(robot, sphere))
-    if len(candidates) == 0:
-        why = ", ".join(f"{reason} ({count})" for reason, count in candidates.rejected.items())
-        raise PlanningError(f"no view of the sphere can be reached: {why}")
-    nearness = candidates.directions @ direction(*np.deg2rad(config.home))
-    reasons: set[str] = set()
-    for index in np.argsort(-nearness, kind="stable"):
-        refused = refusal_of(robot, candidates.T_world_camera[index])
-        if refused is None:
-            return candidates.T_world_camera[index]
-        reasons.add(refused.reason)
-    raise PlanningError(f"no view of the sphere can be reached: {', '.join(sorted(reasons))}")
 
 
 def _wrap(angle: Array) -> Array:

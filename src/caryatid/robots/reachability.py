@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import os
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +20,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
+from caryatid.io.staging import write_file
 
 Forward = Callable[[Array], Array]
 """Forward kinematics: joints (N, J) [rad, or m] → `T_base_camera` (N, 4, 4)."""
@@ -23,6 +30,15 @@ ROLLS = 8
 
 CHUNK = 100_000
 """Postures that are sampled at a time at the most: 13 MB of poses."""
+
+FORMAT, VERSION = "caryatid/reachability", 1
+"""What the file says it is."""
+
+MAX_BYTES = 2**31
+"""A larger map is refused before it is unpacked; 3 m of cells of 2 cm with 600 directions are as much."""
+
+REMEDY = "sample it again and write it with write_reachability"
+"""What to do where a file is broken."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -93,7 +109,7 @@ def sample_reachability(
     chunk = min(CHUNK, -(-count // 10))
     for start in range(0, count, chunk):
         joints = rng.uniform(bounds[:, 0], bounds[:, 1], (min(chunk, count - start), len(bounds)))
-        T_base_camera = _checked(forward(joints), len(joints))
+        T_base_camera = _checked_poses(forward(joints), len(joints))
         if len(T_base_camera) == 0:
             continue
         cells = np.floor(T_base_camera[:, :3, 3] / config.cell).astype(np.intp)
@@ -105,6 +121,52 @@ def sample_reachability(
     if not reached.any():
         raise InputError("forward", "holds no posture possible, all are NaN", "check it and the limits")
     return ReachabilityMap(reached, low.astype(np.float64) * config.cell, config.cell, fresh)
+
+
+def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityMap) -> None:
+    """Write a map; the file appears whole or not at all, and the same map gives the same bytes.
+
+    Args:
+        path: The file, `.npz`.
+        reachability: The map.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+    buffer = io.BytesIO()
+    np.savez_compressed(
+        buffer,
+        format=np.array(FORMAT),
+        version=np.array(VERSION),
+        reached=reachability.reached,
+        origin_base=reachability.origin_base,
+        cell=np.array(reachability.cell),
+        fresh=np.array(reachability.fresh),
+    )
+    write_file(Path(path), buffer.getvalue())
+
+
+def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
+    """Read a map.
+
+    Raises:
+        InputError: The file is missing, damaged, something else, or from another version.
+    """
+    file = Path(path)
+    try:
+        with zipfile.ZipFile(file) as archive:
+            size = sum(entry.file_size for entry in archive.infolist())
+        if size > MAX_BYTES:
+            raise InputError(file, f"would unpack to {size / 2**30:.1f} GiB", "sample it with larger cells")
+        with np.load(file, allow_pickle=False) as stored:
+            held = {name: stored[name] for name in stored.files}
+    except FileNotFoundError:
+        raise InputError(file, "the file is missing", REMEDY) from None
+    except OSError as error:
+        raise InputError(file, f"cannot be read ({error.strerror})", "give a file you may read") from error
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError, MemoryError) as error:
+        raise InputError(file, f"is no readable .npz: {error}", REMEDY) from None
+    return _checked_map(held, file)
 
 
 class _Bins:
@@ -130,7 +192,7 @@ class _Bins:
         return nearest, np.left_shift(1, eighth).astype(np.uint8)
 
 
-def _checked(T_base_camera: ArrayLike, count: int) -> Array:
+def _checked_poses(T_base_camera: ArrayLike, count: int) -> Array:
     """Poses (M, 4, 4) of the postures that are possible.
 
     Raises:
@@ -161,3 +223,26 @@ def _grown(
     if not (before.any() or after.any()):
         return reached, low
     return np.pad(reached, [*zip(before, after, strict=True), (0, 0)]), low - before
+
+
+def _checked_map(held: dict[str, Any], file: Path) -> ReachabilityMap:
+    """Make a map of the arrays of a file, if they are those of one."""
+    if "format" not in held or str(held["format"]) != FORMAT:
+        raise InputError(file, f"is no map of what an arm reaches, its format is not '{FORMAT}'", REMEDY)
+    wanted = ("version", "reached", "origin_base", "cell", "fresh")
+    if missing := [name for name in wanted if name not in held]:
+        raise InputError(file, f"holds no {missing[0]}", REMEDY)
+    if held["version"].shape != () or held["version"] != VERSION:
+        raise InputError(file, f"has version {held['version']}, not {VERSION}", REMEDY)
+    reached, origin = held["reached"], held["origin_base"]
+    if reached.ndim != 4 or reached.dtype != np.uint8 or reached.size == 0:
+        raise InputError(
+            file, f"its map is {reached.dtype} of shape {reached.shape}, not uint8 (X, Y, Z, D)", REMEDY
+        )
+    numbers = [("origin_base", origin, (3,)), ("cell", held["cell"], ()), ("fresh", held["fresh"], ())]
+    for name, value, shape in numbers:
+        if value.shape != shape or value.dtype.kind != "f" or not np.isfinite(value).all():
+            raise InputError(file, f"its {name} is not a finite number of shape {shape}", REMEDY)
+    if held["cell"] <= 0.0:
+        raise InputError(file, f"its cells are {held['cell']:g} m wide", REMEDY)
+    return ReachabilityMap(reached, origin.astype(np.float64), float(held["cell"]), float(held["fresh"]))

@@ -1,4 +1,4 @@
-"""A robot that plays a recording back: its camera can only be where a recorded view is."""
+"""A recording played back: the robot can only be where a recorded view is, the camera gives that view."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import numpy as np
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.io.bop import Recording
 from caryatid.planning.candidates import Candidates
-from caryatid.robots.humanoid import Posture, Unreachable
+from caryatid.robots import Posture, Unreachable
 from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import View
 
 SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3
 """Poses nearer than this [m], [rad] are the same recorded view."""
@@ -92,3 +94,27 @@ class RecordingRobot:
         length = float(np.linalg.norm(self._recorded[index, :3, 3] - self.T_world_camera[:3, 3]))
         self._used.append(index)
         return length
+
+
+class RecordingCamera:
+    """Gives the recorded frame nearest to a pose.
+
+    Args:
+        recording: Frames with poses, or a single frame.
+
+    Raises:
+        InputError: Several frames of which some have no pose.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        if len(recording) > 1 and not recording.has_poses:
+            raise InputError(
+                recording.folder, "has several frames without poses", "add cam_R_w2c and cam_t_w2c to each"
+            )
+        self._recording = recording
+
+    def capture(self, T_world_camera: Array) -> View:
+        """Return the frame recorded nearest to a pose (4, 4)."""
+        poses = [f.T_world_camera for f in self._recording.frames]
+        distances = [0.0 if T is None else np.abs(T[:3] - T_world_camera[:3]).max() for T in poses]
+        return self._recording.frames[int(np.argmin(distances))].load()

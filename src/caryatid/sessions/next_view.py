@@ -15,10 +15,18 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.json_files import Numbers, parse_json
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.planners import Decision
+from caryatid.planning.decision import Decision
+from caryatid.robots import (
+    HUMANOID,
+    OwnViews,
+    Posture,
+    Surroundings,
+    Unreachable,
+    find_robot,
+    refusal_of,
+    view_sphere_of,
+)
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.humanoid import OwnViews, Posture, Unreachable, refusal_of, view_sphere_of
-from caryatid.robots.registry import HUMANOID, Surroundings, find_robot
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 

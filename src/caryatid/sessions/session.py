@@ -43,7 +43,7 @@ from caryatid.io.staging import (
 )
 from caryatid.objects.change import changed
 from caryatid.planning.planners import make_planner
-from caryatid.robots.registry import HUMANOID, find_robot
+from caryatid.robots import HUMANOID, find_robot
 from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
 from caryatid.sensing.views import View

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from caryatid.config import Config, NoiseModel
+from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, home_view
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.humanoid import Robot, home_view
-from caryatid.robots.registry import HUMANOID, RobotMaker, Surroundings, find_robot
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.world import SimulatedScene, static_boxes, table_top

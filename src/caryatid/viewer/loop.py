@@ -15,9 +15,10 @@ from caryatid.evaluation.scores import score
 from caryatid.exploration import Step, explore
 from caryatid.graph import SupportGraph
 from caryatid.objects.change import changed
-from caryatid.planning.planners import ORACLE, Decision, make_planner
+from caryatid.planning.decision import Decision
+from caryatid.planning.planners import ORACLE, make_planner
+from caryatid.robots import Posture, Robot, refusal_of
 from caryatid.robots.arm import ArmRobot
-from caryatid.robots.humanoid import Posture, Robot, refusal_of
 from caryatid.robots.recording import RecordingRobot
 from caryatid.viewer.moments import Moment, Standing, moment_of_step
 from caryatid.viewer.steering import SteeredRobot, SwitchedPlanner, planned_anew, taken_by_hand

@@ -18,8 +18,8 @@ from caryatid.viz.colours import DEPTH_STOPS, scale
 if TYPE_CHECKING:
     from caryatid.exploration import Step
     from caryatid.planning.candidates import Candidates
-    from caryatid.planning.planners import Decision
-    from caryatid.robots.humanoid import Posture
+    from caryatid.planning.decision import Decision
+    from caryatid.robots import Posture
     from caryatid.scene import Scene
 
 MOST_POINTS = 1_000_000

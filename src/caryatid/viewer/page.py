@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
-from caryatid.support.removal import predict_removal
+from caryatid.support.relations import predict_removal
 from caryatid.viewer import words
 from caryatid.viewer.canvas import Canvas
 from caryatid.viewer.drawing import LAYERS, draw_moment

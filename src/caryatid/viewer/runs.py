@@ -13,7 +13,7 @@ from caryatid.config.settings import changed_settings
 from caryatid.geometry.transforms import Array
 from caryatid.io.json_files import field, number, numbers, rigid_transform
 from caryatid.io.runs import Run
-from caryatid.planning.planners import Decision
+from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.viewer.moments import Moment, moment_of_run_view

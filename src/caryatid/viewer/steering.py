@@ -9,9 +9,8 @@ import numpy as np
 from caryatid.errors import PlanningError
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.decision import path_cost
-from caryatid.planning.planners import Decision, Planner, PlanningState
-from caryatid.robots.humanoid import OwnViews, Posture, Robot, Unreachable, refusal_of, view_sphere_of
+from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
+from caryatid.robots import OwnViews, Posture, Robot, Unreachable, refusal_of, view_sphere_of
 from caryatid.sensing.view_sphere import ViewSphere
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from caryatid.io.graph_json import graph_from_json, graph_to_json
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.planners import Decision
+from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.robots.humanoid import Posture
+from caryatid.robots import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.viewer.moments import Dots, Moment, Shot, Standing
 

@@ -8,7 +8,7 @@ from html import escape
 from importlib import resources
 
 from caryatid.graph import SupportGraph
-from caryatid.support.removal import Effect
+from caryatid.support.relations import Effect
 from caryatid.viewer.moments import Moment
 from caryatid.viz.colours import SALIENCY_STOPS
 from caryatid.viz.graphs import draw_graph

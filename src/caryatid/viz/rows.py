@@ -13,7 +13,7 @@ from caryatid.graph import SceneObject, SupportGraph
 from caryatid.viz import colours
 
 if TYPE_CHECKING:
-    from caryatid.planning.planners import Decision
+    from caryatid.planning.decision import Decision
 
 FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
 """Names of an object's sides, in the order of `SceneObject.seen`."""

@@ -23,17 +23,21 @@ planners know of no shapes.
 from __future__ import annotations
 
 from functools import cache, partial
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from caryatid.config import ActiveVisionConfig
+from caryatid.geometry.rays import Triple, advance, enter, within
 from caryatid.geometry.transforms import Array, unit
 from caryatid.planning.candidates import Looks
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
-from caryatid.planning.hidden_surface import space_above
-from caryatid.planning.information import FORMULATIONS, gather
+from caryatid.planning.expected_visibility import space_above
+from caryatid.planning.planners import VOLUMETRIC
+from caryatid.runtime.parallel import for_each
 from caryatid.sensing.voxel_map import OCCUPIED, UNKNOWN, VoxelMap
 
 
@@ -41,12 +45,12 @@ class VolumetricPlanner:
     """Takes the candidate with the largest utility IG / ΣIG − w · cost / Σcost.
 
     Args:
-        formulation: How information is counted, one of `FORMULATIONS`.
+        formulation: How information is counted, one of `VOLUMETRIC`.
     """
 
     def __init__(self, formulation: str) -> None:
         self.formulation = formulation
-        self._column = FORMULATIONS.index(formulation)
+        self._column = VOLUMETRIC.index(formulation)
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the candidate with the largest utility; of equal ones the first.
@@ -82,7 +86,7 @@ class VolumetricPlanner:
 
 
 def ray_information(state: PlanningState, T_world_camera: Array, proximity: float = 0.0) -> Array:
-    """What the rays of cameras (C, 4, 4) gather (C, 5), a column each of `FORMULATIONS`.
+    """What the rays of cameras (C, 4, 4) gather (C, 5), a column each of `VOLUMETRIC`.
 
     Without a table or objects there is no box to look into, and nothing is gathered; without a `proximity`,
     d_max [m], nothing is near.
@@ -94,7 +98,7 @@ def ray_information(state: PlanningState, T_world_camera: Array, proximity: floa
     """
     corners = space_above(state.graph, state.voxels)
     if corners is None:
-        return np.zeros((len(T_world_camera), len(FORMULATIONS)))
+        return np.zeros((len(T_world_camera), len(VOLUMETRIC)))
     box, config = state.voxels.cut(*corners), state.config
     return gather(
         np.ascontiguousarray(box.states),
@@ -151,4 +155,90 @@ def _shares(values: Array) -> Array:
     return values / total if total > 0.0 else np.zeros_like(values)
 
 
-__all__ = ["FORMULATIONS", "VolumetricPlanner", "image_rays", "layers", "ray_information"]
+class Views(NamedTuple):
+    """Candidate views of a voxel grid.
+
+    Attributes:
+        states: State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied.
+        layers: Occupancy [1], its entropy [bit] and the nearness to a surface of each voxel (X, Y, Z, 3).
+        T_world_camera: Candidates (C, 4, 4).
+        rays_camera: Unit directions (R, 3) of the rays in the camera.
+        origin: Corner (3,) [m] of voxel [0, 0, 0].
+        size: Edge of a voxel [m].
+        gathered: What the rays of each gather (C, 5), 0 at first; written to.
+    """
+
+    states: NDArray[np.int8]
+    layers: NDArray[np.float32]
+    T_world_camera: Array
+    rays_camera: Array
+    origin: Array
+    size: float
+    gathered: Array
+
+
+@njit(cache=True)
+def _gather_ray(
+    states: NDArray[np.int8], layers: NDArray[np.float32], start: Triple, ray: Triple, gathered: Array
+) -> None:
+    """Add what one ray gathers, start and direction in voxel units, to `gathered` (5,)."""
+    shape = states.shape
+    t, end, voxel, step, ahead = enter(shape, start, ray, 0.0, np.inf)
+    visible, run = 1.0, 0.0
+    while t < end and within(voxel, shape):
+        state = states[voxel]
+        occupancy, entropy, proximity = layers[voxel]
+        gathered[0] += visible * entropy
+        if state == UNKNOWN:
+            gathered[1] += visible * entropy
+            gathered[4] += proximity
+            run += entropy
+        elif state == OCCUPIED:
+            if run > 0.0:
+                gathered[2] += 1.0
+                gathered[3] += run
+            return
+        else:
+            run = 0.0
+        visible *= 1.0 - occupancy
+        t = min(ahead[0], ahead[1], ahead[2])
+        voxel, ahead = advance(voxel, ray, step, ahead)
+
+
+def gather(
+    states: NDArray[np.int8],
+    layers: NDArray[np.float32],
+    T_world_camera: Array,
+    rays_camera: Array,
+    origin: Array,
+    size: float,
+) -> Array:
+    """Sum the information the rays of each candidate gather. Every candidate has a sum of its own.
+
+    The arguments are as in `Views`.
+
+    Returns:
+        (C, 5), a column each of `VOLUMETRIC`.
+    """
+    gathered = np.zeros((len(T_world_camera), len(VOLUMETRIC)))
+    for_each(
+        gather_one,
+        len(T_world_camera),
+        Views(states, layers, T_world_camera, rays_camera, origin, size, gathered),
+    )
+    return gathered
+
+
+@njit(cache=True)
+def gather_one(c: int, views: Views) -> None:
+    """Sum what the rays of one candidate gather."""
+    T, size, origin = views.T_world_camera[c], views.size, views.origin
+    start = ((T[0, 3] - origin[0]) / size, (T[1, 3] - origin[1]) / size, (T[2, 3] - origin[2]) / size)
+    for r in range(len(views.rays_camera)):
+        x, y, z = views.rays_camera[r, 0], views.rays_camera[r, 1], views.rays_camera[r, 2]
+        ray = (
+            (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) / size,
+            (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) / size,
+            (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) / size,
+        )
+        _gather_ray(views.states, views.layers, start, ray, views.gathered[c])

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from caryatid.geometry.transforms import Array
     from caryatid.graph import SupportGraph
     from caryatid.manipulation.order import Order
-    from caryatid.planning.planners import Decision
+    from caryatid.planning.decision import Decision
     from caryatid.sensing.views import View
 
 

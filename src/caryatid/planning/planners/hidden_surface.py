@@ -18,7 +18,7 @@ from caryatid.config import ActiveVisionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
-from caryatid.planning.hidden_surface import (
+from caryatid.planning.expected_visibility import (
     SPACE,
     Samples,
     join,

@@ -1,11 +1,35 @@
-"""A fixed ring around the scene: a plan that does not look at what has been found."""
+"""Planners that do not look at the scene: random placement (the paper's baseline), a ring, farthest point."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from caryatid.geometry import transforms
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, go_to
 from caryatid.sensing.view_sphere import direction
+
+
+class RandomPlanner:
+    """Goes to any reachable view, all equally likely."""
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose one of the candidates at random."""
+        check_candidates(state)
+        index = int(rng.integers(len(state.candidates)))
+        return go_to(state, index, f"one of {len(state.candidates)} reachable views, drawn at random")
+
+
+class FarthestPlanner:
+    """Goes where the smallest angle to any earlier view is largest: coverage of the view sphere."""
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the farthest candidate; of equal ones the first."""
+        check_candidates(state)
+        directions = state.candidates.directions
+        nearest = (directions @ state.visited.T).max(axis=1)
+        index = int(np.argmin(nearest))
+        angle = np.rad2deg(transforms.angle_between(state.visited, directions[index]).min())
+        return go_to(state, index, f"{angle:.0f}° from the nearest earlier view, farther than any other")
 
 
 class RingPlanner:

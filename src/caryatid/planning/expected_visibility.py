@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
@@ -14,7 +15,6 @@ from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.planning.unseen_space import unseen_space
 from caryatid.sensing.visibility import shown
 from caryatid.sensing.voxel_map import Solid, VoxelMap
 from caryatid.support.stability import ground_outline
@@ -223,16 +223,92 @@ def _nothing() -> Samples:
     return Samples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.intp), ())
 
 
-__all__ = [
-    "SPACE",
-    "Samples",
-    "join",
-    "relation_samples",
-    "shown_anew",
-    "space_above",
-    "space_samples",
-    "surface_samples",
-    "unseen_shares",
-    "visibility",
-    "weighted",
-]
+@njit(cache=True, error_model="numpy")
+def unseen_space(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    height: float,
+    T_world_table: Array,
+    half: NDArray[np.float64],
+    heap: NDArray[np.float64],
+    states: NDArray[np.int8],
+    origin: Array,
+    solid: NDArray[np.int8],
+    solid_origin: Array,
+    size: float,
+) -> tuple[Array, Array, Array]:
+    """Pick the points of a lattice that are over a table, in voxels no view has seen, and in nothing solid.
+
+    Args:
+        x: Coordinates (X,) of the lattice [m].
+        y: The same (Y,) [m].
+        z: The same (Z,) [m], from the lowest on.
+        height: How far over the lowest points a point is worth nothing [m]; there they are worth 1.
+        T_world_table: Pose (4, 4) of the table.
+        half: Half extents (2,) of its top [m].
+        heap: Corners (M, 2) [m] of a convex polygon on the ground, in either turn; the last may be the first.
+        states: State (X, Y, Z) of each voxel: 0 = unseen.
+        origin: Corner (3,) [m] of voxel [0, 0, 0].
+        solid: Not 0 = solid (X, Y, Z).
+        solid_origin: Corner (3,) [m] of its voxel [0, 0, 0].
+        size: Edge of a voxel [m].
+
+    Returns:
+        Points (N, 3) [m]; their worth (N,) in shares of that of all the lattice over the table, seen or not;
+        and in shares of that of all over the heap.
+    """
+    most = len(x) * len(y) * len(z)
+    points, on_table, in_heap = np.empty((most, 3)), np.empty(most), np.empty(most)
+    table_total, heap_total, count = 0.0, 0.0, 0
+    for b in y:
+        for a in x:
+            among = 1.0 if _within(heap, a, b) else 0.0
+            for c in z:
+                u, v, w = a - T_world_table[0, 3], b - T_world_table[1, 3], c - T_world_table[2, 3]
+                if (
+                    abs(T_world_table[0, 0] * u + T_world_table[1, 0] * v + T_world_table[2, 0] * w) > half[0]
+                    or abs(T_world_table[0, 1] * u + T_world_table[1, 1] * v + T_world_table[2, 1] * w)
+                    > half[1]
+                ):
+                    continue
+                lowness = 1.0 - (c - z[0]) / height
+                table_total += lowness
+                heap_total += among * lowness
+                if (
+                    _value(states, origin, size, a, b, c) == 0
+                    and _value(solid, solid_origin, size, a, b, c) == 0
+                ):
+                    points[count, 0], points[count, 1], points[count, 2] = a, b, c
+                    on_table[count], in_heap[count] = lowness, among * lowness
+                    count += 1
+    return (
+        points[:count],
+        on_table[:count] / max(table_total, 1e-9),
+        in_heap[:count] / max(heap_total, 1e-9),
+    )
+
+
+@njit(cache=True)
+def _within(polygon: NDArray[np.float64], x: float, y: float) -> bool:
+    """Whether a point is inside a convex polygon, and not on its border."""
+    left, right = False, False
+    for n in range(len(polygon)):
+        ax, ay = polygon[n - 1, 0], polygon[n - 1, 1]
+        bx, by = polygon[n, 0], polygon[n, 1]
+        if ax == bx and ay == by:
+            continue
+        turn = (bx - ax) * (y - ay) - (by - ay) * (x - ax)
+        left, right = left or turn >= 0.0, right or turn <= 0.0
+    return left != right
+
+
+@njit(cache=True, error_model="numpy")
+def _value(grid: NDArray[np.int8], origin: Array, size: float, x: float, y: float, z: float) -> int:
+    """What a grid holds at a point; 0 outside."""
+    i = int(np.floor((x - origin[0]) / size))
+    j = int(np.floor((y - origin[1]) / size))
+    k = int(np.floor((z - origin[2]) / size))
+    if 0 <= i < grid.shape[0] and 0 <= j < grid.shape[1] and 0 <= k < grid.shape[2]:
+        return int(grid[i, j, k])
+    return 0
