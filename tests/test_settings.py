@@ -121,7 +121,7 @@ def test_a_value_of_the_wrong_type_says_what_is_wanted(flag, wanted):
         ("noise.translation=-1", "a number from 0 on"),
         ("fit.confidence=1", "a number above 0 and below 1"),
         ("fusion.keep_share=1.01", "a number from 0 to 1"),
-        ("active.good_incidence=90", "a number from 0 to below 90"),
+        ("active.view_cone=90", "a number from 0 to below 90"),
         ("segmentation.hollow=-1.5", "a number from -1 to 1"),
         ("active.max_views=0", "a whole number from 1 on"),
         ("report.jpeg_quality=96", "a whole number from 1 to 95"),

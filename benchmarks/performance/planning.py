@@ -12,6 +12,7 @@ from caryatid import Config, Scene, SceneObject, Support, SupportGraph
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, PlanningState
+from caryatid.planning.expected_visibility import SURFACE_SAMPLES
 from caryatid.planning.planners import make_planner
 from caryatid.planning.points_of_interest import points_of_interest
 from caryatid.runtime.threads import one_blas_thread
@@ -43,7 +44,7 @@ def measure_decision(effort: Effort = FULL) -> list[Row]:
     decided = calls[OURS]()
     active = state.config
     bound = limits.plan_limit(
-        state.voxels.hits.size, len(state.candidates), active.surface_samples, active.look_directions
+        state.voxels.hits.size, len(state.candidates), SURFACE_SAMPLES, active.look_directions
     )
     note = (
         f"{len(state.sphere.directions):,} views, {len(state.candidates):,} within reach; {POINTS} points of "

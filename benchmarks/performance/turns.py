@@ -13,6 +13,7 @@ import numpy as np
 from caryatid import Scene, View, next_best_view
 from caryatid.config import SegmentationMethod
 from caryatid.geometry.transforms import Array
+from caryatid.planning.expected_visibility import SURFACE_SAMPLES
 from caryatid.segmentation.perception import UP
 from caryatid.segmentation.segments import segment
 from caryatid.segmentation.support_plane import find_support_surface
@@ -223,9 +224,7 @@ def _stage_limits(recording: Recording) -> dict[str, tuple[float, float]]:
         "fit": limits.fit_limit(on_objects),
         "infer": (8.0 * SHAPE_NUMBERS * objects, 12.0 * objects * (objects - 1) / 2.0),
         "fuse": (8.0 * SHAPE_NUMBERS * objects, 0.0),
-        "plan": limits.plan_limit(
-            int(voxels), active.sphere_points, active.surface_samples, active.look_directions
-        ),
+        "plan": limits.plan_limit(int(voxels), active.sphere_points, SURFACE_SAMPLES, active.look_directions),
     }
 
 

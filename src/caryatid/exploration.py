@@ -15,7 +15,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.objects.change import changed
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
+from caryatid.planning.decision import ATTEMPTS, Decision, Planner, PlanningState, path_cost
 from caryatid.planning.planners import make_planner
 from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.robots.arm import ArmRobot
@@ -377,14 +377,14 @@ def _decide(
     """Return the decision and the candidates it was taken among: without those the robot refused."""
     rng = np.random.default_rng([seed, len(visited)])
     why = ""
-    for _ in range(scene.config.active.attempts):
+    for _ in range(ATTEMPTS):
         decision = planner.plan(_state(scene, sphere, visited, candidates), rng)
         refused = refusal_of(robot, decision.T_world_camera)
         if refused is None:
             return decision, candidates
         why = refused.reason
         candidates = candidates.without(decision.index, why)
-    raise PlanningError(f"the robot could take none of {scene.config.active.attempts} views: {why}")
+    raise PlanningError(f"the robot could take none of {ATTEMPTS} views: {why}")
 
 
 def _state(scene: Scene, sphere: ViewSphere, visited: Array, candidates: Candidates) -> PlanningState:

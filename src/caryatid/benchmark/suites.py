@@ -207,7 +207,7 @@ _FIG5 = (
     Method("random SG", "random", "sg"),
 )
 _PLANNERS = ("support", "attention", "paper", "random", "ring", "farthest", *VOLUMETRIC, "oracle")
-_FREE = "active.cost_weight=0.0"
+_FREE = "active.path_cost=none"
 """Volumetric planners that do not mind the way."""
 _FUSIONS: tuple[FusionMethod, ...] = ("pc+sg", "pc", "sg")
 _ATTENTION = {
@@ -229,9 +229,6 @@ _SUPPORT = {
     "no inhibition": "active.inhibition=0.0",
     "cost: angle": "active.path_cost=angle",
     "cost: none": "active.path_cost=none",
-    "no relations": "active.relation_weight=0.0",
-    "space: table alone": "active.heap_weight=0.0",
-    "space: heap alone": "active.space_weight=0.0",
     "effort 0": "active.effort=0.0",
     "effort 0.15": "active.effort=0.15",
 }

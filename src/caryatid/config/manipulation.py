@@ -13,8 +13,6 @@ class LiftConfig(Stage):
 
     speed: Positive = 0.1
     """Speed of the lift [m/s]; a careful arm's."""
-    clearance: NotNegative = 0.02
-    """An object is lifted until its lowest point is this far above all others [m], and then taken aside."""
     watch: NotNegative = 2.0
     """How long the others are watched after that [s]; long enough for what tips slowly."""
     moved: NotNegative = 0.02
@@ -36,5 +34,3 @@ class RehearsalConfig(Stage):
     """Density of each object is drawn from this range [kg/m³]: half-empty packets to full bottles."""
     settling: NotNegative = 0.5
     """The extracted shapes are let come to rest for this long [s]; gaps of a millimetre close at once."""
-    rim: NotNegative = 0.1
-    """The table is taken to be this much larger on each side than what was seen of it [m]."""

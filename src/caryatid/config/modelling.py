@@ -182,14 +182,8 @@ class PlausibilityConfig(Stage):
     """Corrections at the most [1]; 0 leaves shapes as they were fitted."""
     touch: NotNegative = 0.001
     """How far from zero the gap of two shapes in contact may be [m]; roundness of edges, softness."""
-    reach: NotNegative = 0.01
-    """Gap below an object that touches nothing below it that is closed [m]; as of contacts."""
-    max_tilt: Angle = 25.0
-    """Separating planes steeper than this carry nothing for sure [deg]; as for supports."""
     sigmas: NotNegative = 3.0
     """Standard deviations of a gap beyond which the fits' uncertainty does not explain it [1]."""
-    min_extent: Positive = 0.008
-    """Shortest extent [m]; as of the fits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,14 +204,10 @@ class SupportConfig(Stage):
     """Separating planes steeper than this carry nothing [deg]: the normal is too near the horizontal."""
     patch_depth: NotNegative = 0.003
     """Surface this near to the first contact counts as touching [m]; the noise of one reading at 1.5 m."""
-    patch_tilt: Angle = 1.0
-    """The same for faces that a fit turned against each other [deg]; a ball has none."""
     min_area_ratio: Share = 0.1
     """r_s,min of eq. 1 [1]."""
     overhang: NotNegative = 0.003
     """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
-    lean_angle: Angle = 75.0
-    """Widest angle between a sideways push and the direction straight against an object's tipping [deg]."""
     top_down: Literal["paper", "balance"] = "balance"
     """All that rests on an unstable object holds it (`paper`), or only what weighs against its tipping."""
     max_drop: NotNegative = 0.04

@@ -7,7 +7,6 @@ from typing import Annotated, Literal
 
 from caryatid.config.ranges import (
     Acute,
-    Angle,
     Azimuth,
     Count,
     Elevation,
@@ -71,37 +70,10 @@ class ActiveVisionConfig(Stage):
     """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path halves it."""
     max_views: Count = 10
     """Views at the most, the first one too; the paper's."""
-    attempts: Count = 20
-    """Views chosen for one step that the robot, looking closer, cannot take, before it stops [1]; a coarse
-    map of an arm's reach is wrong about every tenth."""
-    clearance: NotNegative = 0.05
-    """Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
-    ring_views: Count = 5
-    """Stops of the planner `ring` in a round [1]; two rounds are the ten views of the paper, 36° apart."""
     look_directions: Count = 1200
     """Directions on the whole sphere that planners look in at the most [1]; about 6° apart."""
-    surface_samples: Count = 400
-    """Points on the fitted shapes the planner `support` tests for being seen [1]."""
-    sample_clearance: NotNegative = 0.025
-    """Length of a surface point's line of sight that does not count [m]; its own surface, 2½ voxels."""
-    good_incidence: Acute = 60.0
-    """A surface met at less than this from its normal is seen as well as can be [deg]."""
-    space_spacing: Positive = 0.04
-    """Spacing of the points in unseen space the planner `support` tests for being seen [m]."""
-    space_weight: NotNegative = 0.5
-    """Worth of all the space on the table against all surfaces of objects [1]; little of it holds any."""
-    heap_weight: NotNegative = 1.0
-    """Worth of the space among the objects against all their surfaces [1]; objects hide in it."""
     effort: NotNegative = 0.05
     """Share of all there is to see for which the planner `support` goes one sphere diameter [1]."""
-    relation_weight: NotNegative = 0.1
-    """Worth of all relations' points of interest against all the objects' surfaces [1]."""
-    ray_spacing: Positive = 0.02
-    """Spacing of the volumetric planners' rays at the sphere's centre [m]; 2 voxels, no object is missed."""
-    proximity: Positive = 0.1
-    """d_max of the planner `proximity-count` [m]; a common object reaches that far behind its seen side."""
-    cost_weight: NotNegative = 1.0
-    """Weight w of the cost in the volumetric planners' utility [1]; the usual one."""
     view_cone: Acute = 30.0
     """Angle from the optical axis within which a point is in the image [deg]; 57° × 43° sensor."""
 
@@ -126,14 +98,6 @@ class RobotConfig(Stage):
     """Half the side of the square of floor the robot may use, around the table [m]."""
     head_yaws: Count = 9
     """Head yaws tried within the limits, straight ahead first, to stand clear of an obstacle."""
-    max_roll: Angle = 0.5
-    """Camera roll beyond this cannot be reached, the head has no third joint [deg]."""
-    step: NotNegative = 0.02
-    """Anything on the floor lower than this is no obstacle to the platform [m]."""
-    head_room: NotNegative = 0.15
-    """What the head needs above the highest camera centre [m]; higher obstacles do not hinder."""
-    table_margin: NotNegative = 0.1
-    """Obstacles met this near to the sphere's centre are the table, not a wall in the line of sight [m]."""
     home: tuple[Azimuth, Elevation] = (180.0, 35.0)
     """Azimuth and elevation on the view sphere of the first view [deg]."""
 
@@ -149,11 +113,6 @@ class ArmConfig(Stage):
     radius: Lengths = (0.4, 1.0)
     """Smallest and largest view sphere tried [m]: nearer, the camera meets what is on the table, and the hand
     of a common arm gets no farther. Equal ends fix the radius."""
-    radii: Count = 13
-    """View spheres tried from the smallest to the largest [1]; 5 cm apart."""
-    radius_share: Share = 0.65
-    """Share of the views within reach on the best of these spheres that makes a larger one do [1]; from
-    farther away a view shows more of the table, and the nearest spheres show too little of it."""
     radius_views: Count = 400
     """Views of each sphere tried to choose among them [1]; about 10° apart."""
     sphere_points: Count = 4000
@@ -162,8 +121,6 @@ class ArmConfig(Stage):
     """Rolls of the camera about its optical axis that are tried, level first [1]; 45° apart, 1 = level."""
     clearance: NotNegative = 0.15
     """Height of the camera over the sphere's centre at least [m]; lower, the hand meets the table."""
-    table_margin: NotNegative = 0.1
-    """Furniture met this near to the sphere's centre is the table, not a wall in the line of sight [m]."""
     cell: Positive = 0.08
     """Edge of a cell of a sampled map [m]; finer ones need more samples, by the third power."""
     view_directions: Count = 150

@@ -26,8 +26,6 @@ class OracleConfig(Stage):
 
     candidates: Count = 32
     """Views tried beside the default planner's, at the most [1]; about 20° apart, 0.7 s each."""
-    surface_cell: Positive = 0.01
-    """Edge of the cells true surface is counted in [m]; that of a voxel of the map."""
     stride: Count = 2
     """Pixels between the rays that look for true surface [1]; 6 mm at 1.5 m, below the cell's size."""
 

@@ -28,6 +28,9 @@ from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
 EQUAL = 1e-9
 """Scores nearer than this are the same [1]; they are ratios of small whole numbers."""
 
+SURFACE_CELL = 0.01
+"""Edge of the cells ground-truth surface is counted in [m]; that of a voxel of the map."""
+
 CELLS = 4096
 """Cells of true surface along each axis around the world's origin [1]; 41 m of 1 cm."""
 
@@ -57,7 +60,7 @@ class OraclePlanner:
     """Takes the candidate that raises F1, vertices and edges together, most.
 
     Of equal ones it takes that which shows most true surface no earlier view has shown, then the shorter way,
-    then the first. True surface is counted in cells of `config.oracle.surface_cell`, object by object: those
+    then the first. True surface is counted in cells of `SURFACE_CELL`, object by object: those
     in which a ray of a camera without noise meets the object. The views tried are spread evenly over the
     candidates, away from the views so far; the one the default planner would choose is tried too, so that no
     step of that planner can be better.
@@ -118,7 +121,7 @@ class OraclePlanner:
                 break
         index = int(tried[best])
         cost = float(path_cost(state)[index])
-        area = float(unseen[best]) * self._config.oracle.surface_cell**2
+        area = float(unseen[best]) * SURFACE_CELL**2
         now = self._f1(self._scene.graph)
         why = (
             f"F1 goes from {now:.2f} to {reached:.2f}, the best of {len(tried)} views; "
@@ -169,7 +172,7 @@ class OraclePlanner:
         on_object = labels > 0
         reach = image.depth.ravel()[on_object, None]
         points_world = T_world_camera[:3, 3] + reach * rays_world[on_object]
-        place = np.floor(points_world / config.surface_cell).astype(np.int64) + CELLS // 2
+        place = np.floor(points_world / SURFACE_CELL).astype(np.int64) + CELLS // 2
         place = np.clip(place, 0, CELLS - 1)
         numbers = np.concatenate([labels[on_object, None].astype(np.int64), place], axis=1)
         return np.unique(numbers @ np.array([CELLS**3, CELLS**2, CELLS, 1], dtype=np.int64))

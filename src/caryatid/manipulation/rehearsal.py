@@ -31,6 +31,9 @@ TIME_STEP = 0.004
 TABLE_FRICTION = 0.1
 """Of the table [1]. Contacts take the larger of two: it is not to hide how slippery objects are."""
 
+RIM = 0.1
+"""The table is taken to be this much larger on each side than what was seen of it [m]."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Trial:
@@ -172,16 +175,16 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     for o, friction, density in zip(objects, frictions, densities, strict=True):
         if o.role == "support_surface":
-            _add_table(spec, o, settings.rim)
+            _add_table(spec, o)
         else:
             add_solid(spec, o.id, Solid(o.shape, density, friction))
     return spec
 
 
-def _add_table(spec: Any, table: SceneObject, rim: float) -> None:
+def _add_table(spec: Any, table: SceneObject) -> None:
     T, extents = table.shape.T_world_object, table.shape.extents
     up = int(np.argmax(np.abs(T[2, :3])))
-    half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, rim)
+    half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, RIM)
     body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[TABLE_FRICTION, 0.005, 0.001])
 

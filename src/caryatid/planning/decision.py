@@ -22,6 +22,9 @@ from caryatid.runtime.threads import one_blas_thread
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.voxel_map import VoxelMap
 
+ATTEMPTS = 20
+"""Refusals by the robot in one step before the loop stops [1]; a coarse map errs about every tenth view."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlanningState:

@@ -22,6 +22,24 @@ from caryatid.support.stability import ground_outline
 SPACE = "unseen space"
 """What a sample of unseen space is about."""
 
+SURFACE_SAMPLES = 400
+"""Points on the fitted shapes that are tested for being seen [1]."""
+
+SAMPLE_CLEARANCE = 0.025
+"""Length of a surface point's line of sight that does not count [m]; its own surface, 2½ voxels."""
+
+GOOD_INCIDENCE = 60.0
+"""A surface met at less than this from its normal is seen as well as can be [deg]."""
+
+SPACE_SPACING = 0.04
+"""Spacing of the points in unseen space that are tested for being seen [m]."""
+
+SPACE_WEIGHT = 0.5
+"""Worth of all the space on the table against all surfaces of objects [1]; little of it holds any."""
+
+HEAP_WEIGHT = 1.0
+"""Worth of the space among the objects against all their surfaces [1]; objects hide in it."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
@@ -54,7 +72,7 @@ def join(parts: Sequence[Samples]) -> Samples:
     )
 
 
-def surface_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig) -> Samples:
+def surface_samples(graph: SupportGraph, solid: Solid) -> Samples:
     """Spread points over the objects' surfaces; together they weigh 1.
 
     Every object weighs the same, small or large: each is one vertex of the graph. What touches another
@@ -63,14 +81,13 @@ def surface_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfi
     Args:
         graph: The objects.
         solid: What was seen occupied, and the shapes.
-        config: How many points.
     """
     objects = [o for o in graph.objects if o.role == "object"]
     if not objects:
         return _nothing()
     size = solid.voxels.config.size
     areas = np.array([_area(o) for o in objects])
-    spacings = np.maximum(np.sqrt(areas * len(objects) / config.surface_samples), size)
+    spacings = np.maximum(np.sqrt(areas * len(objects) / SURFACE_SAMPLES), size)
     points, normals, counts = Primitives.of([o.shape for o in objects]).surface(spacings)
     subjects = np.repeat(np.arange(len(objects)), counts)
     open_ = np.flatnonzero(~solid.holds(points + 1.5 * size * normals))
@@ -102,25 +119,24 @@ def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | 
     return None if (high <= low).any() else (low, high)
 
 
-def space_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig) -> Samples:
+def space_samples(graph: SupportGraph, solid: Solid) -> Samples:
     """Spread points over the unseen space on the table, where something may stand.
 
     Space counts up to the height of the highest object, fully at the table and less the higher it is: what
-    stands there has to be carried. All of the table unseen up to there weighs `config.space_weight`; the
-    space among the objects, over the convex hull of their outlines, weighs `config.heap_weight` beside: what
+    stands there has to be carried. All of the table unseen up to there weighs `SPACE_WEIGHT`; the
+    space among the objects, over the convex hull of their outlines, weighs `HEAP_WEIGHT` beside: what
     holds up a heap, or leans on it, is in there.
 
     Args:
         graph: The objects and the table.
         solid: What was seen occupied, and the shapes.
-        config: Spacing of the points, and their worth.
     """
     table = graph.support_surface
     corners = space_above(graph, solid.voxels)
     if table is None or corners is None:
         return _nothing()
     low, high = corners
-    x, y, z = (np.arange(a, b, config.space_spacing) for a, b in zip(low, high, strict=True))
+    x, y, z = (np.arange(a, b, SPACE_SPACING) for a, b in zip(low, high, strict=True))
     outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
     heap = hull(np.concatenate(outlines))
     voxels = solid.voxels
@@ -128,7 +144,7 @@ def space_samples(graph: SupportGraph, solid: Solid, config: ActiveVisionConfig)
         x, y, z, float(high[2] - low[2]), table.shape.T_world_object, table.shape.extents[:2] / 2.0, heap,
         voxels.states, voxels.origin_world, solid.grid.view(np.int8), solid.origin_world, voxels.config.size,
     )  # fmt: skip
-    weights = config.space_weight * on_table + config.heap_weight * in_heap
+    weights = SPACE_WEIGHT * on_table + HEAP_WEIGHT * in_heap
     return Samples(points, np.zeros_like(points), weights, np.zeros(len(points), dtype=np.intp), (SPACE,))
 
 
@@ -157,7 +173,7 @@ def visibility(samples: Samples, T_world_camera: Array, solid: Solid, config: Ac
     """How well each camera (T, 4, 4) sees each sample: (K, T) from 0 hidden to 1.
 
     A sample is seen when its line of sight is free and within the image; surface turned away by more than
-    `config.good_incidence` is seen less well, as the cosine. Lines of sight are all free where
+    `GOOD_INCIDENCE` is seen less well, as the cosine. Lines of sight are all free where
     `config.occlusion` is `ignore`.
 
     Args:
@@ -195,8 +211,8 @@ def shown_anew(
         samples.weights,
         np.ascontiguousarray(T_world_camera[:, :3, 3].T),
         np.ascontiguousarray(T_world_camera[:, :3, 2].T),
-        float(config.sample_clearance),
-        float(np.cos(np.deg2rad(config.good_incidence))),
+        SAMPLE_CLEARANCE,
+        float(np.cos(np.deg2rad(GOOD_INCIDENCE))),
         float(np.cos(np.deg2rad(config.view_cone))),
     )
 

@@ -31,6 +31,13 @@ REASONS = (
 UNCONFIRMED = "the arm cannot go there on a closer look"
 """Why one is refused that seemed to be within reach."""
 
+RADII = 13
+"""View spheres tried from the smallest to the largest [1]; 5 cm apart."""
+
+RADIUS_SHARE = 0.65
+"""Share of the views within reach on the best of these spheres that makes a larger one do [1]; from farther
+away a view shows more of the table, and the nearest spheres show too little of it."""
+
 
 class ArmRobot(OwnViews):
     """An arm that stands still, in simulation or as the plan for a real one.
@@ -169,10 +176,10 @@ class ArmRobot(OwnViews):
         config = self._config
         if config.radius[0] == config.radius[1]:
             return config.radius[0]
-        radii = np.linspace(*config.radius, config.radii)
+        radii = np.linspace(*config.radius, RADII)
         spheres = [self._sphere_around(centre_world, float(r), config.radius_views) for r in radii]
         views = np.array([len(self._offered(sphere)) for sphere in spheres])
-        return float(radii[views >= config.radius_share * views.max()][-1])
+        return float(radii[views >= RADIUS_SHARE * views.max()][-1])
 
     def _sphere_around(self, centre_world: Array, radius: float, count: int) -> ViewSphere:
         return ViewSphere(centre_world, radius, transforms.rotate(self.T_world_base, fibonacci_sphere(count)))
@@ -200,7 +207,7 @@ class ArmRobot(OwnViews):
         if target_world is not None:
             eyes = T_world_camera[:, :3, 3]
             if self._furniture is not None:
-                code[self._furniture.hidden(eyes, target_world, self._config.table_margin)] = 1
+                code[self._furniture.hidden(eyes, target_world)] = 1
             code[eyes[:, 2] < target_world[2] + self._config.clearance] = 0
         return code
 

@@ -17,6 +17,15 @@ from caryatid.geometry.transforms import Array
 NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 """Half of the eight neighbours of a cell; the other half are the same edges backwards."""
 
+STEP = 0.02
+"""Anything on the floor lower than this is no obstacle to the platform [m]."""
+
+HEAD_ROOM = 0.15
+"""What the head needs above the highest camera centre [m]; higher obstacles do not hinder."""
+
+TABLE_MARGIN = 0.1
+"""Furniture met this near to the view sphere's centre is the table, not a wall in the line of sight [m]."""
+
 
 @dataclass(frozen=True, eq=False)
 class FloorGrid:
@@ -68,7 +77,7 @@ class FloorGrid:
         for centre, extent, R in zip(centres, half, rotations, strict=True):
             corners = centre + (signs * extent) @ R.T
             low, high = corners[:, 2].min(), corners[:, 2].max()
-            if high > config.step and low < config.camera_height[1] + config.head_room:
+            if high > STEP and low < config.camera_height[1] + HEAD_ROOM:
                 footprint = shapely.MultiPoint(corners[:, :2]).convex_hull
                 free &= shapely.distance(footprint, cells) >= config.footprint
         return cls(free, origin, config.cell, (T_world_boxes, half))
@@ -126,18 +135,17 @@ class FloorGrid:
         lengths.ravel()[:] = reached
         return lengths
 
-    def hidden(self, eyes_world: Array, target_world: Array, table_margin: float) -> NDArray[np.bool_]:
+    def hidden(self, eyes_world: Array, target_world: Array) -> NDArray[np.bool_]:
         """Test which eyes (N, 3) have furniture between themselves and a target (3,) [m].
 
         Args:
             eyes_world: Camera positions (N, 3) [m].
             target_world: The view sphere's centre (3,) [m].
-            table_margin: Furniture met only this near to the target does not count [m]: it is the table.
         """
         blocked = np.zeros(len(eyes_world), dtype=np.bool_)
         ray_world = target_world - eyes_world
         length = np.linalg.norm(ray_world, axis=-1)
-        last = 1.0 - table_margin / np.maximum(length, table_margin)
+        last = 1.0 - TABLE_MARGIN / np.maximum(length, TABLE_MARGIN)
         for T_world_box, half in zip(*self.boxes, strict=True):
             eye_box = (eyes_world - T_world_box[:3, 3]) @ T_world_box[:3, :3]
             ray_box = ray_world @ T_world_box[:3, :3]

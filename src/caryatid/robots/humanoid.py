@@ -28,6 +28,9 @@ REASONS = (
 )
 """Why a view is refused; the first that applies counts."""
 
+MAX_ROLL = 0.5
+"""Camera roll beyond this cannot be reached, the head has no third joint [deg]."""
+
 
 class HumanoidRobot:
     """A humanoid of ARMAR-6's kind in simulation: holonomic platform, torso lift, head with yaw and pitch.
@@ -153,13 +156,13 @@ class HumanoidRobot:
             eyes[:, 2] > config.camera_height[1] + tolerance,
             (pitch < np.deg2rad(config.pitch[0]) - tolerance)
             | (pitch > np.deg2rad(config.pitch[1]) + tolerance),
-            roll > np.deg2rad(config.max_roll),
+            roll > np.deg2rad(MAX_ROLL),
             quality == 0,
             quality == 1,
             quality == 2,
             np.zeros(len(eyes), dtype=np.bool_)
             if target_world is None
-            else self._floor.hidden(eyes, target_world, config.table_margin),
+            else self._floor.hidden(eyes, target_world),
         )
         refused = np.stack(tests)
         code = np.where(refused.any(axis=0), refused.argmax(axis=0), -1)

@@ -26,7 +26,7 @@ from caryatid.robots import (
     refusal_of,
     view_sphere_of,
 )
-from caryatid.robots.floor import FloorGrid
+from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 
@@ -140,7 +140,7 @@ def table_floor(scene: Scene, config: Config) -> FloorGrid:
     top = float(scene.surface.point_world[2])
     half = shape.extents / 2.0
     centre = np.array([*shape.T_world_object[:2, 3], top / 2.0])
-    sides = np.array([half[0], half[1], max(abs(top) / 2.0, config.robot.step)])
+    sides = np.array([half[0], half[1], max(abs(top) / 2.0, STEP)])
     R = shape.T_world_object[:3, :3]
     return FloorGrid.from_boxes([centre], [sides], [R], config.robot, scene.sphere.centre_world[:2])
 

@@ -22,6 +22,9 @@ from caryatid.simulation.world import mujoco_warnings_ignored
 ASIDE = 50.0
 """How far up an object is put when it has been lifted [m]; nothing meets it there."""
 
+CLEARANCE = 0.02
+"""An object is lifted until its lowest point is this far above all others [m], and then taken aside."""
+
 SEGMENT = 0.25
 """Time simulated between two looks at the objects [s]; what falls is seen falling."""
 
@@ -114,7 +117,7 @@ class Lifting:
         watched = state[:, 2] < ASIDE / 2.0
         watched[index] = False
         data = self._data(state, [*held, index])
-        lifted = self._rise(data, watched, index, config) / config.speed
+        lifted = self._rise(data, watched, index) / config.speed
         distance, angle = np.zeros(len(state)), np.zeros(len(state))
         film: list[Array] = []
         for speed, seconds in ((config.speed, lifted), (0.0, config.watch)):
@@ -176,11 +179,11 @@ class Lifting:
     def _objects(self, data: Any) -> Array:
         return np.array(data.qpos[self._qpos])
 
-    def _rise(self, data: Any, watched: NDArray[np.bool_], index: int, config: LiftConfig) -> float:
+    def _rise(self, data: Any, watched: NDArray[np.bool_], index: int) -> float:
         """How far up [m] an object has to go to be above all others."""
         low, _ = self._span(data, index)
         tops = [self._span(data, int(k))[1] for k in np.flatnonzero(watched)]
-        return max(max(tops, default=low) - low, 0.0) + config.clearance
+        return max(max(tops, default=low) - low, 0.0) + CLEARANCE
 
     def _span(self, data: Any, index: int) -> tuple[float, float]:
         """Heights [m] of an object's lowest and highest point: of the boxes around its geoms."""

@@ -20,6 +20,12 @@ from caryatid.support.contacts import Contact, find_contacts, local_frames
 
 _FEW = 100
 """Gaps up to which a dense matrix is solved faster than a sparse one, whose cost follows their number [1]."""
+REACH = 0.01
+"""Gap below an object that touches nothing below it that is closed [m]; as of contacts."""
+MAX_TILT = 25.0
+"""Separating planes steeper than this carry nothing for sure [deg]."""
+MIN_EXTENT = 0.008
+"""Shortest extent [m]; as of the fits."""
 
 
 def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> list[SceneObject]:
@@ -42,7 +48,7 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
     variance = sigma**2
     doubts: dict[int, str] = {}
     for number in range(config.rounds):
-        contacts = find_contacts([o.shape for o in done], config.reach)
+        contacts = find_contacts([o.shape for o in done], REACH)
         wrong = [c for c in contacts if c.distance < -config.touch] + _floating(done, contacts, config)
         if not wrong:
             break
@@ -58,7 +64,7 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
         change = closing(pairs[explained], rows[explained], variance, gaps[explained], config.touch**2)
         for k in np.flatnonzero(change.any(axis=1)):
             shape = done[k].shape
-            done[k] = replace(done[k], shape=_changed(shape, change[k], config))
+            done[k] = replace(done[k], shape=_changed(shape, change[k]))
     said = [doubts.get(k, "") for k in range(len(done))]
     return [o if o.doubt == doubt else replace(o, doubt=doubt) for o, doubt in zip(done, said, strict=True)]
 
@@ -69,10 +75,10 @@ def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) 
     Args:
         o: An object; without `uncertainty` it stays as it is.
         rng: Source of the draw.
-        config: Least extent, and how many standard deviations uncertainty can explain.
+        config: How many standard deviations uncertainty can explain.
     """
     change = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas) * _sigma(o)
-    return replace(o, shape=_changed(o.shape, change, config))
+    return replace(o, shape=_changed(o.shape, change))
 
 
 @cache
@@ -120,7 +126,7 @@ def _floating(
 ) -> list[Contact]:
     """The nearest contact below each object that touches nothing below it, among those with a small gap."""
     nearest: dict[int, Contact] = {}
-    steep = np.cos(np.radians(config.max_tilt))
+    steep = np.cos(np.radians(MAX_TILT))
     for contact in contacts:
         upper = contact.b if contact.normal_world[2] > 0.0 else contact.a
         level = abs(contact.normal_world[2]) > steep and objects[upper].role != "support_surface"
@@ -177,11 +183,11 @@ def _ends(rows: Array) -> Array:
     return rows.reshape(-1, rows.shape[-1])
 
 
-def _changed(shape: Shape, change: Array, config: PlausibilityConfig) -> Shape:
+def _changed(shape: Shape, change: Array) -> Shape:
     """Change a shape's independent variables (9,)."""
     change = _effect(shape.ties) @ change
     T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(change[3:6]), change[:3])
-    extents = np.maximum(shape.extents + 2.0 * change[6:9], config.min_extent)
+    extents = np.maximum(shape.extents + 2.0 * change[6:9], MIN_EXTENT)
     return shape.from_extents(T, extents)
 
 

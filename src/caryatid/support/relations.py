@@ -25,6 +25,9 @@ from caryatid.support.stability import (
     support_polygon,
 )
 
+_LEAN_ANGLE = 75.0
+"""Widest angle between a sideways push and the direction straight against an object's tipping [deg]."""
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Touch:
@@ -342,7 +345,7 @@ def _let_down(
 
 def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
     """Leaning supports of an object that tips: who pushes against it, the nearest one if none touches."""
-    push = np.cos(np.radians(config.lean_angle))
+    push = np.cos(np.radians(_LEAN_ANGLE))
     aside = [t for t in touches if config.max_tilt < t.tilt < 180.0 - config.max_tilt]
     against = [t for t in aside if t.normal_world[:2] @ tipping.direction_xy < -push]
     against.sort(key=lambda t: t.gap)

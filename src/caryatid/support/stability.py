@@ -23,6 +23,8 @@ _CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in 2.0 * np.pi * np.arange(
 """Polygon (48, 2) that stands for the rim of a ball's cap; 0.2 % of its radius off."""
 _SIDES = 24
 """Sides of the prism that stands for a cylinder; 1 % of its radius off."""
+_PATCH_TILT = 1.0
+"""Faces that a fit has turned against each other by this still touch all over [deg]; a ball has none."""
 _MARCH_POINTS = 16
 """Surface points along the longest side of a shape that is let down."""
 _MARCH_STEPS = 40
@@ -85,7 +87,7 @@ def contact_patch(
         other: The shape the normal comes from.
         normal_world: Unit normal (3,) of the separating plane, from `other` to `shape`.
         points_world: Contact points (K, 3) [m]; they stand in where those parts do not overlap.
-        config: `patch_depth` and `patch_tilt`.
+        config: `patch_depth`.
     """
     depth = _touching_depth(shape, config)
     upper = _cap(shape, -normal_world, depth)
@@ -160,7 +162,7 @@ def centroid(polygon: Array) -> Array:
 def _touching_depth(shape: Shape, config: SupportConfig) -> float:
     if shape.kind == "sphere":
         return config.patch_depth
-    turned = np.sin(np.radians(config.patch_tilt)) * float(shape.extents.max()) / 2.0
+    turned = np.sin(np.radians(_PATCH_TILT)) * float(shape.extents.max()) / 2.0
     return config.patch_depth + float(turned)
 
 

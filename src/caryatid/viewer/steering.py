@@ -9,7 +9,7 @@ import numpy as np
 from caryatid.errors import PlanningError
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
+from caryatid.planning.decision import ATTEMPTS, Decision, Planner, PlanningState, path_cost
 from caryatid.robots import OwnViews, Posture, Robot, Unreachable, refusal_of, view_sphere_of
 from caryatid.sensing.view_sphere import ViewSphere
 
@@ -87,14 +87,14 @@ def planned_anew(state: PlanningState, planner: Planner, robot: Robot, seed: int
     """
     rng = np.random.default_rng([seed, len(state.visited)])
     why = ""
-    for _ in range(state.config.attempts):
+    for _ in range(ATTEMPTS):
         decision = planner.plan(state, rng)
         refused = refusal_of(robot, decision.T_world_camera)
         if refused is None:
             return decision
         why = refused.reason
         state = replace(state, candidates=state.candidates.without(decision.index, why))
-    raise PlanningError(f"the robot could take none of {state.config.attempts} views: {why}")
+    raise PlanningError(f"the robot could take none of {ATTEMPTS} views: {why}")
 
 
 def taken_by_hand(state: PlanningState, index: int, planned: Decision) -> Decision:

@@ -8,6 +8,9 @@ from caryatid.geometry import transforms
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, go_to
 from caryatid.sensing.view_sphere import direction
 
+STOPS = 5
+"""Stops of the planner `ring` in a round [1]; two rounds are the ten views of the paper, 36° apart."""
+
 
 class RandomPlanner:
     """Goes to any reachable view, all equally likely."""
@@ -33,7 +36,7 @@ class FarthestPlanner:
 
 
 class RingPlanner:
-    """Goes around the scene in `active.ring_views` equal steps of azimuth, at the first view's elevation.
+    """Goes around the scene in `STOPS` equal steps of azimuth, at the first view's elevation.
 
     Each further round is turned into the gaps of those before: by a half, a quarter, three quarters of a
     step, and so on.
@@ -42,14 +45,13 @@ class RingPlanner:
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the candidate nearest to the next stop; of equal ones the first."""
         check_candidates(state)
-        stops = state.config.ring_views
-        rounds, stop = divmod(len(state.visited), stops)
+        rounds, stop = divmod(len(state.visited), STOPS)
         first = state.visited[0]
-        turned = 2.0 * np.pi * (stop + _halving(rounds)) / stops
+        turned = 2.0 * np.pi * (stop + _halving(rounds)) / STOPS
         azimuth = float(np.arctan2(first[1], first[0]) + turned)
         wanted = direction(azimuth, float(np.arcsin(np.clip(first[2], -1.0, 1.0))))
         index = int(np.argmax(state.candidates.directions @ wanted))
-        why = f"stop {stop + 1} of {stops} around the scene, {np.rad2deg(turned):.0f}° from the first view"
+        why = f"stop {stop + 1} of {STOPS} around the scene, {np.rad2deg(turned):.0f}° from the first view"
         return go_to(state, index, why)
 
 

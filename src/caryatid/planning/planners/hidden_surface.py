@@ -41,6 +41,9 @@ from caryatid.planning.points_of_interest import (
 WORTH_SAYING = 0.05
 """Shares of the whole below this are not mentioned."""
 
+RELATION_WEIGHT = 0.1
+"""Worth of all relations' points of interest against all the objects' surfaces [1]."""
+
 
 class SupportPlanner:
     """Takes the candidate that promises to show most of what is hidden, at little cost."""
@@ -77,13 +80,13 @@ def _expected_gain(
     """Samples, and what cameras (C, 4, 4) show of them anew (K, C)."""
     config = state.config
     solid = state.voxels.solid([o.shape for o in state.graph.objects])
-    surfaces = surface_samples(state.graph, solid, config)
+    surfaces = surface_samples(state.graph, solid)
     points = relation_samples(relations)
     T_world_visited = state.sphere.poses(state.visited)
     seen = visibility(join([surfaces, points]), T_world_visited, solid, config).max(axis=1, initial=0.0)
     surfaces = weighted(surfaces, unseen_shares(surfaces, seen[: len(surfaces.weights)]))
-    space = space_samples(state.graph, solid, config)
-    samples = join([surfaces, weighted(points, config.relation_weight), space])
+    space = space_samples(state.graph, solid)
+    samples = join([surfaces, weighted(points, RELATION_WEIGHT), space])
     before = np.concatenate([seen, np.zeros(len(space.weights))])
     return samples, shown_anew(samples, before, T_world_camera, solid, config)
 

@@ -19,6 +19,9 @@ from caryatid.planning.points_of_interest import (
     points_of_interest,
 )
 
+CLEARANCE = 0.05
+"""Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
+
 
 class AttentionPlanner:
     """Saliency painted on the view sphere around projected points of interest.
@@ -107,7 +110,7 @@ def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[
         return np.zeros((len(state.candidates), len(points)), dtype=np.bool_)
     positions = np.stack([p.position_world for p in points])
     eyes_world = state.candidates.T_world_camera[:, :3, 3]
-    return state.voxels.solid().blocked(positions, eyes_world, state.config.clearance).T
+    return state.voxels.solid().blocked(positions, eyes_world, CLEARANCE).T
 
 
 def _largest(given: Array, reached: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:

@@ -40,6 +40,15 @@ from caryatid.planning.planners import VOLUMETRIC
 from caryatid.runtime.parallel import for_each
 from caryatid.sensing.voxel_map import OCCUPIED, UNKNOWN, VoxelMap
 
+RAY_SPACING = 0.02
+"""Spacing of the rays at the sphere's centre [m]; 2 voxels, no object is missed."""
+
+PROXIMITY = 0.1
+"""d_max of `proximity-count` [m]; a common object reaches that far behind its seen side."""
+
+COST_WEIGHT = 1.0
+"""Weight w of the cost in the utility [1]; the usual one."""
+
 
 class VolumetricPlanner:
     """Takes the candidate with the largest utility IG / ΣIG − w · cost / Σcost.
@@ -63,11 +72,11 @@ class VolumetricPlanner:
         candidates, config = state.candidates, state.config
         looks = _new_views(state, candidates.looks(config.look_directions))
         T_world_camera = candidates.T_world_camera[looks.chosen]
-        proximity = config.proximity if self.formulation == "proximity-count" else 0.0
+        proximity = PROXIMITY if self.formulation == "proximity-count" else 0.0
         gain = ray_information(state, T_world_camera, proximity)[:, self._column]
         largest = float(gain.max())
         saliency = gain / largest if largest > 0.0 else gain
-        cost = config.cost_weight * _shares(path_cost(state)[looks.chosen])
+        cost = COST_WEIGHT * _shares(path_cost(state)[looks.chosen])
         return decide(
             candidates,
             saliency,
@@ -132,9 +141,9 @@ def layers(voxels: VoxelMap, proximity: float) -> NDArray[np.float32]:
 def image_rays(config: ActiveVisionConfig) -> Array:
     """Directions (R, 3) in the camera, unit: a square grid over the image within `config.view_cone`.
 
-    Neighbours are `config.ray_spacing` apart at the view sphere's centre.
+    Neighbours are `RAY_SPACING` apart at the view sphere's centre.
     """
-    spacing, edge = config.ray_spacing / config.sphere_radius, np.tan(np.deg2rad(config.view_cone))
+    spacing, edge = RAY_SPACING / config.sphere_radius, np.tan(np.deg2rad(config.view_cone))
     steps = spacing * np.arange(-np.floor(edge / spacing), np.floor(edge / spacing) + 1.0)
     x, y = (g.ravel() for g in np.meshgrid(steps, steps))
     inside = np.hypot(x, y) <= edge
