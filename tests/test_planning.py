@@ -1,0 +1,756 @@
+"""Points of interest, candidates, what views are expected to show, and the planners that choose among them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from functools import cache
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SMALL
+from planning_states import CONFIG, CUBE, HOME, ON_TABLE, OPEN, SPHERE, TABLE, box, candidates, known, state
+
+from caryatid.config import RobotConfig, VoxelConfig
+from caryatid.errors import InputError, PlanningError
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.graph import Support, SupportGraph
+from caryatid.planning import planners
+from caryatid.planning.candidates import Candidates, looks_among
+from caryatid.planning.expected_visibility import (
+    HEAP_WEIGHT,
+    SPACE,
+    SPACE_WEIGHT,
+    join,
+    relation_samples,
+    shown_anew,
+    space_above,
+    space_samples,
+    surface_samples,
+    unseen_shares,
+    unseen_space,
+    visibility,
+)
+from caryatid.planning.planners import BUILT_IN, VOLUMETRIC, make_planner
+from caryatid.planning.planners.baselines import STOPS, RandomPlanner
+from caryatid.planning.planners.volumetric import gather, image_rays, layers, ray_information
+from caryatid.planning.points_of_interest import (
+    inhibition_of_return,
+    largest_arc,
+    painted,
+    points_of_doubt,
+    points_of_interest,
+    relation_saliency,
+    surface_point,
+)
+from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot
+from caryatid.robots.recording import RecordingRobot
+from caryatid.sensing.view_sphere import ViewSphere, direction
+from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
+
+PAPER = replace(CONFIG, saliency="paper", edge_point="midpoint")
+LITERAL = {"saliency": "paper", "edge_point": "midpoint", "path_cost": "angle"}
+ELSEWHERE = direction(-1.0, 0.5)
+COUNT = CONFIG.look_directions
+
+
+def plan(name, objects, supports=(), seed=0, **settings):
+    return make_planner(name).plan(state(objects, supports, **settings), np.random.default_rng(seed))
+
+
+def degrees_between(a, b):
+    return np.rad2deg(transforms.angle_between(a, b))
+
+
+class TestPointsOfInterest:
+    LOWER, UPPER = box(1, (0.1, 0.1, 0.80), (0.1, 0.1, 0.1)), box(2, (0.1, 0.2, 0.90), (0.2, 0.2, 0.1))
+    FLOATING = box(3, (-0.2, -0.1, 0.85), (0.08, 0.08, 0.08))
+    CONTACT = np.array([0.1, 0.13, 0.85])
+    GRAPH = SupportGraph(
+        (TABLE, LOWER, UPPER, FLOATING),
+        (Support("o0", "o1", occurrences=2), Support("o1", "o2", contact_world=CONTACT)),
+    )
+
+    @pytest.mark.parametrize(
+        ("views", "middle"),
+        [
+            ([180.0], 0.0),
+            ([30.0], -150.0),
+            ([180.0, 90.0], -45.0),
+            ([170.0, -170.0], 0.0),
+            ([0.0, 120.0, 200.0], -80.0),
+            ([80.0, 290.0, 10.0, 200.0], 140.0),
+            ([0.0, 180.0], 90.0),
+        ],
+    )
+    def test_the_largest_arc_has_its_middle_far_from_all_views(self, views, middle):
+        azimuth = np.rad2deg(largest_arc(np.stack([direction(np.deg2rad(v), 0.6) for v in views])))
+        assert -180.0 <= azimuth < 180.0
+        if views == [0.0, 180.0]:
+            assert azimuth in (pytest.approx(90.0), pytest.approx(-90.0))
+        else:
+            assert (azimuth - middle + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-6)
+
+    def test_equation_2_as_printed_and_decreasing(self):
+        np.testing.assert_allclose(
+            [relation_saliency(k, 4, PAPER) for k in range(5)], [1, 0.75, 0.5, 0.75, 1]
+        )
+        values = [relation_saliency(k, 4, CONFIG) for k in range(6)]
+        np.testing.assert_allclose(values[::2], [1.0, 0.75, 0.5], err_msg="1 … 2λ − 1")
+        assert values[4] == values[5], "more occurrences than views"
+        assert relation_saliency(0, 0, CONFIG) == 1.0
+        assert relation_saliency(1, 1, CONFIG) == pytest.approx(0.5)
+
+    @pytest.mark.parametrize(
+        "shape",
+        [
+            Box(
+                transforms.rigid(transforms.rotation_from_vector((0.3, 0.2, 0.9)), (0.1, 0, 0.8)),
+                np.array([0.1, 0.2, 0.05]),
+            ),
+            Cylinder(transforms.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.04, 0.12),
+            Sphere(transforms.rigid(np.eye(3), (0.1, 0.0, 0.8)), 0.05),
+        ],
+    )
+    def test_surface_point_is_on_the_surface_and_on_the_line(self, shape):
+        target = np.array([1.5, 0.4, 0.75])
+        point, centre = surface_point(shape, target), shape.T_world_object[:3, 3]
+        assert shape.signed_distance(point[None])[0] == pytest.approx(0.0, abs=1e-6)
+        assert transforms.angle_between(point - centre, target - centre) == pytest.approx(0.0, abs=1e-6)
+
+    def test_every_relation_and_every_unsupported_object_gives_one_point(self):
+        points = points_of_interest(self.GRAPH, SPHERE, HOME[None], 2, CONFIG)
+        assert [p.subject for p in points] == [("o0", "o1"), ("o1", "o2"), ("o3",)]
+        assert [p.saliency for p in points] == [relation_saliency(n, 2, CONFIG) for n in (2, 1, 0)]
+        assert points[1].why == "o1 supports o2: found in 1 of 2 views"
+        midpoints = points_of_interest(self.GRAPH, SPHERE, HOME[None], 2, PAPER)
+        np.testing.assert_allclose(midpoints[1].position_world, [0.1, 0.15, 0.85])
+        np.testing.assert_allclose(points[1].position_world, self.CONTACT)
+        np.testing.assert_allclose(points[0].position_world, midpoints[0].position_world)
+        for p in (*points[:2], *midpoints[:2]):
+            np.testing.assert_allclose(p.direction, transforms.unit(p.position_world - SPHERE.centre_world))
+        assert points_of_interest(SupportGraph(), SPHERE, HOME[None], 1, CONFIG) == []
+        pair = SupportGraph((TABLE, box(1, (0.0, 0.0, 0.77), (0.1, 0.1, 0.04))), (Support("o0", "o1"),))
+        above = points_of_interest(pair, SPHERE, HOME[None], 1, PAPER)[0]
+        np.testing.assert_allclose(above.direction, [0.0, 0.0, 1.0], err_msg="in the sphere's centre")
+
+    def test_what_is_unsupported_or_implausible_is_looked_at_from_the_largest_arc(self):
+        floating = points_of_interest(self.GRAPH, SPHERE, HOME[None], 2, CONFIG)[-1]
+        np.testing.assert_allclose(floating.direction, [1.0, 0.0, 0.0], atol=1e-9)
+        assert floating.position_world[0] == pytest.approx(-0.2 + 0.04), "the face towards +x"
+        assert floating.why == "nothing is known to support o3; the largest gap between views is at 0°"
+        doubtful = SupportGraph((TABLE, replace(self.LOWER, doubt="overlaps o2 by 30 mm"), self.UPPER))
+        (point,) = points_of_doubt(doubtful, SPHERE, direction(0.0, 0.6)[None])
+        assert point.subject == ("o1",)
+        assert "overlaps o2 by 30 mm" in point.why
+        np.testing.assert_allclose(point.direction, (-1.0, 0.0, 0.0), atol=1e-9)
+
+    def test_saliency_peaks_at_the_points_direction_and_earlier_views_repel(self):
+        points = points_of_interest(self.GRAPH, SPHERE, HOME[None], 2, CONFIG)
+        own = painted(points, np.stack([p.direction for p in points]), 0.3)
+        np.testing.assert_allclose(np.diag(own), [p.saliency for p in points])
+        assert painted([], SPHERE.directions[:500], 0.3).shape == (500, 0)
+        beside = transforms.rotation_from_vector((0, 0, np.deg2rad(CONFIG.spread))) @ direction(np.pi, 0.0)
+        flat = direction(np.pi, 0.0)
+        values = inhibition_of_return(np.stack([flat, flat]), np.stack([flat, -flat, beside]), CONFIG)
+        np.testing.assert_allclose(values, [-1.0, 0.0, -np.exp(-0.5)], atol=1e-6)
+
+
+class TestCandidates:
+    BOXES = (((0.0, 0.0, 0.73), (0.35, 0.5, 0.02)), ((0.0, 2.2, 1.0), (3.0, 0.05, 1.0)))
+
+    def test_looks_are_evenly_spread_and_every_view_has_one_near(self):
+        looks = OPEN.looks(COUNT)
+        assert 0.2 * COUNT < len(looks.chosen) < 0.4 * COUNT
+        assert (np.diff(looks.chosen) > 0).all()
+        chosen = OPEN.directions[looks.chosen]
+        np.testing.assert_array_equal(looks.nearest, np.argmax(OPEN.directions @ chosen.T, axis=1))
+        apart = transforms.angle_between(OPEN.directions, chosen[looks.nearest])
+        assert apart.max() < 1.2 * np.sqrt(4.0 * np.pi / COUNT)
+        far = looks_among(np.array([[0.0, 0, 1], [0.0, 0, -1]] * 10), 80)
+        assert len(far.chosen) == 2
+
+    @pytest.mark.parametrize(("views", "all_"), [(20, True), (COUNT // 8, True), (COUNT // 8 + 1, False)])
+    def test_of_few_views_all_are_looks(self, views, all_):
+        few = looks_among(OPEN.directions[:: len(OPEN) // views][:views], COUNT)
+        assert (few.chosen.tolist() == few.nearest.tolist() == list(range(views))) == all_
+
+    def test_looks_left_out_are_stood_for_by_the_nearest_that_stay(self):
+        looks = OPEN.looks(COUNT)
+        left_out = np.random.default_rng(0).random(len(looks.chosen)) < 0.3
+        fewer = looks.without(left_out, OPEN.directions)
+        np.testing.assert_array_equal(fewer.chosen, looks.chosen[~left_out])
+        right = np.argmax(OPEN.directions @ OPEN.directions[fewer.chosen].T, axis=1)
+        np.testing.assert_array_equal(fewer.nearest, right)
+
+    def test_a_refused_view_is_left_out_and_counted(self):
+        two = Candidates(OPEN.T_world_camera[:2], OPEN.directions[:2], np.array([0.5, 1.0]), {"wall": 3})
+        left = two.without(0, "wall").without(0, "arm")
+        assert len(left) == 0
+        assert left.rejected == {"wall": 4, "arm": 1}
+        assert two.without(0, "arm").path_length.tolist() == [1.0]
+        assert OPEN.without(5, "arm").indices.tolist() == np.delete(OPEN.indices, 5).tolist()
+        assert repr(two) == "Candidates(2; refused: 3 wall)"
+
+    def test_a_robot_that_moved_is_offered_the_same_views_by_other_ways(self):
+        centres, half = ([b[k] for b in self.BOXES] for k in (0, 1))
+        floor = FloorGrid.from_boxes(centres, half, [np.eye(3)] * 2, RobotConfig())
+        moved = HumanoidRobot(floor, RobotConfig(), SPHERE.poses(HOME[None])[0])
+        before = moved.candidates(SPHERE)
+        there = int(np.argmax(before.directions @ direction(0.0, 0.6)))
+        moved.move_to(before.T_world_camera[there])
+        after = moved.candidates(SPHERE)
+        fresh = HumanoidRobot(floor, RobotConfig(), before.T_world_camera[there]).candidates(SPHERE)
+        for field in ("T_world_camera", "directions", "path_length", "indices"):
+            np.testing.assert_array_equal(getattr(after, field), getattr(fresh, field))
+        assert after.rejected == fresh.rejected
+        assert after.path_length[there] == 0.0 < before.path_length[there]
+        assert after.looks(COUNT) is moved.candidates(SPHERE).looks(COUNT)
+        other = ViewSphere.around((0.1, 0.0, 0.85), CONFIG)
+        offered = moved.candidates(other)
+        np.testing.assert_allclose(other.poses(offered.directions), offered.T_world_camera)
+
+
+class TestExpectedVisibility:
+    GRAPH = SupportGraph((TABLE, CUBE))
+
+    @cache
+    def samples(self):
+        solid = known([TABLE, CUBE]).solid()
+        return surface_samples(self.GRAPH, solid), solid
+
+    def test_surfaces_in_contact_are_not_asked_for(self):
+        samples, _ = self.samples()
+        assert 100 < len(samples.points_world) < 1000
+        assert np.abs(CUBE.shape.signed_distance(samples.points_world)).max() < 1e-9
+        assert samples.normals_world[:, 2].min() > -0.5, "the face on the table"
+        assert samples.weights.sum() == pytest.approx(5.0 / 6.0, abs=0.01)
+        flat = box(2, (0.0, 0.3, 0.76), (0.3, 0.2, 0.02))
+        both = surface_samples(SupportGraph((TABLE, CUBE, flat)), known([TABLE, CUBE, flat]).solid())
+        for subject, open_ in ((0, 5.0 / 6.0), (1, (0.06 + 0.02) / (0.12 + 0.02))):
+            assert both.weights[both.subjects == subject].sum() == pytest.approx(open_ / 2.0, abs=0.03)
+        assert len(surface_samples(SupportGraph((TABLE,)), known([TABLE]).solid()).weights) == 0
+
+    def test_a_surface_is_seen_from_before_and_less_from_aside_and_not_from_behind(self):
+        samples, solid = self.samples()
+        seen = visibility(samples, SPHERE.poses(HOME[None]), solid, CONFIG)[:, 0]
+        assert seen[samples.normals_world[:, 0] < -0.9].min() == 1.0
+        assert seen[samples.normals_world[:, 0] > 0.9].max() == 0.0
+        low = visibility(samples, SPHERE.poses(direction(np.pi, np.deg2rad(10.0))[None]), solid, CONFIG)[:, 0]
+        top = low[samples.normals_world[:, 2] > 0.9]
+        assert 0.1 < top.mean() < 0.4
+        away = SPHERE.poses(HOME[None])
+        away[0, :3, :3] = away[0, :3, :3] @ transforms.rotation_from_vector((0.0, np.deg2rad(45.0), 0.0))
+        assert visibility(samples, away, solid, CONFIG).max() == 0.0, "outside the image"
+
+    def test_walls_hide_but_where_occlusion_is_ignored(self):
+        wall = box(2, (0.0, 0.16, 0.95), (0.5, 0.02, 0.4))
+        solid = known([TABLE, CUBE, wall]).solid()
+        samples = surface_samples(self.GRAPH, solid)
+        beyond = SPHERE.poses(direction(np.pi / 2.0, np.deg2rad(35.0))[None])
+        seen, through = (
+            visibility(samples, beyond, solid, replace(CONFIG, occlusion=how))[:, 0]
+            for how in ("invert", "ignore")
+        )
+        towards = samples.normals_world[:, 1] > 0.9
+        assert seen[towards].max() == 0.0
+        assert through[towards].min() > 0.9
+
+    def test_only_what_was_seen_worse_before_counts(self):
+        samples, solid = self.samples()
+        poses = SPHERE.poses(HOME[None])
+        seen = visibility(samples, poses, solid, CONFIG)[:, 0]
+        for before in (0.0, 0.4, 1.0):
+            gained = shown_anew(samples, np.full(len(seen), before), poses, solid, CONFIG)[:, 0]
+            np.testing.assert_allclose(gained, samples.weights * np.maximum(seen - before, 0.0), atol=1e-12)
+        two = join([samples, replace(samples, names=("o9",))])
+        assert two.names == ("o1", "o9")
+        assert np.bincount(two.subjects).tolist() == [len(seen)] * 2
+        shares = unseen_shares(two, np.where(two.subjects == 0, 1.0, 0.25))
+        np.testing.assert_allclose(shares, np.where(two.subjects == 0, 0.0, 0.75))
+
+    def test_relations_weigh_one_together(self):
+        graph = TestPointsOfInterest.GRAPH
+        samples = relation_samples(points_of_interest(graph, SPHERE, HOME[None], 2, CONFIG))
+        np.testing.assert_allclose(samples.weights, np.array([0.5, 0.75, 1.0]) / 2.25)
+        assert samples.names == ("o1", "o2", "o3")
+        assert len(relation_samples([]).weights) == 0
+
+    def test_space_on_the_table_counts_while_it_has_not_been_seen(self):
+        assert len(space_samples(self.GRAPH, known([TABLE, CUBE]).solid()).points_world) == 0
+        corners = [box(k, (x, y, 0.8), (0.06, 0.06, 0.1)) for k, (x, y) in enumerate(CORNERS, start=1)]
+        unknown = VoxelMap.around(SPHERE.centre_world, VoxelConfig()).solid([o.shape for o in corners])
+        samples = space_samples(SupportGraph((TABLE, *corners)), unknown)
+        assert samples.names == (SPACE,)
+        assert 0.9 * SPACE_WEIGHT < samples.weights.sum() <= SPACE_WEIGHT + HEAP_WEIGHT
+        for o in corners:
+            assert (o.shape.signed_distance(samples.points_world) >= -0.01).all()
+        reach = np.abs(samples.points_world[:, :2]).max(axis=1)
+        among, beyond = samples.weights[reach < 0.1].mean(), samples.weights[reach > 0.15].mean()
+        assert among > 10.0 * beyond > 0.0
+        assert np.abs(samples.points_world[:, 0]).max() <= 0.35
+        low, high = space_above(SupportGraph((TABLE, *corners)), unknown.voxels)
+        np.testing.assert_allclose(low, (-0.35, -0.5, 0.77))
+        np.testing.assert_allclose(high, (0.35, 0.5, 0.85))
+        assert space_above(SupportGraph((TABLE,)), unknown.voxels) is None
+        assert space_above(SupportGraph((CUBE,)), unknown.voxels) is None
+
+    def test_unseen_space_is_what_is_over_the_table_unknown_and_not_solid(self):
+        """A lattice of 1 over a table turned by 90°, cells of 2, heights 0, 1, 2 of 4."""
+        x, y, z = np.arange(-3.0, 4.0), np.arange(-3.0, 4.0), np.arange(3.0)
+        states = np.zeros((4, 4, 2), dtype=np.int8)
+        states[3] = 1
+        solid = np.zeros((2, 2, 2), dtype=np.int8)
+        solid[0, 0, 0] = 1
+        turned = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, np.pi / 2.0)), np.zeros(3))
+        triangle = np.array([[-2.5, -2.5], [2.5, -2.5], [-2.5, 2.5]])
+        for heap in (triangle, triangle[::-1].copy(), np.vstack([triangle, triangle[:1]])):
+            points, on_table, in_heap = unseen_space(
+                x, y, z, 4.0, turned, np.array([1.5, 2.5]), heap, states, np.array([-4.0, -4.0, 0.0]),
+                solid, np.array([0.0, 0.0, 0.0]), 2.0,
+            )  # fmt: skip
+            wanted = {
+                (a, b, c)
+                for a in (-2, -1, 0, 1)
+                for b in (-1, 0, 1)
+                for c in (0, 1, 2)
+                if not (a in (0, 1) and b in (0, 1) and c in (0, 1))
+            }
+            assert {tuple(p) for p in points.astype(int).tolist()} == wanted
+            lowness = 1.0 - points[:, 2] / 4.0
+            np.testing.assert_allclose(on_table, lowness / (15 * 2.25))
+            inside = points[:, 0] + points[:, 1] < 0.0
+            everywhere = sum(a + b < 0 for a in range(-2, 3) for b in range(-1, 2)) * 2.25
+            np.testing.assert_allclose(in_heap, np.where(inside, lowness, 0.0) / everywhere)
+        assert (points[:, 0] + points[:, 1] < 0.0).any()
+
+
+CORNERS = ((0.12, 0.12), (0.12, -0.12), (-0.12, 0.12), (-0.12, -0.12))
+"""Where four objects stand around the middle of the table [m]."""
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+class TestEveryPlanner:
+    def test_it_chooses_a_candidate_gives_a_reason_and_paints_the_sphere(self, name):
+        decision, again = (plan(name, [CUBE], (ON_TABLE,), seed=7) for _ in range(2))
+        assert (decision.index, decision.score) == (again.index, again.score)
+        np.testing.assert_array_equal(decision.T_world_camera, OPEN.T_world_camera[decision.index])
+        assert decision.why
+        assert decision.score == pytest.approx(decision.saliency - decision.cost)
+        assert f"candidate {decision.index}" in repr(decision)
+        if name in ("random", "ring", "farthest"):
+            assert decision.candidate_saliency is decision.sphere_saliency is None
+            return
+        assert decision.sphere_saliency.shape == (40_000,)
+        np.testing.assert_array_equal(decision.sphere_saliency[OPEN.indices], decision.candidate_saliency)
+        assert decision.saliency == decision.candidate_saliency[decision.index]
+
+    def test_few_views_no_views_and_an_empty_table(self, name):
+        none = Candidates(np.zeros((0, 4, 4)), np.zeros((0, 3)), np.zeros(0), {"a wall stands": 3})
+        with pytest.raises(PlanningError, match=r"a wall stands \(3\)"):
+            plan(name, [CUBE], offered=none)
+        assert 0 <= plan(name, []).index < len(OPEN)
+        recorded = RecordingRobot(SPHERE.poses(np.stack([HOME, direction(0.0, 0.5), direction(1.5, 0.5)])))
+        assert plan(name, [CUBE], (ON_TABLE,), offered=recorded.candidates(SPHERE)).index in (0, 1)
+
+
+def test_the_path_costs_an_angle_a_length_or_nothing():
+    index = plan("farthest", [CUBE]).index
+    alpha = transforms.angle_between(HOME, OPEN.directions[index])
+    assert plan("farthest", [CUBE], path_cost="angle").cost == pytest.approx(np.sin(alpha / 2.0))
+    assert plan("farthest", [CUBE], path_cost="path").cost == pytest.approx(OPEN.path_length[index] / 3.0)
+    assert plan("farthest", [CUBE], path_cost="none").cost == 0.0
+
+
+class TestSaliency:
+    """Algorithm 2 with every open question as a setting, and as printed."""
+
+    SCREEN = box(2, (0.2, 0.1, 0.95), (0.02, 0.5, 0.4))
+    HEAP = (
+        CUBE,
+        SCREEN,
+        box(3, (0.02, -0.01, 0.88), (0.06, 0.08, 0.06)),
+        box(4, (-0.1, 0.3, 0.9), (0.1,) * 3),
+    )
+    SUPPORTS = (Support("o0", "o1", occurrences=2), Support("o0", "o2"), Support("o1", "o3"))
+    LONE, WALL = box(1, (0.0, 0.0, 0.9), (0.1, 0.1, 0.1)), box(2, (0.2, 0.0, 1.0), (0.02, 0.6, 0.5))
+    HELD = (Support("o0", "o2", occurrences=1),)
+    OTHER = {
+        "saliency": "decreasing",
+        "edge_point": "contact",
+        "path_cost": "none",
+        "occlusion": "ignore",
+        "propagation": False,
+    }
+
+    def run(self, name, views=5, **settings):
+        visited, found = HOME[None], []
+        for _ in range(views):
+            d = plan(name, list(self.HEAP), self.SUPPORTS, visited=visited, **settings)
+            sums = float(d.candidate_saliency.sum()), float(d.sphere_saliency.sum())
+            figures = (d.saliency, d.cost, d.score, *sums)
+            names = ("saliency", "cost", "score", "sum", "sphere")
+            found.append({"index": d.index, "why": d.why} | dict(zip(names, figures, strict=True)))
+            visited = np.vstack([visited, OPEN.directions[d.index]])
+        return found
+
+    @pytest.mark.parametrize("settings", [{}, OTHER], ids=["defaults", "other settings"])
+    def test_the_papers_planner_decides_as_it_always_did(self, settings):
+        golden = json.loads((Path(__file__).parent / "golden" / "paper.json").read_text())
+        for before, now in zip(golden, self.run("paper", **settings), strict=True):
+            assert (now["index"], now["why"]) == (before["index"], before["why"])
+            for figure in ("saliency", "cost", "score", "sum", "sphere"):
+                assert now[figure] == pytest.approx(before[figure], rel=1e-9)
+
+    def test_with_the_literal_settings_it_is_the_papers(self):
+        assert self.run("attention", 3, **LITERAL) == self.run("paper", 3)
+        assert self.run("attention", 3) != self.run("paper", 3)
+
+    @pytest.mark.parametrize(
+        "setting",
+        [
+            {"saliency": "paper"}, {"saliency_weight": 0.5}, {"edge_point": "midpoint"},
+            {"occlusion": "ignore"}, {"propagation": False}, {"spread": 10.0}, {"inhibition": 0.0},
+            {"path_cost": "none"}, {"path_cost": "angle"},
+        ],
+        ids=lambda s: "-".join(f"{k}={v}" for k, v in s.items()),
+    )  # fmt: skip
+    def test_every_setting_matters(self, setting):
+        supports = (replace(self.SUPPORTS[0], contact_world=np.array([0.1, 0.2, 0.75])), *self.SUPPORTS[1:])
+        both = np.stack([HOME, ELSEWHERE])
+        seen = [plan("attention", list(self.HEAP), supports, visited=both, **s) for s in ({}, setting)]
+        figures = [(d.score, tuple(d.candidate_saliency)) for d in seen]
+        assert figures[0] != figures[1]
+
+    def test_its_score_is_the_papers_formula(self):
+        decision = plan("paper", [CUBE], (ON_TABLE,))
+        chosen = OPEN.directions[decision.index]
+        midpoint = (TABLE.centre_world + CUBE.centre_world) / 2.0 - SPHERE.centre_world
+
+        def bump(top):
+            return float(np.exp(-0.5 * (degrees_between(top, chosen) / CONFIG.spread) ** 2))
+
+        assert decision.cost == pytest.approx(np.sin(transforms.angle_between(HOME, chosen) / 2.0))
+        assert abs(decision.saliency + bump(HOME)) == pytest.approx(bump(midpoint), abs=1e-6)
+
+    def test_a_hidden_point_counts_against_a_view_unless_occlusion_is_ignored(self):
+        opposite = int(np.argmax(OPEN.directions @ direction(0.0, 0.4)))
+
+        def there(objects, supports=(), **settings):
+            return plan("attention", objects, supports, **settings).candidate_saliency[opposite]
+
+        free = there([self.LONE])
+        assert free > 0.3
+        assert there([self.LONE, self.WALL], self.HELD) < free - 0.2
+        ignored = there([self.LONE, self.WALL], self.HELD, occlusion="ignore")
+        assert ignored == pytest.approx(free, abs=1e-6)
+
+    def test_without_propagation_one_candidate_a_point_has_saliency(self):
+        settings = {"inhibition": 0.0, "occlusion": "ignore"}
+        alone = plan("attention", list(self.HEAP), self.SUPPORTS, propagation=False, **settings)
+        tops = np.stack([p.direction for p in alone.points_of_interest])
+        nearest = np.argmax(OPEN.directions @ tops.T, axis=0)
+        assert set(np.flatnonzero(alone.candidate_saliency)) == set(nearest)
+        for k in set(nearest):
+            own = [p.saliency for p, n in zip(alone.points_of_interest, nearest, strict=True) if n == k]
+            assert alone.candidate_saliency[k] == max(own)
+        spreading = plan("attention", list(self.HEAP), self.SUPPORTS, **settings)
+        assert np.count_nonzero(spreading.candidate_saliency > 0.1) > 100
+        hidden = plan("attention", [self.LONE, self.WALL], self.HELD, propagation=False, inhibition=0.0)
+        assert hidden.candidate_saliency.min() == -1.0, "a hidden point still repels"
+
+    def test_a_view_no_point_reaches_is_not_said_to_be_about_one(self):
+        """A relation found in all views is worth nothing with λ_s = ½: the robot stays where it is."""
+        settings = {"saliency_weight": 0.5, "inhibition": 0.0, "path_cost": "angle", "propagation": False}
+        alone = plan("attention", [CUBE], (Support("o0", "o1"),), **settings)
+        assert degrees_between(HOME, OPEN.directions[alone.index]) < 1.2
+        assert "no point of interest" in alone.why
+
+
+class TestHiddenSurface:
+    def test_it_looks_at_the_other_sides_and_never_twice_the_same(self):
+        visited = HOME[None]
+        for turn in range(4):
+            decision = plan("support", [CUBE], (ON_TABLE,), visited=visited)
+            chosen = OPEN.directions[decision.index]
+            assert degrees_between(visited, chosen).min() > 15.0
+            assert turn or chosen @ HOME < 0.5
+            assert turn or decision.why == "shows most of what is still hidden: o1 (100%)"
+            visited = np.vstack([visited, chosen])
+        about = [p for p in plan("support", [CUBE], (ON_TABLE,)).points_of_interest if "part of" in p.why]
+        assert [(p.subject, p.saliency, p.why) for p in about] == [
+            (("o1",), 1.0, "part of o1 has not been seen")
+        ]
+        assert about[0].direction[0] > 0.5
+        assert np.linalg.norm(about[0].position_world - CUBE.centre_world) < 0.07
+
+    def test_it_looks_past_a_screen(self):
+        screen = box(2, (0.0, 0.16, 0.95), (0.5, 0.02, 0.4))
+        other_side = direction(np.pi / 2.0, np.deg2rad(35.0))
+        decision = plan("support", [CUBE, screen], visited=np.stack([HOME, other_side]))
+        solid = known([TABLE, CUBE, screen]).solid()
+        samples = surface_samples(SupportGraph((TABLE, CUBE)), solid)
+        shown = visibility(samples, decision.T_world_camera[None], solid, CONFIG)[:, 0]
+        assert decision.T_world_camera[1, 3] < 0.0
+        assert (shown > 0.5).mean() > 0.2
+
+    def test_what_cannot_be_reached_is_not_wanted(self):
+        offered = candidates(((0.62, 0.0, 1.0), (0.03, 1.6, 1.0)))
+        decision = plan("support", [CUBE], (ON_TABLE,), offered=offered)
+        assert abs(np.arctan2(*offered.directions[decision.index][1::-1])) > np.deg2rad(30.0)
+
+    def test_unseen_space_behind_a_screen_draws_the_view(self):
+        decision = make_planner("support").plan(beside_screen(1.0), np.random.default_rng(0))
+        assert OPEN.directions[decision.index][0] > 0.3
+        assert SPACE in decision.why
+        (space,) = [p for p in decision.points_of_interest if p.why == "unseen space on the table"]
+        assert space.subject == ()
+        assert space.position_world[0] > 0.0
+
+    def test_the_more_a_way_costs_the_shorter_it_is(self):
+        ways = []
+        for effort in (0.0, 0.05, 0.5, 100.0):
+            decision = plan("support", [CUBE], (ON_TABLE,), effort=effort, inhibition=0.0)
+            ways.append(float(OPEN.path_length[decision.index]))
+        assert ways == sorted(ways, reverse=True)
+        assert ways[0] > 2.0 * ways[2] > 0.0
+        assert ways[3] < 0.1
+        nothing = plan("support", [])
+        assert nothing.why == "nothing hidden is expected to come into sight; the cheapest new view"
+
+
+class TestBaselines:
+    def tour(self, name, views, offered=OPEN):
+        rng, visited = np.random.default_rng(0), HOME[None]
+        while len(visited) < views:
+            decision = make_planner(name).plan(state([CUBE], visited=visited, offered=offered), rng)
+            visited = np.vstack([visited, offered.directions[decision.index]])
+        return visited
+
+    def test_random_reaches_all_sides(self):
+        rng, situation = np.random.default_rng(0), state([CUBE])
+        indices = [make_planner("random").plan(situation, rng).index for _ in range(200)]
+        azimuth = np.arctan2(OPEN.directions[indices, 1], OPEN.directions[indices, 0])
+        assert (np.histogram(azimuth, bins=6, range=(-np.pi, np.pi))[0] > 10).all()
+
+    def test_a_ring_goes_around_in_equal_steps_and_further_rounds_fill_the_gaps(self):
+        visited = self.tour("ring", 4 * STOPS)
+        azimuths = np.rad2deg(np.arctan2(visited[:, 1], visited[:, 0]))
+        np.testing.assert_allclose(np.diff(azimuths[:STOPS]) % 360.0, 72.0, atol=3.0)
+        np.testing.assert_allclose(np.rad2deg(np.arcsin(visited[:, 2])), 35.0, atol=2.0)
+        for rounds in (1, 2, 4):
+            part = np.sort(azimuths[: rounds * STOPS])
+            np.testing.assert_allclose(np.diff(np.append(part, part[0] + 360.0)), 72.0 / rounds, atol=4.0)
+        third = plan("ring", [CUBE], visited=visited[:2])
+        assert third.why == "stop 3 of 5 around the scene, 144° from the first view"
+
+    def test_farthest_is_farthest_and_of_equal_ones_the_first(self):
+        visited = self.tour("farthest", 6)
+        for n in range(1, len(visited)):
+            smallest = max(transforms.angle_between(visited[:n], d).min() for d in OPEN.directions[::7])
+            assert transforms.angle_between(visited[:n], visited[n]).min() >= smallest - 1e-6
+        equal = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0]])
+        offered = Candidates(np.tile(np.eye(4), (3, 1, 1)), equal, np.zeros(3), {})
+        decision = plan("farthest", [CUBE], visited=np.array([[-1.0, 0.0, 0.0]]), offered=offered)
+        assert decision.index == 0
+        assert decision.why == "90° from the nearest earlier view, farther than any other"
+
+
+SIZE, OF_FREE, OF_OCCUPIED = 0.01, 0.12, 0.97
+"""Edge of a voxel [m]; occupancy of voxels of one reading's kind seen often enough for the clamp."""
+
+
+def entropy(p):
+    return float(-p * np.log2(p) - (1.0 - p) * np.log2(1.0 - p))
+
+
+def map_of(states):
+    """A map whose voxels have these states (X, Y, Z), each of five views' evidence."""
+    hits, passes = (5 * (np.asarray(states) == s).astype(np.uint8) for s in (OCCUPIED, FREE))
+    return VoxelMap(np.zeros(3), hits, passes, VoxelConfig(size=SIZE))
+
+
+def along(*states, proximity=0.1, backwards=False):
+    """What a single ray along +x, or −x, through a row of voxels gathers."""
+    voxels = map_of(np.array(states)[:, None, None])
+    eye, target = (-0.5, 0.005, 0.005), (1.0, 0.005, 0.005)
+    T = transforms.look_at(target, eye) if backwards else transforms.look_at(eye, target)
+    straight = np.array([[0.0, 0.0, 1.0]])
+    found = gather(voxels.states, layers(voxels, proximity), T[None], straight, np.zeros(3), SIZE)
+    return dict(zip(VOLUMETRIC, found[0], strict=True))
+
+
+@cache
+def unseen_beside_screen(side):
+    """A screen across the table; what is on one side of it, +1 or −1 along x, has not been seen."""
+    voxels = known([TABLE, box(1, (0.0, 0.0, 0.9), (0.02, 0.6, 0.3))])
+    x, y, z = np.moveaxis(voxels.centres_world(np.moveaxis(np.indices(voxels.hits.shape), 0, -1)), -1, 0)
+    unseen = (side * x > 0.01) & (side * x < 0.3) & (np.abs(y) < 0.3) & (z > 0.75) & (z < 1.05)
+    passes = np.where(unseen, 0, voxels.passes).astype(np.uint8)
+    return VoxelMap(voxels.origin_world, voxels.hits, passes, voxels.config)
+
+
+def beside_screen(side, **settings):
+    screen = box(1, (0.0, 0.0, 0.9), (0.02, 0.6, 0.3))
+    return replace(state([screen], (ON_TABLE,), **settings), voxels=unseen_beside_screen(side))
+
+
+SHOWN = [name for name in VOLUMETRIC if name != "occlusion-aware"]
+"""Those that count nothing of what has been seen free."""
+
+
+class TestVolumetric:
+    def test_occlusion_aware_is_entropy_by_visibility(self):
+        found = along(FREE, UNKNOWN, FREE, OCCUPIED, UNKNOWN)["occlusion-aware"]
+        visible = np.cumprod([1.0, 1.0 - OF_FREE, 0.5, 1.0 - OF_FREE])
+        assert found == pytest.approx(
+            visible @ [entropy(OF_FREE), 1.0, entropy(OF_FREE), entropy(OF_OCCUPIED)]
+        )
+        unknown = along(FREE, UNKNOWN, UNKNOWN, OCCUPIED, UNKNOWN)["unobserved-voxel"]
+        assert unknown == pytest.approx((1.0 - OF_FREE) * (1.0 + 0.5), rel=1e-5)
+
+    def test_a_rear_side_is_an_occupied_voxel_met_from_an_unknown_one(self):
+        back = (OCCUPIED, UNKNOWN, UNKNOWN, FREE)
+        assert along(*back)["rear-side-voxel"] == 0.0
+        assert along(*back, backwards=True)["rear-side-voxel"] == 1.0
+        assert along(UNKNOWN, FREE, OCCUPIED)["rear-side-voxel"] == 0.0
+        assert along(UNKNOWN, UNKNOWN, FREE)["rear-side-voxel"] == 0.0
+        run = along(UNKNOWN, FREE, UNKNOWN, UNKNOWN, OCCUPIED)["rear-side-entropy"]
+        assert run == pytest.approx(2.0)
+        assert along(UNKNOWN, UNKNOWN, FREE, OCCUPIED)["rear-side-entropy"] == 0.0
+        assert along(UNKNOWN, UNKNOWN)["rear-side-entropy"] == 0.0
+
+    def test_proximity_count_falls_off_from_the_surface(self):
+        row = (FREE, UNKNOWN, UNKNOWN, UNKNOWN, OCCUPIED, UNKNOWN)
+        found = along(*row, proximity=0.025)["proximity-count"]
+        assert found == pytest.approx((0.025 - 0.01) + (0.025 - 0.02), rel=1e-5)
+        assert along(*row, proximity=0.0)["proximity-count"] == 0.0
+        assert along(UNKNOWN, UNKNOWN, FREE)["proximity-count"] == 0.0
+
+    def test_nothing_behind_an_occupied_voxel_counts(self):
+        for start in ((FREE, OCCUPIED), (UNKNOWN, OCCUPIED)):
+            assert along(*start) == pytest.approx(along(*start, UNKNOWN, UNKNOWN, OCCUPIED))
+
+    def test_a_wall_is_worth_looking_at_from_behind(self):
+        states = np.full((30, 30, 30), FREE)
+        states[15], states[16:] = OCCUPIED, UNKNOWN
+        voxels, middle = map_of(states), np.full(3, 0.15)
+        poses = np.stack([transforms.look_at(middle + (x, 0.0, 0.0), middle) for x in (-1.0, 1.0)])
+        found = gather(voxels.states, layers(voxels, 0.1), poses, image_rays(CONFIG), np.zeros(3), SIZE)
+        for name in SHOWN:
+            front, back = found[:, VOLUMETRIC.index(name)]
+            assert front == 0.0
+            assert back > 100.0 * (SIZE if name == "proximity-count" else 1.0)
+
+    def test_rays_fill_the_image_two_voxels_apart(self):
+        rays_camera = image_rays(CONFIG)
+        np.testing.assert_allclose(np.linalg.norm(rays_camera, axis=1), 1.0)
+        angle = np.rad2deg(np.arccos(rays_camera[:, 2]))
+        assert 29.0 < angle.max() <= 30.0
+        at_centre = np.unique((CONFIG.sphere_radius * rays_camera[:, 0] / rays_camera[:, 2]).round(6))
+        np.testing.assert_allclose(np.diff(at_centre), 0.02, atol=1e-6)
+        assert (angle < 1e-6).sum() == 1
+
+    @pytest.mark.parametrize("side", [1.0, -1.0])
+    @pytest.mark.parametrize("name", SHOWN)
+    def test_it_goes_to_the_side_that_shows_unknown_space(self, name, side):
+        decision = make_planner(name).plan(beside_screen(side, path_cost="none"), np.random.default_rng(0))
+        assert side * OPEN.directions[decision.index][0] > 0.3
+        assert decision.saliency == 1.0
+        assert "100% of the most" in decision.why
+
+    @pytest.mark.parametrize("name", VOLUMETRIC)
+    def test_its_score_is_the_utility(self, name):
+        free, dear = (
+            make_planner(name).plan(beside_screen(1.0, path_cost=cost), np.random.default_rng(0))
+            for cost in ("none", "angle")
+        )
+        looks = OPEN.looks(COUNT)
+        old = OPEN.directions[looks.chosen] @ HOME >= np.cos(np.sqrt(4.0 * np.pi / COUNT))
+        cost = np.sin(transforms.angle_between(HOME, OPEN.directions[looks.chosen[~old]]) / 2.0)
+        chosen = looks.without(old, OPEN.directions).chosen
+        gain = free.candidate_saliency[chosen]
+        utility = gain / gain.sum() - cost / cost.sum()
+        assert dear.index == chosen[int(np.argmax(utility))]
+        assert dear.score == pytest.approx(utility.max() * gain.sum())
+        assert degrees_between(HOME, OPEN.directions[dear.index]) > 5.0, "it does not stay where it is"
+
+    def test_unknown_space_outside_the_box_over_the_table_counts_for_nothing(self):
+        inside = beside_screen(1.0)
+        low, high = space_above(inside.graph, inside.voxels)
+        centres = inside.voxels.centres_world(np.moveaxis(np.indices(inside.voxels.hits.shape), 0, -1))
+        outside = ((centres < low - SIZE) | (centres > high + SIZE)).any(axis=-1)
+        hits, passes = (
+            np.where(outside, 0, a).astype(np.uint8) for a in (inside.voxels.hits, inside.voxels.passes)
+        )
+        emptied = VoxelMap(inside.voxels.origin_world, hits, passes, inside.voxels.config)
+        poses = OPEN.T_world_camera[::300]
+        found, same = (ray_information(s, poses, 0.1) for s in (inside, replace(inside, voxels=emptied)))
+        np.testing.assert_array_equal(found, same)
+        assert found.max() > 0.0
+        assert ray_information(state([]), poses).max() == 0.0
+        nearness = VOLUMETRIC.index("proximity-count")
+        assert ray_information(inside, poses)[:, nearness].max() == 0.0 < found[:, nearness].max()
+
+
+PACKAGE = Path(__file__).parents[1] / "examples" / "planner_package"
+PROJECT = tomllib.loads((PACKAGE / "pyproject.toml").read_text())["project"]
+((NAME, VALUE),) = PROJECT["entry-points"]["caryatid.planners"].items()
+
+
+class TestAPlannerOfAnotherPackage:
+    """One file and its entry point make a planner."""
+
+    def test_it_is_found_by_its_entry_point_and_listed_with_the_others(self, monkeypatch):
+        with pytest.raises(InputError, match=f"no planner 'best'.*{', '.join(BUILT_IN)}, oracle"):
+            make_planner("best")
+        with pytest.raises(InputError, match="'oracle' needs a simulated scene"):
+            make_planner("oracle")
+        value = "caryatid.planning.planners.baselines:RandomPlanner"
+        offers = [EntryPoint(n, value, "caryatid.planners") for n in ("mine", "support")]
+        monkeypatch.setattr(
+            planners, "entry_points", lambda group: offers if group == offers[0].group else []
+        )
+        assert isinstance(make_planner("mine"), RandomPlanner)
+        assert not isinstance(make_planner("support"), RandomPlanner), "a name of ours stays ours"
+        with pytest.raises(InputError, match=f"{', '.join(BUILT_IN)}, mine, oracle"):
+            make_planner("best")
+
+    @pytest.mark.slow
+    def test_the_command_line_explores_with_it(self, tmp_path):
+        """The package is installed: its metadata is where and as pip writes it."""
+        name, version = PROJECT["name"], PROJECT["version"]
+        folder = tmp_path / f"site/{name.replace('-', '_')}-{version}.dist-info"
+        folder.mkdir(parents=True)
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
+        (folder / "entry_points.txt").write_text(f"[caryatid.planners]\n{NAME} = {VALUE}\n")
+        path = [str(tmp_path / "site"), str(PACKAGE / "src"), os.environ.get("PYTHONPATH", "")]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, path)), "COLUMNS": "200"}
+        options = ["--planner", NAME, "--views", "2", "--no-report", "--quiet", *SMALL]
+        run = ["-m", "caryatid", "explore", "tower", "--out", str(tmp_path / "run"), *options]
+        command = [sys.executable, *map(str, run)]
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=300, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        assert "from above" in (tmp_path / "run/views/00/view.json").read_text()
+        assert f'"planner": "{NAME}"' in (tmp_path / "run/run.json").read_text()
+
+    def test_it_looks_from_above_and_then_all_around(self, monkeypatch):
+        monkeypatch.syspath_prepend(PACKAGE / "src")
+        planner, visited = EntryPoint(NAME, VALUE, "caryatid.planners").load()(), HOME[None]
+        for _ in range(4):
+            decision = planner.plan(state([CUBE], visited=visited), np.random.default_rng(0))
+            visited = np.vstack([visited, OPEN.directions[decision.index]])
+        assert visited[1, 2] == OPEN.directions[:, 2].max()
+        flat = transforms.unit(np.delete(visited, 1, axis=0) * (1.0, 1.0, 0.0))
+        assert degrees_between(flat[:, None], flat[None])[~np.eye(len(flat), dtype=bool)].min() > 80.0
+        assert f"--planner {NAME}" in (PACKAGE / "README.md").read_text()
