@@ -1,4 +1,4 @@
-"""Points of interest, candidates, what views are expected to show, and the planners that choose among them."""
+"""Points of interest, candidates, what views are expected to show, and the planners that choose."""
 
 from __future__ import annotations
 
@@ -58,6 +58,13 @@ from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
 PAPER = replace(CONFIG, saliency="paper", edge_point="midpoint")
 LITERAL = {"saliency": "paper", "edge_point": "midpoint", "path_cost": "angle"}
+OTHER = {
+    "saliency": "decreasing",
+    "edge_point": "contact",
+    "path_cost": "none",
+    "occlusion": "ignore",
+    "propagation": False,
+}
 ELSEWHERE = direction(-1.0, 0.5)
 COUNT = CONFIG.look_directions
 
@@ -222,7 +229,6 @@ class TestCandidates:
 class TestExpectedVisibility:
     GRAPH = SupportGraph((TABLE, CUBE))
 
-    @cache
     def samples(self):
         solid = known([TABLE, CUBE]).solid()
         return surface_samples(self.GRAPH, solid), solid
@@ -236,7 +242,7 @@ class TestExpectedVisibility:
         flat = box(2, (0.0, 0.3, 0.76), (0.3, 0.2, 0.02))
         both = surface_samples(SupportGraph((TABLE, CUBE, flat)), known([TABLE, CUBE, flat]).solid())
         for subject, open_ in ((0, 5.0 / 6.0), (1, (0.06 + 0.02) / (0.12 + 0.02))):
-            assert both.weights[both.subjects == subject].sum() == pytest.approx(open_ / 2.0, abs=0.03)
+            assert both.weights[both.subjects == subject].sum() == pytest.approx(open_ / 2.0, abs=0.05)
         assert len(surface_samples(SupportGraph((TABLE,)), known([TABLE]).solid()).weights) == 0
 
     def test_a_surface_is_seen_from_before_and_less_from_aside_and_not_from_behind(self):
@@ -383,13 +389,6 @@ class TestSaliency:
     SUPPORTS = (Support("o0", "o1", occurrences=2), Support("o0", "o2"), Support("o1", "o3"))
     LONE, WALL = box(1, (0.0, 0.0, 0.9), (0.1, 0.1, 0.1)), box(2, (0.2, 0.0, 1.0), (0.02, 0.6, 0.5))
     HELD = (Support("o0", "o2", occurrences=1),)
-    OTHER = {
-        "saliency": "decreasing",
-        "edge_point": "contact",
-        "path_cost": "none",
-        "occlusion": "ignore",
-        "propagation": False,
-    }
 
     def run(self, name, views=5, **settings):
         visited, found = HOME[None], []
@@ -612,7 +611,7 @@ class TestVolumetric:
         found = along(FREE, UNKNOWN, FREE, OCCUPIED, UNKNOWN)["occlusion-aware"]
         visible = np.cumprod([1.0, 1.0 - OF_FREE, 0.5, 1.0 - OF_FREE])
         assert found == pytest.approx(
-            visible @ [entropy(OF_FREE), 1.0, entropy(OF_FREE), entropy(OF_OCCUPIED)]
+            visible @ [entropy(OF_FREE), 1.0, entropy(OF_FREE), entropy(OF_OCCUPIED)], rel=1e-5
         )
         unknown = along(FREE, UNKNOWN, UNKNOWN, OCCUPIED, UNKNOWN)["unobserved-voxel"]
         assert unknown == pytest.approx((1.0 - OF_FREE) * (1.0 + 0.5), rel=1e-5)
