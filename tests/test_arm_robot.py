@@ -14,7 +14,7 @@ from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import explore, next_best_view
 from caryatid.geometry import transforms
 from caryatid.robots import Posture, Unreachable, home_view, view_sphere_of
-from caryatid.robots.arm import REASONS, UNCONFIRMED, ArmRobot
+from caryatid.robots.arm import RADII, RADIUS_SHARE, REASONS, UNCONFIRMED, ArmRobot
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.reachability import sample_reachability
@@ -59,8 +59,8 @@ class TestViewSphere:
             return len(robot.candidates(robot.view_sphere(PROPOSED)))
 
         chosen = arm().view_sphere(PROPOSED).radius
-        most = max(count(float(r)) for r in np.linspace(*CONFIG.radius, CONFIG.radii))
-        share = CONFIG.radius_share
+        most = max(count(float(r)) for r in np.linspace(*CONFIG.radius, RADII))
+        share = RADIUS_SHARE
         assert count(chosen) > (share - 0.05) * most
         assert count(chosen + 0.1) < share * most
 

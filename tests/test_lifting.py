@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caryatid.config import LiftConfig
-from caryatid.simulation.lifting import ASIDE, Lifting
+from caryatid.simulation.lifting import ASIDE, CLEARANCE, Lifting
 from caryatid.simulation.world import box, build_spec, scene_from_spec, sphere
 
 CONFIG = LiftConfig(watch=1.0)
@@ -60,7 +60,7 @@ def test_an_object_goes_up_at_the_speed_asked_for_until_it_is_clear(stack):
     done = lift.lift(state, BESIDE, CONFIG)
     heights = done.film[:, BESIDE, 2]
     rising = heights[heights < ASIDE / 2.0]
-    clear = state[UPPER, 2] + 0.03 + CONFIG.clearance - (state[BESIDE, 2] - 0.025)
+    clear = state[UPPER, 2] + 0.03 + CLEARANCE - (state[BESIDE, 2] - 0.025)
     assert rising[-1] - state[BESIDE, 2] == pytest.approx(clear, abs=0.003)
     slow = lift.lift(state, BESIDE, replace(CONFIG, speed=0.05))
     assert (slow.film[:, BESIDE, 2] < ASIDE / 2.0).sum() == pytest.approx(2 * len(rising), abs=1)

@@ -102,7 +102,7 @@ class TestFloorGrid:
         grid = floor(TABLE, WALL)
         eyes = np.array([[1.3, 0.0, 1.5], [-1.3, 0.0, 1.5], [0.9, 0.0, 8.0]])
         target = np.array([0.0, 0.0, 0.74])
-        assert grid.hidden(eyes, target, CONFIG.table_margin).tolist() == [True, False, False]
+        assert grid.hidden(eyes, target).tolist() == [True, False, False]
 
 
 class TestHumanoidRobot:
