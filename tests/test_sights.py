@@ -1,10 +1,8 @@
 from __future__ import annotations
 
 import numpy as np
-import shapely
 
 from caryatid.geometry import transforms
-from caryatid.planning.expected_visibility import unseen_space, unseen_space_reference
 from caryatid.sensing.visibility import shown, shown_reference
 
 
@@ -40,23 +38,3 @@ def test_without_anything_solid_nothing_is_hidden():
     np.testing.assert_array_equal(shown(*nothing), shown(np.zeros_like(args[0]), *args[1:]))
     assert shown(*(a[:0] if n in (3, 4, 5, 6) else a for n, a in enumerate(args))).shape == (0, 20)
     assert shown(*(a[:, :0].copy() if n in (7, 8) else a for n, a in enumerate(args))).shape == (10, 0)
-
-
-def test_the_unseen_space_over_a_table_agrees_with_its_reference():
-    rng = np.random.default_rng(3)
-    T_world_table = transforms.rigid(transforms.rotation_from_vector((0.02, -0.03, 0.6)), (0.02, -0.03, 0.0))
-    x, y, z = np.arange(-0.5, 0.5, 0.04), np.arange(-0.4, 0.6, 0.04), np.arange(0.03, 0.3, 0.04)
-    corners = rng.uniform(-0.3, 0.3, (12, 2))
-    states = rng.choice(np.array([0, 1, 2], dtype=np.int8), (13, 17, 5), p=(0.3, 0.5, 0.2))
-    solid = (rng.random((8, 9, 4)) < 0.3).astype(np.int8)
-    hull = shapely.get_coordinates(shapely.MultiPoint(corners).convex_hull)
-    for heap in (hull, hull[::-1], hull[:0], hull[:1], hull[:2]):
-        args = (
-            x, y, z, 0.29, T_world_table, np.array([0.3, 0.4]), np.ascontiguousarray(heap), states,
-            np.array([-0.31, -0.41, -0.1]), solid, np.array([-0.2, -0.2, 0.01]), 0.06,
-        )  # fmt: skip
-        compiled, reference = unseen_space(*args), unseen_space_reference(*args)
-        for ours, theirs in zip(compiled, reference, strict=True):
-            np.testing.assert_allclose(ours, theirs, atol=1e-12)
-        assert 300 < len(compiled[0]) < 0.7 * len(x) * len(y) * len(z)
-        assert (compiled[2] > 0.0).any() == (len(heap) > 2)

@@ -17,8 +17,7 @@ from caryatid.errors import InputError
 from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import area, hull
-from caryatid.geometry.shape_arrays import shape_arrays
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Primitives, Sphere
 from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject
 from caryatid.support.contacts import find_contacts, find_gap, local_frames
@@ -180,7 +179,7 @@ class TestContacts:
         pairs = np.array([(c.a, c.b) for c in contacts])
         points_world = np.array([c.point_world for c in contacts])
         normals_world = np.array([c.normal_world for c in contacts])
-        points, outward = local_frames(shape_arrays(shapes), pairs, points_world, normals_world)
+        points, outward = local_frames(Primitives.of(shapes), pairs, points_world, normals_world)
         for k, pair in enumerate(pairs):
             for side, sign in ((0, 1.0), (1, -1.0)):
                 T = shapes[pair[side]].T_world_object
@@ -289,7 +288,7 @@ class TestPolygons:
         for _ in range(3):
             shapes = random_shapes(8, rng, 0.12)
             for k, shape in enumerate(shapes):
-                below = beneath(shape_arrays(shapes), k, 0.05)
+                below = beneath(Primitives.of(shapes), k, 0.05)
                 assert k not in below
                 hit = {m for m, o in enumerate(shapes) if m != k and drop_distance(shape, o, 0.05) < np.inf}
                 assert hit <= set(below)
