@@ -9,8 +9,7 @@ from scipy.ndimage import gaussian_filter
 
 from caryatid.config import RecordingConfig
 from caryatid.geometry import transforms
-from caryatid.io.recordings import choose_views
-from caryatid.io.recordings.frame_filter import apart, sharpness_of_colour
+from caryatid.io.importing import apart, choose_views, sharpness_of_colour
 
 CONFIG = RecordingConfig()
 

@@ -252,14 +252,14 @@ def nothing(document):
         ("scene_camera.json", lambda d: d.update({"9": d["1"]}), "depth/000009.png"),
         ("scene_camera.json", lambda d: d.update({"first": d["1"]}), "'first'"),
         ("scene_camera.json", lambda d: d.update({"01": d["1"]}), "'01'"),
-        ("scene_camera.json", lambda d: d.update({"1": 5}), "no JSON object"),
+        ("scene_camera.json", lambda d: d.update({"1": 5}), "must be an object"),
         ("scene_gt.json", lambda d: d["1"][0].pop("obj_id"), "'obj_id' is missing"),
-        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=0), "obj_id is 0"),
+        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=0), "'obj_id' is 0"),
         ("scene_gt.json", lambda d: d["1"][0].update(obj_id=65535), "65535"),
         ("scene_gt.json", lambda d: d["1"][0].update(obj_id=300), "two masks have obj_id 300"),
         ("scene_gt.json", lambda d: d["1"].append({"obj_id": 4}), "missing"),
         ("scene_gt.json", lambda d: d.pop("1"), "names no object"),
-        ("scene_gt.json", lambda d: d.update({"1": {"obj_id": 1}}), "no list"),
+        ("scene_gt.json", lambda d: d.update({"1": {"obj_id": 1}}), "must be a valid array"),
         ("scene_gt.json", lambda d: d.update({"8": []}), "not in scene_camera.json"),
     ],
 )
@@ -288,7 +288,7 @@ def test_a_rotation_that_drifted_is_made_a_rotation(folder):
 
 
 def test_no_folder_is_refused(tmp_path):
-    refused(tmp_path / "nowhere", "is no folder")
+    refused(tmp_path / "nowhere", "is not a folder")
 
 
 def test_writing_refuses_what_does_not_fit(tmp_path, folder):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,8 @@ from caryatid.config import Config, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
-from caryatid.io.bop import Recording, read_recording
+from caryatid.io.datasets import Dataset, format_of, open_dataset
+from caryatid.io.importing import FrameFilter
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.sensing.views import Camera
@@ -45,8 +46,8 @@ class Source:
 
 
 def is_recording(source: str) -> bool:
-    """Whether SOURCE is a folder in the BOP format."""
-    return (Path(source) / "scene_camera.json").is_file() or (Path(source) / "depth").is_dir()
+    """Whether SOURCE is a dataset of a known format."""
+    return Path(source).exists() and format_of(Path(source)) is not None
 
 
 def open_source(
@@ -89,13 +90,17 @@ def open_source(
     return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
 
 
-def open_recording(folder: str, config: Config, segmentation: SegmentationMethod | None) -> Recording:
-    """Read a recording and decode every frame once, so that what is broken is said before any work is done.
+def open_recording(folder: str, config: Config, segmentation: SegmentationMethod | None) -> Dataset:
+    """Open a dataset and decode every frame once, so that a broken one is reported before any work is done.
+
+    Of a video a few sharp frames are chosen.
 
     Raises:
         InputError: It is broken, has no labels where they are demanded, or a segment too small for a shape.
     """
-    recording = read_recording(folder)
+    recording = open_dataset(folder, config.recording)
+    if recording.is_video:
+        recording = replace(recording, frames=FrameFilter(config.recording).choose(recording)[0])
     if segmentation == "labels" and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()
@@ -129,7 +134,7 @@ def check_segments(source: str, points: Mapping[int, int], config: Config) -> No
         )
 
 
-def _open_recording(recording: Recording) -> Source:
+def _open_recording(recording: Dataset) -> Source:
     camera = RecordingCamera(recording)
     poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
-    return Source(recording.folder.name, camera, RecordingRobot(poses), None, len(recording))
+    return Source(recording.path.name, camera, RecordingRobot(poses), None, len(recording))

@@ -9,9 +9,9 @@ from typing import Any
 from caryatid.cli.import_recording import Import
 from caryatid.cli.progress import Progress
 from caryatid.config import Config
+from caryatid.io.datasets import Topics
+from caryatid.io.importing import Imported, import_recording, reasons
 from caryatid.io.json_files import json_text
-from caryatid.io.recordings.bag_footage import Topics
-from caryatid.io.recordings.importing import Imported, import_recording, reasons
 from caryatid.runtime.interrupts import interruptible
 
 
@@ -46,8 +46,13 @@ def _document(options: Import, imported: Imported) -> dict[str, Any]:
         "recording": str(options.out),
         "frames": imported.read,
         "views": [
-            {"view": index, "frame": shot.number, "time": shot.time, "posed": shot.T_world_camera is not None}
-            for index, shot in enumerate(imported.chosen)
+            {
+                "view": index,
+                "frame": frame.number,
+                "time": frame.time,
+                "posed": frame.T_world_camera is not None,
+            }
+            for index, frame in enumerate(imported.chosen)
         ],
         "skipped": imported.skipped,
         "notes": list(imported.notes),

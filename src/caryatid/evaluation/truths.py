@@ -11,7 +11,7 @@ import numpy as np
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueObject, TrueScene, score, score_masks
-from caryatid.io.bop import Frame, Recording, read_recording
+from caryatid.io.bop import RecordedFrame, Recording, read_recording
 from caryatid.io.runs import Run, RunView, read_run
 from caryatid.simulation import world
 from caryatid.simulation.scenes import load_scene
@@ -140,6 +140,6 @@ def _score_recording(
     return tuple(scores)
 
 
-def _frame_of(view: RunView, recording: Recording) -> Frame:
+def _frame_of(view: RunView, recording: Recording) -> RecordedFrame:
     """Frame a view was made from; a recording of one frame needs no names."""
     return recording.frames[0] if len(recording) == 1 else recording.frame(view.name)

@@ -1,23 +1,51 @@
-"""Files: recordings (BOP folders), clouds (PCD, PLY), graph.json and run folders."""
+"""Files: datasets (BOP folders, TUM RGB-D folders, bags), clouds (PCD, PLY), graph.json and run folders."""
 
 from __future__ import annotations
 
-from caryatid.io.bop import Frame, Recording, read_recording
-from caryatid.io.bop_writer import write_recording
-from caryatid.io.graph_json import graph_from_json, graph_text, graph_to_json, read_graph
-from caryatid.io.point_clouds import StoredCloud, read_cloud, read_stored_cloud
-from caryatid.io.runs import Run, RunView, RunWriter, read_run
+from typing import TYPE_CHECKING
+
+from caryatid.runtime.late import imported_late
+
+if TYPE_CHECKING:
+    from caryatid.io.bop import RecordedFrame, Recording, read_recording, write_recording
+    from caryatid.io.datasets import Dataset, Format, Frame, OpenOptions, Topics, open_dataset
+    from caryatid.io.graph_json import graph_from_json, graph_text, graph_to_json, read_graph
+    from caryatid.io.importing import FrameFilter, Imported, choose_views, import_recording
+    from caryatid.io.point_clouds import StoredCloud, read_cloud, read_stored_cloud
+    from caryatid.io.runs import Run, RunView, RunWriter, read_run
+    from caryatid.io.transform_tree import TransformTree
+
+_HOMES = {
+    "bop": ["RecordedFrame", "Recording", "read_recording", "write_recording"],
+    "datasets": ["Dataset", "Format", "Frame", "OpenOptions", "Topics", "open_dataset"],
+    "graph_json": ["graph_from_json", "graph_text", "graph_to_json", "read_graph"],
+    "importing": ["FrameFilter", "Imported", "choose_views", "import_recording"],
+    "point_clouds": ["StoredCloud", "read_cloud", "read_stored_cloud"],
+    "runs": ["Run", "RunView", "RunWriter", "read_run"],
+    "transform_tree": ["TransformTree"],
+}
 
 __all__ = [
+    "Dataset",
+    "Format",
     "Frame",
+    "FrameFilter",
+    "Imported",
+    "OpenOptions",
+    "RecordedFrame",
     "Recording",
     "Run",
     "RunView",
     "RunWriter",
     "StoredCloud",
+    "Topics",
+    "TransformTree",
+    "choose_views",
     "graph_from_json",
     "graph_text",
     "graph_to_json",
+    "import_recording",
+    "open_dataset",
     "read_cloud",
     "read_graph",
     "read_recording",
@@ -25,3 +53,10 @@ __all__ = [
     "read_stored_cloud",
     "write_recording",
 ]
+
+if not TYPE_CHECKING:
+    __getattr__ = imported_late(__name__, _HOMES)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

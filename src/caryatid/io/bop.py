@@ -1,38 +1,60 @@
-"""Recordings: scene folders of the BOP benchmark format, read frame by frame."""
+"""Recordings: scene folders of the BOP benchmark format, read frame by frame and written view by view."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from types import TracebackType
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
+from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 
+from caryatid.config import RecordingConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io import images
-from caryatid.io.json_files import field, number, numbers, read_json
+from caryatid.io.datasets import Dataset, OpenOptions
+from caryatid.io.json_files import Numbers, json_text, parse_json, read_json
+from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import SUPPORT_LABEL, View, check_intrinsics
 
 COLOUR_ENDINGS: Final = (".png", ".jpg", ".jpeg")
-"""Files of colour images, the first that exists."""
+"""Files of colour images; the first that exists counts."""
 ROTATION_DRIFT: Final = 0.02
 """How far RᵀR of a recorded rotation may be from the identity (per entry): trackers that multiply up single
 precision drift by 5e-4 in 1000 frames; a scaled or sheared matrix is far beyond this."""
-_MASK_NAME: Final = re.compile(r"(\d{6})_(\d{6})")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Frame:
+class _Camera:
+    cam_K: Annotated[Array, Numbers(9)]  # noqa: N815
+    depth_scale: Annotated[float, Gt(0)]
+    cam_R_w2c: Annotated[Array, Numbers(9)] | None = None  # noqa: N815
+    cam_t_w2c: Annotated[Array, Numbers(3)] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Mask:
+    obj_id: Annotated[int, Ge(1), Lt(SUPPORT_LABEL)]
+
+
+@dataclass(frozen=True, slots=True)
+class _Masks:
+    masks: list[_Mask]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RecordedFrame:
     """One recorded frame, checked but not decoded yet.
 
     Attributes:
         number: Its number in the recording.
-        name: Folder and number, as the view will be called.
+        name: Folder and number, which is also the view's name.
         depth_path: 16-bit depth image.
         depth_scale: One unit of depth [mm].
         rgb_path: Colour image, or None where the recording has no colour.
@@ -40,6 +62,7 @@ class Frame:
         K: Pinhole matrix (3, 3) [px].
         T_world_camera: Pose (4, 4), or None where it is not known.
         size: Width and height [px].
+        time: 0: a recording's frames are all worth keeping.
     """
 
     number: int
@@ -51,6 +74,12 @@ class Frame:
     K: Array
     T_world_camera: Array | None
     size: tuple[int, int]
+    time: int = 0
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether it has masks."""
+        return self.masks is not None
 
     def load(self) -> View:
         """Decode the frame.
@@ -90,40 +119,18 @@ class Frame:
         return labels
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Recording(Sequence[View]):
-    """The frames of a recording in their order; views are decoded when asked for and not kept.
+@dataclass(frozen=True, eq=False)
+class Recording(Dataset):
+    """The frames of a recording in their order."""
 
-    Attributes:
-        folder: The scene folder.
-        frames: The frames.
-    """
-
-    folder: Path
-    frames: tuple[Frame, ...]
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [frame.load() for frame in self.frames[index]]
-        return self.frames[index].load()
-
-    def __iter__(self) -> Iterator[View]:
-        return (frame.load() for frame in self.frames)
+    frames: Sequence[RecordedFrame]
 
     @property
-    def has_poses(self) -> bool:
-        """Every frame has a pose."""
-        return all(frame.T_world_camera is not None for frame in self.frames)
+    def folder(self) -> Path:
+        """The scene folder."""
+        return self.path
 
-    @property
-    def has_labels(self) -> bool:
-        """Every frame has a segmentation."""
-        return all(frame.masks is not None for frame in self.frames)
-
-    def frame(self, name: str) -> Frame:
+    def frame(self, name: str) -> RecordedFrame:
         """Return the frame whose number ends `name`, as in a view's name.
 
         Raises:
@@ -133,6 +140,22 @@ class Recording(Sequence[View]):
             if frame.name.rpartition("/")[2] == name.rpartition("/")[2]:
                 return frame
         raise InputError(self.folder, f"has no frame '{name}'", "give the recording the run was made from")
+
+
+def recognises(path: Path) -> bool:
+    """Whether a path is a scene folder."""
+    return (path / "scene_camera.json").is_file() or (
+        (path / "depth").is_dir() and not (path / "depth.txt").exists()
+    )
+
+
+def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Recording:
+    """Read a scene folder; see `read_recording`.
+
+    Raises:
+        InputError: It is broken.
+    """
+    return read_recording(path)
 
 
 def read_recording(folder: str | Path) -> Recording:
@@ -151,40 +174,121 @@ def read_recording(folder: str | Path) -> Recording:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(folder, "is no folder", "give a scene folder of the BOP format")
+        raise InputError(folder, "is not a folder", "give a scene folder of the BOP format")
     camera_path = folder / "scene_camera.json"
-    cameras = _by_frame(
-        read_json(camera_path, "a recording needs it: cam_K and depth_scale of each frame"), camera_path
-    )
+    cameras = _by_frame(camera_path, "a recording needs it: cam_K and depth_scale of each frame")
     if not cameras:
         raise InputError(folder, "has no frames: scene_camera.json is empty", "give a recording with frames")
-    _check_no_stray_depth(folder, set(cameras))
+    for path in sorted((folder / "depth").glob("*.png")):
+        if not path.stem.isdigit() or int(path.stem) not in cameras:
+            raise InputError(
+                path, "has no entry in scene_camera.json", "add its camera there, or take the image out"
+            )
     masks = _read_mask_table(folder, set(cameras))
-    result = Recording(
-        folder, tuple(_read_frame(folder, n, cameras[n], masks.get(n), camera_path) for n in sorted(cameras))
-    )
-    without = [f.number for f in result.frames if f.T_world_camera is None]
-    if len(result) > 1 and without:
+    frames = tuple(_read_frame(folder, n, cameras[n], masks.get(n), camera_path) for n in sorted(cameras))
+    without = [f.number for f in frames if f.T_world_camera is None]
+    if len(frames) > 1 and without:
         raise InputError(
             camera_path,
-            f"{len(without)} of {len(result)} frames have no pose (cam_R_w2c, cam_t_w2c), the first is frame "
+            f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c), the first is frame "
             f"{without[0]}",
             "several frames need poses; without them give a single frame",
         )
-    return result
+    return Recording(folder, frames)
+
+
+class RecordingWriter:
+    """Writes a BOP scene folder view by view; it appears whole, at `finish`, or not at all.
+
+    Args:
+        folder: Where; must not exist, or be empty.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self._staged = StagedFolder(Path(folder))
+        self._cameras: dict[str, Any] = {}
+        self._objects: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._staged.discard()
+
+    def add_view(self, view: View, depth_scale: float = 0.1) -> None:
+        """Write the next view.
+
+        Args:
+            view: Labels become one mask each and `obj_id` = label.
+            depth_scale: One unit of depth [mm]; 0.1 reaches to 6.5 m.
+
+        Raises:
+            InputError: Depth beyond what 16 bits hold, or the disk is full or refuses.
+        """
+        index = len(self._cameras)
+        camera: dict[str, Any] = {"cam_K": view.K.ravel(), "depth_scale": depth_scale}
+        if view.T_world_camera is not None:
+            T_camera_world = transforms.invert(view.T_world_camera)
+            camera["cam_R_w2c"] = T_camera_world[:3, :3].ravel()
+            camera["cam_t_w2c"] = T_camera_world[:3, 3] * 1000.0
+        self._cameras[str(index)] = camera
+        self._staged.write(f"depth/{index:06d}.png", images.png(_depth_units(view, depth_scale)))
+        if view.rgb is not None:
+            self._staged.write(f"rgb/{index:06d}.png", images.png(view.rgb))
+        if view.labels is not None:
+            present = [int(k) for k in np.unique(view.labels) if k > 0]
+            self._objects[str(index)] = [{"obj_id": k} for k in present]
+            for order, label in enumerate(present):
+                mask = np.where(view.labels == label, np.uint8(255), np.uint8(0))
+                self._staged.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
+
+    def finish(self) -> None:
+        """Put the folder in its place.
+
+        Raises:
+            InputError: The place has been taken meanwhile, or the disk is full or refuses.
+        """
+        self._staged.write("scene_camera.json", json_text(self._cameras).encode())
+        if self._objects:
+            self._staged.write("scene_gt.json", json_text(self._objects).encode())
+        self._staged.publish()
+
+
+def write_recording(folder: str | Path, views: Sequence[View], depth_scale: float = 0.1) -> None:
+    """Write views as a BOP scene folder; `read_recording` gives them back to half a `depth_scale`.
+
+    Args:
+        folder: Where; must not exist, or be empty.
+        views: In frame order. Labels become one mask each and `obj_id` = label.
+        depth_scale: One unit of depth [mm]; 0.1 reaches to 6.5 m.
+
+    Raises:
+        InputError: No views, depth beyond what 16 bits hold, or the folder cannot be written.
+    """
+    if not views:
+        raise InputError(folder, "there are no views to write", "give at least one")
+    with RecordingWriter(folder) as writer:
+        for view in views:
+            writer.add_view(view, depth_scale)
+        writer.finish()
 
 
 def _read_frame(
-    folder: Path,
-    number_: int,
-    camera: dict[str, Any],
-    masks: tuple[tuple[Path, int], ...] | None,
-    source: Path,
-) -> Frame:
-    name = f"{source}: frame {number_}"
-    depth_path = folder / "depth" / f"{number_:06d}.png"
+    folder: Path, number: int, document: Any, masks: tuple[tuple[Path, int], ...] | None, source: Path
+) -> RecordedFrame:
+    name = f"{source}: frame {number}"
+    camera = parse_json(_Camera, document, name)
+    depth_path = folder / "depth" / f"{number:06d}.png"
     size = images.check_image(depth_path, images.DEPTH_MODES, "a 16-bit grey PNG")
-    rgb_path = _colour_path(folder, number_)
+    rgb_path = None
+    if (folder / "rgb").is_dir():
+        paths = [folder / "rgb" / f"{number:06d}{ending}" for ending in COLOUR_ENDINGS]
+        rgb_path = next((path for path in paths if path.exists()), paths[0])
     for path in ([] if rgb_path is None else [rgb_path]) + [path for path, _ in masks or ()]:
         other = images.check_image(path, None if path is rgb_path else images.MASK_MODES, "a grey PNG")
         if other != size:
@@ -193,48 +297,31 @@ def _read_frame(
                 f"is {other[0]}×{other[1]} pixels, the depth image {depth_path} is {size[0]}×{size[1]}",
                 "register the images to one size",
             )
-    depth_scale = number(camera, "depth_scale", name)
-    if depth_scale <= 0.0:
-        raise InputError(name, f"'depth_scale' is {depth_scale:g}", "give the millimetres of one depth unit")
-    K = numbers(field(camera, "cam_K", list, name), (9,), f"{name}: cam_K").reshape(3, 3)
-    return Frame(
-        number=number_,
-        name=f"{folder.resolve().name}/{number_:06d}",
+    return RecordedFrame(
+        number=number,
+        name=f"{folder.resolve().name}/{number:06d}",
         depth_path=depth_path,
-        depth_scale=depth_scale,
+        depth_scale=camera.depth_scale,
         rgb_path=rgb_path,
         masks=masks,
-        K=check_intrinsics(K, f"{name}: cam_K"),
+        K=check_intrinsics(camera.cam_K.reshape(3, 3), f"{name}: cam_K"),
         T_world_camera=_pose(camera, name),
         size=size,
     )
 
 
-def _pose(camera: dict[str, Any], name: str) -> Array | None:
-    if "cam_R_w2c" not in camera and "cam_t_w2c" not in camera:
+def _pose(camera: _Camera, name: str) -> Array | None:
+    if camera.cam_R_w2c is None and camera.cam_t_w2c is None:
         return None
-    R = numbers(field(camera, "cam_R_w2c", list, name), (9,), f"{name}: cam_R_w2c").reshape(3, 3)
-    t_mm = numbers(field(camera, "cam_t_w2c", list, name), (3,), f"{name}: cam_t_w2c")
+    if camera.cam_R_w2c is None or camera.cam_t_w2c is None:
+        missing = "cam_R_w2c" if camera.cam_R_w2c is None else "cam_t_w2c"
+        raise InputError(name, f"the key '{missing}' is missing", "add it")
+    R = camera.cam_R_w2c.reshape(3, 3)
     if np.linalg.det(R) > 0.0 and np.allclose(R.T @ R, np.eye(3), atol=ROTATION_DRIFT):
         left, _, right = np.linalg.svd(R)
         R = left @ right
-    T_camera_world = transforms.as_rigid(transforms.rigid(R, t_mm / 1000.0), f"{name}: cam_R_w2c")
-    return transforms.invert(T_camera_world)
-
-
-def _colour_path(folder: Path, number_: int) -> Path | None:
-    if not (folder / "rgb").is_dir():
-        return None
-    paths = [folder / "rgb" / f"{number_:06d}{ending}" for ending in COLOUR_ENDINGS]
-    return next((path for path in paths if path.exists()), paths[0])
-
-
-def _check_no_stray_depth(folder: Path, known: set[int]) -> None:
-    for path in sorted((folder / "depth").glob("*.png")):
-        if not path.stem.isdigit() or int(path.stem) not in known:
-            raise InputError(
-                path, "has no entry in scene_camera.json", "add its camera there, or take the image out"
-            )
+    T_camera_world = transforms.rigid(R, camera.cam_t_w2c / 1000.0)
+    return transforms.invert(transforms.as_rigid(T_camera_world, f"{name}: cam_R_w2c"))
 
 
 def _read_mask_table(folder: Path, known: set[int]) -> dict[int, tuple[tuple[Path, int], ...]]:
@@ -243,24 +330,22 @@ def _read_mask_table(folder: Path, known: set[int]) -> dict[int, tuple[tuple[Pat
         return {}
     table: dict[int, tuple[tuple[Path, int], ...]] = {}
     expected: set[Path] = set()
-    for frame, entries in _by_frame(read_json(gt_path, "masks need it: the obj_id of each"), gt_path).items():
+    for frame, entries in _by_frame(gt_path, "masks need it: the obj_id of each").items():
         source = f"{gt_path}: frame {frame}"
         if frame not in known:
             raise InputError(source, "is not in scene_camera.json", "add its camera there")
-        if not isinstance(entries, list):
-            raise InputError(source, "is no list of objects", 'give one {"obj_id": …} for each mask')
-        labels = [_obj_id(entry, f"{source}, mask {index}") for index, entry in enumerate(entries)]
-        for index, label in enumerate(labels):
-            if label in labels[:index]:
-                raise InputError(
-                    source, f"two masks have obj_id {label}", "number each object of the scene by itself"
-                )
+        remedy = f'give one {{"obj_id": …}} for each mask, from 1 to {SUPPORT_LABEL - 1}'
+        labels = [mask.obj_id for mask in parse_json(_Masks, {"masks": entries}, source, remedy).masks]
+        for twice in {label for label in labels if labels.count(label) > 1}:
+            raise InputError(
+                source, f"two masks have obj_id {twice}", "number each object of the scene by itself"
+            )
         paths = [mask_folder / f"{frame:06d}_{index:06d}.png" for index in range(len(labels))]
         table[frame] = tuple(zip(paths, labels, strict=True))
         expected.update(paths)
     for path in sorted(mask_folder.glob("*.png")):
         if path not in expected:
-            match = _MASK_NAME.fullmatch(path.stem)
+            match = re.fullmatch(r"(\d{6})_(\d{6})", path.stem)
             which = f"mask {int(match[2])} of frame {int(match[1])}" if match else "that name"
             raise InputError(
                 path, f"names no object: scene_gt.json has no entry for {which}", "add its obj_id there"
@@ -268,23 +353,22 @@ def _read_mask_table(folder: Path, known: set[int]) -> dict[int, tuple[tuple[Pat
     return table
 
 
-def _obj_id(entry: Any, source: str) -> int:
-    if not isinstance(entry, dict):
-        raise InputError(source, "is no JSON object", 'give {"obj_id": …}')
-    label: int = field(entry, "obj_id", int, source)
-    if not 0 < label < SUPPORT_LABEL:
-        raise InputError(source, f"obj_id is {label}", f"number objects from 1 to {SUPPORT_LABEL - 1}")
-    return label
-
-
-def _by_frame(document: dict[str, Any], source: Path) -> dict[int, Any]:
+def _by_frame(path: Path, remedy: str) -> dict[int, Any]:
     result: dict[int, Any] = {}
-    for key, item in document.items():
+    for key, item in read_json(path, remedy).items():
         if not key.isascii() or not key.isdigit() or int(key) in result:
-            raise InputError(
-                source, f"'{key}' is no frame number, or is there twice", "number the frames 0, 1, …"
-            )
-        if source.name == "scene_camera.json" and not isinstance(item, dict):
-            raise InputError(f"{source}: frame {key}", "is no JSON object", "give cam_K and depth_scale")
+            reason = f"'{key}' is no frame number, or is there twice"
+            raise InputError(path, reason, "number the frames 0, 1, …")
         result[int(key)] = item
     return result
+
+
+def _depth_units(view: View, depth_scale: float) -> NDArray[np.uint16]:
+    units = np.rint(view.depth.astype(np.float64) * (1000.0 / depth_scale))
+    if units.max() > np.iinfo(np.uint16).max:
+        raise InputError(
+            view.name,
+            f"depth reaches {view.depth.max():.1f} m, 16 bits of {depth_scale:g} mm do not",
+            "take a larger depth_scale",
+        )
+    return units.astype(np.uint16)

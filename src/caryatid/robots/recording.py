@@ -9,7 +9,7 @@ import numpy as np
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.bop import Recording
+from caryatid.io.datasets import Dataset
 from caryatid.planning.candidates import Candidates
 from caryatid.robots import Posture, Unreachable
 from caryatid.sensing.view_sphere import ViewSphere
@@ -106,10 +106,10 @@ class RecordingCamera:
         InputError: Several frames of which some have no pose.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Dataset) -> None:
         if len(recording) > 1 and not recording.has_poses:
             raise InputError(
-                recording.folder, "has several frames without poses", "add cam_R_w2c and cam_t_w2c to each"
+                recording.path, "has several frames without poses", "add cam_R_w2c and cam_t_w2c to each"
             )
         self._recording = recording
 

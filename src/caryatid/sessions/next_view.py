@@ -39,7 +39,7 @@ class NextView:
         number: Which view it would be, 0 the first.
         decision: Pose, expected gain, cost, and why.
         posture: How the session's robot would stand there; None where candidates were given.
-        stop: Why the next view may as well be left out, or None.
+        stop: Why another view may not pay, or None.
     """
 
     number: int
@@ -48,7 +48,7 @@ class NextView:
     stop: str | None
 
     def to_json(self) -> dict[str, Any]:
-        """What `caryatid session next` and the service answer."""
+        """Return the answer of `caryatid session next` and of the service."""
         d, p = self.decision, self.posture
         return {
             "view": self.number,
@@ -78,23 +78,23 @@ def plan_next(
     Args:
         scene: What is known, of at least one view.
         T_world_cameras: Where the views so far were taken (4, 4), the last one last.
-        planner: Name of who chooses.
-        candidates: Poses (N, 4, 4) the robot reaches and the way (N,) [m] to each, or None for straight
-            lines; None for those of the robot of this name, which knows the table.
-        stop: Why looking on may not pay, or None.
+        planner: Name of the planner.
+        candidates: Poses (N, 4, 4) the robot reaches and the path length (N,) [m] to each, or None for
+            straight lines; None for those of the robot of this name, which knows the table.
+        stop: Why another view may not pay, or None.
         robot_name: As `find_robot` knows it.
 
     Raises:
         PlanningError: Nothing has been seen yet, or no view can be reached.
-        InputError: A candidate is no pose, or ways are not as many, or negative; or there is no such robot.
+        InputError: A candidate is no pose, path lengths are not as many, or negative; or no such robot.
     """
     if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; add a first view")
-    robot: _Reaching | _Standing
+    robot: _Given | _NearTable
     if candidates is None:
-        robot = _Standing(scene, robot_name, T_world_cameras[-1])
+        robot = _NearTable(scene, robot_name, T_world_cameras[-1])
     else:
-        robot = _Reaching(T_world_cameras[-1], *candidates)
+        robot = _Given(T_world_cameras[-1], *candidates)
     sphere = view_sphere_of(robot, scene.sphere)
     visited = np.stack([sphere.direction_of(T) for T in T_world_cameras])
     decision = next_best_view(scene, robot, visited, planner=planner, seed=scene.seed)
@@ -145,7 +145,7 @@ def table_floor(scene: Scene, config: Config) -> FloorGrid:
     return FloorGrid.from_boxes([centre], [sides], [R], config.robot, scene.sphere.centre_world[:2])
 
 
-class _Standing(OwnViews):
+class _NearTable(OwnViews):
     """A robot by the table, which stands where the last view was taken."""
 
     def __init__(self, scene: Scene, name: str, T_world_camera: Array) -> None:
@@ -158,12 +158,12 @@ class _Standing(OwnViews):
         self._placed = self._place(around.centre_world)
 
     def _place(self, centre_world: Array) -> bool:
-        """Put it where the camera is, as it is held or looking at the scene without roll; whether it can."""
+        """Put it where the camera is, as it is held or without roll; returns whether it can stand there."""
         eye = self.T_world_camera[:3, 3]
-        ways = [self.T_world_camera]
+        poses = [self.T_world_camera]
         if np.linalg.norm(eye - centre_world) > 1e-6:
-            ways.append(transforms.look_at(eye, centre_world))
-        for T in ways:
+            poses.append(transforms.look_at(eye, centre_world))
+        for T in poses:
             if isinstance(self._robot.solve(T), Posture):
                 self._robot.move_to(T)
                 return True
@@ -179,7 +179,7 @@ class _Standing(OwnViews):
         return self._robot.solve(T_world_camera)
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
-        """What it reaches; where it does not know its own place the ways are straight lines."""
+        """Views it reaches, with straight paths where it cannot stand at the camera's place."""
         found = self._robot.candidates(sphere)
         if self._placed:
             return found
@@ -189,15 +189,19 @@ class _Standing(OwnViews):
         return self._robot.move_to(T_world_camera)
 
 
-class _Reaching:
+class _Given:
     """A robot that has said itself which views it reaches."""
 
-    def __init__(self, T_world_camera: Array, poses: Array, ways: Array | None) -> None:
+    def __init__(self, T_world_camera: Array, poses: Array, path_length: Array | None) -> None:
         self.T_world_camera = T_world_camera
         self._poses = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in enumerate(poses)])
         self._poses = self._poses.reshape(-1, 4, 4)
-        self._ways = _straight(T_world_camera, self._poses) if ways is None else np.asarray(ways, np.float64)
-        if self._ways.shape != (len(self._poses),) or not (self._ways >= 0.0).all():
+        self._path_length = (
+            _straight(T_world_camera, self._poses)
+            if path_length is None
+            else np.asarray(path_length, np.float64)
+        )
+        if self._path_length.shape != (len(self._poses),) or not (self._path_length >= 0.0).all():
             raise InputError(
                 "path_length", "is not one length a candidate", "give as many as candidates, 0 or more"
             )
@@ -206,12 +210,12 @@ class _Reaching:
         return Unreachable("the robot itself knows how it stands")
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
-        return Candidates(self._poses, sphere.direction_of(self._poses), self._ways, {})
+        return Candidates(self._poses, sphere.direction_of(self._poses), self._path_length, {})
 
     def move_to(self, T_world_camera: Array) -> float:
         raise PlanningError("the robot moves itself")
 
 
 def _straight(T_world_camera: Array, poses: Array) -> Array:
-    """Straight way (N,) [m] from one camera pose to others (N, 4, 4)."""
+    """Straight path length (N,) [m] from one camera pose to others (N, 4, 4)."""
     return np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=-1)

@@ -30,6 +30,7 @@ from numpy.typing import ArrayLike, NDArray
 from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
+from caryatid.exploration import reason_to_stop
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text
 from caryatid.io.json_files import field, read_json
@@ -343,12 +344,7 @@ class Session:
             PlanningError: There is no view yet, or none can be reached.
             InputError: Candidates are no poses.
         """
-        config = self.beginning.config
-        stop = None
-        if self.views >= config.active.max_views:
-            stop = f"{config.active.max_views} views were asked for"
-        elif self.views > 1 and not self._state.changed:
-            stop = "the last view changed nothing"
+        stop = reason_to_stop(self.views, self._state.changed, self.beginning.config.active)
         reach = None
         if candidates is not None:
             poses = np.asarray(candidates, dtype=np.float64).reshape(-1, 4, 4)

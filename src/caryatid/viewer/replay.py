@@ -23,11 +23,11 @@ from caryatid.viewer.moments import Moment, moment_of_scene, shot_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from caryatid.io.bop import Recording
+    from caryatid.io.datasets import Dataset
     from caryatid.sources import Source
 
     OpenSource = Callable[..., Source]
-    OpenRecording = Callable[..., Recording]
+    OpenRecording = Callable[..., Dataset]
 
 
 def replayed(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import hypot, isfinite
@@ -133,6 +133,13 @@ class TransformTree:
             fixed = [link.fixed[0]] if link.fixed is not None and not link.times else []
             for parent in {*link.parents, *fixed}:
                 yield child, parent
+
+
+def nearest(times: Sequence[int], time: int) -> int | None:
+    """Index of the time nearest to another, of two as near the earlier one; None where there is none."""
+    after = bisect_left(times, time)
+    around = range(max(after - 1, 0), min(after + 1, len(times)))
+    return min(around, key=lambda index: abs(times[index] - time), default=None)
 
 
 def is_pose(numbers: Sequence[float]) -> bool:

@@ -1,0 +1,217 @@
+"""Datasets: sequences of frames in any format, decoded one by one.
+
+An input format is a module or object with two functions, `recognises(path)` and
+`open_dataset(path, config, options)`. Those of other packages are found by their entry points in the group
+`caryatid.datasets`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import RecordingConfig
+from caryatid.errors import InputError
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import View
+
+BUILT_IN: Final = ("bop", "tum", "bags")
+"""Modules of `caryatid.io` that are formats, in the order they are tried."""
+ENTRY_POINTS: Final = "caryatid.datasets"
+"""Group under which other packages offer formats."""
+
+
+NO_COLOUR: Final = "no colour image of that time"
+NO_POSE: Final = "no pose"
+BROKEN: Final = "broken"
+DARK: Final = "hardly any depth"
+BLURRED: Final = "blurred"
+ALIKE: Final = "seen from where another view is"
+SPARE: Final = "more than are wanted"
+"""Why a frame does not become a view."""
+
+
+class BrokenFrameError(InputError):
+    """One frame cannot be decoded; others of its dataset may be whole."""
+
+
+class Frame(Protocol):
+    """One frame of a dataset, not decoded yet."""
+
+    @property
+    def name(self) -> str:
+        """Name of the view it becomes."""
+        ...
+
+    @property
+    def number(self) -> int:
+        """Its number in the dataset."""
+        ...
+
+    @property
+    def time(self) -> int:
+        """When it was taken [ns]; 0 where that does not matter."""
+        ...
+
+    @property
+    def T_world_camera(self) -> Array | None:
+        """Camera pose (4, 4), or None where it is not known."""
+        ...
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether its view has labels."""
+        ...
+
+    def load(self) -> View:
+        """Decode the frame.
+
+        Raises:
+            BrokenFrameError: It cannot be decoded, but other frames may.
+            InputError: It does not fit the dataset.
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset(Sequence[View]):
+    """A sequence of frames; as a sequence, of their views, which are decoded when asked for and not kept.
+
+    Attributes:
+        path: File or folder.
+        frames: The frames, in order.
+        skipped: How many others cannot become views, by reason.
+        notes: What a person should know.
+        is_video: Whether neighbouring frames show nearly the same, so that a few of them should be chosen.
+        depth_scale: Millimetres of the unit its depth is counted in, or None where it is not counted.
+    """
+
+    path: Path
+    frames: Sequence[Frame]
+    skipped: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    is_video: bool = False
+    depth_scale: float | None = None
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [frame.load() for frame in self.frames[index]]
+        return self.frames[index].load()
+
+    def __iter__(self) -> Iterator[View]:
+        return (frame.load() for frame in self.frames)
+
+    @property
+    def has_poses(self) -> bool:
+        """Every frame has a pose."""
+        return all(frame.T_world_camera is not None for frame in self.frames)
+
+    @property
+    def has_labels(self) -> bool:
+        """Every frame has labels."""
+        return all(frame.has_labels for frame in self.frames)
+
+
+@dataclass(frozen=True, slots=True)
+class Topics:
+    """What to take from a bag.
+
+    Attributes:
+        depth: Topic of depth images, registered to the colour where there is one.
+        info: Topic of the depth images' camera.
+        rgb: Topic of colour images, or None.
+        world: Frame to be the world: level, z up; None without poses.
+    """
+
+    depth: str | None = None
+    info: str | None = None
+    rgb: str | None = None
+    world: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OpenOptions:
+    """What a format may need to know.
+
+    Attributes:
+        topics: What to take from a bag.
+        camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
+    """
+
+    topics: Topics = Topics()
+    camera_file: Path | None = None
+
+
+@runtime_checkable
+class Format(Protocol):
+    """An input format."""
+
+    def recognises(self, path: Path) -> bool:
+        """Whether a path looks like a dataset of this format."""
+        ...
+
+    def open_dataset(self, path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:
+        """Open a dataset.
+
+        Raises:
+            InputError: It is damaged, or does not fit the options.
+        """
+        ...
+
+
+def format_of(path: Path) -> Format | None:
+    """The format of a path, or None where it is no dataset.
+
+    Raises:
+        InputError: A package offers a format that is none.
+    """
+    ours = (import_module(f"caryatid.io.{name}") for name in BUILT_IN)
+    others = (entry_point.load() for entry_point in entry_points(group=ENTRY_POINTS))
+    for known in (*ours, *others):
+        if not isinstance(known, Format):
+            raise InputError(str(known), "is no format of datasets", "give it recognises and open_dataset")
+        if known.recognises(path):
+            return known
+    return None
+
+
+def open_dataset(
+    path: str | Path, config: RecordingConfig | None = None, options: OpenOptions | None = None
+) -> Dataset:
+    """Open a dataset of any known format.
+
+    Args:
+        path: BOP scene folder, TUM RGB-D folder, bag, or what another package recognises.
+        config: Limits of time and range.
+        options: What the format may need to know.
+
+    Raises:
+        InputError: It does not exist, is of no known format, or is damaged.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(path, "there is no such file or folder", "give a recording")
+    known = format_of(path)
+    if known is None:
+        raise InputError(
+            path,
+            "is of no known format",
+            "give a BOP scene folder, a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), or a TUM "
+            "RGB-D folder with depth.txt",
+        )
+    return known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
+
+
+def within(depth: NDArray[np.float32], far: float) -> NDArray[np.float32]:
+    """Depth (H, W) [m] without readings farther away than `far` [m]."""
+    return np.where(depth <= far, depth, np.float32(0.0))

@@ -1,0 +1,296 @@
+"""A robot's recording becomes a recording of a few good views, a scene folder of the BOP format."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import laplace
+
+from caryatid.config import Config, RecordingConfig
+from caryatid.errors import InputError, PerceptionError
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.io import datasets
+from caryatid.io.bop import RecordingWriter
+from caryatid.io.datasets import BrokenFrameError, Dataset, Frame, OpenOptions, Topics, open_dataset
+from caryatid.segmentation.perception import levelled
+from caryatid.sensing.views import View
+
+SCALES: Final = (0.1, 0.2, 0.5, 1.0)
+"""Units depth is written in [mm]: the finest that reaches far enough."""
+_REMEDIES: Final[Mapping[str, str]] = {
+    datasets.NO_COLOUR: "leave colour out, or allow more with --set recording.colour_gap=SECONDS",
+    datasets.NO_POSE: "record its poses all the time, or allow more with --set recording.pose_gap=SECONDS",
+    datasets.BROKEN: "record it again",
+    datasets.DARK: "allow less with --set recording.min_readings=SHARE",
+}
+"""What to do where no frame is usable for one reason."""
+_UP: Final = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Choice:
+    """The frames to keep, and why the others are not kept.
+
+    Attributes:
+        kept: Indices, in the order of time.
+        blurred: How many are less sharp than others around them.
+        alike: How many show what a kept frame shows.
+        spare: How many were more than are wanted.
+    """
+
+    kept: tuple[int, ...]
+    blurred: int
+    alike: int
+    spare: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FrameFilter:
+    """Chooses sharp frames of a dataset, each from another viewpoint.
+
+    Attributes:
+        config: What is sharp, what is another viewpoint, and how many frames are wanted.
+    """
+
+    config: RecordingConfig
+
+    def choose(self, dataset: Dataset) -> tuple[list[Frame], dict[str, int], float]:
+        """Look through a dataset.
+
+        Returns:
+            The chosen frames in the order of time, how many others there are by reason, and the farthest
+            reading of the usable ones [m].
+
+        Raises:
+            InputError: No frame can become a view.
+        """
+        skipped, reach = Counter(dataset.skipped), 0.0
+        usable: list[Frame] = []
+        sharpness: list[float] = []
+        for frame in dataset.frames:
+            try:
+                view = frame.load()
+            except BrokenFrameError:
+                skipped[datasets.BROKEN] += 1
+                continue
+            readings = sharpness_of_depth(view.depth)
+            if readings < self.config.min_readings:
+                skipped[datasets.DARK] += 1
+                continue
+            usable.append(frame)
+            sharpness.append(readings if view.rgb is None else sharpness_of_colour(view.rgb))
+            reach = max(reach, float(view.depth.max()))
+        if not usable:
+            raise _nothing_usable(dataset.path, skipped)
+        times = np.array([(frame.time - usable[0].time) * 1e-9 for frame in usable])
+        poses = [frame.T_world_camera for frame in usable if frame.T_world_camera is not None]
+        posed = np.stack(poses) if len(poses) == len(usable) else None
+        choice = choose_views(times, np.array(sharpness), posed, self.config)
+        counts = {
+            datasets.BLURRED: choice.blurred,
+            datasets.ALIKE: choice.alike,
+            datasets.SPARE: choice.spare,
+        }
+        skipped.update({reason: count for reason, count in counts.items() if count})
+        return [usable[index] for index in choice.kept], dict(skipped), reach
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Imported:
+    """Result of an import.
+
+    Attributes:
+        read: Number of depth images.
+        chosen: The frames that became views, in order.
+        skipped: How many did not, by reason; together with the chosen ones all that were read.
+        notes: What a person should know.
+    """
+
+    read: int
+    chosen: tuple[Frame, ...]
+    skipped: dict[str, int]
+    notes: tuple[str, ...]
+
+
+def import_recording(
+    source: str | Path,
+    out: str | Path,
+    topics: Topics | None = None,
+    *,
+    camera_file: Path | None = None,
+    level: bool = False,
+    config: Config | None = None,
+    seed: int = 0,
+) -> Imported:
+    """Choose sharp frames from different viewpoints and write them as a BOP scene folder.
+
+    Args:
+        source: A bag, a TUM RGB-D folder, or another dataset that `open_dataset` recognises.
+        out: Folder to write; must not exist, or be empty. It appears whole or not at all.
+        topics: What to take from a bag.
+        camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
+        level: Turn the world so that the table is level: for poses whose z axis does not point up.
+        config: What is sharp, what is different, and how many views there may be; and how a table is found.
+        seed: Seed of how the table is found.
+
+    Raises:
+        InputError: The recording is damaged or does not fit the options, no frame of it can become a view,
+            there is no table to level the world by, or `out` cannot be written.
+    """
+    config = config or Config()
+    dataset = open_dataset(source, config.recording, OpenOptions(topics or Topics(), camera_file))
+    with RecordingWriter(out) as writer:
+        chosen, skipped, reach = FrameFilter(config.recording).choose(dataset)
+        T_level_world = np.eye(4)
+        if level and chosen[0].T_world_camera is not None:
+            views = (frame.load() for frame in chosen)
+            T_level_world = level_rotation(dataset.path, views, config, np.random.default_rng(seed))
+        scale = dataset.depth_scale
+        if scale is None:
+            scale = next((s for s in SCALES if reach <= s * 65.535), SCALES[-1])
+        for frame in chosen:
+            view, T = frame.load(), frame.T_world_camera
+            writer.add_view(view if T is None else view.with_pose(T_level_world @ T), scale)
+        writer.finish()
+    turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
+    note = (f"world: turned by {turn:.1f}°, so that the table is level",) if turn > 0.0 else ()
+    read = len(chosen) + sum(skipped.values())
+    return Imported(read, tuple(chosen), skipped, (*dataset.notes, *note))
+
+
+def reasons(skipped: Mapping[str, int]) -> str:
+    """How many were skipped, by reason, the most frequent one first."""
+    return ", ".join(f"{skipped[reason]} {reason}" for reason in sorted(skipped, key=lambda r: -skipped[r]))
+
+
+def sharpness_of_colour(rgb: NDArray[np.uint8]) -> float:
+    """Variance of the Laplacian of the brightness of an image (H, W, 3): the higher, the sharper."""
+    return float(laplace(rgb.mean(axis=2, dtype=np.float32)).var())
+
+
+def sharpness_of_depth(depth: NDArray[np.float32]) -> float:
+    """Share of pixels (H, W) with a reading: a depth camera in motion loses them at edges."""
+    return float((depth > 0.0).mean())
+
+
+def choose_views(
+    times: Array, sharpness: Array, T_world_camera: Array | None, config: RecordingConfig
+) -> Choice:
+    """Choose frames that are sharp for their time and seen from viewpoints apart from each other.
+
+    Through time, the sharpest frame of the next moments that is seen from elsewhere than all chosen ones is
+    chosen. Of more than are wanted those stay that are farthest from each other.
+
+    Args:
+        times: When frames were taken (N,) [s], rising.
+        sharpness: How sharp they are (N,); only ratios count.
+        T_world_camera: Their poses (N, 4, 4), or None where poses are not known: a single frame is chosen.
+        config: What is sharp, and how far apart viewpoints are.
+    """
+    if len(times) == 0:
+        return Choice((), 0, 0, 0)
+    if T_world_camera is None:
+        return Choice((int(np.argmax(sharpness)),), 0, 0, len(times) - 1)
+    sharp = sharpness >= config.sharp_share * _most_around(times, sharpness, config.sharp_window)
+    candidates = np.flatnonzero(sharp)
+    chosen: list[int] = []
+    free = np.ones(len(candidates), dtype=np.bool_)
+    while free.any():
+        first = int(np.argmax(free))
+        soon = free & (times[candidates] <= times[candidates[first]] + config.sharp_window)
+        best = candidates[soon][np.argmax(sharpness[candidates[soon]])]
+        chosen.append(int(best))
+        free &= apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
+    kept = _farthest(T_world_camera[chosen], config)
+    return Choice(
+        tuple(sorted(chosen[i] for i in kept)),
+        blurred=int((~sharp).sum()),
+        alike=len(candidates) - len(chosen),
+        spare=len(chosen) - len(kept),
+    )
+
+
+def apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
+    """How far poses (N, 4, 4) are from another one (4, 4), in units of what makes a view another one (N,).
+
+    Args:
+        T_world_camera: Poses (N, 4, 4).
+        T_world_other: The other one (4, 4).
+        config: Which distance and which angle make a view another one.
+    """
+    distance = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_other[:3, 3], axis=1)
+    cosine = (np.einsum("nij,ij->n", T_world_camera[:, :3, :3], T_world_other[:3, :3]) - 1.0) / 2.0
+    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+    return np.maximum(distance / config.min_distance, angle / config.min_angle)
+
+
+def level_rotation(path: Path, views: Iterable[View], config: Config, rng: np.random.Generator) -> Array:
+    """Find the smallest turn of the world about its origin (4, 4) that makes the table of views level.
+
+    Each view says where up is as if it had no pose, by the largest plane that faces its camera and has the
+    rest of the scene in front of it. Of these directions the one counts that is nearest to all the others.
+
+    Args:
+        path: The recording, for errors.
+        views: With poses.
+        config: How a plane is found, and how far two directions of the same table may be apart.
+        rng: Draws the hypotheses.
+
+    Raises:
+        InputError: No view shows a plane, or less than half of those that do agree.
+    """
+    found = [up for view in views if (up := _up_world(view, config, rng)) is not None]
+    if not found:
+        raise InputError(path, "no view shows a table to level the world by", "leave --level out")
+    ups = np.stack(found)
+    between = transforms.angle_between(ups[:, None], ups[None])
+    near = between[int(np.argmin(between.sum(axis=1)))] <= np.deg2rad(config.surface.max_tilt)
+    if 2 * int(near.sum()) < len(ups):
+        reason = f"only {int(near.sum())} of {len(ups)} views agree on where up is"
+        raise InputError(path, reason, "leave --level out, and give a world that is level")
+    up = transforms.unit(ups[near].mean(axis=0))
+    axis = np.cross(up, _UP)
+    if np.linalg.norm(axis) < 1e-9:
+        axis = transforms.perpendicular(up)
+    angle = float(transforms.angle_between(up, _UP))
+    return transforms.rigid(transforms.rotation_from_vector(angle * transforms.unit(axis)), np.zeros(3))
+
+
+def _up_world(view: View, config: Config, rng: np.random.Generator) -> Array | None:
+    """The table's normal (3,) in the world of a view, or None where no table can be seen."""
+    try:
+        T_level_camera = levelled(replace(view, T_world_camera=None), config, rng).pose
+    except PerceptionError:
+        return None
+    return transforms.rotate(view.pose, transforms.rotate(transforms.invert(T_level_camera), _UP))
+
+
+def _most_around(times: Array, values: Array, window: float) -> Array:
+    """Largest value (N,) within `window` seconds of each time, either way."""
+    first = np.searchsorted(times, times - window, side="left")
+    stop = np.searchsorted(times, times + window, side="right")
+    return np.array([values[a:b].max() for a, b in zip(first, stop, strict=True)])
+
+
+def _farthest(T_world_camera: Array, config: RecordingConfig) -> Sequence[int]:
+    """Indices of as many poses as are wanted: the first, then always the one farthest from those before."""
+    kept = [0]
+    gap = apart(T_world_camera, T_world_camera[0], config)
+    while len(kept) < min(config.max_views, len(T_world_camera)):
+        kept.append(int(np.argmax(gap)))
+        gap = np.minimum(gap, apart(T_world_camera, T_world_camera[kept[-1]], config))
+    return kept
+
+
+def _nothing_usable(path: Path, skipped: Mapping[str, int]) -> InputError:
+    if not skipped:
+        return InputError(path, "holds no depth image", "record it again, or give another --depth TOPIC")
+    read, most = sum(skipped.values()), max(skipped, key=lambda reason: skipped[reason])
+    return InputError(path, f"none of its {read} depth images is usable: {reasons(skipped)}", _REMEDIES[most])

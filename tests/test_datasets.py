@@ -1,0 +1,97 @@
+"""An input format is one Dataset: a package outside caryatid adds one, and every command reads it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from conftest import run_command
+
+from caryatid.errors import InputError
+from caryatid.io import open_dataset, read_recording, read_run
+
+FORMAT = """
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from caryatid import View
+from caryatid.io import Dataset
+
+
+@dataclass(frozen=True)
+class Frame:
+    path: Path
+    number: int
+    time: int
+    has_labels: bool = True
+
+    @property
+    def name(self):
+        return self.path.name
+
+    @property
+    def T_world_camera(self):
+        return np.load(self.path)["T_world_camera"]
+
+    def load(self):
+        with np.load(self.path) as members:
+            arrays = {key: members[key] for key in ("depth", "K", "T_world_camera", "labels")}
+        return View(**arrays, name=self.name)
+
+
+def recognises(path):
+    return (path / "frames.npzs").is_file()
+
+
+def open_dataset(path, config, options):
+    files = sorted(path.glob("*.npz"))
+    return Dataset(path, [Frame(file, n, 10**9 * n) for n, file in enumerate(files)])
+"""
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """An installed package that offers the format."""
+    site = tmp_path / "site"
+    about = site / "elsewhere-1.0.dist-info"
+    about.mkdir(parents=True)
+    (site / "elsewhere_format.py").write_text(FORMAT)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: elsewhere\nVersion: 1.0\n")
+    (about / "entry_points.txt").write_text("[caryatid.datasets]\nnpzs = elsewhere_format\n")
+    monkeypatch.syspath_prepend(site)
+
+
+@pytest.fixture
+def folder(tmp_path, views):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/frames.npzs").touch()
+    for number, view in enumerate(views):
+        members = {"depth": view.depth, "K": view.K, "T_world_camera": view.pose, "labels": view.labels}
+        np.savez(tmp_path / f"mine/{number}.npz", **members)
+    return tmp_path / "mine"
+
+
+def test_a_format_of_another_package_is_extracted_from(tmp_path, package, folder, recording):
+    assert open_dataset(folder).has_poses
+    for source, run in ((folder, "a"), (recording, "b")):
+        assert run_command("extract", source, "--out", tmp_path / run, "--quiet", "--no-report") == 0
+    found, expected = (read_run(tmp_path / run).graph for run in ("a", "b"))
+    assert [s.pair for s in found.supports] == [s.pair for s in expected.supports]
+
+
+def test_a_format_of_another_package_is_imported(tmp_path, package, folder, views, capsys):
+    assert run_command("import", folder, "--out", tmp_path / "out", "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["views"]) == len(views)
+    for view, original in zip(read_recording(tmp_path / "out"), views, strict=True):
+        assert np.allclose(view.depth, original.depth, atol=1e-4)
+        assert np.array_equal(view.labels, original.labels)
+
+
+def test_without_the_package_the_format_is_not_known(folder, monkeypatch):
+    with pytest.raises(InputError, match="is of no known format"):
+        open_dataset(folder)
+    with pytest.raises(InputError, match="there is no such file"):
+        open_dataset(folder / "nowhere")
