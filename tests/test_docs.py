@@ -111,10 +111,10 @@ def workplace(prepared, tmp_path, monkeypatch):
     """A copy of these files, in the current folder."""
     place = shutil.copytree(prepared, tmp_path / "here")
     monkeypatch.chdir(place)
-    monkeypatch.setattr("caryatid.cli.benchmarking.run_locally", lambda *arguments: iter(()))
-    monkeypatch.setattr("caryatid.cli.benchmarking.run_on_cluster", lambda *arguments: iter(()))
+    monkeypatch.setattr("caryatid.benchmark.running.run_locally", lambda *arguments: iter(()))
+    monkeypatch.setattr("caryatid.benchmark.running.run_on_cluster", lambda *arguments: iter(()))
     monkeypatch.setattr(
-        "caryatid.cli.benchmarking.connect", lambda address: SimpleNamespace(close=lambda: None)
+        "caryatid.benchmark.running.connect", lambda address: SimpleNamespace(close=lambda: None)
     )
     return place
 

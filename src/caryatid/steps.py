@@ -13,9 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from caryatid.config import Config
+from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
 from caryatid.exploration import RobotPose, Step
 from caryatid.io.graph_json import read_graph
+from caryatid.io.json_files import field
 from caryatid.io.runs import Run, RunWriter
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
@@ -86,6 +89,16 @@ def read_steps(run: Run) -> Iterator[Step]:
     """
     check_steps(run)
     return (read_step(view.folder) for view in run.views)
+
+
+def read_config(run: Run) -> Config:
+    """Return the settings a run was made with; settings that no longer exist are passed over.
+
+    Raises:
+        InputError: run.json holds no settings, or they are not valid.
+    """
+    path = str(run.folder / "run.json")
+    return changed_settings(Config(), field(run.record, "settings", dict, path), path)
 
 
 def check_steps(run: Run) -> None:

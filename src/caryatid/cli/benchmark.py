@@ -1,32 +1,49 @@
-"""`caryatid benchmark`: ways to look at clutter compared over scenes, sensors and seeds."""
+"""`caryatid benchmark`: methods compared over scenes, sensors and seeds."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+import shlex
+import time
+from contextlib import closing
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from caryatid.cli.names import PlannerName, SuiteName
-from caryatid.cli.options import SAID, General, defaults_to, whole_number
+from caryatid.benchmark.suites import SUITES, find_suite
+from caryatid.cli.options import SAID, Command, PlannerName, defaults_to, name_of, whole_number
 from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from caryatid.benchmark.episodes import Episode
+    from caryatid.benchmark.running import Outcomes
+    from caryatid.benchmark.store import ResultStore
+    from caryatid.benchmark.suites import Suite
 
 Count = Annotated[int | None, whole_number(1)]
 CORES = os.cpu_count() or 1
-"""Processes that are started where nobody says how many."""
-GENERAL = General()
+"""Default number of processes."""
+SUMMARY = "summary.json.gz"
+"""What figures are made of, without the episodes; the documentation is built from such files."""
+MINUTE = 60.0
+"""Without a terminal, print a line at most this often [s]."""
+
+SuiteName = Annotated[str | None, name_of(find_suite, SUITES)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Benchmark:
-    """Compare ways to look at clutter: methods × scenes × seeds, with figures.
+class Benchmark(Command):
+    """Compare methods over scenes and seeds, with figures.
 
-    What is done is kept after every episode: stop it at any time and start it again. Without --suite the
-    figures of what a folder holds are made again, and nothing is run.
+    Every finished episode is kept: stop at any time and start again. Without --suite nothing is run, and the
+    figures of what the folder holds are made again.
 
-    To try:
+    Examples:
       caryatid benchmark --suite smoke --out bench
       caryatid benchmark --suite planners --planner support --planner random --out bench
       caryatid benchmark --suite fig5 --scenes my-scenes/ --seeds 1 --out bench
@@ -34,44 +51,165 @@ class Benchmark:
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder of the results; those already there count."""
+    """Folder of the results; earlier ones count."""
     suite: Annotated[SuiteName, SAID] = None
     """What to compare."""
     scenes: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")
     ] = ()
-    """Scenes in place of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
+    """Scenes instead of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
     planner: Annotated[tyro.conf.UseAppendAction[tuple[PlannerName, ...]], SAID] = ()
-    """Planner in place of the suite's methods; may be repeated. The others are compared with the first."""
+    """Planner instead of the suite's methods; may be repeated. The others are compared with the first."""
     fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], SAID] = ()
-    """Fusion in place of the suite's; may be repeated."""
+    """Fusion instead of the suite's; may be repeated."""
     segmentation: Annotated[tyro.conf.UseAppendAction[tuple[SegmentationMethod, ...]], SAID] = ()
-    """Where parts come from, in place of the suite's conditions; may be repeated. Without: labels."""
+    """Segmentation instead of the suite's conditions; may be repeated. Default: labels."""
     noise: Annotated[tyro.conf.UseAppendAction[tuple[NoiseModel, ...]], SAID] = ()
-    """Noise of the camera, in place of the suite's conditions; may be repeated. Without: carmine."""
+    """Noise of the camera, instead of the suite's conditions; may be repeated. Default: carmine."""
     set: Annotated[
         tyro.conf.UseAppendAction[tuple[str, ...]],
         tyro.conf.arg(metavar="STAGE.NAME=VALUE", help_behavior_hint=""),
     ] = ()
-    """One setting of all episodes, say `--set noise.translation=0.02`; may be repeated."""
+    """One setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
     seeds: Annotated[Count, defaults_to("the suite's")] = None
     """Seeds 0…N−1 of every episode."""
     views: Annotated[Count, defaults_to("the suite's")] = None
-    """Views of every episode, the first one too."""
+    """Views of every episode, including the first."""
     jobs: Annotated[Count, defaults_to(f"the cores of this machine, {CORES}")] = None
-    """Processes of this machine."""
+    """Number of processes."""
     scheduler: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="ADDRESS"), SAID] = None
-    """Run on the workers of this dask.distributed scheduler instead, say tcp://10.0.0.5:8786."""
+    """Run on the workers of this dask.distributed scheduler instead, such as tcp://10.0.0.5:8786."""
     retry: Annotated[bool, SAID] = False
-    """Run episodes again that failed."""
+    """Run failed episodes again."""
     reference: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="METHOD"), SAID] = None
-    """Method the others are compared with in the figures, in place of the suite's."""
+    """Method the others are compared with in the figures, instead of the suite's."""
     docs: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.md"), SAID] = None
     """Write the figures as a Markdown document too."""
-    general: tyro.conf.OmitArgPrefixes[General] = GENERAL
 
-    def __call__(self) -> int:
-        """Run the command."""
-        from caryatid.cli.benchmarking import run_benchmark
+    def __call__(self) -> None:
+        """Run the episodes that are missing and write the figures; what is done is kept."""
+        from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
+        from caryatid.cli.output import progress_console
+        from caryatid.runtime.fingerprint import fingerprint
 
-        return run_benchmark(self)
+        console = progress_console(self.general.silent)
+        import_pandas()
+        path = self.out / RESULTS
+        suite = None if self.suite is None else self._suite(self.suite)
+        if self.scheduler is not None and self.jobs is not None:
+            raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
+        if suite is not None:
+            self._check(suite, path)
+        code = None if suite is None else fingerprint()
+        with ResultStore(path, code, collect_provenance()) as store:
+            try:
+                if suite is not None:
+                    self._run(suite, store, console)
+                self._report(store, console)
+            except KeyboardInterrupt:
+                raise KeyboardInterrupt("what is done is kept, start again to continue") from None
+
+    def _suite(self, name: str) -> Suite:
+        """The suite with what the options change."""
+        from caryatid.benchmark import suites
+        from caryatid.benchmark.episodes import find_scenes
+
+        suite = find_suite(name)
+        if self.planner:
+            suite = suites.with_planners(suite, self.planner)
+        if self.fusion:
+            suite = suites.with_fusions(suite, self.fusion)
+        if self.segmentation or self.noise:
+            conditions = self.segmentation or ("labels",), self.noise or ("carmine",)
+            suite = suites.with_conditions(suite, *conditions)
+        if self.set:
+            suite = suites.with_settings(suite, self.set)
+        if self.scenes:
+            suite = replace(suite, scenes=tuple(find_scenes(self.scenes)))
+        return replace(suite, seeds=self.seeds or suite.seeds, views=self.views or suite.views)
+
+    def _check(self, suite: Suite, path: Path) -> None:
+        """Refuse an unknown reference, or a cluster that does not answer, before anything is written."""
+        from caryatid.benchmark.report import check_reference
+        from caryatid.benchmark.running import connect
+        from caryatid.benchmark.store import ResultStore
+
+        methods = {member.method: None for member in suite.members()}
+        if path.is_file() and path.stat().st_size:
+            with ResultStore(path) as store:
+                methods |= {member.method: None for members in store.suites.values() for member in members}
+        elif self.scheduler is not None:
+            connect(self.scheduler).close()
+        check_reference(self.reference, methods)
+
+    def _run(self, suite: Suite, store: ResultStore, console: Console) -> None:
+        """Run the missing episodes with a progress bar; where there is no terminal, print a line a minute."""
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from caryatid.benchmark.episodes import short_name
+        from caryatid.runtime.compiling import compile_kernels
+
+        missing = store.plan(suite.name, suite.members(), retry=self.retry)
+        total = len({member.episode for member in store.suites[suite.name]})
+        if missing and self.scheduler is None:
+            compile_kernels(console.print)
+        columns = (
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        )  # fmt: skip
+        hidden = console.quiet or not console.is_interactive
+        bar = Progress(*columns, console=console, disable=hidden, speed_estimate_period=600.0)
+        task = bar.add_task(suite.name, total=total, completed=total - len(missing))
+        printed = time.monotonic()
+        with bar, closing(self._outcomes(missing, console)) as outcomes:
+            for done, (episode, outcome) in enumerate(outcomes, start=total - len(missing) + 1):
+                store.add(episode, outcome)
+                bar.advance(task)
+                if outcome.error is not None:
+                    name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
+                    console.print(f"failed: {name}: {outcome.error}", markup=False)
+                if hidden and time.monotonic() - printed >= MINUTE:
+                    printed = time.monotonic()
+                    console.print(f"{suite.name}: {done} of {total} episodes", markup=False)
+
+    def _outcomes(self, missing: list[Episode], console: Console) -> Outcomes:
+        from caryatid.benchmark.running import run_locally, run_on_cluster
+
+        if missing and self.scheduler is not None:
+            yield from run_on_cluster(
+                missing, self.scheduler, lambda text: console.print(text, markup=False)
+            )
+        elif missing:
+            yield from run_locally(missing, self.jobs or CORES)
+
+    def _report(self, store: ResultStore, console: Console) -> None:
+        """Write tables, figures and pages, and print what there is."""
+        from caryatid.benchmark import report
+        from caryatid.cli.output import write_json
+
+        results = report.summarise_store(store, self.reference)
+        for result in results:
+            failed = f", {len(result.failures)} failed" if result.failures else ""
+            line = f"{result.name}: {result.episodes} of {result.planned} episodes{failed}"
+            console.print(line, markup=False)
+        for line in report.write_tables(store, self.out):
+            console.print(line, markup=False)
+        if results:
+            command = f"caryatid benchmark --out {self.out.name}"
+            if self.reference is not None:
+                command += f" --reference {shlex.quote(self.reference)}"
+            report.write_results(results, store.about, self.out / SUMMARY)
+            page = report.write_page(results, store.about, self.out, command)
+            console.print(f"figures: {page}", markup=False)
+            if self.docs is not None:
+                report.write_document(results, store.about, self.docs, f"{command} --docs {self.docs.name}")
+        if self.general.json:
+            suites = {
+                result.name: {
+                    "planned": result.planned,
+                    "done": result.episodes,
+                    "failed": len(result.failures),
+                    "f1": result.f1(),
+                }
+                for result in results
+            }
+            write_json({"results": str(self.out), "suites": suites})

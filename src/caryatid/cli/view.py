@@ -7,15 +7,13 @@ from typing import Annotated
 
 import tyro
 
-from caryatid.cli.names import PlannerName, RobotName
-from caryatid.cli.options import SAID, ModellingCommand, Views, defaults_to, whole_number, with_views
-from caryatid.config import NoiseModel, SegmentationMethod
+from caryatid.cli.options import SAID, ExploringCommand, SourceName, whole_number
 
 Port = Annotated[int, whole_number(0)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(ModellingCommand):
+class View(ExploringCommand):
     """Look at a finished run in the browser, or work the loop there on a scene or a recording.
 
     SOURCE is one of
@@ -25,13 +23,13 @@ class View(ModellingCommand):
 
     The page is served to this machine only, loads nothing from elsewhere, and stays until Ctrl-C.
 
-    To try:
+    Examples:
       caryatid view run
       caryatid view clutter --noise carmine
       caryatid view recording/ --segmentation auto --port 8080 --no-browser
     """
 
-    source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+    source: SourceName
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen at; at any other than this one others can come, and nobody asks them who they are."""
@@ -39,22 +37,10 @@ class View(ModellingCommand):
     """Port to listen at, or the next one that is free; 0 = any that is free."""
     no_browser: Annotated[bool, SAID] = False
     """Say where the page is, and leave it to you to open it."""
-    views: Annotated[Views, defaults_to(10)] = None
-    """After so many views `run` pauses."""
-    planner: PlannerName = "support"
-    """Who chooses the next view, until another is chosen in the page."""
-    robot: RobotName = "humanoid"
-    """Who carries the simulated camera, as of explore."""
-    segmentation: Annotated[
-        SegmentationMethod | None, tyro.conf.DisallowNone, defaults_to("labels where the source has them")
-    ] = None
-    """Where parts come from: the masks that are given, or automatic."""
-    noise: NoiseModel = "none"
-    """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 
-    def __call__(self) -> int:
+    def __call__(self) -> None:
         """Run the command."""
-        config = with_views(self.modelling.settings(), self.views)
+        config = self.settings()
         from caryatid.cli.viewing import run_viewer
 
-        return run_viewer(self, config)
+        run_viewer(self, config)

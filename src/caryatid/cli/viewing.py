@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from threading import Event, Thread
 
-from caryatid.cli.progress import Progress
+from caryatid.cli.output import Progress
 from caryatid.cli.view import View
 from caryatid.config import Config
 from caryatid.errors import CaryatidError
@@ -33,7 +33,7 @@ def run_viewer(options: View, config: Config) -> int:
     """Show a run, a scene or a recording until Ctrl-C."""
     # Drawing is to give way to the loop at once, which it shares the interpreter with.
     sys.setswitchinterval(SWITCH_INTERVAL)
-    progress = Progress(options.general.quiet or options.general.json)
+    progress = Progress(options.general.silent)
     with ExitStack() as stack:
         opened = _open_run if is_run(Path(options.source)) else _open_loop
         page = opened(options, config, progress, stack)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from caryatid.cli.progress import Progress
+from caryatid.cli.output import Progress
 from caryatid.config import Config
 from caryatid.exploration import Step
 from caryatid.sources import Source

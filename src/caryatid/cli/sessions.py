@@ -1,0 +1,291 @@
+"""`caryatid session` and `caryatid serve`: a robot's own software drives the loop."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from caryatid.cli.options import (
+    SAID,
+    Assignments,
+    Command,
+    ConfigPath,
+    General,
+    Modelling,
+    OptionalPath,
+    PlannerName,
+    RobotName,
+    defaults_to,
+    one_of,
+    whole_number,
+)
+from caryatid.config import SegmentationMethod
+from caryatid.config.settings import read_settings
+from caryatid.errors import InputError
+
+NEEDED = ("fastapi", "starlette", "pydantic", "uvicorn")
+"""Packages of the extra `serve`."""
+
+Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+Count = Annotated[int, whole_number(1)]
+Port = Annotated[int, whole_number(0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class New(Command):
+    """Begin a session in a new folder.
+
+    Examples:
+      caryatid session new table
+      caryatid session new table --segmentation auto --set "robot.camera_height=[1.2, 1.8]"
+      caryatid session new table --robot arm:arm.npz
+    """
+
+    folder: Folder
+    """Folder of the session; new or empty."""
+    segmentation: Annotated[
+        SegmentationMethod | None,
+        one_of(SegmentationMethod),
+        defaults_to("labels where the first view has them"),
+    ] = None
+    """Use the label images that are given, or segment automatically."""
+    planner: PlannerName = "support"
+    """Planner of the next view."""
+    robot: RobotName = "humanoid"
+    """Robot: arm:FILE.npz is an arm with a reachability map, module:callable one of your own."""
+    modelling: tyro.conf.OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
+
+    def __call__(self) -> None:
+        """Run the command."""
+        config = self.modelling.settings()
+        from caryatid.robots.registry import located
+        from caryatid.sessions import Session
+
+        session = Session.begin(
+            self.folder,
+            config,
+            segmentation=self.segmentation,
+            seed=self.modelling.seed,
+            planner=self.planner,
+            robot=located(self.robot),
+        )
+        with session:
+            document = {"session": str(self.folder), "views": 0}
+            _print(self.general, document, f"session: {self.folder}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Add(Command):
+    """Add a view; when the command ends with 0, the view is on the disk and stays.
+
+    camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm of one unit of depth, else 1}
+
+    Examples:
+      caryatid session add table --depth depth.png --camera camera.json
+      caryatid session add table --depth depth.npy --rgb rgb.png --labels labels.png --camera camera.json
+    """
+
+    folder: Folder
+    """Folder of the session."""
+    depth: Annotated[Path, tyro.conf.arg(metavar="D.png")]
+    """Depth image: 16-bit PNG, or .npy in metres; 0 or NaN = no reading."""
+    camera: Annotated[Path, tyro.conf.arg(metavar="C.json")]
+    """Camera of the view: pinhole matrix, pose, scale of the depth image."""
+    rgb: OptionalPath = None
+    """Colour image: PNG, JPEG or .npy."""
+    labels: OptionalPath = None
+    """Object number of each pixel: grey PNG or .npy; 0 = nothing, an object keeps its number."""
+    number: Annotated[int | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="N"), SAID] = None
+    """Expected number of the view, from 0: a view that is already there is not added again."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from caryatid.cli.output import summary
+        from caryatid.io.graph_json import graph_to_json
+        from caryatid.sessions import Capture, Session
+
+        with _views_kept(), Session.open(self.folder) as session:
+            limits = session.beginning.config.session
+            capture = Capture.from_files(self.depth, self.camera, self.rgb, self.labels, limits)
+            added = session.add(capture, self.number)
+        document = {"view": added.number, "changed": added.changed, "graph": graph_to_json(added.graph)}
+        news = "" if added.changed else ", nothing new"
+        _print(self.general, document, f"view {added.number + 1}: {summary(added.graph)}{news}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Next(Command):
+    """Print where to look next: camera pose, platform, gaze, expected gain, and why; as JSON.
+
+    candidates.json: {"T_world_camera": [4×4 …] that the robot reaches, "path_length": [m …], optional}
+
+    Examples:
+      caryatid session next table
+      caryatid session next table --candidates candidates.json
+    """
+
+    folder: Folder
+    """Folder of the session."""
+    candidates: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="C.json"), SAID] = None
+    """Poses to choose from, instead of those the session's robot reaches."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from caryatid.cli.output import write_json
+        from caryatid.io.json_files import read_json
+        from caryatid.sessions import Session
+        from caryatid.sessions.next_view import candidates_from
+
+        with Session.open(self.folder, read_only=True) as session:
+            poses, lengths = None, None
+            if self.candidates is not None:
+                poses, lengths = candidates_from(read_json(self.candidates), str(self.candidates))
+            write_json(session.next(poses, lengths).to_json())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Graph(Command):
+    """Print the support graph so far, as graph.json.
+
+    Examples:
+      caryatid session graph table > graph.json
+    """
+
+    folder: Folder
+    """Folder of the session."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from caryatid.io.graph_json import graph_text
+        from caryatid.sessions import Session
+
+        with Session.open(self.folder, read_only=True) as session:
+            sys.stdout.write(graph_text(session.graph))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undo(Command):
+    """Take the last view back.
+
+    Examples:
+      caryatid session undo table
+    """
+
+    folder: Folder
+    """Folder of the session."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        from caryatid.cli.output import counted, summary
+        from caryatid.io.graph_json import graph_to_json
+        from caryatid.sessions import Session
+
+        with _views_kept(), Session.open(self.folder) as session:
+            left = session.undo()
+            document = {"views": left, "graph": graph_to_json(session.graph)}
+            _print(self.general, document, f"{counted(left, 'view')} left: {summary(session.graph)}")
+
+
+@dataclass(frozen=True)
+class SessionCommand:
+    """A scene model in a folder that grows as a robot's own software adds views.
+
+    A view that was added stays, whatever happens to the process. One command writes at a time.
+    """
+
+    step: tyro.conf.OmitArgPrefixes[
+        tyro.conf.OmitSubcommandPrefixes[
+            Annotated[New, tyro.conf.subcommand("new")]
+            | Annotated[Add, tyro.conf.subcommand("add")]
+            | Annotated[Next, tyro.conf.subcommand("next")]
+            | Annotated[Graph, tyro.conf.subcommand("graph")]
+            | Annotated[Undo, tyro.conf.subcommand("undo")]
+        ]
+    ]
+
+    @property
+    def general(self) -> General:
+        """Output options."""
+        return self.step.general
+
+    def __call__(self) -> None:
+        """Run the command."""
+        self.step()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Serve(Command):
+    """Serve sessions over HTTP to robot software in any language; /docs shows the OpenAPI page.
+
+    At 127.0.0.1 only programs of this machine can connect, and need no token. Any other --host demands one,
+    as `Authorization: Bearer TOKEN`; there is no encryption, so use it within a network you trust.
+
+    Examples:
+      caryatid serve sessions
+      CARYATID_TOKEN=$(openssl rand -hex 16) caryatid serve sessions --host 0.0.0.0
+    """
+
+    folder: Folder
+    """Folder of the sessions; made if missing."""
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen at."""
+    port: Port = 8765
+    """Port to listen at; 0 = any that is free."""
+    token: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="TOKEN"), SAID] = None
+    """Token that requests need; better given as CARYATID_TOKEN, where no process list shows it."""
+    open_sessions: Count = 4
+    """Sessions kept open; others are opened from disk on request, in a tenth of a second."""
+    waiting: Count = 16
+    """Maximum number of waiting requests; more are asked to try again."""
+    max_request: Count = 16
+    """Maximum size of a request [MB]."""
+    config: ConfigPath = None
+    """Settings of new sessions, instead of the defaults."""
+    set: Assignments = ()
+    """One setting of new sessions; overrides the file."""
+
+    def __call__(self) -> None:
+        """Run the command."""
+        config = read_settings(self.config, self.set)
+        try:
+            from caryatid.service.serving import run_service
+        except ModuleNotFoundError as error:
+            if error.name not in NEEDED:
+                raise
+            raise InputError("serve", f"needs {error.name}", 'pip install "caryatid[serve]"') from None
+        run_service(
+            self.folder,
+            config,
+            host=self.host,
+            port=self.port,
+            token=self.token or os.environ.get("CARYATID_TOKEN") or None,
+            open_sessions=self.open_sessions,
+            waiting=self.waiting,
+            max_request=self.max_request * 1_000_000,
+            quiet=self.general.quiet,
+            json=self.general.json,
+        )
+
+
+@contextmanager
+def _views_kept() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("the session keeps every view that is in it") from None
+
+
+def _print(general: General, document: Mapping[str, Any], line: str) -> None:
+    from caryatid.cli.output import write_json
+
+    if general.json:
+        write_json(document)
+    elif not general.quiet:
+        sys.stdout.write(f"{line}\n")
