@@ -30,7 +30,7 @@ SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 
 FORKING = """
 import os, sys, json
-import caryatid.cli, caryatid.cli.session_steps, caryatid.service.serving
+import caryatid.cli, caryatid.cli.sessions, caryatid.service.serving
 for line in sys.stdin:
     child = os.fork()
     if child == 0:

@@ -52,8 +52,12 @@ def kept_run(tmp_path_factory, scene_file):
 
 def test_a_run_folder_holds_what_the_interfaces_say(kept_run, scene_file):
     files = {str(p.relative_to(kept_run)) for p in kept_run.rglob("*") if p.is_file()}
-    views = {f"views/{k:02d}/{name}" for k in (0, 1) for name in ("graph.json", "labels.png", "view.json")}
-    assert files == {"run.json", "graph.json", "report.html", "report.json"} | views
+    views = {
+        f"views/{k:02d}/{name}"
+        for k in (0, 1)
+        for name in ("graph.json", "labels.png", "view.json", "step.npz")
+    }
+    assert files == {"run.json", "graph.json", "report.html"} | views
 
     record = json.loads((kept_run / "run.json").read_text())
     assert record["source"] == str(scene_file)
@@ -318,9 +322,9 @@ def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, r
         "demo": ["--scene", "tower", "--views", 2, *SMALL],
         "extract": [recording],
     }
-    stages = ["segment", "register", "map", "fit", "infer", "fuse"]
+    stages = ["capture", "segment", "register", "map", "fit", "infer", "fuse"]
     if command != "extract":
-        stages = ["capture", *stages, "plan"]
+        stages = [*stages, "plan"]
     words = [command, *options[command], "--out", tmp_path / "run", "--profile"]
     assert run_command(*words, "--quiet") == 0
     said = capsys.readouterr()
@@ -424,9 +428,11 @@ def test_an_interrupt_keeps_a_whole_run_of_the_views_done(tmp_path, scene_file, 
     assert run.record["interrupted"] is True
     assert len(run.views) == len(run.record["steps"]) == len(run.record["scores"]) == 1
     assert (tmp_path / "run/graph.json").read_bytes() == (tmp_path / "run/views/00/graph.json").read_bytes()
-    assert (tmp_path / "run/report.html").is_file()
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told == f"interrupted: 1 view is kept in {tmp_path / 'run'}, open its report.html"
+    out = tmp_path / "run"
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said == f"interrupted: 1 view is kept in {out}; `caryatid report {out}` makes the report"
+    assert run_command("report", out) == 0
+    assert (out / "report.html").is_file()
 
 
 def test_an_interrupt_before_the_first_view_leaves_nothing(tmp_path, scene_file, monkeypatch, leftovers):

@@ -7,82 +7,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from contextlib import suppress
 
 import pytest
 from conftest import SMALL, run_command
 
 from caryatid.io import read_run
-from caryatid.runtime import interrupts
-from caryatid.runtime.interrupts import TIME_TO_MAKE, interrupted, interruptible, made_in_time
 
-
-@pytest.fixture
-def heard(monkeypatch):
-    """Ctrl-C pressed in this process, as often as asked for."""
-    monkeypatch.setattr(interrupts, "_heard", [])
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def press():
-        with suppress(KeyboardInterrupt), interruptible():
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(60.0)
-
-    yield press
-    signal.signal(signal.SIGINT, before)
-
-
-# What there is time for
-
-
-def test_what_can_be_left_out_is_made_where_nobody_waits(heard):
-    assert made_in_time(lambda: "report") == "report"
-    assert not interrupted()
-
-
-def test_after_an_interrupt_it_is_made_while_there_is_time(heard, monkeypatch):
-    heard()
-    assert interrupted()
-    monkeypatch.setattr(interrupts, "TIME_TO_MAKE", 60.0)
-    assert made_in_time(lambda: "report") == "report"
-    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
-
-
-@pytest.mark.parametrize("seconds", [0.0, 0.05])
-def test_after_an_interrupt_it_is_left_out_when_time_is_up(heard, monkeypatch, seconds):
-    heard()
-    interrupts._heard[0] = time.monotonic()
-    monkeypatch.setattr(interrupts, "TIME_TO_MAKE", seconds)
-    assert made_in_time(lambda: time.sleep(60.0)) is None
-
-
-def test_an_interrupt_meanwhile_leaves_it_out(heard, monkeypatch):
-    def pressed():
-        os.kill(os.getpid(), signal.SIGINT)
-        time.sleep(60.0)
-
-    monkeypatch.setattr(interrupts, "TIME_TO_MAKE", 60.0)
-    with interruptible():
-        assert made_in_time(pressed) is None
-        assert made_in_time(pressed) is None
-
-
-def test_an_interrupt_that_a_library_took_for_a_failure_is_one(heard, monkeypatch, capsys, tmp_path):
-    def failing(*_, **__):
-        with interruptible():
-            try:
-                os.kill(os.getpid(), signal.SIGINT)
-                time.sleep(60.0)
-            except KeyboardInterrupt:
-                raise ImportError("initialization failed") from None
-
-    monkeypatch.setattr("caryatid.cli.options.read_settings", failing)
-    assert run_command("config") == 130
-    assert capsys.readouterr().err == "interrupted: nothing was written\n"
-
-
-# Processes
+pytestmark = pytest.mark.slow
 
 
 class Command:
@@ -134,8 +65,7 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     assert (status, out) == (130, "")
     run = whole(folder, 3 if moment == "view 02" else 1)
     count = "1 view is" if len(run.views) == 1 else f"{len(run.views)} views are"
-    report = "open its report.html" if (folder / "report.html").exists() else "without a report"
-    assert told == f"interrupted: {count} kept in {folder}, {report}"
+    assert told == f"interrupted: {count} kept in {folder}; `caryatid report {folder}` makes the report"
     assert len(run.record["scores"]) == len(run.views)
 
 
@@ -229,22 +159,3 @@ def test_a_command_in_the_background_goes_on(tmp_path, scene_file):
     process.communicate(timeout=60)
     assert process.returncode == 0
     assert len(read_run(tmp_path / "run").views) == 2
-
-
-def test_an_alarm_that_is_lost_rings_again_and_says_nothing(monkeypatch, capsys):
-    class Ending:
-        def __del__(self):
-            end = time.monotonic() + 0.3
-            while time.monotonic() < end:
-                pass
-
-    def make():
-        Ending()
-        time.sleep(5.0)
-        return "made"
-
-    monkeypatch.setattr("caryatid.runtime.interrupts._heard", [time.monotonic() - TIME_TO_MAKE + 0.1])
-    began = time.monotonic()
-    assert made_in_time(make) is None
-    assert time.monotonic() - began < 3.0
-    assert capsys.readouterr().err == ""

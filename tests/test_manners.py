@@ -20,8 +20,8 @@ from test_benchmark import fill
 
 from caryatid import __version__, cli
 from caryatid.benchmark.store import RESULTS
-from caryatid.cli import session
-from caryatid.cli.reading import read_command
+from caryatid.cli import sessions
+from caryatid.cli.options import read_command
 from caryatid.io.images import png
 
 ESCAPE = "\x1b"
@@ -33,7 +33,7 @@ COMMANDS = [name for name in cli.commands() if name != "session"] + [f"session {
 def documented(command):
     """The docstring of a command."""
     name, _, step = command.partition(" ")
-    return inspect.getdoc(getattr(session, step.capitalize()) if step else cli.commands()[name])
+    return inspect.getdoc(getattr(sessions, step.capitalize()) if step else cli.commands()[name])
 
 
 def examples(command):

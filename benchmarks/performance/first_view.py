@@ -15,12 +15,11 @@ STARTED = time.perf_counter()
 def look() -> None:
     """Explore the scene of `caryatid demo` for two views, with all that a turn compiles."""
     import caryatid as ct
-    from caryatid.cli.demo import SCENE
     from caryatid.simulation import load_scene
     from caryatid.simulation.setup import make_simulation
 
     for segmentation in ("auto", "labels"):
-        stage = make_simulation(load_scene(SCENE), ct.Config(), noise="carmine", seed=0)
+        stage = make_simulation(load_scene("clutter"), ct.Config(), noise="carmine", seed=0)
         scene = ct.Scene(segmentation="auto" if segmentation == "auto" else "labels")
         for _ in range(2):
             scene.update(stage.camera.capture(stage.robot.T_world_camera))

@@ -20,7 +20,7 @@ class Import(Command):
     Reads bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), and folders of the
     TUM RGB-D benchmark, which need no topics. Depth must be registered to the colour image.
 
-    Examples:
+    To try:
       caryatid import pour.bag --out pour
       caryatid import pour.bag --depth /depth/image --info /depth/camera_info --tf map --out pour
       caryatid import rgbd_dataset_freiburg1_desk --out desk

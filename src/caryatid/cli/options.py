@@ -18,7 +18,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.config.settings import read_settings, write_settings
 from caryatid.errors import InputError
-from caryatid.planning.planners import BUILT_IN, ORACLE, make_planner
+from caryatid.planning.planners import BUILT_IN, ORACLE, make_planner, offered
 from caryatid.robots.registry import ARM, HUMANOID, find_robot
 
 DESCRIPTION = """Explore a cluttered table until it is known which object supports which.
@@ -89,9 +89,9 @@ def one_of(choice: Any) -> PrimitiveConstructorSpec[str | None]:
     """One of a few words, or None when left out; anything else is a usage error that lists them.
 
     Args:
-        choice: A Literal of the words.
+        choice: The words, or a Literal of them.
     """
-    words: tuple[str, ...] = get_args(choice)
+    words: tuple[str, ...] = get_args(choice) or choice
     return _spec("{" + ",".join(words) + "}", lambda word: word, str, words)
 
 
@@ -111,7 +111,7 @@ def name_of(find: Callable[[str], object], shown: Iterable[str]) -> PrimitiveCon
 
     Args:
         find: Raises InputError where it does not know a name.
-        shown: Names the help lists.
+        shown: Names the help lists; where the last one is `…`, there are others.
     """
 
     def parse(word: str) -> str:
@@ -121,7 +121,9 @@ def name_of(find: Callable[[str], object], shown: Iterable[str]) -> PrimitiveCon
             raise ValueError(f"{error.reason}; {error.remedy}") from None
         return word
 
-    return _spec("{" + ",".join(shown) + "}", parse, str)
+    names = tuple(shown)
+    complete = not any(name.endswith("…") for name in names)
+    return _spec("{" + ",".join(names) + "}", parse, str, names if complete else None)
 
 
 def _spec(
@@ -156,7 +158,7 @@ SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE"
 Segmentation = Annotated[
     SegmentationMethod | None, one_of(SegmentationMethod), defaults_to("labels where the source has them")
 ]
-PlannerName = Annotated[str, name_of(_known_planner, [*BUILT_IN, ORACLE, "…"])]
+PlannerName = Annotated[str, name_of(_known_planner, [*BUILT_IN, *sorted(offered()), ORACLE])]
 """`oracle`, or a name `make_planner` knows, including planners of other packages."""
 RobotName = Annotated[str, name_of(_known_robot, [HUMANOID, f"{ARM}FILE.npz", "module:callable", "…"])]
 """A name `find_robot` knows; files and modules are checked when they are opened."""
@@ -274,7 +276,7 @@ def with_views(config: Config, views: int | None) -> Config:
 class ShowConfig(ModellingCommand):
     """Print all settings as TOML, to edit and pass back with --config.
 
-    Examples:
+    To try:
       caryatid config > settings.toml
     """
 
@@ -293,7 +295,7 @@ class ShowConfig(ModellingCommand):
 class Completion(Command):
     """Print a script that lets the shell complete commands and options.
 
-    Examples:
+    To try:
       source <(caryatid completion bash)
       caryatid completion bash > ~/.local/share/bash-completion/completions/caryatid
       caryatid completion zsh > "${fpath[1]}/_caryatid"

@@ -24,7 +24,7 @@ from caryatid.config.choices import ExportFormat
 class Evaluate(Command):
     """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU.
 
-    Examples:
+    To try:
       caryatid evaluate run scenes/tower
     """
 
@@ -62,7 +62,7 @@ class OrderCommand(ModellingCommand):
     Each lift is rehearsed in physics on the extracted shapes, and on others as likely, before it is chosen.
     Where no order is safe, the output names the objects in each other's way and gives the least risky order.
 
-    Examples:
+    To try:
       caryatid order run
       caryatid order run --goal o3
     """
@@ -108,7 +108,7 @@ class OrderCommand(ModellingCommand):
 class ReportCommand(Command):
     """Write the report of a run again, also as a PDF.
 
-    Examples:
+    To try:
       caryatid report run
       caryatid report run --pdf report.pdf
     """
@@ -153,7 +153,7 @@ class ReportCommand(Command):
 class Export(Command):
     """Write the scene model of a run for simulators, viewers and graph programs.
 
-    Examples:
+    To try:
       caryatid export run --format mjcf --out scene.xml
       caryatid export run --out scene.glb
     """

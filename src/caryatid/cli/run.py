@@ -55,7 +55,7 @@ class Explore(ExploringCommand):
       the name of a built-in scene: tower, clutter, pile-8-0, dense-12-0, …
       a recording: a folder in the BOP format; the camera can only be where a recorded view is
 
-    Examples:
+    To try:
       caryatid explore tower --noise carmine --out run
       caryatid explore scene.xml --views 5 --out run
       caryatid explore tower --robot arm:arm.npz --out run
@@ -99,7 +99,7 @@ class Explore(ExploringCommand):
 class Demo(ModellingCommand):
     """Explore a built-in cluttered table in simulation and print what every view finds.
 
-    Examples:
+    To try:
       caryatid demo --out run
     """
 
@@ -125,7 +125,7 @@ class Demo(ModellingCommand):
 class Extract(ModellingCommand):
     """Extract shapes and support graph from all views of a recording, or from one cloud.
 
-    Examples:
+    To try:
       caryatid extract recording/ --out run
       caryatid extract table.pcd --segmentation auto --out run
     """
@@ -201,7 +201,7 @@ class Dismantle(ExploringCommand):
     Objects are lifted straight up, one by one. A step fails when any other object moves by more than 2 cm
     or 15°.
 
-    Examples:
+    To try:
       caryatid dismantle bridge --noise carmine
       caryatid dismantle scene.xml --views 5 --hands 1 --out run
     """

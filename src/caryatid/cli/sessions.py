@@ -42,7 +42,7 @@ Port = Annotated[int, whole_number(0)]
 class New(Command):
     """Begin a session in a new folder.
 
-    Examples:
+    To try:
       caryatid session new table
       caryatid session new table --segmentation auto --set "robot.camera_height=[1.2, 1.8]"
       caryatid session new table --robot arm:arm.npz
@@ -87,7 +87,7 @@ class Add(Command):
 
     camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm of one unit of depth, else 1}
 
-    Examples:
+    To try:
       caryatid session add table --depth depth.png --camera camera.json
       caryatid session add table --depth depth.npy --rgb rgb.png --labels labels.png --camera camera.json
     """
@@ -126,7 +126,7 @@ class Next(Command):
 
     candidates.json: {"T_world_camera": [4×4 …] that the robot reaches, "path_length": [m …], optional}
 
-    Examples:
+    To try:
       caryatid session next table
       caryatid session next table --candidates candidates.json
     """
@@ -154,7 +154,7 @@ class Next(Command):
 class Graph(Command):
     """Print the support graph so far, as graph.json.
 
-    Examples:
+    To try:
       caryatid session graph table > graph.json
     """
 
@@ -174,7 +174,7 @@ class Graph(Command):
 class Undo(Command):
     """Take the last view back.
 
-    Examples:
+    To try:
       caryatid session undo table
     """
 
@@ -227,7 +227,7 @@ class Serve(Command):
     At 127.0.0.1 only programs of this machine can connect, and need no token. Any other --host demands one,
     as `Authorization: Bearer TOKEN`; there is no encryption, so use it within a network you trust.
 
-    Examples:
+    To try:
       caryatid serve sessions
       CARYATID_TOKEN=$(openssl rand -hex 16) caryatid serve sessions --host 0.0.0.0
     """

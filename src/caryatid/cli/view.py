@@ -23,7 +23,7 @@ class View(ExploringCommand):
 
     The page is served to this machine only, loads nothing from elsewhere, and stays until Ctrl-C.
 
-    Examples:
+    To try:
       caryatid view run
       caryatid view clutter --noise carmine
       caryatid view recording/ --segmentation auto --port 8080 --no-browser
