@@ -33,7 +33,8 @@ MINUTE = 60.0
 """Without a terminal, print a line at most this often [s]."""
 
 SUITES = (
-    "smoke", "fig5", "planners", "path", "ablation", "ablation-attention", "poses", "noise", "dismantle", "full",
+    "smoke", "fig5", "planners", "path", "ablation", "ablation-attention", "poses", "noise", "dismantle",
+    "full",
 )  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
 
