@@ -51,8 +51,8 @@ class Import(Command):
         """Run the command."""
         config = self.settings.settings()
         from caryatid.cli.output import Progress, write_json
-        from caryatid.io.recordings.bag_footage import Topics
-        from caryatid.io.recordings.importing import import_recording, reasons
+        from caryatid.io.datasets import Topics
+        from caryatid.io.importing import import_recording, reasons
 
         if self.views is not None:
             config = replace(config, recording=replace(config.recording, max_views=self.views))
@@ -64,8 +64,8 @@ class Import(Command):
             )
         if self.general.json:
             views = [
-                {"view": n, "frame": shot.number, "time": shot.time, "posed": shot.T_world_camera is not None}
-                for n, shot in enumerate(imported.chosen)
+                {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}
+                for n, f in enumerate(imported.chosen)
             ]
             document = {"recording": str(self.out), "frames": imported.read, "views": views}
             write_json(document | {"skipped": imported.skipped, "notes": list(imported.notes)})

@@ -19,7 +19,7 @@ from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.config.settings import read_settings, write_settings
 from caryatid.errors import InputError
 from caryatid.planning.planners import BUILT_IN, ORACLE, make_planner, offered
-from caryatid.robots.registry import ARM, HUMANOID, find_robot
+from caryatid.robots import ARM, HUMANOID, find_robot
 
 DESCRIPTION = """Explore a cluttered table until it is known which object supports which.
 

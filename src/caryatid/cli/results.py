@@ -80,8 +80,7 @@ class OrderCommand(ModellingCommand):
 
         from caryatid.cli.output import Progress, left_table, result_console, write_json
         from caryatid.io.runs import read_run
-        from caryatid.manipulation.documents import order_record
-        from caryatid.manipulation.order import plan_order
+        from caryatid.manipulation.order import order_record, plan_order
         from caryatid.runtime.threads import cores
 
         config = self.modelling.settings()

@@ -220,8 +220,7 @@ class Dismantle(ExploringCommand):
         config = self.settings()
         from caryatid.cli.output import Progress, write_json
         from caryatid.io.runs import RunWriter
-        from caryatid.manipulation.dismantling import bodies_of, dismantle
-        from caryatid.manipulation.documents import dismantling_record
+        from caryatid.manipulation.dismantling import bodies_of, dismantle, dismantling_record
         from caryatid.manipulation.order import Order, plan_order
         from caryatid.runtime.threads import cores
         from caryatid.sources import is_recording
@@ -336,7 +335,7 @@ def _print_dismantling(order: Order, taken: Sequence[Taken], left: Sequence[str]
     from rich.text import Text
 
     from caryatid.cli.output import left_table, result_console
-    from caryatid.manipulation.documents import succeeded
+    from caryatid.manipulation.dismantling import succeeded
 
     outcome = "all taken, nothing disturbed" if succeeded(taken, left) else "not without harm"
     if left and all(t.ok for t in taken):

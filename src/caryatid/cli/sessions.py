@@ -65,7 +65,7 @@ class New(Command):
     def __call__(self) -> None:
         """Run the command."""
         config = self.modelling.settings()
-        from caryatid.robots.registry import located
+        from caryatid.robots import located
         from caryatid.sessions import Session
 
         session = Session.begin(
