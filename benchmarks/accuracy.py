@@ -1,13 +1,11 @@
 """How well the loop finds support graphs: F1 per view over scenes, planners, seeds, and on real frames.
 
     python benchmarks/accuracy.py suite [NAMES…] [--gate]
-    python benchmarks/accuracy.py explore [SCENES…] --noise carmine --views 5
     python benchmarks/accuracy.py extract RECORDINGS… --segmentation labels
 
 `suite` measures the settings the committed baseline is of (see `suites.py`), all where no NAMES are
-given; with `--gate` it fails where a figure is worse than the baseline by more than its tolerance. SCENES
-are folders with scene.xml and gt.json or names of built-in scenes, the built-in suite where none are given;
-RECORDINGS are BOP folders with masks and gt.json.
+given; with `--gate` it fails where a figure is worse than the baseline by more than its tolerance. RECORDINGS
+are BOP folders with masks and gt.json. `caryatid benchmark` compares planners and settings over scenes.
 """
 
 from __future__ import annotations
@@ -18,7 +16,6 @@ import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
@@ -30,7 +27,7 @@ from measures import gate, read_baseline, write_baseline
 from rich.console import Console
 from tables import show
 
-from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config import SegmentationMethod
 from caryatid.errors import CaryatidError
 
 BASELINE = Path(__file__).with_name("accuracy_baseline.json")
@@ -74,52 +71,6 @@ class SuiteRun:
             others = [m for m in read_baseline(BASELINE) if m.name.split(".")[0] not in names]
             write_baseline([m for m in others if m.name.split(".")[0] in suites.SUITES] + measures, BASELINE)
         return gate(measures, BASELINE, console) if self.gate else 0
-
-
-@dataclass(frozen=True)
-class Explore:
-    """Explore scenes and score every view."""
-
-    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = suites.BUILT_IN
-    """Scene folders or names of built-in scenes."""
-    noise: NoiseModel = "carmine"
-    """Noise of the camera."""
-    segmentation: SegmentationMethod = "labels"
-    """Where parts come from."""
-    fusion: FusionMethod = "pc+sg"
-    """What is fused."""
-    planner: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Planners compared; may be given more than once. [default: support]"""
-    seeds: int = 1
-    """Seeds 0…n−1."""
-    views: int = 5
-    """Views an episode."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Settings, e.g. `--set registration.enabled=false`."""
-    early_stop: bool = False
-    """Stop when a view changed nothing; its scores then stand for the later views."""
-    jobs: int = 4
-    """Processes."""
-    out: Path | None = None
-    """JSON file for all rows."""
-
-    def run(self, console: Console) -> int:
-        """Explore and print."""
-        tasks = [
-            Episode(
-                scene,
-                self.views,
-                self.noise,
-                self.segmentation,
-                self.set,
-                self.fusion,
-                planner,
-                seed,
-                self.early_stop,
-            )
-            for scene, planner, seed in product(self.scenes, self.planner or ("support",), range(self.seeds))
-        ]
-        return show_and_write(run_all(tasks, self.jobs), self.out, console)
 
 
 @dataclass(frozen=True)
@@ -167,7 +118,7 @@ def write_json(document: object, path: Path) -> None:
 
 def main() -> int:
     """Run the measurement."""
-    args = tyro.extras.subcommand_cli_from_dict({"suite": SuiteRun, "explore": Explore, "extract": Extract})
+    args = tyro.extras.subcommand_cli_from_dict({"suite": SuiteRun, "extract": Extract})
     return args.run(Console(width=160))
 
 

@@ -123,7 +123,7 @@ def leave_settings_out(
     gives: str | None,
 ) -> tuple[str | None, str | None]:
     """Let classes of settings stand without their dozens of arguments: a page of their own lists these."""
-    return ("", None) if name.startswith("caryatid.config.") else (arguments, gives)
+    return ("", None) if what == "class" and name.startswith("caryatid.config.") else (arguments, gives)
 
 
 def setup(app: object) -> None:

@@ -9,7 +9,6 @@ from caryatid.config import (
     Config,
     FitConfig,
     FusionConfig,
-    GenerationConfig,
     MaskConfig,
     StatisticsConfig,
     VoxelConfig,
@@ -63,7 +62,6 @@ def test_what_was_there_is_started_from_and_stays():
         ("fit.threshold=1", "fit", "threshold", 1.0),
         ("fit.threshold=1e-3", "fit", "threshold", 0.001),
         ("robot.pitch=[-50, 10]", "robot", "pitch", (-50.0, 10.0)),
-        ("generation", None, None, None),
     ],
 )
 def test_values_are_written_as_toml_does_or_as_bare_words(flag, stage, name, value):
@@ -163,7 +161,6 @@ def test_every_number_says_its_range():
     stages = {f.name: f.default_factory for f in fields(Config)} | {
         "mask": MaskConfig,
         "statistics": StatisticsConfig,
-        "generation": GenerationConfig,
     }
     for stage, kind in stages.items():
         assert issubclass(kind, Stage)

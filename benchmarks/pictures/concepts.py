@@ -18,13 +18,13 @@ import matplotlib
 import numpy as np
 import tyro
 from matplotlib import pyplot as plt
-from panels import png
 from solids import Eye, draw_solids
 from stages import (
     colour_of,
     framed,
     on_table,
     plate,
+    png,
     show_graph,
     show_interest,
     show_planes,

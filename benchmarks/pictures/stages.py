@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib import patheffects
+from matplotlib import pyplot as plt
 from matplotlib.patches import FancyArrowPatch
 from numpy.typing import NDArray
-from panels import HALO
+from PIL import Image
 from scipy.spatial import cKDTree
 from solids import Eye, draw_solids
 
@@ -22,6 +25,8 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 from caryatid.viz import colours
 from caryatid.viz.layout import arrange
 
+HALO = (patheffects.withStroke(linewidth=3.5, foreground="white"),)
+"""Sets letters and lines off from what is behind them."""
 CERTAIN, UNCERTAIN = "#3b4252", "#d55e00"
 """Colours of supports."""
 PLANE = 0.042
@@ -264,3 +269,15 @@ def _mark(panel: Any, at: Array, text: str, colour: str, star: bool = False) -> 
     panel.plot(*at, marker, color=colour, markersize=size, markeredgecolor="white", zorder=5)
     style = {"fontsize": 8.5, "fontweight": "bold", "ha": "center", "path_effects": HALO}
     panel.text(at[0], at[1] + 0.09, text, zorder=6, **style)
+
+
+def png(figure: Any, palette: int | None = None) -> bytes:
+    """Write a figure as PNG, of so many colours where a number is given."""
+    written, packed = io.BytesIO(), io.BytesIO()
+    figure.savefig(written, format="png")
+    plt.close(figure)
+    image = Image.open(written).convert("RGB")
+    if palette is not None:
+        image = image.quantize(palette, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    image.save(packed, format="png", optimize=True)
+    return packed.getvalue()

@@ -44,7 +44,6 @@ from caryatid.config.reporting import (
 )
 from caryatid.config.sessions import SessionConfig
 from caryatid.config.simulation import (
-    GenerationConfig,
     NoiseConfig,
     PhysicsConfig,
     SensorConfig,
@@ -124,7 +123,6 @@ __all__ = [
     "FitConfig",
     "FusionConfig",
     "FusionMethod",
-    "GenerationConfig",
     "LiftConfig",
     "MaskConfig",
     "NoiseConfig",

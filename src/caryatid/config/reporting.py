@@ -62,5 +62,3 @@ class StatisticsConfig(Stage):
     """Probability with which an interval covers the true mean [1]."""
     thresholds: tuple[Share, ...] = (0.94, 0.90)
     """F1 of which views and path to reach it are told [1]; the paper's, and what nearly all methods reach."""
-    views: tuple[Count, ...] = (1, 2, 3, 5, 10)
-    """Views the tables have columns of, as far as they exist; the last is always told."""

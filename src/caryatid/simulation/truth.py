@@ -20,6 +20,15 @@ from caryatid.simulation.world import SimulatedScene, displacement, state_of
 ASIDE = 100.0
 """How far up an object is lifted to take it away [m]; it falls 5 m in the second the others are watched."""
 
+FORCE_WINDOW = 0.2
+"""Contact forces are averaged over this long [s]; soft contacts creep, longer ones drift."""
+LEAN_ANGLE = 30.0
+"""A force nearer to the horizontal than this leans, a steeper one that points down presses [deg]."""
+DISTURBED = 0.02
+"""`removal` lists what is displaced by more than this [m]: it slid or fell, and did not merely settle."""
+DISTURBED_TURN = 15.0
+"""`removal` lists what is turned by more than this [deg]."""
+
 _REMEDY = 'write {"vertices": […], "edges": [{"supporter", "supported", "kind"}, …]}'
 
 
@@ -77,12 +86,12 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
         if b != 0 and force[2] > config.force_share * _weight(scene, b):
             kinds[a, b] = "bottom-up"
     removals = {a: displaced_without(scene, a, config) for a in scene.object_bodies}
-    presses = np.sin(np.deg2rad(config.lean_angle))
+    presses = np.sin(np.deg2rad(LEAN_ANGLE))
     for (a, b), force in forces.items():
         if a != 0 and b != 0 and (a, b) not in kinds and _beyond(removals[a][b], config.moved, config.turned):
             kinds[a, b] = "top-down" if -force[2] > presses * np.linalg.norm(force) else "lean"
     removal = {
-        a: [b for b, by in moves.items() if _beyond(by, config.disturbed, config.disturbed_turn)]
+        a: [b for b, by in moves.items() if _beyond(by, DISTURBED, DISTURBED_TURN)]
         for a, moves in removals.items()
     }
     return GroundTruth(
@@ -105,7 +114,7 @@ def mean_contact_forces(scene: SimulatedScene, config: PhysicsConfig) -> dict[tu
     """
     labels = _labels_with_table(scene)
     data = state_of(scene)
-    steps = max(1, round(config.force_window / scene.model.opt.timestep))
+    steps = max(1, round(FORCE_WINDOW / scene.model.opt.timestep))
     sums: dict[tuple[int, int], Array] = {}
     for _ in range(steps):
         mujoco.mj_step(scene.model, data)
