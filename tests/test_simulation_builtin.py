@@ -140,14 +140,6 @@ def test_neighbouring_objects_differ_in_colour():
     assert apart.min() > 0.02
 
 
-def test_the_way_of_the_robot_is_free():
-    for seed in range(6):
-        for box in static_boxes(dense(10, seed))[5:]:
-            low = box.T_world_object[:3, 3] - box.extents / 2.0
-            high = box.T_world_object[:3, 3] + box.extents / 2.0
-            assert not (low[0] < -1.5 < high[0] and low[1] < 0.0 < high[1])
-
-
 @pytest.mark.parametrize("name", ["pile-0-1", "pile-99-1", "dense-3-1", "dense-26-0", "packed-1-0"])
 def test_sizes_out_of_range_say_the_range(name: str):
     with pytest.raises(InputError, match=r"ask for \d+ to \d+"):
