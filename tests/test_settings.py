@@ -184,7 +184,7 @@ def test_a_file_is_named_when_something_in_it_is_wrong(file):
         ("[fit]\nstep = 3\n", "fit.step"),
         ("[fit]\nsteps = 'three'\n", "fit.steps"),
         ("fit = 3\n", "is a table of settings"),
-        ("[fit\n", "is no TOML"),
+        ("[fit\n", "is not TOML"),
     ]:
         path = file(text)
         with pytest.raises(InputError, match=r"settings\.toml") as caught:
@@ -199,7 +199,7 @@ def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path):
         read_settings(tmp_path, [])
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="is no TOML"):
+    with pytest.raises(InputError, match="is not TOML"):
         read_settings(binary, [])
 
 
@@ -215,4 +215,5 @@ def test_what_is_written_is_read_back_as_it_was(file):
     assert read_settings(path, []) == config
     text = path.read_text()
     assert all(f"[{stage.name}]" in text for stage in fields(Config))
+    assert "# An object displaced by more than this has been disturbed [m]" in text
     assert read_settings(file(write_settings(Config())), []) == Config()

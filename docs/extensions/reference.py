@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
-import inspect
 import io
 import os
 import re
@@ -19,6 +17,7 @@ from sphinx.util.docutils import SphinxDirective
 
 from caryatid import cli, config
 from caryatid.config.ranges import kinds
+from caryatid.config.settings import field_docs
 
 WIDTH = 100
 """Columns of the help."""
@@ -75,7 +74,7 @@ def table_of(stage: str) -> str:
     kind = kind_of(stage)
     values = kind()
     ranges = kinds(kind)
-    reasons = _reasons(kind)
+    reasons = field_docs(kind)
     lines = ["| setting | default | allowed | what, and why this value |", "|---|---|---|---|"]
     for field in fields(kind):
         unit, reason = _unit(reasons.get(field.name, ""))
@@ -95,19 +94,6 @@ def _toml(value: Any) -> str:
     if isinstance(value, tuple):
         return "[" + ", ".join(map(_toml, value)) + "]"
     return f'"{value}"' if isinstance(value, str) else repr(value)
-
-
-def _reasons(kind: type) -> dict[str, str]:
-    """Names of a dataclass's fields → the strings below them."""
-    tree = ast.parse(inspect.getsource(kind)).body[0]
-    assert isinstance(tree, ast.ClassDef)
-    found = {}
-    for field, below in zip(tree.body, tree.body[1:], strict=False):
-        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
-            assert isinstance(field.target, ast.Name)
-            assert isinstance(below.value, ast.Constant)
-            found[field.target.id] = " ".join(str(below.value.value).split())
-    return found
 
 
 def _unit(reason: str) -> tuple[str, str]:

@@ -9,7 +9,6 @@ from caryatid.config.choices import (
     NoiseModel,
     SegmentationMethod,
 )
-from caryatid.config.manipulation import LiftConfig, RehearsalConfig
 from caryatid.config.modelling import (
     CompletionConfig,
     ExplanationConfig,
@@ -32,17 +31,17 @@ from caryatid.config.planning import (
     RobotConfig,
     VoxelConfig,
 )
-from caryatid.config.recording import (
-    ExportConfig,
-    RecordingConfig,
-)
 from caryatid.config.reporting import (
     EvaluationConfig,
+    ExportConfig,
+    LiftConfig,
     OracleConfig,
+    RecordingConfig,
+    RehearsalConfig,
     ReportConfig,
+    SessionConfig,
     StatisticsConfig,
 )
-from caryatid.config.sessions import SessionConfig
 from caryatid.config.simulation import (
     NoiseConfig,
     PhysicsConfig,

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import math
+import textwrap
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_type_hints
 
@@ -34,7 +38,7 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
         except OSError as error:
             raise InputError(file, f"cannot be read ({error.strerror})", "give a TOML file") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(file, f"is no TOML: {error}", "mend it, or see `caryatid config`") from None
+            raise InputError(file, f"is not TOML: {error}", "correct it, or see `caryatid config`") from None
         config = _changed(config, document, str(file), "")
     for flag in flags:
         config = _changed(config, _parse_flag(flag), f"--set {flag}", "")
@@ -56,14 +60,31 @@ def changed_settings(base: Config, document: Mapping[str, Any], source: str) -> 
 
 
 def write_settings(config: Config) -> str:
-    """Write a configuration as TOML that `read_settings` reads."""
+    """Write a configuration as TOML that `read_settings` reads, with unit and reason of each setting."""
     lines: list[str] = []
     for stage in fields(config):
         section = getattr(config, stage.name)
+        reasons = field_docs(type(section))
         lines.append(f"[{stage.name}]")
-        lines += [f"{f.name} = {_toml(getattr(section, f.name))}" for f in fields(section)]
+        for f in fields(section):
+            lines += textwrap.wrap(reasons.get(f.name, ""), 100, initial_indent="# ", subsequent_indent="# ")
+            lines.append(f"{f.name} = {_toml(getattr(section, f.name))}")
         lines.append("")
     return "\n".join(lines)
+
+
+def field_docs(kind: type) -> dict[str, str]:
+    """Unit and reason of each setting of a stage: the text below its field, in one line."""
+    stage = ast.parse(inspect.getsource(kind)).body[0]
+    assert isinstance(stage, ast.ClassDef)
+    return {
+        field.target.id: " ".join(str(below.value.value).split())
+        for field, below in pairwise(stage.body)
+        if isinstance(field, ast.AnnAssign)
+        and isinstance(field.target, ast.Name)
+        and isinstance(below, ast.Expr)
+        and isinstance(below.value, ast.Constant)
+    }
 
 
 def _parse_flag(flag: str) -> dict[str, Any]:
@@ -75,7 +96,7 @@ def _parse_flag(flag: str) -> dict[str, Any]:
             return tomllib.loads(f"{name} = {text}")
         except tomllib.TOMLDecodeError:
             continue
-    raise InputError("--set", f"'{value}' is no value", "write it as TOML does")
+    raise InputError("--set", f"'{value}' is not a TOML value", "write it as TOML does")
 
 
 def _changed(config: T, document: Mapping[str, Any], source: str, prefix: str) -> T:
