@@ -37,7 +37,7 @@ from caryatid.fitting.primitives import Fit, fit
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
-from caryatid.objects.sightings import axes_rotation
+from caryatid.objects.fusion import axes_rotation
 
 BASELINE = Path(__file__).with_name("fits_baseline.json")
 """The committed figures."""

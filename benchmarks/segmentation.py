@@ -142,7 +142,7 @@ def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> tuple[int, i
 
 def measure(task: tuple[str, Args]) -> list[Row]:
     """Segment the views of one source."""
-    from caryatid.segmentation.perception import perceive
+    from caryatid.segmentation.observation import observe
     from caryatid.segmentation.segments import segment
 
     source, args = task
@@ -150,11 +150,13 @@ def measure(task: tuple[str, Args]) -> list[Row]:
     rows = []
     for number, view in enumerate(views_of(source, args, config)):
         rng = np.random.default_rng(args.seed)
-        percept = perceive(view, config, segmentation="auto", known=None, rng=rng)
-        if percept.view is None or view.labels is None:
+        observation = observe(view, config, segmentation="auto", known=None, rng=rng)
+        if observation.view is None or view.labels is None:
             raise CaryatidError(f"{view.name}: has no masks to compare with")
         started = time.perf_counter()
-        labels = segment(percept.view, percept.surface, config.segmentation, config.cloud, config.fit, rng)
+        labels = segment(
+            observation.view, observation.surface, config.segmentation, config.cloud, config.fit, rng
+        )
         seconds = time.perf_counter() - started
         name = Path(source).name
         rows.append(Row(name, number, *compare(labels[view.valid], view.labels[view.valid]), seconds))

@@ -10,7 +10,7 @@ from caryatid.config import FusionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.graph import Support, SupportGraph
-from caryatid.objects.change import changed, reshaped
+from caryatid.objects.fusion import changed, reshaped
 
 CONFIG = FusionConfig()
 CRATE = thing(1, box((0.0, 0.0, 0.8), (0.1, 0.2, 0.3)))

@@ -12,7 +12,7 @@ from caryatid.fitting.primitives import Fit, fit
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
 from caryatid.graph import SceneObject
-from caryatid.objects.sightings import axes_rotation, merge
+from caryatid.objects.fusion import axes_rotation, merged_sightings
 
 ALL = (True,) * 6
 NONE = (False,) * 6
@@ -20,7 +20,7 @@ LEVEL = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians(np.arange(0.0,
 
 
 def merged_of(sightings):
-    return merge(sightings, FusionConfig())
+    return merged_sightings(sightings, FusionConfig())
 
 
 def renamed(shape, turn):

@@ -9,20 +9,21 @@ import pytest
 from synthetic import box, cylinder, surface_points
 
 from caryatid.config import Config
-from caryatid.objects.models import ObjectModels
-from caryatid.segmentation.perception import Percept
-from caryatid.sensing.views import Cloud
+from caryatid.geometry import transforms
+from caryatid.objects.models import ObjectModels, ObjectPoints, joined
+from caryatid.segmentation.observation import Observation
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
 CRATE, CAN = box((0.0, 0.0, 0.8), (0.16, 0.12, 0.1)), cylinder((0.0, 0.0, 0.91), 0.03, 0.12)
 
 
-def percept_of(labels, shapes=(CRATE, CAN), eye=(-1.2, -0.6, 1.8), seed=0):
+def observation_of(labels, shapes=(CRATE, CAN), eye=(-1.2, -0.6, 1.8), seed=0):
     rng = np.random.default_rng(seed)
     parts = [surface_points(s, rng, eye=eye, spacing=0.005, sigma=0.001) for s in shapes]
     points = np.concatenate([p for p, _ in parts])
     named = np.repeat(np.array(labels, dtype=np.int32), [len(p) for p, _ in parts])
     cloud = Cloud(points, np.concatenate([n for _, n in parts]), named)
-    return Percept(None, cloud, np.arange(len(points)), None)
+    return Observation(None, cloud, np.arange(len(points)), None)
 
 
 @pytest.fixture
@@ -31,14 +32,14 @@ def models():
 
 
 def test_what_was_taken_for_one_is_divided_and_the_view_relabelled(models):
-    percept = percept_of((1, 1))
-    models.fit_all(models.add(percept, 0))
+    observation = observation_of((1, 1))
+    models.fit_all(models.add(observation, 0))
     assert [o.label for o in models.objects()] == [1]
     changed = models.divide({1})
     assert len(changed) == 2
     assert sorted(o.shape.kind for o in models.objects()) == ["box", "cylinder"]
-    relabelled = models.nearest(percept, changed)
-    truth = percept_of((1, 2)).labels
+    relabelled = models.nearest(observation, changed)
+    truth = observation_of((1, 2)).labels
     for k in (1, 2):
         assert (
             np.unique(relabelled.labels[truth == k], return_counts=True)[1].max() > 0.9 * (truth == k).sum()
@@ -46,17 +47,17 @@ def test_what_was_taken_for_one_is_divided_and_the_view_relabelled(models):
 
 
 def test_later_parts_over_both_are_divided_among_the_known(models):
-    models.fit_all(models.add(percept_of((1, 2)), 0))
-    again = models.associate(percept_of((7, 7), seed=1))
+    models.fit_all(models.add(observation_of((1, 2)), 0))
+    again = models.associate(observation_of((7, 7), seed=1))
     assert set(np.unique(again.labels)) == {1, 2}
-    assert (again.labels == percept_of((1, 2), seed=1).labels).mean() > 0.9
+    assert (again.labels == observation_of((1, 2), seed=1).labels).mean() > 0.9
 
 
 def test_two_labels_of_one_object_are_united(models):
     left, right = (-1.2, -0.6, 1.8), (1.2, 0.6, 1.8)
-    models.fit_all(models.add(percept_of((1,), (CRATE,), left), 0))
-    models.fit_all(models.add(percept_of((1,), (CRATE,), right), 0))
-    models.fit_all(models.add(percept_of((2,), (CRATE,), left, seed=3), 0))
+    models.fit_all(models.add(observation_of((1,), (CRATE,), left), 0))
+    models.fit_all(models.add(observation_of((1,), (CRATE,), right), 0))
+    models.fit_all(models.add(observation_of((2,), (CRATE,), left, seed=3), 0))
     given_up = models.unite({1, 2})
     assert len(given_up) == 1
     assert [o.shape.kind for o in models.objects()] == ["box"]
@@ -64,40 +65,144 @@ def test_two_labels_of_one_object_are_united(models):
 
 
 def test_the_newest_view_alone_is_fitted_on_demand(models):
-    models.fit_all(models.add(percept_of((1, 2)), 0))
-    models.fit_newest(models.add(percept_of((2,), (CAN,)), 0))
+    models.fit_all(models.add(observation_of((1, 2)), 0))
+    models.fit_newest(models.add(observation_of((2,), (CAN,)), 0))
     assert [o.label for o in models.objects()] == [2]
 
 
 def test_an_object_that_could_not_be_divided_is_left_alone_until_it_has_grown(models, monkeypatch):
     tried = []
     monkeypatch.setattr("caryatid.objects.models.split", lambda *a, **k: tried.append(len(a[0].points)))
-    models.fit_all(models.add(percept_of((1,), (CRATE,)), 0))
+    models.fit_all(models.add(observation_of((1,), (CRATE,)), 0))
     assert models.divide({1}) == set()
     assert models.divide({1}) == set()
     assert len(tried) == 1
-    models.fit_all(models.add(percept_of((1,), (CRATE,), (1.2, 0.6, 1.8)), 0))
+    models.fit_all(models.add(observation_of((1,), (CRATE,), (1.2, 0.6, 1.8)), 0))
     models.divide({1})
     assert len(tried) == 2
 
 
 def test_a_pair_is_looked_at_again_when_one_of_them_has_been_divided(models, monkeypatch):
-    models.fit_all(models.add(percept_of((1, 1)), 0))
-    models.fit_all(models.add(percept_of((2,), (CRATE,), seed=3), 0))
+    models.fit_all(models.add(observation_of((1, 1)), 0))
+    models.fit_all(models.add(observation_of((2,), (CRATE,), seed=3), 0))
 
     def all_are_two(evidence, alone, changed, apart, **settings):
         apart[1, 2] = 10**6
 
     with monkeypatch.context() as patched:
-        patched.setattr("caryatid.objects.models.united", all_are_two)
+        patched.setattr("caryatid.objects.models.best_merge", all_are_two)
         assert models.unite({1, 2}) == {}
     assert models.unite({1, 2}) == {}
     models.unite(models.divide({1}))
     assert sorted(o.shape.kind for o in models.objects()) == ["box", "cylinder"]
 
 
-def test_labels_of_the_percept_are_required():
-    percept = percept_of((1, 2))
-    bare = replace(percept, cloud=replace(percept.cloud, labels=None))
+def test_labels_of_the_observation_are_required():
+    observation = observation_of((1, 2))
+    bare = replace(observation, cloud=replace(observation.cloud, labels=None))
     with pytest.raises(ValueError, match="labelled"):
         _ = bare.labels
+
+
+def cloud(count, label, at=0.0):
+    points = np.full((count, 3), at) + np.arange(count)[:, None]
+    return Cloud(points, np.tile((0.0, 0.0, 1.0), (count, 1)), np.full(count, label, dtype=np.int32))
+
+
+def two_views():
+    points = ObjectPoints()
+    for view, at in enumerate((0.0, 100.0)):
+        for label, count in ((1, 4), (3, 6), (SUPPORT_LABEL, 5)):
+            points.add(label, cloud(count, label, at), view)
+    return points
+
+
+def test_views_add_up():
+    points = two_views()
+    assert points.objects == [1, 3]
+    assert points.labels_used == 3
+    assert len(points.of(3)) == 12
+    assert len(points.newest(3)) == 6
+    assert points.newest(3).points_world[0, 0] == 100.0
+    assert len(points.everything()) == 30
+    assert set(points.everything().labels) == {1, 3, SUPPORT_LABEL}
+    assert len(points.of(7)) == 0
+    assert 3 in points
+    assert 7 not in points
+
+
+def test_merging_keeps_every_point_under_the_new_label():
+    points = two_views()
+    points.merge(1, 3)
+    assert points.objects == [3]
+    assert len(points.of(3)) == 20
+    assert set(points.of(3).labels) == {3}
+    assert len(points.everything()) == 30
+
+
+def test_dividing_gives_each_group_its_points_and_new_labels_only():
+    points = two_views()
+    groups = np.tile([0, 1, 2], 4)
+    before = points.of(3).points_world
+    names = points.divide(3, groups)
+    assert names == [3, 4, 5]
+    assert points.labels_used == 5
+    for number, name in enumerate(names):
+        np.testing.assert_array_equal(points.of(name).points_world, before[groups == number])
+        assert set(points.of(name).labels) == {name}
+    assert len(points.everything()) == 30
+
+
+def test_a_move_moves_the_points_of_its_views_only():
+    points = two_views()
+    points.add(9, cloud(3, 9, 7.0), 2)
+    before = {k: points.of(k) for k in (1, 3, 9)}
+    copied = points.copy()
+    T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
+    assert points.move({1: T}) == {1, 3, SUPPORT_LABEL}
+    assert points.move({}) == set()
+    for label, count in ((1, 4), (3, 6)):
+        old, new = before[label], points.of(label)
+        np.testing.assert_array_equal(new.points_world[:count], old.points_world[:count])
+        np.testing.assert_allclose(
+            new.points_world[count:], transforms.transform(T, old.points_world[count:])
+        )
+        np.testing.assert_allclose(new.normals_world[count:], transforms.rotate(T, old.normals_world[count:]))
+        np.testing.assert_array_equal(copied.of(label).points_world, old.points_world)
+    np.testing.assert_array_equal(points.of(9).points_world, before[9].points_world)
+
+
+def test_a_divided_objects_points_still_move_with_their_views():
+    points = two_views()
+    names = points.divide(3, np.arange(12) % 2)
+    T = transforms.rigid(np.eye(3), (0.0, 0.0, 5.0))
+    heights = [points.of(k).points_world[:, 2] for k in names]
+    points.move({1: T})
+    for label, height in zip(names, heights, strict=True):
+        np.testing.assert_array_equal(points.of(label).points_world[:, 2] - height, [0, 0, 0, 5, 5, 5])
+
+
+def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
+    points = ObjectPoints()
+    for view in range(9):
+        points.add(1, cloud(20, 1, 0.01 * view), view)
+        points.bound(1, 0.5, 4)
+        assert len(points.of(1)) == (20 * (view + 1) if view < 8 else 80)
+    left = np.unique(np.round(points.of(1).points_world[:, 0] % 1.0, 9))
+    np.testing.assert_array_equal(left, [0.05, 0.06, 0.07, 0.08])
+    points.move({8: transforms.rigid(np.eye(3), (0.2, 0.0, 0.0))})
+    assert (points.of(1).points_world[:, 0] % 1.0 > 0.2).sum() == 20
+
+
+def test_a_label_given_up_is_not_given_again():
+    points = two_views()
+    points.merge(3, 1)
+    assert points.divide(1, np.arange(20) % 2) == [1, 4]
+
+
+def test_colours_stay_only_where_all_have_them():
+    plain = cloud(2, 1)
+    coloured = Cloud(plain.points_world, plain.normals_world, plain.labels, np.zeros((2, 3), dtype=np.uint8))
+    assert joined([coloured, coloured]).rgb is not None
+    assert joined([coloured, plain]).rgb is None
+    assert len(joined([])) == 0

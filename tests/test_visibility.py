@@ -7,9 +7,8 @@ import pytest
 from raycast import TABLE, from_the_side, table_scene
 from synthetic import box, sphere
 
-from caryatid.config import FusionConfig
 from caryatid.geometry import transforms
-from caryatid.sensing.seen_through import seen_through as seen_through_with
+from caryatid.sensing.seen_through import BEHIND, seen_through
 
 EYE = from_the_side(azimuth=180.0)
 CRATE = box((0.0, 0.0, TABLE + 0.06), (0.1, 0.1, 0.12))
@@ -25,10 +24,6 @@ def view_of(*boxes, spheres=()):
 
 
 EMPTY = view_of()
-
-
-def seen_through(shape, view):
-    return seen_through_with(shape, view, FusionConfig())
 
 
 def test_what_is_there_is_not_seen_through():
@@ -59,7 +54,7 @@ def test_an_error_of_registration_is_no_contradiction():
     view = view_of(CRATE)
     forward = EYE[:3, 2]
     for share, contradicted in ((0.8, False), (1.6, True)):
-        nearer = CRATE.moved(transforms.rigid(np.eye(3), -share * FusionConfig().behind * forward))
+        nearer = CRATE.moved(transforms.rigid(np.eye(3), -share * BEHIND * forward))
         assert seen_through(nearer, view) == contradicted
 
 

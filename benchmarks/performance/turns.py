@@ -14,7 +14,7 @@ from caryatid import Scene, View, next_best_view
 from caryatid.config import SegmentationMethod
 from caryatid.geometry.transforms import Array
 from caryatid.planning.expected_visibility import SURFACE_SAMPLES
-from caryatid.segmentation.perception import UP
+from caryatid.segmentation.observation import MAX_POINTS, UP
 from caryatid.segmentation.segments import segment
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points
@@ -183,7 +183,7 @@ def _calls(recording: Recording) -> dict[str, tuple[str, Callable[[], object], t
     points, normals, pixels = oriented_points(view, config.cloud)
     assert view.labels is not None
     loose = np.flatnonzero(view.labels.ravel()[pixels] == 0)
-    loose = loose[:: max(1, len(loose) // config.surface.max_points)]
+    loose = loose[:: max(1, len(loose) // MAX_POINTS)]
 
     def surface() -> object:
         rng = np.random.default_rng(0)

@@ -13,7 +13,7 @@ from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.objects.change import changed
+from caryatid.objects.fusion import changed
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import ATTEMPTS, Decision, Planner, PlanningState, path_cost
 from caryatid.planning.planners import make_planner

@@ -20,7 +20,7 @@ from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.display import Pictured, call
 from caryatid.runtime.stopwatch import Stopwatch
 from caryatid.runtime.threads import one_blas_thread
-from caryatid.segmentation.perception import UP, Percept, label_image, perceive
+from caryatid.segmentation.observation import UP, Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
 from caryatid.sensing.joint_registration import ViewRegistration
 from caryatid.sensing.seen_through import seen_through
@@ -145,99 +145,103 @@ class Scene(Pictured):
         watch = Stopwatch()
         rng = np.random.default_rng([self.seed, self.views])
         given = source.labels is not None and self.segmentation != "auto"
-        percept = perceive(source, self.config, segmentation=self.segmentation, known=self.surface, rng=rng)
+        observation = observe(
+            source, self.config, segmentation=self.segmentation, known=self.surface, rng=rng
+        )
         watch.lap("segment")
-        percept, moved = self._registered(percept, given)
+        observation, moved = self._registered(observation, given)
         watch.lap("register")
         if not given and self.config.fusion.method != "sg":
-            percept = self._models.associate(percept)
-        shown = self._models.add(percept, self.views) | moved
-        self.surface = self._fused_surface(percept)
-        surface, voxels = self._bounds(percept)
+            observation = self._models.associate(observation)
+        shown = self._models.add(observation, self.views) | moved
+        self.surface = self._fused_surface(observation)
+        surface, voxels = self._bounds(observation)
         watch.lap("map")
-        percept = self._fitted(percept, shown, given)
+        observation = self._fitted(observation, shown, given)
         watch.lap("fit")
         completed = complete(self._models.objects(), surface, voxels, self.config.completion)
         table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
         plausible = reconcile([table, *completed], self.config.plausibility)
         newest = infer(plausible, self.config.support)
         watch.lap("infer")
-        percept = self._fused(percept, newest, given)
-        self.labels = label_image(percept, source)
-        self.T_world_camera = None if percept.view is None else percept.view.pose
+        observation = self._fused(observation, newest, given)
+        self.labels = label_image(observation, source)
+        self.T_world_camera = None if observation.view is None else observation.view.pose
         self.views += 1
         watch.lap("fuse")
         self.timings = watch.laps
         return self.graph
 
-    def _registered(self, percept: Percept, given: bool) -> tuple[Percept, set[int]]:
+    def _registered(self, observation: Observation, given: bool) -> tuple[Observation, set[int]]:
         """Lay the view onto the earlier ones and move those by what it shows of them.
 
         Returns:
-            The percept, moved, and the labels of the objects some of whose points moved.
+            The observation, moved, and the labels of the objects some of whose points moved.
         """
         if not self.config.registration.enabled:
-            return percept, set()
+            return observation, set()
         if self._registration is None:
-            self._registration = ViewRegistration(percept.surface.point_world, self.config.registration)
-        moves = self._registration.add(percept.cloud, same_labels=given)
+            self._registration = ViewRegistration(observation.surface.point_world, self.config.registration)
+        moves = self._registration.add(observation.cloud, same_labels=given)
         moved = self._models.move({v: T for v, T in moves.items() if v < self.views})
-        return percept.moved(moves[self.views]), moved
+        return observation.moved(moves[self.views]), moved
 
-    def _fused_surface(self, percept: Percept) -> SupportSurface:
+    def _fused_surface(self, observation: Observation) -> SupportSurface:
         """The support surface from the points of all views."""
         table = self._models.points.of(SUPPORT_LABEL)
         if self.views == 0 or len(table) < self.config.surface.min_points:
-            return percept.surface
-        known, config = self.surface or percept.surface, self.config.surface
+            return observation.surface
+        known, config = self.surface or observation.surface, self.config.surface
         fused = refitted(known, table.points_world, table.normals_world, UP, config)
         return known if fused is None else fused
 
-    def _bounds(self, percept: Percept) -> tuple[SupportSurface, VoxelMap]:
+    def _bounds(self, observation: Observation) -> tuple[SupportSurface, VoxelMap]:
         """Enter the view into the map; return what bounds hidden extents: of this view alone with `sg`."""
         if self.sphere is None or self.voxels is None:
-            centre = percept.surface.point_world
+            centre = observation.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
             self.voxels = VoxelMap.around(centre, self.config.voxels)
         max_depth = self.config.cloud.max_depth
-        if percept.view is not None:
-            self.voxels = self.voxels.integrate(percept.view, max_depth)
+        if observation.view is not None:
+            self.voxels = self.voxels.integrate(observation.view, max_depth)
         if self.config.fusion.method != "sg":
-            return self.surface or percept.surface, self.voxels
+            return self.surface or observation.surface, self.voxels
         newest = VoxelMap.around(self.sphere.centre_world, self.config.voxels)
-        return percept.surface, newest if percept.view is None else newest.integrate(percept.view, max_depth)
+        if observation.view is not None:
+            newest = newest.integrate(observation.view, max_depth)
+        return observation.surface, newest
 
-    def _fitted(self, percept: Percept, shown: set[int], given: bool) -> Percept:
+    def _fitted(self, observation: Observation, shown: set[int], given: bool) -> Observation:
         """Fit what this view changed; automatic parts are divided and united as the shapes suggest."""
         if self.config.fusion.method == "sg":
             self._models.fit_newest(shown)
-            return percept
+            return observation
         self._models.fit_all(shown, self.voxels)
         if given:
-            return percept
+            return observation
         changed = self._models.divide(shown, self.voxels)
         if changed:
-            percept = self._models.nearest(percept, changed)
+            observation = self._models.nearest(observation, changed)
         given_up = self._models.unite(shown | changed, self.voxels)
         self._evidence = absorbed(
             self._evidence, {object_id(old): object_id(new) for old, new in given_up.items()}
         )
-        return percept.relabelled(given_up)
+        return observation.relabelled(given_up)
 
-    def _fused(self, percept: Percept, newest: SupportGraph, given: bool) -> Percept:
-        """Add the newest graph to the evidence; the percept's labels become those of the fused objects."""
+    def _fused(self, observation: Observation, newest: SupportGraph, given: bool) -> Observation:
+        """Add the newest graph to the evidence; its labels become those of the fused objects."""
         config = self.config.fusion
         same_labels = given or config.method != "sg"
         self._evidence, names = fuse(self._evidence, newest, config, same_labels=same_labels)
-        percept = percept.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
-        seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in percept.shown}
+        observation = observation.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
+        seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}
         self._shown.update(seen)
-        if percept.view is not None:
+        if observation.view is not None:
             for o in self.graph.objects:
-                if o.role == "object" and o.id not in seen and seen_through(o.shape, percept.view, config):
+                if o.role == "object" and o.id not in seen and seen_through(o.shape, observation.view):
                     self._contradicted[o.id] += 1
         fused = fused_graph(self._evidence, config, shown=self._shown, contradicted=self._contradicted)
         ids = {o.id for o in fused.objects}
         stability = {names[i]: verdict for i, verdict in newest.stability.items() if names[i] in ids}
         self.graph = replace(fused, stability=stability)
-        return percept
+        return observation

@@ -175,7 +175,7 @@ class Extract(ModellingCommand):
 
         from caryatid.exploration import Explorer
         from caryatid.io.point_clouds import read_stored_cloud
-        from caryatid.segmentation.perception import level_cloud
+        from caryatid.segmentation.observation import level_cloud
         from caryatid.sources import check_segments
 
         with progress.working("reading the cloud"):

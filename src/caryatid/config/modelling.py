@@ -86,22 +86,14 @@ class FitConfig(Stage):
 
 @dataclass(frozen=True, slots=True)
 class SplitConfig(Stage):
-    """Parting what automatic segmentation took for one object."""
+    """Model split: what automatic segmentation took for one object may be several."""
 
     cuts: WholeNumber = 5
     """Cuts tried along each direction [1]; a sixth of the points apart."""
-    patches: WholeNumber = 3
-    """Largest patches a single shape does not explain that are tried as objects of their own [1]."""
-    finalists: Count = 2
-    """Best starts that are settled with full fits [1]."""
     rounds: WholeNumber = 3
     """Times the points go to the shape that explains them better and the shapes are fitted anew [1]."""
     min_points: Count = 20
     """Thinned points a side needs [1]; 1.5 times what a shape needs."""
-    crumb: WholeNumber = 8
-    """Fewer points off the rest of their side go to the other side [1]; 2 cm square of them, thinned."""
-    reach: Positive = 0.02
-    """Points further apart are not connected [m]; four times their spacing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,36 +112,14 @@ class ExplanationConfig(Stage):
     """Surface whose points err alike [m²]; half of the 2 cm square a registration error shows in."""
     border: NotNegative = 4.0
     """Cost of a point with only the other object around it, on a surface without crease [nats]."""
-    smooth_border: Share = 0.8
-    """Share of a border without crease for two with shapes to be one irregular object [1]."""
     free_cost: NotNegative = 0.5
     """Cost of a voxel inside a shape that was seen free [nats]; four points off at 5 mm spacing."""
     usual: NotNegative = 0.9
     """Mean cost of the points around a point that is still well explained [nats]; 9 in 10 true shapes."""
-    neighbours: Count = 8
-    """Points the mean around a point is taken over [1]; 2 cm square of them."""
     spacing: Positive = 0.008
     """Spacing the points are thinned to [m]; a third of the patch that errs alike."""
-    least_noise: Positive = 0.002
-    """Least standard deviation of points from their surfaces [m]; what registration leaves."""
-    crease: Angle = 15.0
-    """Turn between neighbouring normals from which on a crease is concave [deg]; as in segmentation."""
     reach: Positive = 0.03
     """Objects further apart are not taken for one [m]; an occluder's shadow."""
-    sample: Count = 150
-    """Points of an object at the most in a fit that only tells what is worth a full one [1]."""
-    hypotheses: Count = 10
-    """RANSAC hypotheses a shape in such a fit [1]."""
-    steps: WholeNumber = 6
-    """Least-squares steps in such a fit [1]."""
-    growth: Factor = 1.3
-    """What was found to be one object, or two, is looked at again when its points have grown by this [1]."""
-    layer: NotNegative = 0.009
-    """Points within this of a surface may be of it [m]; a view that is off by 3σ leaves a layer of them."""
-    layer_share: Share = 0.8
-    """Share of an object's points in such a layer, or inside the other, for it to be the other's [1]."""
-    inset: NotNegative = 1.2
-    """How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,16 +130,8 @@ class CompletionConfig(Stage):
     """An unseen side that faces down within this angle may be extended [deg]; what rests on a face does."""
     step: Positive = 0.01
     """Step of the extension [m]; a voxel."""
-    spacing: Positive = 0.015
-    """Spacing of the points tested on the moving side [m]."""
-    inset: NotNegative = 0.01
-    """How far inside the walls free space is looked for [m]; a voxel, so that a wall's noise says nothing."""
     overlap: NotNegative = 0.004
     """How deep the moving side may enter another shape [m]; the fits' uncertainty."""
-    flat: NotNegative = 0.02
-    """Extent below which a single side's points say nothing of the depth behind it [m]; their noise."""
-    least: NotNegative = 0.0005
-    """Gaps below this are none [m]."""
     max_free: Share = 0.15
     """The extension ends where more of its rim lies in voxels seen free [1]; half of one side of four."""
 
@@ -226,19 +188,7 @@ class FusionConfig(Stage):
     """Axes further apart are two orientations [deg], up to the shape's symmetry."""
     max_ratio: Factor = 1.6
     """Sorted extents that differ by more than this factor [1] are two objects."""
-    sigmas: NotNegative = 2.0
-    """Standard deviations of centres and extents by which two sightings may differ beyond that [1]."""
     settled: NotNegative = 0.005
     """A shape that moves, grows or turns by less than this has not changed [m]; σ of registration error."""
-    surface_spacing: Positive = 0.01
-    """Spacing of the points on a shape that are looked for in a view that does not show the object [m]."""
-    behind: NotNegative = 0.02
-    """A reading this far behind such a point contradicts it [m]; 2σ of registration and depth together."""
-    contradicting: Share = 0.5
-    """Share of the points that must be contradicted for the view to speak against the object [1]."""
-    blind: NotNegative = 0.1
-    """Weight, in sides, of a sighting of which no side was seen (`sg`) [1]; small beside any other."""
-    residual: Positive = 0.01
-    """Mean distance of its points at which a sighting counts half in the merged shape (`sg`) [m]."""
     keep_share: Share = 0.5
     """A support is kept while occurrences / opportunities is at least this [1]."""

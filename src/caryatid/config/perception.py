@@ -37,40 +37,24 @@ class CloudConfig(Stage):
 class SurfaceConfig(Stage):
     """The support surface (table top)."""
 
-    iterations: Count = 400
-    """RANSAC hypotheses a plane [1]; 400 find a plane of 20 % of the points with confidence 0.96."""
-    sample: Count = 4000
-    """Points the hypotheses are scored on [1]; spread evenly over the cloud."""
     tolerance: Positive = 0.01
     """Distance within which a point belongs to the plane [m]; 3σ of the sensor at 1.8 m."""
     max_tilt: Angle = 10.0
     """How far the normal may lean from the vertical where the view has a pose [deg]."""
     max_deviation: Angle = 25.0
     """How far a point's normal may lean from its plane's [deg]; 3σ of normals from depth."""
-    planes: Count = 6
-    """Horizontal planes looked at, largest first, before the table is chosen [1]."""
-    cell: Positive = 0.03
-    """Grid on a plane its area is measured by [m]; above the points' spacing at 3 m."""
     gap: NotNegative = 0.3
     """Parts of one plane further apart than this are two surfaces [m]; shadows of objects are narrower."""
     min_area: NotNegative = 0.05
     """Seen area a table has at least [m²]; more than most objects' tops."""
     storey: NotNegative = 0.3
     """A plane that has a table this far above it is the floor [m]."""
-    storey_share: Share = 0.05
-    """Points the table above a floor has at least, as a share of the floor's [1]; less is a shelf behind."""
     min_points: Count = 200
     """Fewer inliers are no table [points]."""
-    max_points: Count = 20_000
-    """Points of a view the surface is looked for in [1]; spread evenly, they give its height to 0.1 mm."""
-    max_points_known: Count = 5000
-    """The same once the table is known [1]: as many of a first view's are the table's, the rest is floor."""
     search: Positive = 0.05
     """Once known, the table is looked for within this height of itself [m]; 5σ of registration and tilt."""
     spacing: Positive = 0.02
     """Spacing its points are kept at for later views [m]."""
-    thickness: Positive = 0.04
-    """Thickness of the box the table top is modelled by [m]; only its top counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,81 +138,30 @@ class SegmentationConfig(Stage):
     """Points further than this outside the support surface's outline belong to no object on it [m]."""
     edge_jump: Positive = 0.006
     """A sample further than this from its neighbour's plane is another surface's [m], at 1 m and times z²."""
-    max_jump: Positive = 0.009
-    """A depth step between samples beyond this parts two surfaces, however steep [m], at 1 m and times z²."""
-    gap: WholeNumber = 3
-    """Depth steps are looked for across this many samples without a reading [1]; they leave 2 px a side."""
-    min_rise: NotNegative = 0.015
-    """Height over a neighbour's plane from which a depth step repels [m]; above staircases on steep faces."""
     surfel: Positive = 0.015
     """Size of the patches whose edges are judged convex or concave [m]; four times the noise at 1.5 m."""
     crease: NotNegative = 4.0
     """What a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at edges."""
     step: NotNegative = 0.0035
     """Height of one surfel over its neighbour's plane beyond which they are two layers [m]; 2σ evened out."""
-    neighbours: Count = 10
-    """Nearest points a point of an unorganised cloud is joined to [1]."""
     reach: Positive = 0.012
     """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
     concavity: Angle = 15.0
     """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's 10 and noise."""
     rise: NotNegative = 0.01
     """Height over the tangent plane of another place of a part from which the pair is concave [m]."""
-    concave_share: Share = 0.2
-    """Share of concave pairs between two clusters from which they are two bodies [1]."""
-    least_surfels: Count = 10
-    """Surfels a cluster needs for that to be asked [1]; fewer are bumps and flaws."""
-    hollow: Cosine = 0.2
-    """Mean cosine between normals and the way inwards that makes a patch the inside of something [1]; a
-    bowl's has 0.6, flat faces and their noise 0.05."""
-    rim: NotNegative = 0.025
-    """Difference in height of the tops of an inside and of what it hangs in [m]; a rim's width and noise."""
     min_size: Count = 40
     """Samples a part needs to be an object [points]."""
     min_width: NotNegative = 0.02
     """A part narrower than this beside a larger one belongs to it [m]; creases are rounded so far."""
-    normal_size: Positive = 0.013
-    """Side of the window normals are estimated over, at the objects' median distance [m]."""
-    plane_radius: Count = 5
-    """Radius of the wider window the samples' tangent planes are evened out over [px]."""
-    plane_tolerance: Positive = 0.004
-    """Readings further from a tangent plane are another surface's [1/m]; 3σ of the sensor at 2 m."""
-    rejoin_gap: NotNegative = 0.25
-    """Parts are rejoined across what hides this much between them at the most [m]; table-top sizes."""
-    rejoin_votes: Count = 5
-    """Rows and columns of samples on which they must meet [1]; 3 cm at 1.5 m."""
-    rejoin_share: Share = 0.25
-    """A part smaller than this share of two that touch may be a splinter of the other [1]."""
-    rejoin_concave: Share = 0.1
-    """Share of pairs of samples that may be concave where two parts are one [1]; creases are rounded."""
-    rejoin_hypotheses: Count = 40
-    """RANSAC hypotheses a shape when a joint is judged [1]; samples are evened out and hold few outliers."""
-    rejoin_points: Count = 300
-    """Points a joint is judged by [1]."""
-    rejoin_distance: NotNegative = 0.006
-    """Distance within which a sample lies at a shape [m]; 3σ of the evened out samples."""
-    rejoin_cosine: Cosine = 0.7
-    """Cosine of the angle between the normals of a sample and of the shape it lies at, at least [1]; 45°."""
-    rejoin_loss: Share = 0.1
-    """Share of a part's samples that its own shape explains and the joint one need not [1]."""
-    plain_colour: NotNegative = 0.02
-    """Usual distance of the shares of red, green and blue from their mean below which a part is plain [1]."""
-    other_colour: NotNegative = 0.08
-    """Distance between the mean shares from which two plain colours differ [1]; four times their spread."""
-    plain_share: NotNegative = 0.9
-    """Share of a part its plain pieces make up where it is cut between them [1]; above 1 nothing is."""
-    border_bend: NotNegative = 0.25
-    """Width of a border between two colours over its length that is straight [1]; round bodies bend it."""
-    rejoin_empty: Share = 0.1
-    """Share of a joint shape's visible faces that may lie where the camera saw through [1]; edges fray."""
+    merge_gap: NotNegative = 0.25
+    """Parts are merged across something nearer that hides up to this much between them [m]."""
     clearance: NotNegative = 0.008
     """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
     max_height: Positive = 0.6
     """Points higher above the table belong to no object on it [m]; table-top sizes."""
     overlap: Share = 0.3
     """Share of a part's points that must lie at an object's points or shape for it to be that object [1]."""
-    divide_share: Share = 0.1
-    """A part is divided among the known objects at which at least this share of its points lies [1]."""
     overlap_reach: NotNegative = 0.02
     """Distance within which a point lies at an object [m]; 2σ of registration error of both views."""
 
@@ -243,5 +176,3 @@ class MaskConfig(Stage):
     """A mask of more than this share of the image is the table or what is behind it [1]."""
     min_score: float = 0.0
     """Masks with a lower score are left out [the segmenter's unit]."""
-    same: Share = 0.8
-    """Two masks with a larger intersection over union are one object seen twice [1]."""

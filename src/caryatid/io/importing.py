@@ -19,7 +19,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io import datasets
 from caryatid.io.bop import RecordingWriter
 from caryatid.io.datasets import BrokenFrameError, Dataset, Frame, OpenOptions, Topics, open_dataset
-from caryatid.segmentation.perception import levelled
+from caryatid.segmentation.observation import levelled
 from caryatid.sensing.views import View
 
 SCALES: Final = (0.1, 0.2, 0.5, 1.0)

@@ -1,4 +1,4 @@
-"""Which known object is a part of a new view: the one in whose points or shape it lies."""
+"""Which known object is a segment of a new view: the one in whose points or shape it lies."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from caryatid.config import SegmentationConfig
 from caryatid.geometry.points import most_central
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
-from caryatid.objects.object_distance import KnownObjects, gaps_to_objects
 
+DIVIDE_SHARE = 0.1
+"""A segment is divided among the known objects at which at least this share of its points lies [1]."""
 DENSITY = 4
-"""Points of a part, and of an object, along the distance that counts as overlap [1]; others are left out."""
+"""Points along the distance that counts as overlap [1]; the others are left out."""
 
 
 def associate(
@@ -26,64 +27,79 @@ def associate(
     config: SegmentationConfig,
     labels_used: int = 0,
 ) -> NDArray[np.int32]:
-    """Give the points of each new part the label of the object they belong to, or one never used before.
+    """Give the points of each new segment the label of the object they belong to, or one never used before.
 
-    A part that lies at several known objects is divided among them: each point goes to the nearest.
+    A segment that lies at several known objects is divided among them: each point goes to the nearest.
 
     Args:
         points_world: (N, 3) [m].
-        labels: Part of each point (N,); 0 belongs to none.
+        labels: Segment of each point (N,); 0 belongs to none.
         known_points: Points (M, 3) [m] of each known object.
         known_shapes: Fitted shape of each known object that has one.
         config: Share that must overlap, and the distance that counts as overlap.
         labels_used: Highest label ever given; new objects are numbered from the next one.
 
     Returns:
-        Label of the object (N,) of each point; 0 where there was no part.
+        Label of the object (N,) of each point; 0 where there was no segment.
     """
-    names = sorted(known_points)
+    names = np.array(sorted(known_points), dtype=np.int32)
     spacing = config.overlap_reach / DENSITY
-    known = _thinned(
-        KnownObjects.of([known_points[k] for k in names], [known_shapes.get(k) for k in names]), spacing
-    )
+    owners = np.repeat(np.arange(len(names), dtype=np.int32), [len(known_points[k]) for k in names])
+    points = np.concatenate([np.zeros((0, 3)), *(known_points[k] for k in names)])
+    thinned = most_central(points, owners, np.full(len(names), spacing))
+    points, owners = points[thinned], owners[thinned]
+    shapes = [known_shapes.get(k) for k in names.tolist()]
     counts = np.bincount(labels, minlength=1)
     kept = most_central(points_world, labels, np.where(np.arange(len(counts)) > 0, spacing, 0.0))
-    gaps = gaps_to_objects(np.take(points_world, kept, axis=0), known, config.overlap_reach)
-    part_of = labels[kept]
-    fresh = max(labels_used, *names, 0)
-    name_of: NDArray[np.int32] = np.zeros(len(counts), dtype=np.int32)
-    divided: dict[int, NDArray[np.intp]] = {}
-    for part in (int(k) for k in np.flatnonzero(counts) if k != 0):
-        own = gaps[part_of == part]
-        near = np.isfinite(own).any(axis=1) if names else np.zeros(len(own), dtype=bool)
-        if near.mean() < config.overlap or not near.any():
+    owner = _nearest_objects(points_world[kept], points, owners, shapes, config.overlap_reach)
+    fresh = max(labels_used, int(names.max(initial=0)))
+    result = np.zeros(len(labels), dtype=np.int32)
+    for segment in np.flatnonzero(counts[1:]) + 1:
+        own = owner[labels[kept] == segment]
+        index = np.flatnonzero(labels == segment)
+        shares = np.bincount(own[own >= 0], minlength=len(names)) / len(own)
+        if shares.sum() < config.overlap or not (own >= 0).any():
             fresh += 1
-            name_of[part] = fresh
+            result[index] = fresh
             continue
-        shares = np.bincount(np.argmin(own[near], axis=1), minlength=len(names)) / len(own)
-        owners = np.flatnonzero(shares >= min(config.divide_share, shares.max()))
-        name_of[part] = names[owners[0]]
-        if len(owners) > 1:
-            divided[part] = owners
-    result = np.take(name_of, labels)
-    for part, owners in divided.items():
-        index = np.flatnonzero(labels == part)
-        nearest = _nearest(np.take(points_world, index, axis=0), known.select(owners), config.overlap_reach)
-        result[index] = np.array(names)[owners[nearest]]
+        among = np.flatnonzero(shares >= min(DIVIDE_SHARE, shares.max()))
+        result[index] = names[among[0]]
+        if len(among) > 1:
+            theirs = np.isin(owners, among)
+            some = [shape if k in among else None for k, shape in enumerate(shapes)]
+            nearest = _nearest_objects(
+                points_world[index], points[theirs], owners[theirs], some, config.overlap_reach
+            )
+            far = nearest < 0
+            if far.any():
+                nearest[far] = owners[theirs][cKDTree(points[theirs]).query(points_world[index[far]])[1]]
+            result[index] = names[nearest]
     return result
 
 
-def _thinned(known: KnownObjects, spacing: float) -> KnownObjects:
-    edges = np.full(len(known.kinds), spacing)
-    return known.keep(most_central(known.points, known.owners.astype(np.int32), edges))
+def _nearest_objects(
+    points: Array, known: Array, owners: NDArray[np.int32], shapes: list[Shape | None], reach: float
+) -> NDArray[np.int32]:
+    """Which object (N,) is nearest to each point (N, 3), by its points or its shape's surface; −1 = none.
 
-
-def _nearest(points: Array, known: KnownObjects, reach: float) -> NDArray[np.intp]:
-    """Which of some objects is nearest to each point (N, 3) [m]; beyond the reach, to whose points."""
-    gaps = gaps_to_objects(points, known, reach)
-    nearest = np.argmin(gaps, axis=1)
-    far = np.flatnonzero(~np.isfinite(gaps).any(axis=1))
-    if len(far) > 0:
-        _, index = cKDTree(known.points).query(points[far])
-        nearest[far] = known.owners[index]
+    Args:
+        points: (N, 3) [m].
+        known: Points (M, 3) [m] of all objects.
+        owners: Object (M,) of each: 0 … K−1.
+        shapes: Shape of each object, or None.
+        reach: Objects from here on count as none [m].
+    """
+    nearest, gap = np.full(len(points), -1, dtype=np.int32), np.full(len(points), reach)
+    if len(known):
+        distance, index = cKDTree(known).query(points, distance_upper_bound=reach)
+        found = np.isfinite(distance)
+        nearest[found], gap[found] = owners[index[found]], distance[found]
+    for number, shape in enumerate(shapes):
+        if shape is None:
+            continue
+        radius = float(np.linalg.norm(shape.extents)) / 2.0 + reach
+        near = np.flatnonzero(np.linalg.norm(points - shape.T_world_object[:3, 3], axis=1) < radius)
+        distance = np.abs(shape.signed_distance(points[near]))
+        nearer = distance < gap[near]
+        nearest[near[nearer]], gap[near[nearer]] = number, distance[nearer]
     return nearest

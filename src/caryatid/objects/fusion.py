@@ -1,20 +1,39 @@
-"""Fusing support graphs over views: matching objects and counting evidence (section III-B, Table I)."""
+"""Fusing support graphs over views: matching and merging objects, counting evidence (section III-B)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import permutations, product
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from caryatid.config import FusionConfig
-from caryatid.geometry.shapes import Shape
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
-from caryatid.objects.sightings import axes_rotation, merge
 
 Pair = tuple[str, str]
+
+_TURNS = np.array(
+    [
+        matrix
+        for order in permutations(range(3))
+        for signs in product((1.0, -1.0), repeat=3)
+        if np.linalg.det(matrix := np.diag(signs)[:, list(order)]) > 0.0
+    ]
+)
+"""The 24 rotations (24, 3, 3) of a cube: ways to name the axes of a box."""
+
+
+SIGMAS = 2.0
+"""Standard deviations of centres and extents by which two sightings may differ beyond the tolerances [1]."""
+BLIND = 0.1
+"""Weight, in sides, of a sighting of which no side was seen (`sg`) [1]; small beside any other."""
+RESIDUAL = 0.01
+"""Mean distance of its points at which a sighting counts half in the merged shape (`sg`) [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -173,7 +192,7 @@ def _distances(known: list[SceneObject], seen: list[SceneObject], config: Fusion
     sigma = [np.array([np.linalg.norm(_position(o)) for o in objects]) for objects in (known, seen)]
     table = [np.array([o.role == "support_surface" for o in objects]) for objects in (known, seen)]
     reach = np.maximum(config.max_distance, np.minimum(half[0][:, None], half[1]))
-    reach += config.sigmas * np.hypot(sigma[0][:, None], sigma[1])
+    reach += SIGMAS * np.hypot(sigma[0][:, None], sigma[1])
     distances = np.linalg.norm(centres[0][:, None] - centres[1], axis=-1) / reach
     distances[table[0][:, None] & table[1]] = 0.0
     distances[table[0][:, None] != table[1]] = np.inf
@@ -197,7 +216,7 @@ def _extent_ratio(known: SceneObject, seen: SceneObject, config: FusionConfig) -
     """Largest ratio of the sorted extents, once what both fits' uncertainty explains is taken off."""
     a, b = known.shape.extents, seen.shape.extents
     first, second = np.argsort(a, kind="stable"), np.argsort(b, kind="stable")
-    unsure = config.sigmas * np.hypot(_sizes(known)[first], _sizes(seen)[second])
+    unsure = SIGMAS * np.hypot(_sizes(known)[first], _sizes(seen)[second])
     excess = np.maximum(np.abs(a[first] - b[second]) - unsure, 0.0)
     return float(np.max(1.0 + excess / np.minimum(a[first], b[second])))
 
@@ -219,7 +238,9 @@ def _is_round(shape: Shape) -> bool:
 
 
 def _vertex(seen: Mapping[int, SceneObject], config: FusionConfig) -> SceneObject:
-    return merge([seen[v] for v in sorted(seen)], config) if config.method == "sg" else _newest(seen)
+    return (
+        merged_sightings([seen[v] for v in sorted(seen)], config) if config.method == "sg" else _newest(seen)
+    )
 
 
 def _newest(seen: Mapping[int, SceneObject]) -> SceneObject:
@@ -237,3 +258,144 @@ def _fresh_id(o: SceneObject, taken: set[str]) -> str:
     while object_id(label) in taken:
         label += 1
     return object_id(label)
+
+
+def merged_sightings(sightings: Sequence[SceneObject], config: FusionConfig) -> SceneObject:
+    """Merge sightings of one object into a vertex whose shape is better than each.
+
+    The kind is the one with the most evidence. Poses and radii are averaged with the evidence as weight; each
+    side is averaged over the sightings that saw it, and lies farthest out where none did. The result does not
+    depend on the order of the sightings but for rounding.
+
+    Args:
+        sightings: At least one; the first lends id, label and role.
+        config: What a bad residual costs.
+    """
+    weights = np.array([_evidence(o, config) for o in sightings])
+    kinds = sorted({o.shape.kind for o in sightings})
+    votes = [sum(w for w, o in zip(weights, sightings, strict=True) if o.shape.kind == k) for k in kinds]
+    kind = kinds[int(np.argmax(votes))]
+    same = [o for o in sightings if o.shape.kind == kind]
+    w = np.array([_evidence(o, config) for o in same])
+    best = same[int(np.argmax(w))]
+    if len(same) == 1:
+        shape, seen = best.shape, best.seen
+    elif isinstance(best.shape, Sphere):
+        shape, seen = _merged_sphere([o.shape for o in same], w), best.seen
+    else:
+        shape, seen = _merged_sides(same, w, best)
+    return replace(
+        sightings[0],
+        shape=shape,
+        seen=seen,
+        residual=float(np.average([o.residual for o in same], weights=w)),
+        poor_fit=best.poor_fit,
+        uncertainty=best.uncertainty,
+        why=best.why,
+        doubt=sightings[-1].doubt,
+    )
+
+
+def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
+    """Turn of a shape's axes, within its symmetry, that brings them nearest to a reference's.
+
+    Returns:
+        The turn (3, 3), to be applied on the right of the shape's rotation, and the angle left [rad]; of a
+        sphere, to which no turn matters, the identity and 0.
+    """
+    if isinstance(shape, Sphere):
+        return np.eye(3), 0.0
+    R, R_reference = shape.T_world_object[:3, :3], reference.T_world_object[:3, :3]
+    round_ = isinstance(shape, Cylinder)
+    turn = _turns(R[None], R_reference, round_)[0]
+    if round_:
+        return turn, float(transforms.angle_between((R @ turn)[:, 2], R_reference[:, 2]))
+    trace = float(np.sum((R @ turn) * R_reference))
+    return turn, float(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
+
+
+def _evidence(o: SceneObject, config: FusionConfig) -> float:
+    """Weight of a sighting: the sides seen, less for a bad residual."""
+    return (BLIND + sum(o.seen)) / (1.0 + (o.residual / RESIDUAL) ** 2)
+
+
+def _merged_sphere(spheres: Sequence[Shape], weights: Array) -> Sphere:
+    centre = np.average([s.T_world_object[:3, 3] for s in spheres], axis=0, weights=weights)
+    radius = float(np.average([s.extents[0] / 2.0 for s in spheres], weights=weights))
+    return Sphere(transforms.rigid(np.eye(3), centre), radius)
+
+
+def _merged_sides(
+    same: Sequence[SceneObject], weights: Array, best: SceneObject
+) -> tuple[Box | Cylinder, tuple[bool, bool, bool, bool, bool, bool]]:
+    """Average axes, then each of the six sides along them."""
+    T = np.array([o.shape.T_world_object for o in same])
+    extents = np.array([o.shape.extents for o in same])
+    round_ = isinstance(best.shape, Cylinder)
+    turns = _turns(T[:, :3, :3], best.shape.T_world_object[:3, :3], round_)
+    R = _mean_axes(np.average(T[:, :3, :3] @ turns, axis=0, weights=weights), round_)
+    middles = T[:, :3, 3] @ R
+    half = np.abs(np.einsum("kij,ki->kj", turns, extents))[:, :, None] / 2.0
+    ends = middles[:, :, None] + half * (-1.0, 1.0)
+    # The sides along a new axis are those along one of the old axes, in the other order where it points back.
+    sources = np.abs(turns).argmax(axis=1)
+    seen = np.take_along_axis(np.array([o.seen for o in same]).reshape(-1, 3, 2), sources[:, :, None], axis=1)
+    ahead = turns.sum(axis=1)[:, :, None] > 0.0
+    seen = np.where(ahead, seen, seen[:, :, ::-1])
+    share = weights[:, None, None] * seen
+    known = seen.any(axis=0)
+    mean = (share * ends).sum(axis=0) / np.where(known, share.sum(axis=0), 1.0)
+    widest = np.stack([ends[:, :, 0].min(axis=0), ends[:, :, 1].max(axis=0)], axis=1)
+    low, high = np.where(known, mean, widest).T
+    sides = known.ravel().tolist()
+    flags = (sides[0], sides[1], sides[2], sides[3], sides[4], sides[5])
+    if round_:
+        centre = np.average(middles, axis=0, weights=weights)
+        centre[2] = (low[2] + high[2]) / 2.0
+        radius = float(np.average(extents[:, 0] / 2.0, weights=weights))
+        return Cylinder(transforms.rigid(R, R @ centre), radius, float(max(high[2] - low[2], 1e-3))), flags
+    return Box(transforms.rigid(R, R @ ((low + high) / 2.0)), np.maximum(high - low, 1e-3)), flags
+
+
+def _turns(R: Array, R_reference: Array, axis_only: bool) -> Array:
+    """Turns (K, 3, 3) within a shape's symmetry that bring axes (K, 3, 3) nearest to a reference's (3, 3)."""
+    if axis_only:
+        flipped = R[:, :, 2] @ R_reference[:, 2] < 0.0
+        return np.where(flipped[:, None, None], np.diag([1.0, -1.0, -1.0]), np.eye(3))
+    traces = (np.swapaxes(R, 1, 2) @ R_reference).reshape(-1, 9) @ _TURNS.reshape(-1, 9).T
+    return _TURNS[traces.argmax(axis=1)]
+
+
+def _mean_axes(mean: Array, axis_only: bool) -> Array:
+    """Chordal mean of rotations from their average; of a cylinder only the axis means something."""
+    if axis_only:
+        z = transforms.unit(mean[:, 2])
+        x = transforms.perpendicular(z)
+        return np.stack([x, np.cross(z, x), z], axis=1)
+    u, _, vt = np.linalg.svd(mean)
+    return u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+
+
+def changed(before: SupportGraph, after: SupportGraph, config: FusionConfig) -> bool:
+    """Whether a vertex came, went or changed its shape beyond the tolerance, or an edge came or went."""
+    earlier = {o.id: o for o in before.objects}
+    if earlier.keys() != {o.id for o in after.objects}:
+        return True
+    if {s.pair for s in before.supports} != {s.pair for s in after.supports}:
+        return True
+    return any(reshaped(earlier[o.id], o, config) for o in after.objects if o.role == "object")
+
+
+def reshaped(before: SceneObject, after: SceneObject, config: FusionConfig) -> bool:
+    """Whether an object's shape moved, turned or grew by more than the tolerance."""
+    a, b = before.shape, after.shape
+    if a is b:
+        return False
+    if a.kind != b.kind or np.linalg.norm(before.centre_world - after.centre_world) > config.settled:
+        return True
+    turn, angle = axes_rotation(b, a)
+    lever = float(a.extents.max()) / 2.0
+    return bool(
+        np.abs(a.extents - np.abs(turn.T @ b.extents)).max() > config.settled
+        or angle * lever > config.settled
+    )

@@ -9,12 +9,20 @@ import numpy as np
 
 from caryatid.config import CompletionConfig
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
+from caryatid.geometry.shapes import Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
-from caryatid.objects.sweeps import way_to_shapes
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.voxel_map import FREE, VoxelMap
+
+SPACING = 0.015
+"""Spacing of the points tested on the moving side [m]."""
+INSET = 0.01
+"""How far inside the walls free space is looked for [m]; a voxel, so that a wall's noise says nothing."""
+FLAT = 0.02
+"""Extent below which a single side's points say nothing of the depth behind it [m]; their noise."""
+LEAST = 0.0005
+"""Gaps below this are none [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -52,23 +60,21 @@ def complete(
         config: Steps and tolerances.
     """
     done = list(objects)
-    shapes = Primitives.of([o.shape for o in objects])
-    lowest = shapes.bounds()[0][:, 2]
+    lowest = [o.shape.surface(SPACING)[0][:, 2].min() for o in objects]
     for k in sorted(range(len(done)), key=lambda k: (lowest[k], done[k].label)):
-        done[k] = _extended(done[k], k, shapes, surface, voxels, config)
-        shapes.centres[k], shapes.half[k] = done[k].centre_world, done[k].shape.extents / 2.0
+        others = [o.shape for n, o in enumerate(done) if n != k]
+        done[k] = _extended(done[k], others, surface, voxels, config)
     return done
 
 
 def _extended(
     candidate: SceneObject,
-    index: int,
-    shapes: Primitives,
+    others: Sequence[Shape],
     surface: SupportSurface,
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
-    """Extend an object, the one with this index among the shapes."""
+    """Extend an object among the shapes of the others."""
     shape = candidate.shape
     if isinstance(shape, Sphere):
         return candidate
@@ -83,14 +89,14 @@ def _extended(
             candidate = replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
         else:
             aim = "down to the table"
-            candidate = _moved_out(candidate, bottom, to_table, aim, index, shapes, voxels, config)
+            candidate = _moved_out(candidate, bottom, to_table, aim, others, voxels, config)
     hidden = _depth_side(candidate, config)
     if hidden is None or isinstance(candidate.shape, Sphere) or (upright and hidden[0] == axis):
         return candidate
     extents = candidate.shape.extents
     guess = float(np.delete(extents, hidden[0]).min()) - float(extents[hidden[0]])
     back = _face(candidate.shape, *hidden, config)
-    return _moved_out(candidate, back, guess, "as deep as it is wide", index, shapes, voxels, config)
+    return _moved_out(candidate, back, guess, "as deep as it is wide", others, voxels, config)
 
 
 def _moved_out(
@@ -98,23 +104,22 @@ def _moved_out(
     face: _Face,
     limit: float,
     aim: str,
-    index: int,
-    shapes: Primitives,
+    others: Sequence[Shape],
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
     """Move one side outwards up to a limit [m], another shape or free space, whichever comes first."""
     shape = candidate.shape
-    if isinstance(shape, Sphere) or limit < config.least:
+    if isinstance(shape, Sphere) or limit < LEAST:
         return candidate
     length, reason = limit, f"is taken to reach {aim}"
-    to_object = _way_to_others(face, limit, index, shapes, config)
+    to_object = _way_to_others(face, limit, others, config)
     if to_object < length:
         length, reason = to_object, "ends at the next object"
     to_free = _free_before(face, length, voxels, config)
     if to_free < length:
         length, reason = to_free, "ends where free space was seen"
-    if length < config.least:
+    if length < LEAST:
         return candidate
     why = f"a side that was not seen {reason}, {1000 * length:.0f} mm further"
     why = f"{candidate.why}; {why}" if candidate.why else why
@@ -129,24 +134,31 @@ def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, 
     axis, side = divmod(int(seen[0]), 2)
     if isinstance(candidate.shape, Cylinder) and axis != 2:
         return None
-    if candidate.shape.extents[axis] > config.flat:
+    if candidate.shape.extents[axis] > FLAT:
         return None
     return axis, -1.0 if side else 1.0
 
 
-def _way_to_others(
-    face: _Face, limit: float, index: int, shapes: Primitives, config: CompletionConfig
-) -> float:
-    """How far [m] the face of one of the shapes can move before it meets another one, by sphere tracing."""
+def _way_to_others(face: _Face, limit: float, others: Sequence[Shape], config: CompletionConfig) -> float:
+    """How far [m] a face can move before it meets another shape, by sphere tracing."""
     points, outward = face.points_world, face.outward_world
     middle = points.mean(axis=0)
-    to_centres = shapes.centres - middle
-    ahead = np.clip(to_centres @ outward, 0.0, limit)
-    aside = np.linalg.norm(to_centres - ahead[:, None] * outward, axis=1)
-    # No ball around a shape that is further than the limit from the one around the face ever bounds a step.
-    reach = np.linalg.norm(points - middle, axis=1).max() + np.linalg.norm(shapes.half, axis=1)
-    near = np.flatnonzero(aside < limit + reach)
-    return way_to_shapes(points, outward, limit, config.overlap, config.least, near[near != index], *shapes)
+    radius = np.linalg.norm(points - middle, axis=1).max()
+    near = []
+    for shape in others:
+        # No ball around a shape that is further than the limit from the one around the face bounds a step.
+        to_centre = shape.T_world_object[:3, 3] - middle
+        ahead = np.clip(to_centre @ outward, 0.0, limit)
+        aside = np.linalg.norm(to_centre - ahead * outward)
+        if aside < limit + radius + np.linalg.norm(shape.extents) / 2.0:
+            near.append(shape)
+    length = 0.0
+    while near and length < limit:
+        gap = min(shape.signed_distance(points + length * outward).min() for shape in near) + config.overlap
+        if gap < LEAST:
+            return max(length - config.overlap, 0.0)
+        length += gap
+    return limit
 
 
 def _free_before(face: _Face, limit: float, voxels: VoxelMap, config: CompletionConfig) -> float:
@@ -170,7 +182,7 @@ def _downward_side(shape: Shape) -> tuple[int, float]:
 def _face(shape: Shape, axis: int, sign: float, config: CompletionConfig) -> _Face:
     across = [(axis + 1) % 3, (axis + 2) % 3]
     half = shape.extents / 2.0
-    u, v = (_ticks(half[k], config.spacing) for k in across)
+    u, v = (_ticks(half[k], SPACING) for k in across)
     grid = np.empty((len(u), len(v), 3))
     grid[..., axis], grid[..., across[0]], grid[..., across[1]] = sign * half[axis], u[:, None], v
     points = grid.reshape(-1, 3)
@@ -180,7 +192,7 @@ def _face(shape: Shape, axis: int, sign: float, config: CompletionConfig) -> _Fa
     else:
         outward = np.abs(points[:, across] / half[across]).max(axis=1)
     rim = points[outward > 0.99]
-    rim[:, across] *= np.maximum(1.0 - config.inset / half[across], 0.0)
+    rim[:, across] *= np.maximum(1.0 - INSET / half[across], 0.0)
     T = shape.T_world_object
     return _Face(
         axis, sign, sign * T[:3, axis], transforms.transform(T, points), transforms.transform(T, rim)

@@ -1,28 +1,89 @@
-"""Locally convex parts of a sampled surface: surfels, the verdict on each edge between them, clustering."""
+"""Locally convex connected patches (LCCP): a sampled surface is cut where it is concave or has a step."""
 
 from __future__ import annotations
 
+import heapq
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
 
 from caryatid.config import SegmentationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.segmentation.clusters import OneBody, cluster_by_mean
-from caryatid.segmentation.concavity import convex
-from caryatid.segmentation.sample_graph import bent_lengths, count_borders, nearest_seeds
 from caryatid.sensing.clouds import thin
 
 Index = NDArray[np.intp]
 
+TOUCHING = [(0, 1), (1, 0), (1, 1), (1, -1)]
+"""Rows down and columns right of a sample's later neighbours, diagonals too."""
 EDGES_ACROSS = 3.0
 """Sample edges that cross a border for each sample along it, on a grid with diagonals."""
-
-
+MAX_JUMP = 0.009
+"""A difference in inverse depth beyond this parts two surfaces, however steep [1/m]."""
+MIN_RISE = 0.015
+"""Height over a neighbour's plane from which a depth step repels [m]; above staircases on steep faces."""
+GAP = 3
+"""Depth steps are looked for across this many samples without a reading [1]; sensors leave 2 px a side."""
 STEP_ATTRACTION = -1.0
 """Attraction over a depth step, as strong as that over a flat surface."""
+
+
+def grid_edges(
+    places: NDArray[np.bool_],
+    points: Array,
+    normals: Array,
+    edge_jump: float,
+) -> tuple[Index, Index]:
+    """Pairs of samples that are neighbours in the image: on one surface, and at a step.
+
+    There is a step where neither sample's inverse depth lies near the other's tangent plane: unlike the bare
+    difference this does not grow on steep surfaces. Steps are also looked for across short gaps without
+    readings, which sensors leave there.
+
+    Args:
+        places: Which places of the grid hold a sample (H, W).
+        points: Samples (N, 3) [m] in the camera frame.
+        normals: Unit normals (N, 3).
+        edge_jump: Distance from the neighbour's plane beyond which a sample is another surface's [1/m].
+
+    Returns:
+        Pairs (E, 2) on one surface, and pairs (F, 2) at a step.
+    """
+    number = np.where(places, np.cumsum(places).reshape(places.shape) - 1, -1)
+    around = np.pad(number, GAP, constant_values=-1)
+    height, width = number.shape
+
+    def neighbour(down: int, right: int) -> Index:
+        return around[GAP + down : GAP + down + height, GAP + right : GAP + right + width]
+
+    offset = np.einsum("ij,ij->i", normals, points)
+    planes = normals / np.where(offset == 0.0, np.inf, offset)[:, None]
+    inverse_depth = 1.0 / points[:, 2]
+    edges, steps = [], []
+    for down, right in TOUCHING + [way for k in range(2, GAP + 1) for way in ((0, k), (k, 0))]:
+        other = neighbour(down, right)
+        paired = (number >= 0) & (other >= 0)
+        for k in range(1, max(down, right)):
+            paired &= neighbour(min(k, down), min(k, right)) < 0
+        i, j = number[paired], other[paired]
+        between = points[j] - points[i]
+        rise = np.maximum(
+            np.einsum("ij,ij->i", normals[i], between), -np.einsum("ij,ij->i", normals[j], between)
+        )
+        off = np.minimum(
+            np.abs(np.einsum("ij,ij->i", planes[i], points[j]) - 1.0) * inverse_depth[j],
+            np.abs(np.einsum("ij,ij->i", planes[j], points[i]) - 1.0) * inverse_depth[i],
+        )
+        one = (off <= edge_jump) & (np.abs(inverse_depth[i] - inverse_depth[j]) <= MAX_JUMP)
+        pairs = np.column_stack([i, j])
+        steps.append(pairs[~one & (rise > MIN_RISE)])
+        if (down, right) in TOUCHING:
+            edges.append(pairs[one])
+    return np.concatenate(edges), np.concatenate(steps)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -65,7 +126,9 @@ def convex_parts(
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)
-    distances, turns = bent_lengths(points, normals, edges)
+    ends, others = np.take(points, edges, axis=0), np.take(normals, edges, axis=0)
+    distances = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1)
+    turns = 1.0 - np.einsum("ij,ij->i", others[:, 0], others[:, 1])
     costs = distances / config.surfel + config.crease * turns
     surfels = gather_surfels(points, normals, edges, costs, thin(points, config.surfel))
     count = len(surfels.sizes)
@@ -73,9 +136,7 @@ def convex_parts(
     borders = pairs, border_attraction(surfels, pairs, config), lengths
     if steps is not None:
         borders = _with_steps(*borders, *count_borders(surfels.owner, steps, count), count)
-    cluster = cluster_by_mean(
-        *borders, np.column_stack([surfels.centres, surfels.normals]), _one_body(config)
-    )
+    cluster = cluster_by_mean(count, *borders)
     min_width = config.min_width / _usual(distances)
     cluster = _absorb_slivers(cluster, surfels.sizes, pairs, lengths, config.min_size, min_width)
     part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
@@ -93,11 +154,39 @@ def gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, se
         costs: What an edge takes (E,).
         seeds: Samples that begin a surfel (S,).
     """
-    owner = nearest_seeds(len(points), edges, costs, seeds)
+    owner = _nearest_seeds(len(points), edges, costs, seeds)
     count = len(seeds)
     sizes = np.bincount(owner + 1, minlength=count + 1)[1:]
     centres = _sum_by(owner, points, count) / np.maximum(sizes, 1)[:, None]
     return Surfels(owner, centres, transforms.unit(_sum_by(owner, normals, count)), sizes)
+
+
+def _nearest_seeds(count: int, edges: Index, costs: Array, seeds: Index) -> Index:
+    """For each of the nodes, the number of the seed (S,) nearest along the edges (E, 2), −1 = none."""
+    graph = coo_array((np.maximum(costs, 1e-12), edges.T), shape=(count, count)).tocsr()
+    sources = dijkstra(graph, directed=False, indices=seeds, min_only=True, return_predecessors=True)[2]
+    number = np.full(count + 1, -1)
+    number[seeds] = np.arange(len(seeds))
+    return np.asarray(number[np.where(sources < 0, count, sources)])
+
+
+def count_borders(owner: Index, edges: Index, owners: int) -> tuple[Index, Array]:
+    """Pairs of owners that edges lead across, and how many.
+
+    Args:
+        owner: Owner of each node (N,), −1 = none.
+        edges: Pairs of nodes (E, 2).
+        owners: Number of owners S.
+
+    Returns:
+        Pairs (B, 2), i < j, in ascending order, and the number of edges across each (B,).
+    """
+    first, second = owner[edges].T
+    across = (first != second) & (first >= 0) & (second >= 0)
+    first, second = first[across], second[across]
+    keys = np.minimum(first, second) * owners + np.maximum(first, second)
+    keys, lengths = np.unique(keys, return_counts=True)
+    return np.stack(np.divmod(keys, owners), axis=-1), lengths.astype(np.float64)
 
 
 def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
@@ -125,32 +214,45 @@ def _with_steps(
     return np.stack(np.divmod(keys, count), axis=-1), total / length, length
 
 
-def _one_body(config: SegmentationConfig) -> OneBody:
-    """When two clusters of surfels may be one body."""
-    bend = float(np.sin(np.radians(config.concavity)))
-    return OneBody(config.least_surfels, config.hollow, config.rise, bend, config.concave_share)
-
-
-def convex_together(first: Array, second: Array, share: float, config: SegmentationConfig) -> bool:
-    """Whether hardly a point of one patch rises above the tangent plane of a point of the other.
+def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array) -> Index:
+    """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
 
     Args:
-        first: Points [m] and unit normals (N, 6).
-        second: Points [m] and unit normals (M, 6).
-        share: Greatest share of the pairs of points of which one rises [1].
-        config: How far counts: a height, and an angle as normals err.
+        count: Number of nodes N.
+        pairs: Borders (B, 2) between nodes, each once.
+        attraction: Signed attraction of each border (B,).
+        lengths: Weight of each border in the mean (B,).
+
+    Returns:
+        Cluster of each node (N,): the number of one of its nodes.
     """
-    return convex(first, second, config.rise, float(np.sin(np.radians(config.concavity))), share)
-
-
-def number_by_appearance(part: NDArray[np.integer]) -> NDArray[np.int32]:
-    """Number the parts (N,) of samples 1 … n in the order of their first ones; negative = 0."""
-    first = np.full(int(part.max(initial=-1)) + 2, len(part))
-    first[part[::-1] + 1] = np.arange(len(part))[::-1]
-    known = np.flatnonzero(first[1:] < len(part))
-    number = np.zeros(len(first), dtype=np.int32)
-    number[known[np.argsort(first[1:][known])] + 1] = np.arange(1, len(known) + 1)
-    return number[np.maximum(part, -1) + 1]
+    borders: list[dict[int, tuple[float, float]]] = [{} for _ in range(count)]
+    heap: list[tuple[float, int, int, float]] = []
+    for (i, j), weight, length in zip(pairs.tolist(), attraction.tolist(), lengths.tolist(), strict=True):
+        borders[i][j] = borders[j][i] = (weight * length, length)
+        if weight > 0.0:
+            heap.append((-weight, i, j, length))
+    heapq.heapify(heap)
+    parent = np.arange(count)
+    while heap:
+        _, i, j, length = heapq.heappop(heap)
+        if parent[i] != i or parent[j] != j or borders[i][j][1] != length:
+            continue
+        if len(borders[i]) < len(borders[j]):
+            i, j = j, i
+        parent[j] = i
+        del borders[i][j]
+        for k, (total, size) in borders[j].items():
+            if k == i:
+                continue
+            del borders[k][j]
+            known_total, known_size = borders[i].get(k, (0.0, 0.0))
+            total, size = known_total + total, known_size + size
+            borders[i][k] = borders[k][i] = (total, size)
+            if total > 0.0:
+                heapq.heappush(heap, (-total / size, min(i, k), max(i, k), size))
+        borders[j] = {}
+    return _roots(parent)
 
 
 def _absorb_slivers(
@@ -181,6 +283,58 @@ def _absorb_slivers(
         merged[small[order]] = large[order]
         cluster = _roots(merged)[cluster]
     return cluster
+
+
+def wide_parts(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """Which parts 0 … n of a label image (H, W) have a sample amid eight of their own.
+
+    At the image's border what lies beyond it speaks for neither.
+    """
+    wide = np.zeros(int(labels.max(initial=0)) + 1, dtype=np.bool_)
+    around = (
+        extreme(labels, size=3, mode="nearest")
+        for extreme in (ndimage.minimum_filter, ndimage.maximum_filter)
+    )
+    wide[labels[np.equal(*around)]] = True
+    return wide
+
+
+def convex_together(first: Array, second: Array, share: float, config: SegmentationConfig) -> bool:
+    """Whether hardly a point of one patch rises above the tangent plane of a point of the other.
+
+    Args:
+        first: Points [m] and unit normals (N, 6).
+        second: Points [m] and unit normals (M, 6).
+        share: Greatest share of the pairs of points of which one rises [1].
+        config: How far counts: a height, and an angle as normals err.
+    """
+    between = second[None, :, :3] - first[:, None, :3]
+    over = np.einsum("nmi,ni->nm", between, first[:, 3:])
+    under = -np.einsum("nmi,mi->nm", between, second[:, 3:])
+    bend = np.sin(np.radians(config.concavity)) * np.linalg.norm(between, axis=-1)
+    return float((np.maximum(over, under) > config.rise + bend).mean()) <= share
+
+
+def hollowness(patch: Array) -> float:
+    """How much a patch looks inwards: mean cosine between its normals and the way to its middle.
+
+    0 on a plane, positive on the inside of a bowl, negative on the outside.
+
+    Args:
+        patch: Points [m] and unit normals (N, 6).
+    """
+    inwards = transforms.unit(patch[:, :3].mean(axis=0) - patch[:, :3])
+    return float(np.einsum("ij,ij->i", inwards, patch[:, 3:]).mean())
+
+
+def number_by_appearance(part: NDArray[np.integer]) -> NDArray[np.int32]:
+    """Number the parts (N,) of samples 1 … n in the order of their first ones; negative = 0."""
+    first = np.full(int(part.max(initial=-1)) + 2, len(part))
+    first[part[::-1] + 1] = np.arange(len(part))[::-1]
+    known = np.flatnonzero(first[1:] < len(part))
+    number = np.zeros(len(first), dtype=np.int32)
+    number[known[np.argsort(first[1:][known])] + 1] = np.arange(1, len(known) + 1)
+    return number[np.maximum(part, -1) + 1]
 
 
 def _usual(distances: Array) -> float:

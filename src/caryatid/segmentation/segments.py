@@ -1,42 +1,72 @@
-"""Automatic segmentation: what stands on the support surface, cut into locally convex parts."""
+"""Automatic segmentation: what stands on the support surface, cut into convex parts, parts merged again."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
+from caryatid.fitting.primitives import Fit, Oriented, candidates
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
-from caryatid.segmentation.colour_cut import cut_by_colour
-from caryatid.segmentation.lccp import convex_parts, number_by_appearance
-from caryatid.segmentation.occlusion_merge import rejoin
-from caryatid.segmentation.sample_grid import grid_edges, spread_labels, wide_parts
+from caryatid.segmentation.lccp import (
+    convex_parts,
+    convex_together,
+    grid_edges,
+    hollowness,
+    number_by_appearance,
+    wide_parts,
+)
 from caryatid.segmentation.samples import Samples, find_foreground, take_samples
-from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
+from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
 
-__all__ = ["SupportSurface", "find_support_surface", "on_surface", "segment", "segment_cloud"]
-
 Labels = NDArray[np.int32]
+Mask = NDArray[np.bool_]
 
-
-def on_surface(points_world: Array, surface: SupportSurface, config: SegmentationConfig) -> NDArray[np.bool_]:
-    """Which points (N, 3) [m] belong to what stands on the support surface: above it, within its outline."""
-    height = surface.height(points_world)
-    kept = (height > config.clearance) & (height < config.max_height)
-    index = np.flatnonzero(kept)
-    kept[index] = surface.distance_outside(points_world[index]) <= config.margin
-    return kept
+NEIGHBOURS = 10
+"""Nearest points a point of an unorganised cloud is joined to [1]."""
+HOLLOW = 0.2
+"""Mean cosine between normals and the way inwards that makes a part the inside of something [1]; a bowl's
+has 0.6, flat faces and their noise 0.05."""
+RIM = 0.025
+"""Difference in height of the tops of an inside and of what it hangs in [m]; a rim's width and noise."""
+MEETING = 5
+"""Rows and columns of samples on which two parts must meet to be taken for one [1]; 3 cm at 1.5 m."""
+CONCAVE = 0.1
+"""Share of pairs of samples that may be concave where two parts are one [1]; creases are rounded."""
+COMPARED = 60
+"""Samples of a part, about, that are compared with another's [1]; bounds time."""
+HYPOTHESES = 40
+"""RANSAC hypotheses a shape when a merge is judged [1]; samples are evened out and hold few outliers."""
+FIT_POINTS = 300
+"""Points a merge is judged by [1]."""
+DISTANCE = 0.006
+"""Distance within which a sample lies at a shape [m]; 3σ of the evened out samples."""
+COSINE = 0.7
+"""Least cosine of the angle between the normals of a sample and of the shape it lies at [1]; 45°."""
+LOSS = 0.1
+"""Share of a part's samples that its own shape explains and the joint one need not [1]."""
+EMPTY = 0.1
+"""Share of a joint shape's visible faces that may lie where the camera saw through [1]; edges fray."""
+EDGE = 2
+"""Pixels at either end of a gap whose readings mix both sides and say nothing [px]."""
+TURNS = ((0, 1), (0, -1), (1, 0), (-1, 0))
+"""Rows down and columns right of the neighbours labels are taken from, one after the other."""
 
 
 def segment(
     view: View,
     surface: SupportSurface,
     config: SegmentationConfig,
-    clouds: CloudConfig | None = None,
-    fit: FitConfig | None = None,
-    rng: np.random.Generator | None = None,
+    clouds: CloudConfig,
+    fit_config: FitConfig,
+    rng: np.random.Generator,
 ) -> Labels:
     """Cut one view into the parts that stand on the support surface.
 
@@ -45,44 +75,33 @@ def segment(
         surface: The support surface.
         config: Sampling, sizes and angles.
         clouds: Working range and normals.
-        fit: Limits of the shapes that parts of one object are rejoined by.
-        rng: Draws the samples of their fits; without it nothing is rejoined.
+        fit_config: Limits of the shapes that parts of one object are merged by.
+        rng: Draws the samples of their fits.
 
     Returns:
         Label image (H, W): parts 1 … n, 0 = nothing and the surface itself.
     """
-    clouds = clouds or CloudConfig()
     labels = np.zeros(view.depth.shape, dtype=np.int32)
     foreground = find_foreground(view, surface, config, clouds)
-    if not foreground.pixels.any():
+    if not foreground.any():
         return labels
-    samples = take_samples(view, foreground, config, clouds)
-    part = _parts(samples, config)
-    if rng is not None:
-        part = number_by_appearance(rejoin(samples, part, config, fit or FitConfig(), rng) - 1)
+    samples = take_samples(view, foreground, surface, config, clouds)
+    points, normals = samples.points_camera, samples.normals_camera
+    edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
+    part = convex_parts(points, normals, edges, config, steps)
+    wide = wide_parts(samples.image(part))
+    part = number_by_appearance(np.where(wide[part], part, 0) - 1)
+    part = number_by_appearance(merge_occluded(samples, part, config, fit_config, rng) - 1)
     labels[samples.grid] = samples.image(part)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
     labels[around] = spread_labels(
         labels[around],
-        foreground.pixels[around],
+        foreground[around],
         view.depth[around],
         2.0 * config.edge_jump,
         2 * config.stride,
     )
     return labels
-
-
-def _parts(samples: Samples, config: SegmentationConfig) -> Labels:
-    """Cut the samples into parts (N,), 0 = none, where they are concave and where their colours say so."""
-    points, normals = samples.points_camera, samples.normals_camera
-    jumps = config.edge_jump, config.max_jump, config.min_rise
-    edges, steps = grid_edges(samples.places, points, normals, *jumps, config.gap)
-    part = convex_parts(points, normals, edges, config, steps)
-    wide = wide_parts(samples.image(part))
-    part = number_by_appearance(np.where(wide[part], part, 0) - 1)
-    if samples.rgb is None:
-        return part
-    return cut_by_colour(samples.image(part), samples.rgb, config)[samples.places]
 
 
 def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationConfig) -> Labels:
@@ -92,11 +111,13 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
         Label of each point (N,): parts 1 … n, 0 = nothing and the surface itself.
     """
     labels = np.zeros(len(cloud), dtype=np.int32)
-    index = np.flatnonzero(on_surface(cloud.points_world, surface, config))
+    index = np.flatnonzero(
+        surface.over(cloud.points_world, config.clearance, config.max_height, config.margin)
+    )
     if len(index) < 2:
         return labels
     points = cloud.points_world[index]
-    count = min(config.neighbours + 1, len(index))
+    count = min(NEIGHBOURS + 1, len(index))
     distance, neighbour = cKDTree(points).query(points, k=count)
     source = np.repeat(np.arange(len(index)), count - 1)
     target, near = neighbour[:, 1:].ravel(), distance[:, 1:].ravel() <= config.reach
@@ -106,3 +127,220 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
     edges = np.stack(np.divmod(keys, len(index)), axis=-1)
     labels[index] = convex_parts(points, cloud.normals_world[index], edges, config)
     return labels
+
+
+def spread_labels(
+    labels: Labels, foreground: Mask, depth: NDArray[np.float32], jump: float, rounds: int
+) -> Labels:
+    """Bring labels to the foreground pixels without one that lie no depth step from a labelled neighbour.
+
+    In each round a pixel takes the label to its right, then others to their left, below and above.
+
+    Args:
+        labels: Label image (H, W), 0 = none.
+        foreground: Pixels to label (H, W).
+        depth: Readings (H, W) [m].
+        jump: Difference in depth beyond which neighbours lie on two surfaces, at 1 m and times z² [m].
+        rounds: How often, each a pixel further.
+    """
+    height, width = labels.shape
+    around = [
+        (slice(1 + down, 1 + down + height), slice(1 + right, 1 + right + width)) for down, right in TURNS
+    ]
+    padded, result = np.pad(depth, 1), np.pad(labels, 1)
+    own = result[1:-1, 1:-1]
+    joined = [
+        foreground & (np.abs(depth - padded[there]) <= np.float32(jump) * depth * padded[there])
+        for there in around
+    ]
+    for _ in range(rounds):
+        for there, one in zip(around, joined, strict=True):
+            own[...] = np.where(one & (own == 0), result[there], own)
+    return own
+
+
+def merge_occluded(
+    samples: Samples,
+    part: Labels,
+    config: SegmentationConfig,
+    fit_config: FitConfig,
+    rng: np.random.Generator,
+) -> Labels:
+    """Merge parts of one object that something nearer cuts apart, and insides with what they are inside of.
+
+    The inside of a bowl belongs to the outside whose rim it ends at. Two parts are one object when a nearer
+    surface hides what would lie between them, neither rises above the other's tangent planes, a single shape
+    explains as many samples of both as the shape of each does, and that shape fills no space seen empty.
+
+    Args:
+        samples: Samples N of a view.
+        part: Part of each (N,), 0 = none.
+        config: Tolerances.
+        fit_config: Limits of the shapes.
+        rng: Draws the samples of the fits.
+
+    Returns:
+        The parts (N,) with the number of the larger where two were merged.
+    """
+    part = _insides_merged(samples, part)
+    inverse_depth = _inverse_depth(samples, part > 0)
+    quick = replace(fit_config, hypotheses=HYPOTHESES, polish=1, max_points=FIT_POINTS)
+    refused: set[tuple[int, int]] = set()
+    while True:
+        pairs = [
+            pair
+            for pair in _hidden_pairs(samples, part, inverse_depth, config)
+            if pair not in refused and _is_convex(samples, part, pair, config)
+        ]
+        asked = list(dict.fromkeys(key for a, b in pairs for key in ((a,), (b,), (a, b))))
+        masks = [np.isin(part, key) for key in asked]
+        fits = dict(zip(asked, _fits(samples, masks, quick, rng), strict=True))
+        for small, large in pairs:
+            alone = [(part == number, fits[number,]) for number in (small, large)]
+            if _is_one(fits[small, large], alone, samples):
+                break
+            refused.add((small, large))
+        else:
+            return part
+        part[part == small] = large
+        refused = {pair for pair in refused if large not in pair}
+
+
+def _insides_merged(samples: Samples, part: Labels) -> Labels:
+    """Give each hollow part to the neighbour with the longest common border whose top is as high."""
+    merged, count = part.copy(), int(part.max(initial=0)) + 1
+    hollow = np.zeros(count, dtype=bool)
+    for number in range(1, count):
+        hollow[number] = hollowness(samples.patch(part == number)) > HOLLOW
+    if not hollow.any():
+        return merged
+    top = np.array([np.quantile(samples.height[part == k], 0.95) if k else 0.0 for k in range(count)])
+    for number in np.flatnonzero(hollow).tolist():
+        image = samples.image(merged)
+        around = ndimage.binary_dilation(samples.image(part) == number, np.ones((3, 3)), iterations=2)
+        border = np.bincount(image[around], minlength=count)
+        border[hollow | (np.abs(top - top[number]) >= RIM)] = 0
+        border[0] = 0
+        if border.max() >= MEETING:
+            merged[part == number] = np.argmax(border)
+    return merged
+
+
+def _inverse_depth(samples: Samples, own: Mask) -> Array:
+    """1/z (H, W) [1/m] of all that is seen, 0 = no reading; of the parts' samples as they are evened out."""
+    inverse_depth = np.zeros(samples.depth.shape)
+    np.divide(1.0, samples.depth, out=inverse_depth, where=samples.depth > 0.0)
+    places = samples.places.copy()
+    places[places] = own
+    inverse_depth[places] = 1.0 / samples.points_camera[own, 2]
+    return inverse_depth
+
+
+def _hidden_pairs(
+    samples: Samples, part: Labels, inverse_depth: Array, config: SegmentationConfig
+) -> list[tuple[int, int]]:
+    """Pairs (small, large) of parts with something nearer between them, the best connected first."""
+    sizes, own = np.bincount(part), part > 0
+    usual = float(np.median(samples.points_camera[own, 2])) if own.any() else 1.0
+    longest = int(config.merge_gap * samples.K[0, 0] / usual)
+    votes = occlusion_gaps(samples.image(part), inverse_depth, config.edge_jump, longest)
+    votes[votes < MEETING] = 0
+    first, second = np.nonzero(np.triu(votes[1:, 1:], k=1))
+    order = np.argsort(-votes[first + 1, second + 1], kind="stable")
+    pairs = ((int(first[k]) + 1, int(second[k]) + 1) for k in order)
+    return [(a, b) if (sizes[a], b) < (sizes[b], a) else (b, a) for a, b in pairs]
+
+
+def _is_convex(samples: Samples, part: Labels, pair: tuple[int, int], config: SegmentationConfig) -> bool:
+    """Whether hardly a sample of one part rises above the planes of the other."""
+    own = [np.flatnonzero(part == number) for number in pair]
+    first, second = (samples.patch(index[:: max(1, len(index) // COMPARED)]) for index in own)
+    return convex_together(first, second, CONCAVE, config)
+
+
+def _fits(
+    samples: Samples, masks: list[Mask], config: FitConfig, rng: np.random.Generator
+) -> list[Fit | None]:
+    """The best shape for each choice (N,) of samples, each from a generator of its own."""
+    parts = [Oriented(samples.points_camera[own], samples.normals_camera[own]) for own in masks]
+    rngs = [np.random.default_rng(seed) for seed in rng.integers(2**63, size=len(masks))]
+    return [found[0] if found else None for found in candidates(parts, config=config, rngs=rngs)]
+
+
+def _is_one(joint: Fit | None, alone: list[tuple[Mask, Fit | None]], samples: Samples) -> bool:
+    """Whether a shape explains about as many samples of each part as its own and fills nothing seen empty."""
+    if joint is None or _seen_empty(joint.shape, samples) > EMPTY:
+        return False
+    return all(
+        fit is not None
+        and _explained(joint.shape, samples, own) >= _explained(fit.shape, samples, own) - LOSS
+        for own, fit in alone
+    )
+
+
+def _explained(shape: Shape, samples: Samples, own: Mask) -> float:
+    """Share of a part's samples that lie at a shape and face as it does."""
+    distance, outward = Primitives.of([shape]).gradient(0, samples.points_camera[own])
+    cosine = np.sum(outward * samples.normals_camera[own], axis=1)
+    return float(((np.abs(distance) < DISTANCE) & (cosine > COSINE)).mean())
+
+
+def _seen_empty(shape: Shape, samples: Samples) -> float:
+    """Share of the shape's faces towards the camera behind which the camera saw something."""
+    points, outward = shape.surface(0.01)
+    facing = np.einsum("ij,ij->i", points, outward) < 0.0
+    points = points[facing & (points[:, 2] > 0.0)]
+    u, v = np.rint((points @ samples.K.T)[:, :2] / points[:, 2:]).astype(np.intp).T
+    height, width = samples.depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    if not inside.any():
+        return 1.0
+    depth = samples.depth[v[inside], u[inside]]
+    return float((depth > points[inside, 2] + 0.02).mean())
+
+
+def occlusion_gaps(labels: Labels, inverse_depth: Array, jump: float, longest: int) -> NDArray[np.intp]:
+    """Count the rows and columns on which one part ends, another begins, and all between lies nearer.
+
+    Between, each reading must lie nearer than the line from end to beginning by the jump; a pixel without
+    one says nothing, but one at least must be nearer.
+
+    Args:
+        labels: Parts (H, W), 1 … N, 0 = none.
+        inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
+        jump: How much nearer [1/m].
+        longest: Longest gap that is looked across [px].
+
+    Returns:
+        Counts (N + 1, N + 1), symmetric; row and column 0 are empty.
+    """
+    votes = np.zeros((int(labels.max(initial=0)) + 1,) * 2, dtype=np.intp)
+    for image, depth in ((labels, inverse_depth), (labels.T, inverse_depth.T)):
+        _count_gaps(np.ascontiguousarray(image), np.ascontiguousarray(depth), jump, longest, votes)
+    return votes + votes.T
+
+
+@njit(cache=True)
+def _count_gaps(labels, inverse_depth, jump, longest, votes):  # type: ignore[no-untyped-def]
+    height, width = labels.shape
+    for row in range(height):
+        for i in range(width - 1):
+            part = labels[row, i]
+            if part == 0 or labels[row, i + 1] == part:
+                continue
+            for j in range(i + 2, min(i + longest + 2, width)):
+                other = labels[row, j]
+                if other == 0 or other == part or labels[row, j - 1] == other:
+                    continue
+                slope = (inverse_depth[row, j] - inverse_depth[row, i]) / (j - i)
+                hidden, some = True, False
+                for k in range(i + 1, j):
+                    here = inverse_depth[row, k]
+                    nearer = here > inverse_depth[row, i] + slope * (k - i) + jump
+                    some = some or nearer
+                    if here > 0.0 and not nearer and k - i > EDGE and j - k > EDGE:
+                        hidden = False
+                        break
+                if hidden and some:
+                    votes[part, other] += 1
+                    break

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from caryatid.config import SurfaceConfig
@@ -13,11 +15,25 @@ from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
-from caryatid.segmentation.outlines import within_prism
-from caryatid.segmentation.support_plane_kernels import Mask, plane_gains, plane_inliers
 
+Mask = NDArray[np.bool_]
+
+HYPOTHESES = 400
+"""RANSAC hypotheses a plane [1]; they find a plane of 20 % of the points with confidence 0.96."""
+SAMPLE = 4000
+"""Points the hypotheses are scored on [1]; spread evenly over the cloud."""
+PLANES = 6
+"""Horizontal planes looked at where the table is not known [1]."""
+REFINEMENTS = 4
+"""Least-squares fits of a plane to its inliers, one after the other [1]."""
+CELL = 0.03
+"""Grid on a plane by which its area is measured [m]; above the points' spacing at 3 m."""
 MAX_CELLS = 1000
-"""Cells along a plane's grid at the most [1]; bounds memory where a cloud is not in metres."""
+"""Most cells along a plane's grid [1]; bounds memory where a cloud is not in metres."""
+STOREY_SHARE = 0.05
+"""Least share of a floor's points that the table above it has [1]; less is a shelf behind."""
+THICKNESS = 0.04
+"""Thickness of the box the table top is modelled by [m]; only its top counts."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -40,15 +56,6 @@ class SupportSurface:
         """Signed height (...,) [m] of points (..., 3) over the surface."""
         return (points_world - self.point_world) @ self.normal_world
 
-    def distance_outside(self, points_world: Array) -> Array:
-        """How far (N,) [m] points (N, 3), laid onto the plane, are outside the outline; ≤ 0 inside.
-
-        Beside a corner this is the distance to the nearer of the two edges' lines: a mitred margin.
-        """
-        sides = self._sides()
-        flat = (points_world - self.point_world) @ _basis(self.normal_world).T
-        return np.max(flat @ sides[:, :2].T - sides[:, 2], axis=-1)
-
     def over(self, points_world: Array, low: float, high: float, margin: float) -> Mask:
         """Which points (N, 3) [m] are over the outline, or no further than the margin [m] outside it.
 
@@ -56,10 +63,12 @@ class SupportSurface:
             points_world: (N, 3) [m].
             low: Least height [m].
             high: Greatest height [m].
-            margin: Greatest `distance_outside` [m].
+            margin: Distance outside the lines of all sides within which points still count [m].
         """
         axes = np.concatenate([_basis(self.normal_world), self.normal_world[None]])
-        return within_prism(points_world, self.point_world, axes, self._sides(), low, high, margin)
+        points, over = np.ascontiguousarray(points_world), np.zeros(len(points_world), dtype=np.bool_)
+        _find_over(points, self.point_world, axes, self._sides(), low, high, margin, over)
+        return over
 
     def _sides(self) -> Array:
         """Outward unit normal, in the plane's coordinates, and offset [m] of each side (M, 3)."""
@@ -98,6 +107,7 @@ def find_support_surface(
     up: Array | None,
     config: SurfaceConfig,
     rng: np.random.Generator,
+    max_planes: int = PLANES,
 ) -> SupportSurface:
     """Find the table among the planes of a scene.
 
@@ -112,6 +122,7 @@ def find_support_surface(
         up: Upward direction (3,), or None where the camera's pose is not known.
         config: Tolerances and sizes.
         rng: Draws the hypotheses.
+        max_planes: Horizontal planes looked at, largest first, before the table is chosen.
 
     Raises:
         PerceptionError: No plane has enough points.
@@ -123,7 +134,7 @@ def find_support_surface(
         if largest is None:
             raise PerceptionError(_nothing_found(len(points), config))
         up = largest.normal
-    candidates = _horizontal_planes(points, normals, transforms.unit(up), config, rng)
+    candidates = _horizontal_planes(points, normals, transforms.unit(up), config, rng, max_planes)
     if not candidates:
         raise PerceptionError(_nothing_found(len(points), config))
     return _surface(points, _choose_table(candidates, transforms.unit(up), config), config)
@@ -148,11 +159,16 @@ def refitted(
 
 
 def _horizontal_planes(
-    points: Array, normals: Array, up: Array, config: SurfaceConfig, rng: np.random.Generator
+    points: Array,
+    normals: Array,
+    up: Array,
+    config: SurfaceConfig,
+    rng: np.random.Generator,
+    max_planes: int,
 ) -> list[_Plane]:
     left = normals @ up > np.cos(np.radians(config.max_deviation))
     planes: list[_Plane] = []
-    while len(planes) < config.planes:
+    while len(planes) < max_planes:
         plane = _largest_plane(points, normals, left, up, config, rng)
         if plane is None:
             break
@@ -166,7 +182,7 @@ def _choose_table(planes: list[_Plane], up: Array, config: SurfaceConfig) -> _Pl
         return any(
             other.area >= config.min_area
             and other.height(up) > plane.height(up) + config.storey
-            and other.inliers.sum() >= config.storey_share * plane.inliers.sum()
+            and other.inliers.sum() >= STOREY_SHARE * plane.inliers.sum()
             for other in planes
         )
 
@@ -187,9 +203,9 @@ def _largest_plane(
     index = np.flatnonzero(among)
     if len(index) < config.min_points:
         return None
-    sample = index[np.linspace(0, len(index) - 1, min(config.sample, len(index))).astype(np.intp)]
+    sample = index[np.linspace(0, len(index) - 1, min(SAMPLE, len(index))).astype(np.intp)]
     p, n = points[sample], normals[sample]
-    triples = p[rng.integers(0, len(p), size=(config.iterations, 3))]
+    triples = p[rng.integers(0, len(p), size=(HYPOTHESES, 3))]
     directions = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     proper = np.linalg.norm(directions, axis=-1) > 1e-9
     directions, anchors = transforms.unit(directions[proper]), triples[proper, 0]
@@ -203,13 +219,13 @@ def _largest_plane(
         upright = directions @ up > np.cos(np.radians(config.max_tilt))
     directions, anchors = directions[upright], anchors[upright]
     if up is not None:
-        anchors = np.concatenate([anchors, p[rng.integers(0, len(p), size=config.iterations // 4)]])
+        anchors = np.concatenate([anchors, p[rng.integers(0, len(p), size=HYPOTHESES // 4)]])
         directions = np.concatenate([directions, np.tile(up, (len(anchors) - len(directions), 1))])
     if len(directions) == 0:
         return None
     offsets = np.einsum("ij,ij->i", directions, anchors)
     agree, behind = np.cos(np.radians(config.max_deviation)), 0.0 if up is not None else 1.0
-    best = int(np.argmax(plane_gains(p, n, directions, offsets, config.tolerance, agree, behind)))
+    best = int(np.argmax(_plane_gains(p, n, directions, offsets, config.tolerance, agree, behind)))
     return _refine(points, normals, among, directions[best], float(offsets[best]), up, config)
 
 
@@ -223,15 +239,16 @@ def _refine(
     config: SurfaceConfig,
 ) -> _Plane | None:
     """Least squares on the inliers, a few times over; None if too few remain or the plane has tilted."""
-    agree = np.cos(np.radians(config.max_deviation))
+    least_cosine = np.cos(np.radians(config.max_deviation))
     inliers = among
-    for _ in range(4):
-        inliers, count, centre, scatter = plane_inliers(
-            points, normals, among, (normal, offset), config.tolerance, agree
-        )
-        if count < max(config.min_points, 3):
+    for _ in range(REFINEMENTS):
+        inliers = among & (np.abs(points @ normal - offset) <= config.tolerance)
+        inliers &= normals @ normal > least_cosine
+        if np.count_nonzero(inliers) < max(config.min_points, 3):
             return None
-        refined = np.linalg.eigh(scatter)[1][:, 0]
+        on_plane = np.compress(inliers, points, axis=0)
+        centre = on_plane.mean(axis=0)
+        refined = np.linalg.eigh(np.cov(on_plane.T))[1][:, 0]
         normal = refined if refined @ normal > 0 else -refined
         offset = float(normal @ centre)
     if up is not None and normal @ up < np.cos(np.radians(config.max_tilt)):
@@ -244,7 +261,7 @@ def _main_part(points: Array, normal: Array, inliers: Mask, config: SurfaceConfi
     """Keep the largest part of a plane that holds together over gaps, and say how much of it is seen [m²]."""
     index = np.flatnonzero(inliers)
     flat = _basis(normal) @ np.take(points, index, axis=0).T
-    cell = max(config.cell, float((flat.max(axis=1) - flat.min(axis=1)).max()) / MAX_CELLS)
+    cell = max(CELL, float((flat.max(axis=1) - flat.min(axis=1)).max()) / MAX_CELLS)
     cells = np.floor(flat / cell).astype(np.intp)
     cells -= cells.min(axis=1, keepdims=True)
     size = cells.max(axis=1) + 1
@@ -269,9 +286,7 @@ def _surface(points: Array, plane: _Plane, config: SurfaceConfig) -> SupportSurf
     if len(corners) < 3:
         raise PerceptionError("the points of the support surface lie on one line")
     outline = centroid + corners @ basis
-    return SupportSurface(
-        plane.normal, centroid, outline, _top_box(corners, centroid, basis, config.thickness)
-    )
+    return SupportSurface(plane.normal, centroid, outline, _top_box(corners, centroid, basis, THICKNESS))
 
 
 def _top_box(corners: Array, origin: Array, basis: Array, thickness: float) -> Box:
@@ -306,3 +321,39 @@ def _nothing_found(count: int, config: SurfaceConfig) -> str:
         f"no support surface: no level plane holds {config.min_points} of the {count} points; "
         "the table top must be in view"
     )
+
+
+@njit(cache=True, error_model="numpy")
+def _plane_gains(points, normals, directions, offsets, tolerance, least_cosine, penalty):  # type: ignore[no-untyped-def]
+    """Score (B,) planes n·p = offset by points: 1 − (distance/tolerance)² each where their normals agree.
+
+    A point further than three tolerances behind a plane costs it the penalty.
+    """
+    gains = np.zeros(len(offsets))
+    for k in range(len(offsets)):
+        nx, ny, nz = directions[k]
+        for i in range(len(points)):
+            signed = nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - offsets[k]
+            if signed < -3.0 * tolerance:
+                gains[k] -= penalty
+                continue
+            cosine = nx * normals[i, 0] + ny * normals[i, 1] + nz * normals[i, 2]
+            if abs(signed) < tolerance and cosine > least_cosine:
+                gains[k] += 1.0 - (signed / tolerance) ** 2
+    return gains
+
+
+@njit(cache=True)
+def _find_over(points, origin, axes, sides, low, high, margin, over):  # type: ignore[no-untyped-def]
+    """Mark the points (N,) that are within."""
+    for i in range(len(points)):
+        u, v, w = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
+        z = axes[2, 0] * u + axes[2, 1] * v + axes[2, 2] * w
+        if not low < z < high:
+            continue
+        x = axes[0, 0] * u + axes[0, 1] * v + axes[0, 2] * w
+        y = axes[1, 0] * u + axes[1, 1] * v + axes[1, 2] * w
+        k = 0
+        while k < len(sides) and sides[k, 0] * x + sides[k, 1] * y - sides[k, 2] <= margin:
+            k += 1
+        over[i] = k == len(sides)

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid.config import FusionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.sensing.views import View
 
+SPACING = 0.01
+"""Spacing of the points on a shape that are looked for in the view [m]."""
+BEHIND = 0.02
+"""A reading this far behind such a point contradicts it [m]; 2σ of registration and depth together."""
+CONTRADICTING = 0.5
+"""Share of the points that must be contradicted for the view to speak against the object [1]."""
 
-def seen_through(shape: Shape, view: View, config: FusionConfig) -> bool:
+
+def seen_through(shape: Shape, view: View) -> bool:
     """Whether a view looks through most of where the shape should be.
 
     Args:
         shape: In the world frame.
         view: A view with a pose.
-        config: How far behind the surface a reading contradicts it, and how many must.
     """
-    points_world, normals_world = shape.surface(config.surface_spacing)
+    points_world, normals_world = shape.surface(SPACING)
     eye_world = view.pose[:3, 3]
     facing = np.sum((eye_world - points_world) * normals_world, axis=1) > 0.0
     p = transforms.transform(transforms.invert(view.pose), points_world[facing])
@@ -31,4 +36,4 @@ def seen_through(shape: Shape, view: View, config: FusionConfig) -> bool:
     read = depth > 0.0
     if not read.any():
         return False
-    return bool((depth[read] > p[inside, 2][read] + config.behind).mean() > config.contradicting)
+    return bool((depth[read] > p[inside, 2][read] + BEHIND).mean() > CONTRADICTING)

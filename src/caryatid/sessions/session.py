@@ -42,7 +42,7 @@ from caryatid.io.staging import (
     write_errors,
     write_file,
 )
-from caryatid.objects.change import changed
+from caryatid.objects.fusion import changed
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, find_robot
 from caryatid.runtime.fingerprint import fingerprint

@@ -14,7 +14,7 @@ from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
 from caryatid.exploration import Step, explore
 from caryatid.graph import SupportGraph
-from caryatid.objects.change import changed
+from caryatid.objects.fusion import changed
 from caryatid.planning.decision import Decision
 from caryatid.planning.planners import ORACLE, make_planner
 from caryatid.robots import Posture, Robot, refusal_of

@@ -16,7 +16,7 @@ from caryatid.io.json_files import field
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.io.runs import Run
 from caryatid.scene import Scene
-from caryatid.segmentation.perception import level_cloud
+from caryatid.segmentation.observation import level_cloud
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.moments import Moment, moment_of_scene, shot_of
 

@@ -12,16 +12,20 @@ from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.segments import segment, segment_cloud
-from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
+from caryatid.segmentation.support_plane import PLANES, SupportSurface, find_support_surface
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 UP = np.array([0.0, 0.0, 1.0])
 """The world's vertical (3,)."""
+MAX_POINTS = 20_000
+"""Points of a view the surface is looked for in [1]; spread evenly, they give its height to 0.1 mm."""
+MAX_POINTS_KNOWN = 5000
+"""The same once the table is known [1]: as many of a first view's are the table's, the rest is floor."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Percept:
+class Observation:
     """What one view shows.
 
     Attributes:
@@ -40,7 +44,7 @@ class Percept:
     def labels(self) -> NDArray[np.int32]:
         """Label (N,) of each point."""
         if self.cloud.labels is None:
-            raise ValueError("a percept's cloud is labelled")
+            raise ValueError("a observation's cloud is labelled")
         return self.cloud.labels
 
     @property
@@ -50,8 +54,8 @@ class Percept:
         labels: list[int] = np.unique(self.labels[last_of_run]).tolist()
         return labels
 
-    def relabelled(self, names: dict[int, int]) -> Percept:
-        """Return the percept with some labels changed: old → new."""
+    def relabelled(self, names: dict[int, int]) -> Observation:
+        """Return the observation with some labels changed: old → new."""
         if not names:
             return self
         labels = self.labels.copy()
@@ -59,24 +63,24 @@ class Percept:
             labels[self.labels == old] = new
         return self.with_labels(labels)
 
-    def with_labels(self, labels: NDArray[np.int32]) -> Percept:
-        """Return the percept with other labels (N,)."""
+    def with_labels(self, labels: NDArray[np.int32]) -> Observation:
+        """Return the observation with other labels (N,)."""
         return replace(self, cloud=replace(self.cloud, labels=labels))
 
-    def moved(self, T: Array) -> Percept:
-        """Return the percept moved by a rigid transform (4, 4) of the world."""
+    def moved(self, T: Array) -> Observation:
+        """Return the observation moved by a rigid transform (4, 4) of the world."""
         view = None if self.view is None else self.view.with_pose(T @ self.view.pose)
         return replace(self, view=view, cloud=self.cloud.moved(T), surface=self.surface.moved(T))
 
 
-def perceive(
+def observe(
     source: View | Cloud,
     config: Config,
     *,
     segmentation: SegmentationMethod | None,
     known: SupportSurface | None,
     rng: np.random.Generator,
-) -> Percept:
+) -> Observation:
     """Find the support surface and the parts on it.
 
     Args:
@@ -110,7 +114,7 @@ def perceive(
     on_surface = (labels == 0) & surface.over(cloud.points_world, -reach, reach, reach)
     labels = np.where(on_surface, np.int32(SUPPORT_LABEL), labels)
     view = source if isinstance(source, View) else None
-    return Percept(view, replace(cloud, labels=labels), pixels, surface)
+    return Observation(view, replace(cloud, labels=labels), pixels, surface)
 
 
 def level_cloud(
@@ -135,12 +139,12 @@ def level_cloud(
     return cloud.moved(T)
 
 
-def label_image(percept: Percept, source: View | Cloud) -> NDArray[np.int32]:
+def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.int32]:
     """Labels of all pixels (H, W) of a view, or of all points (N,) of a cloud."""
-    labels = percept.labels
+    labels = observation.labels
     shape = source.depth.shape if isinstance(source, View) else (len(source),)
     image = np.zeros(shape, dtype=np.int32)
-    image.ravel()[percept.pixels] = labels
+    image.ravel()[observation.pixels] = labels
     return image
 
 
@@ -212,11 +216,10 @@ def _surface(
             "table label 0 (of a cloud --label-divisor may do so), or use --segmentation auto"
         )
     if known is None:
-        return _found(_spread(cloud, loose, config.surface.max_points), up, config.surface, rng)
+        return _found(_spread(cloud, loose, MAX_POINTS), up, config.surface, rng, PLANES)
     near = np.abs(known.height(cloud.points_world)) < config.surface.search
     try:
-        largest = replace(config.surface, planes=1)
-        return _found(_spread(cloud, loose & near, config.surface.max_points_known), up, largest, rng)
+        return _found(_spread(cloud, loose & near, MAX_POINTS_KNOWN), up, config.surface, rng, 1)
     except PerceptionError:
         return known
 
@@ -227,8 +230,10 @@ def _spread(cloud: Cloud, among: NDArray[np.bool_], count: int) -> Cloud:
     return cloud.select(index[:: max(1, len(index) // count)])
 
 
-def _found(cloud: Cloud, up: Array | None, config: SurfaceConfig, rng: np.random.Generator) -> SupportSurface:
+def _found(
+    cloud: Cloud, up: Array | None, config: SurfaceConfig, rng: np.random.Generator, planes: int
+) -> SupportSurface:
     try:
-        return find_support_surface(cloud.points_world, cloud.normals_world, up, config, rng)
+        return find_support_surface(cloud.points_world, cloud.normals_world, up, config, rng, planes)
     except PerceptionError as error:
         raise PerceptionError(f"{cloud.name}: {error}") from None

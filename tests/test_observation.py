@@ -9,15 +9,15 @@ from synthetic import TABLE_TOP, motion_about_vertical, moved, random_motion, si
 from caryatid.config import Config
 from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
-from caryatid.segmentation.perception import label_image, level_cloud, perceive
+from caryatid.segmentation.observation import label_image, level_cloud, observe
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 CONFIG = Config()
 VIEW = simulated_views("tower")[0]
 
 
-def percept_of(source, segmentation=None, known=None, config=CONFIG):
-    return perceive(source, config, segmentation=segmentation, known=known, rng=np.random.default_rng(0))
+def observation_of(source, segmentation=None, known=None, config=CONFIG):
+    return observe(source, config, segmentation=segmentation, known=known, rng=np.random.default_rng(0))
 
 
 def without_pose(view):
@@ -25,36 +25,36 @@ def without_pose(view):
 
 
 def test_given_labels_stay_and_the_table_gets_its_own():
-    percept = percept_of(VIEW, "labels")
-    given = VIEW.labels.ravel()[percept.pixels]
-    np.testing.assert_array_equal(percept.labels[given > 0], given[given > 0])
-    table = percept.cloud.points_world[percept.labels == SUPPORT_LABEL]
+    observation = observation_of(VIEW, "labels")
+    given = VIEW.labels.ravel()[observation.pixels]
+    np.testing.assert_array_equal(observation.labels[given > 0], given[given > 0])
+    table = observation.cloud.points_world[observation.labels == SUPPORT_LABEL]
     assert (np.abs(table[:, 2] - TABLE_TOP) < CONFIG.surface.tolerance).all()
     assert np.abs(table[:, 2] - TABLE_TOP).mean() < 0.001
-    on_table = (np.abs(percept.cloud.points_world[:, 2] - TABLE_TOP) < 0.001) & (given == 0)
-    assert (percept.labels[on_table] == SUPPORT_LABEL).mean() > 0.98
+    on_table = (np.abs(observation.cloud.points_world[:, 2] - TABLE_TOP) < 0.001) & (given == 0)
+    assert (observation.labels[on_table] == SUPPORT_LABEL).mean() > 0.98
 
 
 def test_what_is_shown_is_each_label_once():
-    percept = percept_of(VIEW, "labels")
-    assert percept.shown == np.unique(percept.labels).tolist()
-    renamed = percept.relabelled({percept.shown[1]: 99})
+    observation = observation_of(VIEW, "labels")
+    assert observation.shown == np.unique(observation.labels).tolist()
+    renamed = observation.relabelled({observation.shown[1]: 99})
     assert 99 in renamed.shown
-    assert percept.shown[1] not in renamed.shown
-    assert percept.with_labels(percept.labels[:1]).shown == [int(percept.labels[0])]
-    assert percept.with_labels(percept.labels[:0]).shown == []
+    assert observation.shown[1] not in renamed.shown
+    assert observation.with_labels(observation.labels[:1]).shown == [int(observation.labels[0])]
+    assert observation.with_labels(observation.labels[:0]).shown == []
 
 
 def test_the_floor_belongs_to_nothing():
-    percept = percept_of(VIEW)
-    floor = percept.cloud.points_world[:, 2] < 0.1
+    observation = observation_of(VIEW)
+    floor = observation.cloud.points_world[:, 2] < 0.1
     assert floor.sum() > 100
-    assert (percept.labels[floor] == 0).all()
+    assert (observation.labels[floor] == 0).all()
 
 
 def test_what_is_below_the_known_table_is_not_looked_at():
-    first = percept_of(VIEW, "labels")
-    again = percept_of(VIEW, "labels", known=first.surface)
+    first = observation_of(VIEW, "labels")
+    again = observation_of(VIEW, "labels", known=first.surface)
     assert again.cloud.points_world[:, 2].min() > TABLE_TOP - 0.1
     shared = np.isin(first.pixels, again.pixels)
     np.testing.assert_array_equal(first.pixels[shared], again.pixels)
@@ -65,53 +65,53 @@ def test_what_is_below_the_known_table_is_not_looked_at():
 
 
 def test_labelled_points_below_the_known_table_are_kept():
-    known = percept_of(VIEW).surface
-    floor = percept_of(VIEW, "labels")
+    known = observation_of(VIEW).surface
+    floor = observation_of(VIEW, "labels")
     pixels = floor.pixels[floor.cloud.points_world[:, 2] < 0.1][:500]
     labels = VIEW.labels.copy()
     labels.ravel()[pixels] = 77
-    assert (percept_of(replace(VIEW, labels=labels), "labels", known=known).labels == 77).sum() == 500
+    assert (observation_of(replace(VIEW, labels=labels), "labels", known=known).labels == 77).sum() == 500
 
 
 def test_a_view_of_nothing_but_the_floor_keeps_the_known_table():
-    known = percept_of(VIEW).surface
+    known = observation_of(VIEW).surface
     T = VIEW.pose.copy()
     T[2, 3] -= 2.0
-    below = percept_of(replace(VIEW, T_world_camera=T, labels=None), "auto", known=known)
+    below = observation_of(replace(VIEW, T_world_camera=T, labels=None), "auto", known=known)
     assert below.surface is known
     assert not below.labels.any()
 
 
 def test_points_are_where_their_pixels_see_them():
-    percept = percept_of(VIEW)
-    expected = transforms.transform(VIEW.pose, VIEW.points_camera.reshape(-1, 3)[percept.pixels])
-    np.testing.assert_allclose(percept.cloud.points_world, expected)
-    np.testing.assert_array_equal(percept.cloud.rgb, VIEW.rgb.reshape(-1, 3)[percept.pixels])
-    np.testing.assert_array_equal(percept.cloud.viewpoint_world, VIEW.pose[:3, 3])
+    observation = observation_of(VIEW)
+    expected = transforms.transform(VIEW.pose, VIEW.points_camera.reshape(-1, 3)[observation.pixels])
+    np.testing.assert_allclose(observation.cloud.points_world, expected)
+    np.testing.assert_array_equal(observation.cloud.rgb, VIEW.rgb.reshape(-1, 3)[observation.pixels])
+    np.testing.assert_array_equal(observation.cloud.viewpoint_world, VIEW.pose[:3, 3])
 
 
 def test_a_view_without_a_pose_gets_a_level_world_on_the_table():
-    percept = percept_of(without_pose(VIEW))
-    T_world_camera = percept.view.pose
+    observation = observation_of(without_pose(VIEW))
+    T_world_camera = observation.view.pose
     on_objects = VIEW.labels > 0
     heights = transforms.transform(T_world_camera, VIEW.points_camera)[on_objects][:, 2]
     true = transforms.transform(VIEW.pose, VIEW.points_camera)[on_objects][:, 2] - TABLE_TOP
     np.testing.assert_allclose(heights, true, atol=0.002)
     np.testing.assert_allclose(T_world_camera[:2, 3], 0.0, atol=1e-12)
-    assert percept.surface.point_world[2] == pytest.approx(0.0, abs=0.001)
+    assert observation.surface.point_world[2] == pytest.approx(0.0, abs=0.001)
 
 
 def test_automatic_parts_are_found_without_looking_at_labels():
     (view,) = simulated_views("hidden_stack", (0.0,), vga=True)
-    percept = percept_of(replace(view, labels=None), "auto")
-    np.testing.assert_array_equal(percept.labels, percept_of(view, "auto").labels)
-    given = view.labels.ravel()[percept.pixels]
+    observation = observation_of(replace(view, labels=None), "auto")
+    np.testing.assert_array_equal(observation.labels, observation_of(view, "auto").labels)
+    given = view.labels.ravel()[observation.pixels]
     found = 0
     for label in range(1, 6):
-        own = percept.labels[given == label]
+        own = observation.labels[given == label]
         best = np.bincount(own[own != SUPPORT_LABEL]).argmax()
-        both = ((percept.labels == best) & (given == label)).sum()
-        either = ((percept.labels == best) | (given == label)).sum()
+        both = ((observation.labels == best) & (given == label)).sum()
+        either = ((observation.labels == best) | (given == label)).sum()
         found += best != 0 and both / either > 0.5
     assert found >= 4
 
@@ -119,28 +119,28 @@ def test_automatic_parts_are_found_without_looking_at_labels():
 @pytest.mark.parametrize("source", [VIEW, simulated_cloud("tower")], ids=["view", "cloud"])
 def test_labels_that_are_demanded_and_missing_are_an_error(source):
     with pytest.raises(InputError, match="has no labels") as caught:
-        percept_of(replace(source, labels=None), "labels")
+        observation_of(replace(source, labels=None), "labels")
     assert source.name in str(caught.value)
     assert "auto" in caught.value.remedy
 
 
 def test_only_the_first_view_may_lack_a_pose():
-    known = percept_of(VIEW).surface
+    known = observation_of(VIEW).surface
     with pytest.raises(InputError, match="no camera pose"):
-        percept_of(without_pose(VIEW), known=known)
+        observation_of(without_pose(VIEW), known=known)
 
 
 @pytest.mark.parametrize("posed", [True, False])
 def test_an_empty_frame_is_an_error_that_names_it(posed):
     empty = View(np.zeros((60, 80)), VIEW.K, VIEW.T_world_camera if posed else None, name="frame 7")
     with pytest.raises(PerceptionError, match="frame 7: holds no depth readings"):
-        percept_of(empty)
+        observation_of(empty)
 
 
 def test_an_empty_cloud_is_an_error_that_names_it():
     nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3)), name="cloud 7")
     with pytest.raises(PerceptionError, match="cloud 7: holds no points"):
-        percept_of(nothing)
+        observation_of(nothing)
     with pytest.raises(PerceptionError, match="cloud 7: holds no points"):
         level_cloud(nothing, CONFIG, segmentation=None, rng=np.random.default_rng(0))
 
@@ -151,65 +151,65 @@ def test_a_view_of_a_wall_has_no_support_surface():
     )
     level = transforms.look_at((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
     with pytest.raises(PerceptionError, match="wall: no support surface"):
-        percept_of(wall.with_pose(level))
+        observation_of(wall.with_pose(level))
 
 
 def test_a_view_in_which_the_table_is_not_seen_keeps_the_one_known():
-    known = percept_of(VIEW).surface
+    known = observation_of(VIEW).surface
     T = VIEW.pose.copy()
     T[2, 3] += 1.0
-    elsewhere = percept_of(replace(VIEW, T_world_camera=T), known=known)
+    elsewhere = observation_of(replace(VIEW, T_world_camera=T), known=known)
     assert elsewhere.surface is known
 
 
 def test_the_table_is_looked_for_near_where_it_was():
-    known = percept_of(VIEW).surface
+    known = observation_of(VIEW).surface
     T = VIEW.pose.copy()
     T[2, 3] += 0.01
-    shifted = percept_of(replace(VIEW, T_world_camera=T), known=known)
+    shifted = observation_of(replace(VIEW, T_world_camera=T), known=known)
     assert shifted.surface.point_world[2] == pytest.approx(TABLE_TOP + 0.01, abs=0.001)
 
 
 def test_new_names_replace_old_ones_all_at_once():
-    percept = percept_of(VIEW, "labels")
-    swapped = percept.relabelled({1: 2, 2: 1, 5: 9})
+    observation = observation_of(VIEW, "labels")
+    swapped = observation.relabelled({1: 2, 2: 1, 5: 9})
     for old, new in ((1, 2), (2, 1), (3, 3), (5, 9), (SUPPORT_LABEL, SUPPORT_LABEL)):
-        np.testing.assert_array_equal(swapped.labels == new, percept.labels == old)
-    assert not (percept.labels == 9).any()
+        np.testing.assert_array_equal(swapped.labels == new, observation.labels == old)
+    assert not (observation.labels == 9).any()
 
 
-def test_a_moved_percept_is_moved_in_all_its_parts():
-    percept = percept_of(VIEW)
+def test_a_moved_observation_is_moved_in_all_its_parts():
+    observation = observation_of(VIEW)
     T = motion_about_vertical(np.random.default_rng(0))
-    there = percept.moved(T)
+    there = observation.moved(T)
     np.testing.assert_allclose(
-        there.cloud.points_world, transforms.transform(T, percept.cloud.points_world), atol=1e-12
+        there.cloud.points_world, transforms.transform(T, observation.cloud.points_world), atol=1e-12
     )
-    np.testing.assert_allclose(there.view.pose, T @ percept.view.pose)
+    np.testing.assert_allclose(there.view.pose, T @ observation.view.pose)
     np.testing.assert_allclose(
         there.surface.height(there.cloud.points_world),
-        percept.surface.height(percept.cloud.points_world),
+        observation.surface.height(observation.cloud.points_world),
         atol=1e-12,
     )
-    np.testing.assert_array_equal(there.labels, percept.labels)
+    np.testing.assert_array_equal(there.labels, observation.labels)
 
 
 def test_the_label_image_holds_each_label_at_its_pixel():
-    percept = percept_of(VIEW, "labels")
-    image = label_image(percept, VIEW)
+    observation = observation_of(VIEW, "labels")
+    image = label_image(observation, VIEW)
     assert image.shape == VIEW.depth.shape
-    np.testing.assert_array_equal(image.ravel()[percept.pixels], percept.labels)
+    np.testing.assert_array_equal(image.ravel()[observation.pixels], observation.labels)
     rest = np.ones(image.size, dtype=bool)
-    rest[percept.pixels] = False
+    rest[observation.pixels] = False
     assert (image.ravel()[rest] == 0).all()
     cloud = simulated_cloud("tower")
-    assert label_image(percept_of(cloud), cloud).shape == (len(cloud),)
+    assert label_image(observation_of(cloud), cloud).shape == (len(cloud),)
 
 
 def test_a_cloud_in_its_sensors_frame_is_levelled():
-    percept = percept_of(VIEW, "labels")
+    observation = observation_of(VIEW, "labels")
     T_camera_world = transforms.invert(VIEW.pose)
-    world = replace(percept.cloud, labels=VIEW.labels.ravel()[percept.pixels])
+    world = replace(observation.cloud, labels=VIEW.labels.ravel()[observation.pixels])
     stored = moved(world, T_camera_world)
     level = level_cloud(stored, CONFIG, segmentation=None, rng=np.random.default_rng(0))
     above = world.points_world[:, 2] - TABLE_TOP

@@ -1,0 +1,334 @@
+"""One object or two: model split and model merge compare the description lengths of the same two readings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import combinations
+
+import numpy as np
+import scipy.sparse
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from caryatid.config import Config
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import KINDS
+from caryatid.geometry.transforms import Array
+from caryatid.objects.description_length import (
+    Evidence,
+    Explanation,
+    best_explanation,
+    explain,
+    point_costs,
+    price,
+)
+
+Groups = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+Hints = Callable[[], Sequence[Mask]]
+
+NEIGHBOURS = 8
+"""Points the mean around a point is taken over [1]; 2 cm square of them."""
+CONNECTED = 0.02
+"""Points of one object further apart are not connected [m]; more than twice their spacing."""
+CRUMB = 8
+"""Fewer points off the rest of their side go to the other side [1]; 2 cm square of them."""
+PATCHES = 3
+"""Largest patches a single shape does not explain that are tried as objects of their own [1]."""
+FINALISTS = 2
+"""Best hypotheses that are settled with full fits [1]."""
+SMOOTH = 0.8
+"""Share of the border without a crease from which two may be one object without a shape [1]."""
+GROWTH = 1.3
+"""What was found to be one object, or two, is looked at again when its points have grown by this [1]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class TwoObjects:
+    """Points taken for two objects.
+
+    Attributes:
+        second: Which points (N,) are the second's.
+        explanations: Of both.
+        cost: Of both and of the border between them [nats].
+        smooth: Share of that border without a concave crease [1].
+    """
+
+    second: Mask
+    explanations: tuple[Explanation, Explanation]
+    cost: float
+    smooth: float
+
+
+def split(
+    evidence: Evidence,
+    whole: Explanation,
+    hints: Hints,
+    *,
+    up: Array,
+    config: Config,
+    rng: np.random.Generator,
+) -> Groups | None:
+    """Split points that several shapes explain at a lower cost than one.
+
+    Tried are hints, the patches that the single shape does not explain, and cuts across the vertical, where
+    one object lies on another, and across the two horizontal directions of the points' faces, where they
+    stand side by side. From each such hypothesis the points go to the shape that explains them better, and
+    the shapes are fitted again.
+
+    Args:
+        evidence: The points of what is taken for one object.
+        whole: Its best single explanation.
+        hints: Gives points (N,) that may be an object of their own; asked only where something is tried.
+        up: Unit vector (3,) upwards.
+        config: What is tried, what it costs, and how shapes are fitted.
+        rng: Source of the samples.
+
+    Returns:
+        Group of each point (N,), from 0, or None where one object is the better explanation.
+    """
+    all_hints = cache(hints)
+    groups = np.zeros(len(evidence), dtype=np.intp)
+    waiting = [(np.arange(len(groups)), whole)]
+    while waiting:
+        index, single = waiting.pop()
+        found = _best_two(evidence.select(index), single, index, all_hints, up, config, rng)
+        if found is None:
+            continue
+        groups[index[found.second]] = groups.max() + 1
+        sides = (index[~found.second], index[found.second])
+        waiting += zip(sides, found.explanations, strict=True)
+    return groups if groups.any() else None
+
+
+def _best_two(
+    evidence: Evidence,
+    whole: Explanation,
+    index: Groups,
+    hints: Hints,
+    up: Array,
+    config: Config,
+    rng: np.random.Generator,
+) -> TwoObjects | None:
+    """How points (those with this index among all) are best taken for two objects; None if one is better."""
+    costs = config.explanation
+    if len(evidence) < 2 * config.split.min_points:
+        return None
+    near = _around(evidence.points)
+    own = point_costs(whole.shape, evidence, costs)
+    bad = own[near].mean(axis=1)
+    excess = float(np.maximum(bad - costs.usual, 0.0).sum()) * evidence.weight
+    free = whole.cost - price(whole.shape, costs) - float(own.sum()) * evidence.weight
+    if excess + free < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
+        return None
+    starts = [h[index] for h in hints()]
+    starts = [h for h in starts if h.any() and not h.all()]
+    starts += _hypotheses(evidence, bad, up, config)
+    looks = _settled(evidence, starts, near, 0, config, rng, first_look=True)
+    tried = sorted((look.cost, k) for k, look in enumerate(looks) if look is not None)[:FINALISTS]
+    finalists = [starts[k] for _, k in tried]
+    settled = _settled(evidence, finalists, near, config.split.rounds, config, rng)
+    better = [two for two in settled if two is not None and two.cost < whole.cost]
+    return min(better, key=lambda two: two.cost, default=None)
+
+
+def _settled(
+    evidence: Evidence,
+    starts: Sequence[Mask],
+    near: Groups,
+    rounds: int,
+    config: Config,
+    rng: np.random.Generator,
+    *,
+    first_look: bool = False,
+) -> list[TwoObjects | None]:
+    """Fit both sides of each start, give each point to the side that explains it better, and so on.
+
+    Returns:
+        What each start settles at; None where one side is left with too few points.
+    """
+    costs = config.explanation
+    settled: list[TwoObjects | None] = [None] * len(starts)
+    moving = dict(enumerate(starts))
+    for number in range(rounds + 1):
+        moving = {
+            k: second
+            for k, second in moving.items()
+            if min(second.sum(), (~second).sum()) >= config.split.min_points
+        }
+        sides = [evidence.select(s) for second in moving.values() for s in (~second, second)]
+        found = explain(sides, costs, config.fit, rng.spawn(len(sides)), first_look=first_look)
+        pairs = zip(found[0::2], found[1::2], strict=True)
+        for (k, second), pair in zip(list(moving.items()), pairs, strict=True):
+            moved = second
+            if number < rounds:
+                cost = np.stack([point_costs(e.shape, evidence, costs) for e in pair])
+                cost = (cost + cost[:, near].mean(axis=2)) / 2.0
+                moved = _connected(evidence.points, cost[1] < cost[0])
+            if (moved == second).all():
+                settled[k] = _two(evidence, second, pair, near, config)
+                del moving[k]
+            else:
+                moving[k] = moved
+    return settled
+
+
+def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> Iterator[Mask]:
+    """Points (N,) that may be an object of their own: badly explained patches, and what lies beyond cuts."""
+    poor = bad > config.explanation.irregular
+    if poor.any():
+        part = _components(evidence.points[poor])
+        for number in np.argsort(-np.bincount(part))[:PATCHES]:
+            start = np.zeros(len(bad), dtype=bool)
+            start[np.flatnonzero(poor)[part == number]] = True
+            yield start
+    shares = np.linspace(0.0, 1.0, config.split.cuts + 2)[1:-1]
+    for direction in _directions(evidence.normals, up):
+        height = evidence.points @ direction
+        for level in np.quantile(height, shares):
+            yield height > level
+
+
+def _directions(normals: Array, up: Array) -> list[Array]:
+    """Up, and the two horizontal directions most faces look along."""
+    level = normals - np.outer(normals @ up, up)
+    length = np.linalg.norm(level, axis=1)
+    upright = level[length > 0.5] / length[length > 0.5, None]
+    if len(upright) == 0:
+        return [up]
+    x, y = transforms.perpendicular(up), np.cross(up, transforms.perpendicular(up))
+    angle = np.angle(np.mean(((upright @ x) + 1j * (upright @ y)) ** 4)) / 4.0
+    main = np.cos(angle) * x + np.sin(angle) * y
+    return [up, main, np.cross(up, main)]
+
+
+def _components(points: Array) -> Groups:
+    """Connected part (N,) of each point, from 0."""
+    pairs = cKDTree(points).query_pairs(CONNECTED, output_type="ndarray")
+    graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
+
+
+def _connected(points: Array, second: Mask) -> Mask:
+    """Keep the largest connected part of the second side, and of the first all that is no crumb."""
+    result = second.copy()
+    index = np.flatnonzero(second)
+    if len(index):
+        part = _components(points[index])
+        result[index[part != np.argmax(np.bincount(part))]] = False
+    index = np.flatnonzero(~result)
+    if len(index):
+        part = _components(points[index])
+        sizes = np.bincount(part)
+        result[index[(sizes < min(CRUMB, sizes.max()))[part]]] = True
+    return result
+
+
+def best_merge(
+    evidence: Mapping[int, Evidence],
+    alone: Mapping[int, Explanation],
+    changed: set[int],
+    apart: MutableMapping[tuple[int, int], int],
+    *,
+    config: Config,
+    seed: int,
+) -> tuple[int, int] | None:
+    """Find the pair of neighbours that it is best to take for one.
+
+    Args:
+        evidence: Points of each object, by label.
+        alone: Its explanation as an object of its own.
+        changed: Only pairs with one of these are looked at.
+        apart: Pairs found to be two, with the number of points they had then; they are looked at again when
+            they have grown. Added to.
+        config: What explanations cost, and how shapes are fitted.
+        seed: Seed of the fits.
+
+    Returns:
+        The larger object and the one it takes in, or None where all are better apart.
+    """
+    trees = {k: cKDTree(e.points) for k, e in evidence.items()}
+    pairs = [
+        (a, b)
+        for a, b in combinations(sorted(evidence), 2)
+        if {a, b} & changed
+        and len(evidence[a]) + len(evidence[b]) >= GROWTH * apart.get((a, b), 0)
+        and trees[a].count_neighbors(trees[b], config.explanation.reach) > 0
+    ]
+    joined = [evidence[a].joined(evidence[b]) for a, b in pairs]
+    twos = []
+    for (a, b), both in zip(pairs, joined, strict=True):
+        second = np.arange(len(both)) >= len(evidence[a])
+        twos.append(_two(both, second, (alone[a], alone[b]), _around(both.points), config))
+    best: tuple[float, tuple[int, int]] | None = None
+    for (a, b), gain in zip(pairs, _gains(joined, twos, pairs, config, seed), strict=True):
+        if gain <= 0.0:
+            apart[a, b] = len(evidence[a]) + len(evidence[b])
+        elif best is None or gain > best[0]:
+            best = gain, (a, b) if len(evidence[a]) >= len(evidence[b]) else (b, a)
+    return None if best is None else best[1]
+
+
+def _gains(
+    joined: Sequence[Evidence],
+    twos: Sequence[TwoObjects],
+    pairs: Sequence[tuple[int, int]],
+    config: Config,
+    seed: int,
+) -> list[float]:
+    """How much less [nats] one object costs than two, by the shapes of both and by fits to all the points."""
+    costs = config.explanation
+    rngs = [np.random.default_rng([seed, *pair]) for pair in pairs]
+    ones = []
+    for both, two in zip(joined, twos, strict=True):
+        shapes = [e.shape for e in two.explanations if e.shape is not None]
+        ones.append(best_explanation(shapes, both, costs))
+    worth = list(range(len(pairs)))
+    for first_look in (True, False):
+        found = explain(
+            [joined[k] for k in worth],
+            costs,
+            config.fit,
+            [rngs[k] for k in worth],
+            first_look=first_look,
+        )
+        for k, one in zip(worth, found, strict=True):
+            ones[k] = min(ones[k], one, key=lambda e: e.cost)
+        worth = [k for k in worth if ones[k].cost <= twos[k].cost + price(None, costs)]
+    return [_gain(*case, config) for case in zip(joined, twos, ones, strict=True)]
+
+
+def _gain(both: Evidence, two: TwoObjects, one: Explanation, config: Config) -> float:
+    """How much less [nats] one object costs; nothing where it leaves one of the two unexplained.
+
+    Without a shape two are one only where the surface goes on from one to the other.
+    """
+    if one.shape is None:
+        return two.cost - one.cost if two.smooth > SMOOTH else 0.0
+    cost = point_costs(one.shape, both, config.explanation)
+    unexplained = max(cost[two.second].mean(), cost[~two.second].mean()) > config.explanation.irregular
+    return 0.0 if unexplained else two.cost - one.cost
+
+
+def _around(points: Array) -> Groups:
+    """Indices (N, K) of each point's nearest neighbours among points (N, 3), itself among them."""
+    count = min(NEIGHBOURS, len(points))
+    return np.asarray(cKDTree(points).query(points, k=count)[1]).reshape(len(points), count)
+
+
+def _two(
+    evidence: Evidence, second: Mask, pair: tuple[Explanation, Explanation], near: Groups, config: Config
+) -> TwoObjects:
+    """Points taken for two objects; a border costs where the surface goes on without a concave crease."""
+    row, col = np.repeat(np.arange(len(second)), near.shape[1]), near.ravel()
+    across = second[row] != second[col]
+    row, col = row[across], col[across]
+    between = evidence.points[col] - evidence.points[row]
+    turn = evidence.normals[col] - evidence.normals[row]
+    bend = np.einsum("ij,ij->i", turn, between) / np.maximum(np.linalg.norm(between, axis=1), 1e-9)
+    smooth = np.count_nonzero(bend > -np.sin(np.radians(config.segmentation.concavity)))
+    border = config.explanation.border * smooth * evidence.weight / near.shape[1]
+    return TwoObjects(second, pair, pair[0].cost + pair[1].cost + border, smooth / max(len(row), 1))

@@ -1,0 +1,284 @@
+"""Description length, and what it decides: one object or two."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from synthetic import box, cylinder, motion_about_vertical, sphere, surface_points
+from test_degenerate_fits import POINTS
+from test_degenerate_fits import UP as NORMALS
+
+from caryatid.config import Config, ExplanationConfig, FitConfig, SplitConfig, VoxelConfig
+from caryatid.geometry import transforms
+from caryatid.objects.description_length import Evidence, best_explanation, explain, point_costs, price
+from caryatid.objects.model_selection import best_merge, split
+from caryatid.sensing.clouds import thin
+from caryatid.sensing.views import Cloud
+from caryatid.sensing.voxel_map import VoxelMap
+
+CONFIG, COSTS, FIT = Config(), ExplanationConfig(), FitConfig()
+EYE = (-1.2, -0.6, 1.0)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def gather(cloud, voxels=None, costs=COSTS):
+    kept = cloud.select(thin(cloud.points_world, costs.spacing))
+    weight = costs.spacing**2 / costs.reading
+    return Evidence(kept.points_world, kept.normals_world, weight, 0.003, voxels)
+
+
+def alone_in(evidence):
+    """The explanation of some points as one object."""
+    return explain([evidence], COSTS, FIT, [np.random.default_rng(0)])[0]
+
+
+def divided(points, normals):
+    """Group of each point, or None where they are one object."""
+    evidence = gather(Cloud(points, normals))
+    groups = split(evidence, alone_in(evidence), list, up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    return None if groups is None else groups[cKDTree(evidence.points).query(points)[1]]
+
+
+def pair_of(clouds, changed=None, apart=None, voxels=None, config=CONFIG):
+    evidence = {k: gather(c, voxels) for k, c in clouds.items()}
+    alone = {k: alone_in(e) for k, e in evidence.items()}
+    everything = set(clouds) if changed is None else changed
+    return best_merge(evidence, alone, everything, {} if apart is None else apart, config=config, seed=0)
+
+
+SHAPES = [
+    box((0.0, 0.0, 0.05), (0.1, 0.14, 0.1), turn_deg=20.0),
+    cylinder((0.0, 0.0, 0.05), 0.04, 0.1),
+    sphere((0.0, 0.0, 0.05), 0.05),
+]
+
+
+def evidence_of(shape, seed=0, sigma=0.002, turned=0.2, voxels=None) -> Evidence:
+    rng = np.random.default_rng(seed)
+    points, normals = surface_points(shape, rng, eye=EYE, sigma=sigma)
+    normals = transforms.unit(normals + turned * rng.normal(size=normals.shape))
+    return gather(Cloud(points, normals), voxels)
+
+
+def test_a_point_costs_by_its_distance_over_the_noise_and_by_its_turn():
+    ball = sphere((0.0, 0.0, 0.0), 0.05)
+    points = np.array([[0.05, 0.0, 0.0], [0.053, 0.0, 0.0], [0.05, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    normals = np.array([[1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.5, np.sqrt(0.75), 0.0], [1.0, 0.0, 0.0]])
+    cost = point_costs(ball, Evidence(points, normals, 1.0, 0.003, None), COSTS)
+    np.testing.assert_allclose(cost, (0.0, 0.5, 0.5 * COSTS.normal_weight, COSTS.outlier), atol=1e-9)
+
+
+def test_points_of_no_shape_are_left_without_one():
+    rng = np.random.default_rng(0)
+    crumpled = Evidence(
+        rng.uniform(-0.1, 0.1, (400, 3)),
+        transforms.unit(rng.normal(size=(400, 3))),
+        1.0,
+        0.003,
+        None,
+    )
+    few = crumpled.select(np.arange(FIT.min_points - 1))
+    for evidence, best in zip((crumpled, few), explain([crumpled, few], COSTS, FIT, [rng, rng]), strict=True):
+        assert best.shape is None
+        assert best.cost == pytest.approx(COSTS.irregular * len(evidence.points) + price(None, COSTS))
+
+
+def test_objects_explained_together_are_as_explained_alone():
+    parts = [evidence_of(shape, seed) for seed, shape in enumerate(SHAPES)]
+    together = explain(parts, COSTS, FIT, [np.random.default_rng(k) for k in range(3)])
+    backwards = explain(parts[::-1], COSTS, FIT, [np.random.default_rng(k) for k in (2, 1, 0)])[::-1]
+    for k, part in enumerate(parts):
+        (alone,) = explain([part], COSTS, FIT, [np.random.default_rng(k)])
+        for best in (together[k], backwards[k]):
+            assert best.cost == alone.cost
+            np.testing.assert_array_equal(best.shape.T_world_object, alone.shape.T_world_object)
+    assert explain([], COSTS, FIT, []) == []
+
+
+@pytest.mark.filterwarnings("error")
+def test_points_that_determine_nothing_have_a_finite_cost():
+    finite = {
+        k: p for k, p in POINTS.items() if len(p) > 0 and np.isfinite(p).all() and np.abs(p).max() < 1e6
+    }
+    assert len(finite) > 8
+    parts = [Evidence(p, NORMALS[: len(p)], 1.0, 0.003, None) for p in finite.values()]
+    for best in explain(parts, COSTS, FIT, [np.random.default_rng(0)] * len(parts)):
+        assert np.isfinite(best.cost)
+    for part in parts:
+        whole = best_explanation([SHAPES[0]], part, COSTS)
+        groups = split(part, whole, list, up=UP, config=CONFIG, rng=np.random.default_rng(0))
+        assert groups is None or len(groups) == len(part.points)
+
+
+STACKED = (box((0.0, 0.0, 0.05), (0.16, 0.12, 0.1)), box((0.03, 0.0, 0.15), (0.06, 0.06, 0.1)))
+SIDE_BY_SIDE = (box((0.0, -0.06, 0.05), (0.1, 0.12, 0.1)), box((0.0, 0.04, 0.1), (0.1, 0.08, 0.2)))
+CAN_ON_BOX = (box((0.0, 0.0, 0.04), (0.14, 0.14, 0.08)), cylinder((0.0, 0.0, 0.14), 0.03, 0.12))
+
+
+def points_of(shapes, sigma=0.001, seed=0):
+    rng = np.random.default_rng(seed)
+    parts = [surface_points(s, rng, eye=(-1.2, -0.6, 1.0), spacing=0.006, sigma=sigma) for s in shapes]
+    points = np.concatenate([p for p, _ in parts])
+    normals = np.concatenate([n for _, n in parts])
+    return points, normals, np.repeat(np.arange(len(parts)), [len(p) for p, _ in parts])
+
+
+def agreement(groups, truth):
+    """Share of the points in the group of most of their shape's points."""
+    return np.mean(
+        [(groups[truth == k] == np.bincount(groups[truth == k]).argmax()).mean() for k in set(truth)]
+    )
+
+
+@pytest.mark.parametrize(
+    "shapes", [STACKED, SIDE_BY_SIDE, CAN_ON_BOX], ids=["stacked", "beside", "can on box"]
+)
+def test_two_shapes_are_parted_where_they_meet(shapes):
+    points, normals, truth = points_of(shapes)
+    groups = divided(points, normals)
+    assert groups is not None
+    assert set(groups) == {0, 1}
+    assert agreement(groups, truth) > 0.9
+    assert np.bincount(groups[truth == 0]).argmax() != np.bincount(groups[truth == 1]).argmax()
+
+
+def test_a_bridge_is_parted_into_all_its_three_shapes():
+    pillars = [box((0.0, y, 0.05), (0.06, 0.06, 0.1)) for y in (-0.09, 0.09)]
+    points, normals, truth = points_of([*pillars, box((0.0, 0.0, 0.115), (0.06, 0.26, 0.03))])
+    groups = divided(points, normals)
+    assert groups is not None
+    assert len(set(groups)) == 3
+    assert agreement(groups, truth) > 0.85
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [STACKED[0], cylinder((0.0, 0.0, 0.06), 0.04, 0.12), sphere((0.0, 0.0, 0.05), 0.05)],
+    ids=["box", "cylinder", "sphere"],
+)
+@pytest.mark.parametrize("sigma", [0.0005, 0.004])
+def test_one_shape_stays_one_whatever_the_noise(shape, sigma):
+    points, normals, _ = points_of([shape], sigma)
+    assert divided(points, normals) is None
+
+
+def test_few_points_are_not_divided():
+    points, normals, _ = points_of(STACKED)
+    few = np.random.default_rng(0).choice(len(points), 2 * SplitConfig().min_points - 1, replace=False)
+    assert divided(points[few], normals[few]) is None
+
+
+def test_an_object_that_is_no_primitive_is_not_cut_into_ones():
+    rng = np.random.default_rng(0)
+    azimuth, height = rng.uniform(-np.pi, np.pi, 4000), rng.uniform(0.0, 0.05, 4000)
+    radius = 0.03 + height
+    outward = np.stack([np.cos(azimuth), np.sin(azimuth), -np.ones(4000)], axis=1) / np.sqrt(2.0)
+    bowl = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), height], axis=1)
+    points = np.concatenate([bowl, bowl - 0.004 * outward]) + rng.normal(0.0, 0.001, (8000, 3))
+    assert divided(points, np.concatenate([outward, -outward])) is None
+
+
+def test_a_view_that_is_off_by_three_sigma_leaves_a_layer_and_no_second_object():
+    for seed in range(4):
+        points, normals, _ = points_of([STACKED[0]], seed=seed)
+        top = normals[:, 2] > 0.9
+        layer = points[top] + np.array([0.0, 0.0, 0.006])
+        assert divided(np.concatenate([points, layer]), np.concatenate([normals, normals[top]])) is None
+
+
+def test_the_division_turns_with_the_scene():
+    points, normals, truth = points_of(STACKED)
+    T = motion_about_vertical(np.random.default_rng(5))
+    groups = divided(transforms.transform(T, points), transforms.rotate(T, normals))
+    assert groups is not None
+    assert agreement(groups, truth) > 0.9
+
+
+def cloud_of(shape, eye=EYE, seed=0):
+    points, normals = surface_points(shape, np.random.default_rng(seed), eye=eye, spacing=0.006, sigma=0.001)
+    return Cloud(points, normals)
+
+
+def halves(shape):
+    """A box's points left and right of a gap, as something in front leaves them."""
+    cloud = cloud_of(shape)
+    y = cloud.points_world[:, 1]
+    return cloud.select(y < -0.01), cloud.select(y > 0.01)
+
+
+CRATE = box((0.0, 0.0, 0.05), (0.1, 0.2, 0.1))
+
+
+def test_what_something_in_front_cut_in_two_is_one_object():
+    left, right = halves(CRATE)
+    assert pair_of({1: left, 2: right}) in {(1, 2), (2, 1)}
+
+
+def test_not_where_the_space_between_was_seen_free():
+    left = cloud_of(box((0.0, -0.09, 0.05), (0.1, 0.12, 0.1)))
+    right = cloud_of(box((0.0, 0.09, 0.05), (0.1, 0.12, 0.1)))
+    nothing = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
+    index = np.indices(nothing.hits.shape)
+    between = np.abs(nothing.centres_world(index.reshape(3, -1).T)[:, 1]) < 0.025
+    free = VoxelMap(
+        nothing.origin_world,
+        nothing.hits,
+        between.reshape(nothing.hits.shape).astype(np.uint8),
+        VoxelConfig(),
+    )
+    near = replace(CONFIG, explanation=replace(COSTS, reach=0.1))
+    assert pair_of({1: left, 2: right}, voxels=free, config=near) is None
+
+
+def test_a_few_points_of_an_object_are_given_to_it_whatever_the_labels():
+    whole, again = cloud_of(CRATE), cloud_of(CRATE, seed=1)
+    few = again.select(again.points_world[:, 1] > 0.05)
+    assert pair_of({1: few, 2: whole}) == (2, 1)
+    assert pair_of({1: whole, 2: few}) == (1, 2)
+
+
+def test_neighbours_that_touch_are_two_objects():
+    can = cloud_of(cylinder((0.0, 0.0, 0.16), 0.03, 0.12))
+    beside = cloud_of(box((0.0, 0.16, 0.03), (0.08, 0.12, 0.06)))
+    assert pair_of({1: cloud_of(CRATE), 2: can, 3: beside}) is None
+
+
+def test_what_did_not_change_is_not_looked_at():
+    left, right = halves(CRATE)
+    assert pair_of({1: left, 2: right}, changed=set()) is None
+
+
+def test_two_are_looked_at_again_when_they_have_grown():
+    left, right = halves(CRATE)
+    apart = {(1, 2): 10 * len(left)}
+    assert pair_of({1: left, 2: right}, apart=apart) is None
+    assert pair_of({1: left, 2: right}, apart={(1, 2): 10}) is not None
+
+
+def bowl(azimuths, seed=0):
+    """Outside of a bowl that widens upwards, of the directions [rad] given: none of the shapes."""
+    rng = np.random.default_rng(seed)
+    azimuth, height = rng.uniform(*azimuths, 2500), rng.uniform(0.0, 0.06, 2500)
+    radius = 0.03 + height * (1.0 + 0.5 * np.sin(4.0 * azimuth))
+    across = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+    normals = np.concatenate([across, np.full((2500, 1), -1.0)], axis=1) / np.sqrt(2.0)
+    return Cloud(np.column_stack([radius[:, None] * across, height]), normals)
+
+
+def test_an_irregular_object_in_two_parts_is_one_where_its_surface_goes_on():
+    assert pair_of({1: bowl((-np.pi, 0.3)), 2: bowl((0.3, np.pi))}) is not None
+
+
+def test_irregular_neighbours_stay_two_where_a_crease_parts_them():
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(-0.15, 0.15, (6000, 2))
+    xy = xy[np.hypot(*xy.T) > 0.035]
+    crumpled = np.column_stack([xy, 0.02 * np.sin(70.0 * xy[:, 0]) * np.sin(50.0 * xy[:, 1]) - 0.02])
+    paper = Cloud(crumpled, np.tile((0.0, 0.0, 1.0), (len(xy), 1)))
+    standing = bowl((-np.pi, np.pi))
+    for cloud in (paper, standing):
+        assert alone_in(gather(cloud)).shape is None
+    assert pair_of({1: standing, 2: paper}) is None
