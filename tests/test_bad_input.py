@@ -312,7 +312,7 @@ def test_a_source_that_does_not_exist(tmp_path, refused, name):
     assert "tower" in refused("explore", tmp_path / name, says="no such scene")
 
 
-@pytest.mark.parametrize(("name", "says"), [("nowhere", "is no folder"), ("nowhere.pcd", "missing")])
+@pytest.mark.parametrize(("name", "says"), [("nowhere", "there is no such file"), ("nowhere.pcd", "missing")])
 def test_nothing_to_extract(tmp_path, refused, name, says):
     refused("extract", tmp_path / name, says=says)
 

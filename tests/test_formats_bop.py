@@ -112,19 +112,9 @@ def test_views_are_read_one_by_one_and_not_kept(folder):
         recording[0]
 
 
-def test_a_single_frame_needs_no_pose(tmp_path):
-    write_recording(tmp_path / "one", make_views(1, poses=False))
-    assert read_recording(tmp_path / "one")[0].T_world_camera is None
-
-
 def test_several_frames_without_poses_are_refused(tmp_path):
     write_recording(tmp_path / "scene", make_views(3, poses=False))
     assert "3 of 3" in refused(tmp_path / "scene", "have no pose")
-
-
-def test_one_frame_of_several_without_a_pose_is_refused(folder):
-    edit(folder, "scene_camera.json", lambda d: [d["1"].pop(k) for k in ("cam_R_w2c", "cam_t_w2c")])
-    refused(folder, "frame 1")
 
 
 @pytest.mark.parametrize("name", ["depth/000001.png", "rgb/000001.png", "mask_visib/000001_000001.png"])
@@ -142,15 +132,6 @@ def test_a_truncated_image_is_refused_before_anything_is_decoded(folder, name, k
     assert name in refused(folder, "000001")
 
 
-@pytest.mark.parametrize("position", [0.2, 0.5, 0.8])
-def test_a_damaged_image_is_refused(folder, position):
-    path = folder / "depth/000001.png"
-    content = bytearray(path.read_bytes())
-    content[int(len(content) * position)] ^= 0xFF
-    path.write_bytes(bytes(content))
-    refused(folder, "depth/000001.png", load=True)
-
-
 def test_a_truncated_jpeg_is_refused(folder):
     rgb = Image.open(folder / "rgb/000001.png")
     buffer = io.BytesIO()
@@ -162,11 +143,6 @@ def test_a_truncated_jpeg_is_refused(folder):
     assert len(read_recording(folder)) == 3
     (folder / "rgb/000001.jpg").write_bytes(buffer.getvalue()[:-200])
     refused(folder, "rgb/000001.jpg")
-
-
-def test_text_in_place_of_an_image_is_refused(folder):
-    (folder / "depth/000000.png").write_text("no image at all")
-    refused(folder, "is no image")
 
 
 @pytest.mark.parametrize("name", ["rgb/000001.png", "mask_visib/000001_000001.png"])
@@ -182,11 +158,6 @@ def test_sizes_that_differ_are_refused(folder, name):
 def test_depth_that_is_not_16_bit_is_refused(folder, mode):
     Image.new(mode, (64, 48), 1).save(folder / "depth/000002.png")
     refused(folder, f"mode {mode}, not a 16-bit grey PNG")
-
-
-def test_a_colour_mask_is_refused(folder):
-    Image.new("RGB", (64, 48)).save(folder / "mask_visib/000000_000000.png")
-    refused(folder, "mode RGB")
 
 
 def test_an_empty_frame_is_refused_when_it_is_read(folder):
@@ -213,17 +184,6 @@ def test_a_mask_that_names_no_object_is_refused(folder):
     refused(folder, "names no object: scene_gt.json has no entry for mask 2 of frame 0")
 
 
-def test_frames_without_masks_carry_no_labels(folder):
-    edit(folder, "scene_gt.json", lambda d: d.pop("2"))
-    for path in (folder / "mask_visib").glob("000002_*"):
-        path.unlink()
-    recording = read_recording(folder)
-    assert recording[2].labels is None
-    assert not recording.has_labels
-    with pytest.raises(InputError, match="no masks"):
-        recording.frames[2].load_labels()
-
-
 def nothing(document):
     document.clear()
 
@@ -235,29 +195,22 @@ def nothing(document):
         ("scene_camera.json", lambda d: d["1"].pop("cam_K"), "'cam_K' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(cam_K=[1, 2]), "9 finite numbers"),
         ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(0, 0.0), "focal lengths 0"),
-        ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(4, -5), "focal lengths"),
-        ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(0, "f"), "9 finite numbers"),
         ("scene_camera.json", lambda d: d["1"].pop("depth_scale"), "'depth_scale' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(depth_scale=0), "depth_scale"),
-        ("scene_camera.json", lambda d: d["1"].update(depth_scale=-1.0), "depth_scale"),
         ("scene_camera.json", lambda d: d["1"].pop("cam_t_w2c"), "'cam_t_w2c' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[0.0] * 9), "no rotation"),
-        ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[-1, 0, 0, 0, 1, 0, 0, 0, 1]), "no rotation"),
         (
             "scene_camera.json",
             lambda d: d["1"].update(cam_R_w2c=[1.1, 0, 0, 0, 1, 0, 0, 0, 1]),
             "no rotation",
         ),
         ("scene_camera.json", lambda d: d.pop("1"), "no entry in scene_camera.json"),
-        ("scene_camera.json", lambda d: d.update({"9": d["1"]}), "depth/000009.png"),
         ("scene_camera.json", lambda d: d.update({"first": d["1"]}), "'first'"),
         ("scene_camera.json", lambda d: d.update({"01": d["1"]}), "'01'"),
         ("scene_camera.json", lambda d: d.update({"1": 5}), "must be an object"),
         ("scene_gt.json", lambda d: d["1"][0].pop("obj_id"), "'obj_id' is missing"),
         ("scene_gt.json", lambda d: d["1"][0].update(obj_id=0), "'obj_id' is 0"),
-        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=65535), "65535"),
         ("scene_gt.json", lambda d: d["1"][0].update(obj_id=300), "two masks have obj_id 300"),
-        ("scene_gt.json", lambda d: d["1"].append({"obj_id": 4}), "missing"),
         ("scene_gt.json", lambda d: d.pop("1"), "names no object"),
         ("scene_gt.json", lambda d: d.update({"1": {"obj_id": 1}}), "must be a valid array"),
         ("scene_gt.json", lambda d: d.update({"8": []}), "not in scene_camera.json"),
@@ -285,10 +238,6 @@ def test_a_rotation_that_drifted_is_made_a_rotation(folder):
     R = read_recording(folder).frames[1].T_world_camera[:3, :3]
     assert np.allclose(R.T @ R, np.eye(3), atol=1e-12)
     assert np.allclose(R, np.eye(3), atol=1e-3)
-
-
-def test_no_folder_is_refused(tmp_path):
-    refused(tmp_path / "nowhere", "is not a folder")
 
 
 def test_writing_refuses_what_does_not_fit(tmp_path, folder):

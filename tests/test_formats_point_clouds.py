@@ -87,13 +87,6 @@ def test_all_encodings_give_the_same_cloud(tmp_path, encoding):
     assert cloud.name == "a.pcd"
 
 
-def test_normals_point_to_the_viewpoint(tmp_path):
-    path = write(tmp_path / "a.pcd", plane(), VIEWPOINT="0 0 3 1 0 0 0")
-    cloud = read_cloud(path, CloudConfig())
-    assert np.allclose(cloud.normals_world, (0, 0, 1), atol=1e-6)
-    assert np.allclose(cloud.viewpoint_world, (0, 0, 3))
-
-
 def test_stored_normals_are_used_as_they_are(tmp_path):
     data = plane()
     names = ("x", "y", "z", "normal_x", "normal_y", "normal_z")
@@ -128,26 +121,12 @@ def test_missing_readings_are_dropped_and_labels_spread_back(tmp_path_factory, m
     assert (back[stored.kept] == data["label"][stored.kept] + 5).all()
 
 
-def test_points_in_the_sensor_itself_are_no_readings(tmp_path):
-    data = plane()
-    for axis in ("x", "y", "z"):
-        data[axis][:7] = 0.0
-    assert len(read_cloud(write(tmp_path / "a.pcd", data), CloudConfig())) == 53
-
-
 def test_label_divisor_joins_parts_to_objects(tmp_path):
     data = plane()
     data["label"] = 20 + np.arange(60) % 3
     data["label"][:5] = 3
     stored = read_stored_cloud(write(tmp_path / "a.pcd", data), label_divisor=10)
     assert (stored.labels == np.where(np.arange(60) < 5, 0, 2)).all()
-
-
-@pytest.mark.parametrize("field_type", ["<f4", "<i4", "<u1"])
-def test_labels_may_be_of_any_number_type(tmp_path, field_type):
-    data = np.zeros(6, [("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("label", field_type)])
-    data["z"], data["label"] = 1.0, [0, 1, 2, 3, 4, 5]
-    assert read_stored_cloud(write(tmp_path / "a.pcd", data)).labels.tolist() == [0, 1, 2, 3, 4, 5]
 
 
 @pytest.mark.parametrize(("value", "kind"), [(-1, "<i4"), (0.5, "<f4"), (np.nan, "<f4"), (65535, "<u4")])
@@ -193,15 +172,6 @@ def test_a_compressed_file_that_promises_gigabytes_is_refused(tmp_path):
     refused(path, "the header lies")
 
 
-def test_rubbish_in_place_of_compressed_data_is_refused(tmp_path):
-    path = write(tmp_path / "a.pcd", plane(), "binary_compressed")
-    content = bytearray(path.read_bytes())
-    start = len(header(plane(), "binary_compressed")) + 8
-    content[start:] = bytes([0xFF]) * (len(content) - start)
-    path.write_bytes(bytes(content))
-    refused(path, "error in compressed data")
-
-
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
@@ -209,21 +179,16 @@ def test_rubbish_in_place_of_compressed_data_is_refused(tmp_path):
         ({"FIELDS": "x y z rgba"}, "do not agree"),
         ({"FIELDS": "a b c d e"}, "no fields x y z"),
         ({"FIELDS": None}, "FIELDS"),
-        ({"FIELDS": "x y z x label"}, "occurs more than once"),
         ({"SIZE": "4 4 4 4"}, "header is not valid"),
         ({"SIZE": "4 4 4 4 3"}, "header is not valid"),
-        ({"SIZE": "4 4 4 4 -4"}, "SIZE"),
         ({"SIZE": "4 4 4 4 99999999999999999999"}, "header is not valid"),
         ({"TYPE": "F F F U X"}, "TYPE"),
         ({"TYPE": "U F F U U"}, "floating point"),
-        ({"COUNT": "1 1 1 1 0"}, "COUNT"),
         ({"COUNT": "1 1 1 1 5"}, "header lies"),
         ({"POINTS": "many"}, "many"),
-        ({"POINTS": "-60"}, "POINTS"),
         ({"POINTS": None}, "POINTS"),
         ({"POINTS": 0, "WIDTH": 0}, "no points"),
         ({"VIEWPOINT": "0 0 0"}, "VIEWPOINT"),
-        ({"VIEWPOINT": "a b c d e f g"}, "header is not valid"),
         ({"DATA": "zip"}, "DATA"),
         ({"DATA": None}, "no DATA line"),
     ],
@@ -309,14 +274,6 @@ def test_the_vertices_of_a_mesh_are_a_cloud(tmp_path):
     assert np.allclose(np.abs(stored.points), (0.05, 0.1, 0.15))
     assert stored.normals is not None
     assert stored.labels is None
-
-
-@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
-@pytest.mark.parametrize("points", [61, 4_000_000_000])
-def test_a_ply_header_that_lies_is_refused(tmp_path, encoding, points):
-    path = tmp_path / "a.ply"
-    path.write_bytes(ply(ply_plane(), encoding, points))
-    refused(path, "header lies")
 
 
 @pytest.mark.parametrize(

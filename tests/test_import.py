@@ -26,11 +26,15 @@ from bag_files import (
     write_tum,
 )
 from conftest import run_command, without_labels
-from PIL import Image
+from hypothesis import given
+from hypothesis import settings as limits
+from hypothesis import strategies as st
 from rosbags.typesys import get_types_from_msg
 
+from caryatid.config import RecordingConfig
 from caryatid.geometry import transforms
 from caryatid.io import read_recording, write_recording
+from caryatid.io.importing import apart, choose_views
 from caryatid.scene import Scene
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)
@@ -77,14 +81,6 @@ def test_a_bag_becomes_the_views_it_holds(tmp_path, views, kind):
     same_views(recording, views)
 
 
-@pytest.mark.parametrize("suffix", ["db3", "mcap"])
-def test_the_file_of_a_bag_will_do(tmp_path, views, suffix):
-    folder = bag_of(tmp_path, views, ("two", "mcap" if suffix == "mcap" else "sqlite3"))
-    (file,) = folder.glob(f"*.{suffix}")
-    file.rename(tmp_path / file.name)
-    same_views(imported(tmp_path, tmp_path / file.name, *ALL), views)
-
-
 def test_a_bag_that_does_not_say_how_messages_are_laid_out(tmp_path, views):
     """As ROS 2 wrote them before Iron."""
     folder = bag_of(tmp_path, views, ("two", "sqlite3"))
@@ -92,10 +88,6 @@ def test_a_bag_that_does_not_say_how_messages_are_laid_out(tmp_path, views):
     with sqlite3.connect(file) as database:
         database.execute("DELETE FROM message_definitions")
     same_views(imported(tmp_path, folder, *ALL), views)
-
-
-def test_names_of_frames_may_begin_with_a_slash(tmp_path, views):
-    same_views(imported(tmp_path, bag_of(tmp_path, views, slash="/"), *ALL), views)
 
 
 def test_transforms_of_the_first_kind(tmp_path, views):
@@ -113,6 +105,7 @@ def test_transforms_of_the_first_kind(tmp_path, views):
     same_views(imported(tmp_path, tmp_path / "one.bag", *TOPICS, "--tf", WORLD), views, colour=False)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["bag", "tum"])
 def test_the_graph_is_that_of_the_direct_recording(tmp_path, views, source, settings):
     """Masks are no part of what robots record; they are put beside both."""
@@ -133,12 +126,6 @@ def test_the_graph_is_that_of_the_direct_recording(tmp_path, views, source, sett
         assert (item.id, item.shape.kind) == (other.id, other.shape.kind)
         points_world, _ = item.shape.surface(0.01)
         assert np.abs(other.shape.signed_distance(points_world)).max() < 0.001
-
-
-def test_without_colour_the_fullest_depth_is_the_sharpest(tmp_path, views):
-    recording = imported(tmp_path, bag_of(tmp_path, views), *TOPICS, "--tf", WORLD)
-    same_views(recording, views, colour=False)
-    assert all(view.rgb is None for view in recording)
 
 
 def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views, capsys):
@@ -168,9 +155,7 @@ def one_frame(tmp_path, views, depth=None, colour=None, **camera):
     return tmp_path / "one.bag"
 
 
-@pytest.mark.parametrize("encoding", ["16UC1", "mono16"])
-@pytest.mark.parametrize("big", [False, True])
-@pytest.mark.parametrize("padding", [0, 6])
+@pytest.mark.parametrize(("encoding", "big", "padding"), [("16UC1", False, 0), ("mono16", True, 6)])
 def test_depth_in_millimetres(tmp_path, views, encoding, big, padding):
     millimetres = np.rint(views[0].depth * 1000.0).astype(np.uint16)
     bag = one_frame(tmp_path, views, lambda b, t: b.image(t, millimetres, encoding, padding=padding, big=big))
@@ -226,13 +211,6 @@ def test_colour(tmp_path, views, encoding):
     assert np.array_equal(view.rgb, rgb)
 
 
-def test_grey_images_have_three_equal_channels(tmp_path, views):
-    grey = views[0].rgb[:, :, 1]
-    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, grey, "mono8", padding=3))
-    (view,) = imported(tmp_path, bag, *TOPICS, "--rgb", RGB)
-    assert np.array_equal(view.rgb, np.dstack([grey] * 3))
-
-
 @pytest.mark.parametrize(("pack", "form"), [(png, "rgb8; png compressed bgr8"), (jpeg, "jpeg")])
 def test_compressed_colour(tmp_path, views, pack, form):
     rgb = views[0].rgb
@@ -278,24 +256,6 @@ def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
     assert [view["frame"] for view in document["views"]] == [0, 4]
 
 
-@pytest.mark.parametrize("kind", ["bag", "tum"])
-def test_a_frame_with_nothing_near_is_one_without_depth(tmp_path, views, capsys, kind):
-    nothing = replace(views[1], depth=np.where(views[1].depth > 0.0, np.float32(12.0), np.float32(0.0)))
-    if kind == "bag":
-        source, options = bag_of(tmp_path, [views[0], nothing]), ALL
-    else:
-        source, options = (
-            tum_folder(tmp_path, [views[0], nothing]),
-            ("--camera", camera_file(tmp_path, views[0].K)),
-        )
-    assert summary(tmp_path, capsys, source, *options)["skipped"] == {"hardly any depth": 1}
-
-
-def test_as_many_views_as_wanted(tmp_path, views, capsys):
-    document = summary(tmp_path, capsys, bag_of(tmp_path, views), *ALL, "--views", 2)
-    assert document["skipped"] == {"more than are wanted": 1}
-
-
 def test_a_broken_image_is_left_out(tmp_path, views, capsys):
     with BagFile(tmp_path / "one.bag") as bag:
         for index, view in enumerate(views):
@@ -308,13 +268,6 @@ def test_a_broken_image_is_left_out(tmp_path, views, capsys):
             bag.write("/tf", pose, time)
     document = summary(tmp_path, capsys, tmp_path / "one.bag", *TOPICS, "--tf", WORLD)
     assert document["skipped"] == {"broken": 1}
-
-
-def test_what_is_said_ends_with_what_to_do_next(tmp_path, views, capsys):
-    imported(tmp_path, bag_of(tmp_path, views, without_pose=(0,)), *ALL)
-    told = capsys.readouterr().err.splitlines()
-    assert told[0] == "one.bag: 2 views of 3 frames; skipped: 1 no pose"
-    assert f"caryatid extract {tmp_path / 'out'}" in told[1]
 
 
 # Bags that will not do
@@ -348,11 +301,6 @@ def test_a_bag_of_a_later_version_is_not_called_damaged(tmp_path, views, capsys)
     path.write_text(path.read_text().replace("version: 9", "version: 99"))
     told = refused(capsys, bag, *ALL, "--out", tmp_path / "out")
     assert "is of a kind rosbags does not read (Rosbag2 version 99 not supported" in told
-
-
-def test_a_bag_without_transforms(tmp_path, views, capsys):
-    told = refused(capsys, one_frame(tmp_path, views), *TOPICS, "--tf", "map", "--out", tmp_path / "out")
-    assert "holds no transforms; record /tf and /tf_static, or leave --tf out" in told
 
 
 def test_depth_that_is_not_registered(tmp_path, views, capsys):
@@ -407,13 +355,7 @@ def test_depth_that_cannot_be_decoded(tmp_path, views, capsys, leftovers, make, 
     assert leftovers() == {"one.bag"}
 
 
-def test_colour_of_an_unknown_encoding(tmp_path, views, capsys):
-    rgb = views[0].rgb
-    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, rgb[:, :, 0], "bayer_rggb8"))
-    told = refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
-    assert "its encoding 'bayer_rggb8' is none of colour; record a topic with rgb8, bgr8" in told
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
 def test_a_bag_that_was_cut_off(tmp_path, views, kind, capsys):
     bag = bag_of(tmp_path, views, kind)
@@ -426,6 +368,7 @@ def test_a_bag_that_was_cut_off(tmp_path, views, kind, capsys):
         assert set(tmp_path.iterdir()) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
 def test_a_bag_with_wrong_bytes_is_read_or_refused_in_one_line(tmp_path, views, kind, capsys):
     bag = bag_of(tmp_path, views, kind)
@@ -459,26 +402,12 @@ def test_an_empty_bag(tmp_path, kind, capsys):
     assert "the bag is empty" in refused(capsys, tmp_path / name, *TOPICS, "--out", tmp_path / "out")
 
 
-@pytest.mark.parametrize("name", ["x.bag", "x.mcap", "x.db3"])
-def test_an_empty_file(tmp_path, name, capsys):
-    (tmp_path / name).touch()
-    assert "the bag is empty" in refused(capsys, tmp_path / name, *TOPICS, "--out", tmp_path / "out")
-
-
 def test_what_is_neither_a_bag_nor_a_folder_of_the_benchmark(tmp_path, capsys, recording):
     (tmp_path / "x.zip").write_bytes(b"PK")
     for source in (tmp_path / "x.zip",):
         told = refused(capsys, source, *TOPICS, "--out", tmp_path / "out")
         assert "is of no known format" in told
     assert "there is no such file" in refused(capsys, tmp_path / "no.bag", "--out", tmp_path / "out")
-
-
-def test_a_folder_with_other_files_is_never_touched(tmp_path, views, capsys):
-    bag = bag_of(tmp_path, views)
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/mine.txt").write_text("mine")
-    assert "holds other files" in refused(capsys, bag, *ALL, "--out", tmp_path / "out")
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["mine.txt"]
 
 
 def test_without_the_library_the_extra_is_named(tmp_path, views, capsys, monkeypatch):
@@ -527,32 +456,6 @@ def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, name,
     )
 
 
-def test_a_folder_without_poses_gives_a_single_frame(tmp_path, views, capsys):
-    folder = tum_folder(tmp_path, views)
-    (folder / "groundtruth.txt").unlink()
-    recording = imported(tmp_path, folder, "--camera", camera_file(tmp_path, views[0].K))
-    assert len(recording) == 1
-    assert "no groundtruth.txt: poses are not known" in capsys.readouterr().err
-
-
-def test_poses_of_a_folder_are_interpolated(tmp_path, views):
-    folder = tum_folder(tmp_path, views[:1])
-    lines = (folder / "groundtruth.txt").read_text().splitlines()
-    time, *numbers = lines[-1].split()
-    later = [float(n) + (0.01 if k == 0 else 0.0) for k, n in enumerate(numbers)]
-    rows = [
-        f"{float(time) - 0.05:.6f} {' '.join(numbers)}",
-        f"{float(time) + 0.05:.6f} {' '.join(map(str, later))}",
-    ]
-    (folder / "groundtruth.txt").write_text("\n".join(rows))
-    (view,) = imported(tmp_path, folder, "--camera", camera_file(tmp_path, views[0].K))
-    moved = transforms.invert(views[0].T_world_camera) @ view.T_world_camera
-    assert np.allclose(
-        views[0].T_world_camera[:3, 3] + (0.005, 0.0, 0.0), view.T_world_camera[:3, 3], atol=1e-6
-    )
-    assert np.allclose(moved[:3, :3], np.eye(3), atol=1e-6)
-
-
 def spoil(name, text):
     return lambda folder: (folder / name).write_text(text)
 
@@ -593,14 +496,6 @@ def test_a_camera_that_is_not_known_or_does_not_fit(tmp_path, views, capsys):
     assert "are for bags" in refused(capsys, folder, *TOPICS, *out)
 
 
-def test_colour_of_another_size(tmp_path, views, capsys):
-    folder = tum_folder(tmp_path, views)
-    for path in (folder / "rgb").iterdir():
-        Image.fromarray(views[0].rgb[:60]).save(path)
-    told = refused(capsys, folder, "--camera", camera_file(tmp_path, views[0].K), "--out", tmp_path / "out")
-    assert "its colour image is of another size" in told
-
-
 def lying(views):
     """The same pictures in a world that lies on its side."""
     T = transforms.rigid(transforms.rotation_from_vector((1.4, 0.5, 0.0)), (0.3, -0.2, 1.0))
@@ -613,6 +508,7 @@ def up_from(view, upright):
     return np.rad2deg(transforms.angle_between(up, right))
 
 
+@pytest.mark.slow
 def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views, capsys):
     folder = tum_folder(tmp_path, lying(views))
     options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
@@ -630,12 +526,6 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     assert counts[0] == counts[1]
 
 
-def test_a_level_world_is_hardly_turned(tmp_path, views):
-    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
-    levelled = imported(tmp_path, tum_folder(tmp_path, views), *options)
-    assert max(up_from(view, upright) for view, upright in zip(levelled, views, strict=True)) < 0.5
-
-
 def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, capsys):
     turns = [
         transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
@@ -648,3 +538,65 @@ def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views,
     told = refused(capsys, folder, "--camera", camera, "--level", "--out", tmp_path / "out")
     assert "1 of 3 views agree on where up is" in told
     assert not (tmp_path / "out").exists()
+
+
+# Which frames become views
+
+CONFIG = RecordingConfig()
+
+
+def along_a_line(positions):
+    return np.stack([transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions])
+
+
+def test_a_camera_at_rest_gives_one_view_the_sharpest():
+    times = np.arange(10) / 30.0
+    sharpness = np.full(10, 1.0)
+    sharpness[6] = 1.2
+    choice = choose_views(times, sharpness, along_a_line(np.zeros(10)), CONFIG)
+    assert (choice.kept, choice.alike) == ((6,), 9)
+
+
+def test_blurred_frames_are_left_out_and_sharp_ones_beside_them_taken():
+    times = np.arange(40) * 0.1
+    sharpness = np.where(np.arange(40) % 3 == 0, 10.0, 5.0)
+    choice = choose_views(times, sharpness, along_a_line(times), CONFIG)
+    assert len(choice.kept) > 8
+    assert all(k % 3 == 0 for k in choice.kept)
+    assert choice.blurred == 26
+
+
+def test_a_turn_without_a_step_is_another_view_and_coming_back_is_not():
+    turns = np.radians([0.0, 4.0, 12.0, 4.0, 0.0])
+    poses = np.stack(
+        [transforms.rigid(transforms.rotation_from_vector((0.0, a, 0.0)), np.zeros(3)) for a in turns]
+    )
+    choice = choose_views(np.arange(5) * 1.0, np.ones(5), poses, CONFIG)
+    assert choice.kept == (0, 2)
+
+
+def test_of_too_many_those_farthest_apart_stay():
+    positions = np.concatenate([np.linspace(0.0, 2.0, 11), [10.0, 20.0]])
+    config = RecordingConfig(max_views=3)
+    choice = choose_views(np.arange(13) * 1.0, np.ones(13), along_a_line(positions), config)
+    assert (choice.kept, choice.spare) == ((0, 11, 12), 10)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(1, 12))
+@limits(max_examples=50, deadline=None)
+def test_views_are_few_apart_and_every_frame_is_accounted_for(seed, count, most):
+    rng = np.random.default_rng(seed)
+    times = np.sort(rng.uniform(0.0, 10.0, count))
+    walk = np.cumsum(rng.normal(0.0, 0.05, (count, 3)), axis=0)
+    poses = np.array([transforms.rigid(transforms.random_rotation(rng), p) for p in walk]).reshape(-1, 4, 4)
+    if seed % 2:
+        poses[:, :3, :3] = np.eye(3)
+    config = RecordingConfig(max_views=most)
+    choice = choose_views(times, rng.uniform(0.5, 1.0, count), poses, config)
+    assert len(choice.kept) + choice.blurred + choice.alike + choice.spare == count
+    assert (count == 0) == (len(choice.kept) == 0)
+    assert len(choice.kept) <= most
+    assert list(choice.kept) == sorted(set(choice.kept))
+    for k in choice.kept:
+        others = [j for j in choice.kept if j != k]
+        assert (apart(poses[others], poses[k], config) > 1.0).all()

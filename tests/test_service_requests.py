@@ -25,6 +25,8 @@ from caryatid.service.app import make_app
 from caryatid.service.pool import SessionPool
 from caryatid.sessions import Session
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = 12
 """Requests of each kind."""
 

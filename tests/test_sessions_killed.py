@@ -21,6 +21,8 @@ from sessions import Starter, depth_png, labels_png, views_around
 
 from caryatid.sessions import Session
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def around():

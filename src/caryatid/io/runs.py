@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
-from caryatid.io.json_files import field, json_text, numbers, read_json, rigid_transform
+from caryatid.io.json_files import Numbers, json_text, parse_json, read_json
 from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import SUPPORT_LABEL
 
@@ -191,6 +191,18 @@ class Run:
     views: tuple[RunView, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class _RunFile:
+    views: int
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _View:
+    name: str
+    T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
+    K: Annotated[Array, Numbers(3, 3)] | None = None
+
+
 def read_run(folder: str | Path) -> Run:
     """Read a run folder; label images are loaded when asked for.
 
@@ -204,7 +216,7 @@ def read_run(folder: str | Path) -> Run:
     record = read_json(path, "give the folder a run was written to with --out")
     if record.get("format") != FORMAT or record.get("version") not in (1, VERSION):
         raise InputError(path, f"is not of format '{FORMAT}', version 1 or {VERSION}", "run caryatid again")
-    count: int = field(record, "views", int, str(path))
+    count = parse_json(_RunFile, record, path, "run caryatid again").views
     return Run(
         folder,
         record,
@@ -228,14 +240,14 @@ def _view_folder(index: int) -> str:
 def _read_view(folder: Path, index: int) -> RunView:
     path = folder / "view.json"
     record = read_json(path, "run caryatid again")
-    T, K = record.get("T_world_camera"), record.get("K")
+    given = parse_json(_View, record, path, "run caryatid again")
     image = folder / "labels.png"
     return RunView(
         index=index,
-        name=field(record, "name", str, str(path)),
+        name=given.name,
         graph=read_graph(folder / "graph.json"),
-        T_world_camera=None if T is None else rigid_transform(T, f"{path}: T_world_camera"),
-        K=None if K is None else numbers(K, (3, 3), f"{path}: K"),
+        T_world_camera=given.T_world_camera,
+        K=given.K,
         record=record,
         labels_path=image if image.exists() else folder / "labels.npy",
         folder=folder,

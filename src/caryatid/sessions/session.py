@@ -21,9 +21,10 @@ from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self, get_args
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
+from annotated_types import Ge
 from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike, NDArray
 
@@ -33,7 +34,7 @@ from caryatid.errors import InputError
 from caryatid.exploration import reason_to_stop
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text
-from caryatid.io.json_files import field, read_json
+from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import (
     StagedFolder,
     clear_partials,
@@ -86,6 +87,17 @@ class WrongNumberError(InputError):
 
 
 @dataclass(frozen=True, slots=True)
+class _File:
+    """What is read of session.json."""
+
+    segmentation: SegmentationMethod | None
+    seed: Annotated[int, Ge(0)]
+    planner: str
+    robot: str
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
 class Beginning:
     """What a session was begun with.
 
@@ -130,26 +142,19 @@ class Beginning:
         """
         if not path.is_file():
             raise InputError(path.parent, "holds no session", "begin one with `caryatid session new`")
-        document, where = read_json(path), str(path)
-        release = field(document, "caryatid", str, where, default=FIRST_RELEASE)
+        document = read_json(path)
+        release = document.get("caryatid", FIRST_RELEASE)
         if document.get("format") != FORMAT or document.get("version") != VERSION:
             reason = f"is no '{FORMAT}' of version {VERSION}; caryatid {release} wrote it"
             raise InputError(path, reason, "use the release that wrote it")
-        segmentation = field(document, "segmentation", (str, type(None)), where)
-        if segmentation not in (None, *get_args(SegmentationMethod)):
-            raise InputError(path, f"'segmentation' is '{segmentation}'", "use labels, auto or null")
-        seed = field(document, "seed", int, where)
-        if seed < 0:
-            raise InputError(path, f"'seed' is {seed}", "give 0 or more")
+        given = parse_json(_File, document, path)
         try:
-            settings = changed_settings(Config(), field(document, "settings", dict, where), where)
+            settings = changed_settings(Config(), given.settings, str(path))
         except InputError as error:
             reason = f"was begun with caryatid {release}, whose settings this release does not take"
-            raise InputError(
-                path, f"{reason} ({error})", "open it with that release, or add its views to a new session"
-            ) from None
-        planner, robot = (field(document, key, str, where) for key in ("planner", "robot"))
-        return cls(settings, segmentation, seed, planner, robot)
+            remedy = "open it with that release, or add its views to a new session"
+            raise InputError(path, f"{reason} ({error.reason})", remedy) from None
+        return cls(settings, given.segmentation, given.seed, given.planner, given.robot)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
