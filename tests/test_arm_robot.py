@@ -13,10 +13,9 @@ from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import explore, next_best_view
 from caryatid.geometry import transforms
-from caryatid.robots import Posture, Unreachable, home_view, view_sphere_of
+from caryatid.robots import Posture, Unreachable, home_view
 from caryatid.robots.arm import RADII, RADIUS_SHARE, REASONS, UNCONFIRMED, ArmRobot
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.reachability import sample_reachability
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
@@ -71,24 +70,10 @@ class TestViewSphere:
         fixed = replace(CONFIG, radius=(0.62, 0.62))
         assert arm(refuse, config=fixed).view_sphere(PROPOSED).radius == 0.62
 
-    def test_the_centre_can_be_the_robots(self):
-        sphere = arm(centre_world=(0.1, 0.0, 0.8)).view_sphere(PROPOSED)
-        np.testing.assert_array_equal(sphere.centre_world, (0.1, 0.0, 0.8))
-
     def test_its_own_answer_is_answered_with_itself(self):
         robot = arm(centre_world=(0.1, 0.0, 0.8))
         sphere = robot.view_sphere(PROPOSED)
         assert robot.view_sphere(sphere) is sphere is robot.view_sphere(PROPOSED)
-
-    def test_another_table_has_another_sphere(self):
-        robot = arm()
-        robot.view_sphere(PROPOSED)
-        moved = replace(PROPOSED, centre_world=np.array([0.2, 0.1, 0.7]))
-        np.testing.assert_array_equal(robot.view_sphere(moved).centre_world, moved.centre_world)
-
-    def test_a_humanoid_takes_what_it_is_proposed(self):
-        floor = FloorGrid.from_boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), RobotConfig())
-        assert view_sphere_of(HumanoidRobot(floor, RobotConfig()), PROPOSED) is PROPOSED
 
 
 class TestCandidates:
@@ -141,7 +126,7 @@ class TestCandidates:
         assert robot.move_to(found.T_world_camera[7]) == pytest.approx(found.path_length[7])
         np.testing.assert_array_equal(robot.T_world_camera, found.T_world_camera[7])
 
-    @pytest.mark.parametrize("seed", range(5))
+    @pytest.mark.parametrize("seed", range(2))
     def test_base_and_table_moved_together_change_nothing(self, seed):
         rng = np.random.default_rng(seed)
         T = base_at(*rng.uniform(-3.0, 3.0, 3), float(rng.uniform(-180.0, 180.0)))
@@ -155,13 +140,6 @@ class TestCandidates:
             assert elsewhere.rejected == here.rejected
             np.testing.assert_array_equal(elsewhere.indices, here.indices)
             np.testing.assert_allclose(elsewhere.T_world_camera, T @ here.T_world_camera, atol=1e-9)
-
-    def test_a_map_offers_only_poses_it_holds(self):
-        reach = sample_reachability(gantry, LIMITS, 100_000, np.random.default_rng(0), CONFIG)
-        robot = arm(reach, base_at(-0.4, 0.0, 0.9))
-        found = robot.candidates(robot.view_sphere(PROPOSED))
-        assert len(found) > 20
-        assert reach(transforms.invert(robot.T_world_base) @ found.T_world_camera).all()
 
 
 class TestSolve:
@@ -197,13 +175,6 @@ class TestSolve:
         with pytest.raises(PlanningError, match="cannot go to this view"):
             arm(never).move_to(transforms.look_at(eye, TOP))
 
-    def test_a_refused_move_leaves_it_where_it_is(self):
-        here = transforms.look_at((-0.3, 0.0, 1.2), TOP)
-        robot = arm(T_world_camera=here)
-        with pytest.raises(PlanningError):
-            robot.move_to(transforms.look_at((5.0, 0.0, 1.2), TOP))
-        np.testing.assert_array_equal(robot.T_world_camera, here)
-
     def test_where_it_is_is_taken_as_it_is(self):
         class Real(ArmRobot):
             def move_to(self, T_world_camera):
@@ -213,10 +184,6 @@ class TestSolve:
         np.testing.assert_array_equal(Real(never, BASE, T_world_camera=here).T_world_camera, here)
         with pytest.raises(InputError, match="T_world_camera"):
             Real(never, BASE, T_world_camera=np.ones((4, 4)))
-
-    def test_it_is_nowhere_before_it_is_put_somewhere(self):
-        with pytest.raises(PlanningError, match="nowhere yet"):
-            _ = arm().T_world_camera
 
     def test_a_base_that_is_no_pose_is_refused(self):
         with pytest.raises(InputError, match="T_world_base"):
@@ -231,6 +198,7 @@ class TestSolve:
             robot.view_sphere(PROPOSED)
 
 
+@pytest.mark.slow
 class TestExploring:
     SETTINGS = Config(
         sensor=SENSOR,
@@ -282,16 +250,6 @@ class TestExploring:
             assert one.sphere.radius == self.SETTINGS.active.sphere_radius
             np.testing.assert_array_equal(one.view.T_world_camera, other.view.T_world_camera)
 
-    def test_the_next_view_is_the_one_the_loop_takes(self):
-        stage = self.stage()
-        step = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
-        again = self.stage()
-        scene = Scene(self.SETTINGS)
-        scene.update(again.camera.capture(again.robot.T_world_camera))
-        decision = next_best_view(scene, again.robot)
-        np.testing.assert_array_equal(decision.T_world_camera, step.decision.T_world_camera)
-        assert decision.why == step.decision.why
-
     def test_where_nothing_is_in_reach_it_stops_with_reasons_and_counts(self):
         stage = self.stage()
         stage.robot._reachable = never
@@ -336,10 +294,6 @@ class TestExploring:
         assert step.stop == f"the robot could take none of 20 views: {UNCONFIRMED}"
         assert len(asked) == 20
 
-    def test_no_first_view_that_is_confirmed_is_an_error(self):
-        with pytest.raises(PlanningError, match=f"can be reached: {UNCONFIRMED}"):
-            home_view(arm(confirm=lambda T: False), PROPOSED, RobotConfig())
-
     def test_the_first_view_is_the_reachable_one_nearest_to_home(self):
         robot = arm()
         home = home_view(robot, PROPOSED, RobotConfig(home=(90.0, 40.0)))
@@ -377,6 +331,7 @@ class Rig:
         return view.depth, view.rgb
 
 
+@pytest.mark.slow
 def test_the_hardware_of_the_page_on_robots_goes_around_the_table():
     (code,) = (text for _, _, text in blocks(PAGE) if "class RealArm" in text)
     page = {}

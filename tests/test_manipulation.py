@@ -1,9 +1,14 @@
+"""Safe orders, rehearsals, lifts and scenes taken apart, in Python and as commands."""
+
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import SMALL, run_command
 from synthetic import box, sphere, table_object, thing
 
 from caryatid.config import Config, LiftConfig, RehearsalConfig, SupportConfig
@@ -11,24 +16,26 @@ from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.graph import Support, SupportGraph
+from caryatid.io.runs import read_run
 from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses_of
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.manipulation.rehearsal import Rehearsal
+from caryatid.simulation.lifting import ASIDE, CLEARANCE, Lifting
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import TABLE_HEIGHT, Solid, build_spec, scene_from_spec
-from caryatid.support.relations import infer, predict_removal
+from caryatid.support.relations import infer
 
 CONFIG = replace(Config(), rehearsal=RehearsalConfig(draws=2), lift=LiftConfig(watch=1.0))
 TOP = TABLE_HEIGHT
 FIRM = Uncertainty(np.full(3, 0.001), np.full(3, 0.005), np.full(3, 0.001), np.full(6, 0.001))
 
 
-def graph_of(*shapes, uncertainty=FIRM) -> SupportGraph:
+def graph_of(*shapes, uncertainty=FIRM):
     objects = [thing(k, shape, uncertainty=uncertainty) for k, shape in enumerate(shapes, start=1)]
     return infer([table_object(TOP), *objects], SupportConfig())
 
 
-def tower() -> SupportGraph:
+def tower():
     """o2 on o1, o3 on o2, and o4 beside them."""
     return graph_of(
         box((0.0, 0.0, TOP + 0.03), (0.12, 0.12, 0.06)),
@@ -38,7 +45,7 @@ def tower() -> SupportGraph:
     )
 
 
-def counterweight() -> SupportGraph:
+def counterweight():
     """A plank o2 that juts out from the block o1, and what keeps it there: o3 on its other end."""
     return graph_of(
         box((0.0, 0.0, TOP + 0.05), (0.1, 0.12, 0.1)),
@@ -47,59 +54,13 @@ def counterweight() -> SupportGraph:
     )
 
 
-def ids(effects) -> dict[str, bool]:
-    return {e.object_id: e.certain for e in effects}
-
-
-class TestPredictRemoval:
-    def test_all_that_stands_on_it_falls_for_certain(self):
-        assert ids(predict_removal(tower(), "o1", SupportConfig())) == {"o2": True, "o3": True}
-        assert ids(predict_removal(tower(), "o2", SupportConfig())) == {"o3": True}
-
-    @pytest.mark.parametrize("nothing", ["o3", "o4"])
-    def test_what_carries_nothing_moves_nothing(self, nothing):
-        assert predict_removal(tower(), nothing, SupportConfig()) == ()
-
-    def test_the_reason_names_what_is_lost(self):
-        (effect,) = predict_removal(tower(), "o2", SupportConfig())
-        assert "o2" in effect.why
-
-    def test_a_bridge_falls_with_one_pillar_but_a_slab_on_four_legs_stays(self):
-        pillars = [box((x, 0.0, TOP + 0.05), (0.05, 0.08, 0.1)) for x in (-0.1, 0.1)]
-        bridge = graph_of(*pillars, box((0.0, 0.0, TOP + 0.11), (0.3, 0.08, 0.02)))
-        assert ids(predict_removal(bridge, "o1", SupportConfig())) == {"o3": True}
-        legs = [box((x, y, TOP + 0.05), (0.05, 0.05, 0.1)) for x in (-0.1, 0.1) for y in (-0.1, 0.1)]
-        middle = box((0.0, 0.0, TOP + 0.05), (0.08, 0.08, 0.1))
-        table = graph_of(*legs, middle, box((0.0, 0.0, TOP + 0.11), (0.3, 0.3, 0.02)))
-        assert predict_removal(table, "o5", SupportConfig()) == ()
-
-    def test_a_loss_that_is_uncertain_makes_an_effect_that_is(self):
-        graph = counterweight()
-        assert graph.support("o3", "o2") is not None
-        assert not graph.support("o3", "o2").certain
-        assert ids(predict_removal(graph, "o3", SupportConfig())) == {"o2": False}
-
-    def test_what_only_may_fall_makes_others_possible_too(self):
-        graph = counterweight()
-        rider = thing(4, sphere((0.24, 0.0, TOP + 0.14), 0.02), uncertainty=FIRM)
-        loaded = infer([*graph.objects, rider], SupportConfig())
-        found = ids(predict_removal(loaded, "o3", SupportConfig()))
-        assert found.get("o4") is False
-
-    def test_unknown_objects_and_the_table_are_refused(self):
-        with pytest.raises(InputError, match="no such object"):
-            predict_removal(tower(), "o9", SupportConfig())
-        with pytest.raises(InputError, match="support surface"):
-            predict_removal(tower(), "o0", SupportConfig())
-
-
 class TestOrder:
     def test_a_tower_is_taken_from_the_top(self):
-        order = plan_order(tower(), CONFIG)
+        order = plan_order(tower(), CONFIG, seed=3)
         assert order.safe
-        taken = [s.object_id for s in order.steps]
-        assert [i for i in taken if i != "o4"] == ["o3", "o2", "o1"]
+        assert [s.object_id for s in order.steps if s.object_id != "o4"] == ["o3", "o2", "o1"]
         assert all(s.safe and s.risk == 0.0 and s.hold == () and s.why for s in order.steps)
+        assert plan_order(tower(), CONFIG, seed=3, threads=2) == order
 
     def test_to_get_at_one_object_only_what_is_in_the_way_is_taken(self):
         assert [s.object_id for s in plan_order(tower(), CONFIG, goal="o2").steps] == ["o3", "o2"]
@@ -114,11 +75,6 @@ class TestOrder:
         held = plan_order(counterweight(), CONFIG, hands=2)
         assert held.safe
         assert (held.steps[0].object_id, held.steps[0].hold) == ("o3", ("o2",))
-
-    def test_threads_and_repetition_change_nothing(self):
-        first = plan_order(tower(), CONFIG, seed=3)
-        assert plan_order(tower(), CONFIG, seed=3) == first
-        assert plan_order(tower(), CONFIG, seed=3, threads=2) == first
 
     def test_nothing_to_take_and_unknown_goals_are_refused(self):
         with pytest.raises(InputError, match="no objects"):
@@ -150,51 +106,140 @@ class TestRehearsal:
         assert rehearsal.left() == ["o1", "o2", "o4"]
         assert set(rehearsal.try_lift("o1").harmed) == {"o2"}
 
-    def test_draws_differ_by_uncertainty_and_the_first_is_what_was_extracted(self):
-        unsure = Uncertainty(np.full(3, 0.01), np.full(3, 0.05), np.full(3, 0.01), np.full(6, 0.01))
-        graph = graph_of(box((0.0, 0.0, TOP + 0.03), (0.1, 0.1, 0.06)), uncertainty=unsure)
-        rehearsal = Rehearsal(graph, CONFIG, np.random.default_rng(0))
-        first, second = (s.lifting.start[0, :3] for s in rehearsal._scenes)
-        np.testing.assert_allclose(first, (0.0, 0.0, TOP + 0.03), atol=1e-9)
-        assert 1e-4 < np.linalg.norm(second - first) < 0.05
-
 
 @pytest.fixture(scope="module")
 def scene():
     """The tower in physics."""
     solids = [Solid(o.shape) for o in tower().objects if o.role == "object"]
-    return scene_from_spec(build_spec(solids, "tower"), "tower", "tower")
+    return scene_from_spec(build_spec(solids, "tower"), "tower", "test")
 
 
 BODIES = {f"o{k}": f"object{k - 1}" for k in range(1, 5)}
 
 
 class TestDismantling:
-    def test_a_safe_order_comes_true(self, scene):
+    def test_a_safe_order_comes_true_and_a_wrong_one_names_its_harm(self, scene):
+        assert bodies_of(tower(), true_scene_from_simulation(scene, ground_truth(scene))) == BODIES
         order = plan_order(tower(), CONFIG)
         taken = list(dismantle(scene, order.steps, BODIES, CONFIG))
         assert [t.body for t in taken] == [BODIES[s.object_id] for s in order.steps]
         assert all(t.ok for t in taken)
-
-    def test_a_wrong_one_does_harm_and_names_it(self, scene):
-        (taken,) = dismantle(scene, [TakeStep("o1", (), True, 0.0, "")], BODIES, CONFIG)
-        assert not taken.ok
-        assert taken.disturbed == ("object1", "object2")
-
-    def test_what_is_not_there_cannot_be_taken(self, scene):
-        (taken,) = dismantle(scene, [TakeStep("o7", ("o8",), True, 0.0, "")], BODIES, CONFIG)
-        assert taken.body is None
-        assert taken.ok
-        assert taken.held == ()
+        (harm,) = dismantle(scene, [TakeStep("o1", (), True, 0.0, "")], BODIES, CONFIG)
+        assert not harm.ok
+        assert harm.disturbed == ("object1", "object2")
+        (nothing,) = dismantle(scene, [TakeStep("o7", ("o8",), True, 0.0, "")], BODIES, CONFIG)
+        assert (nothing.body, nothing.ok, nothing.held) == (None, True, ())
 
     def test_the_scene_stays_as_it_is_and_can_be_shown_otherwise(self, scene):
         before = poses_of(scene)
         (taken,) = dismantle(scene, [TakeStep("o3", (), True, 0.0, "")], BODIES, CONFIG)
-        np.testing.assert_array_equal(poses_of(scene), before)
-        shown = posed(scene, taken.film[2])
-        assert poses_of(shown)[2, 2] > before[2, 2] + 0.02
+        assert poses_of(posed(scene, taken.film[2]))[2, 2] > before[2, 2] + 0.02
         np.testing.assert_array_equal(poses_of(scene), before)
 
-    def test_objects_stand_for_the_bodies_they_overlap_most(self, scene):
-        truth = true_scene_from_simulation(scene, ground_truth(scene))
-        assert bodies_of(tower(), truth) == BODIES
+
+LOWER, UPPER, BESIDE = range(3)
+
+
+@pytest.fixture(scope="module")
+def stack():
+    """A box on a box, and one beside them, at rest on a table."""
+    return lifting(
+        box((0.0, 0.0, TOP + 0.03), (0.1, 0.1, 0.06)),
+        box((0.0, 0.0, TOP + 0.09), (0.08, 0.08, 0.06)),
+        box((0.2, 0.0, TOP + 0.025), (0.05, 0.05, 0.05)),
+    )
+
+
+def lifting(*shapes):
+    built = scene_from_spec(build_spec([Solid(s) for s in shapes], "test"), "test", "test")
+    lift = Lifting(built.spec, list(built.object_bodies.values()))
+    return lift, lift.rest(lift.start, (), 0.3)
+
+
+class TestLifting:
+    CONFIG = LiftConfig(watch=1.0)
+
+    def test_what_carries_nothing_is_lifted_without_harm_and_stays_away(self, stack):
+        lift, state = stack
+        once = lift.lift(state, UPPER, self.CONFIG)
+        assert not once.disturbed.any()
+        assert once.distance.max() < 0.002
+        assert once.state[UPPER, 2] > ASIDE / 2.0
+        then = lift.lift(once.state, LOWER, self.CONFIG)
+        assert not then.disturbed.any()
+        np.testing.assert_allclose(then.state[UPPER, :3], once.state[UPPER, :3], atol=1e-3)
+
+    def test_what_loses_its_support_is_disturbed_unless_it_is_held(self, stack):
+        lift, state = stack
+        before = state.copy()
+        for to_the_end in (True, False):
+            done = lift.lift(state, LOWER, self.CONFIG, to_the_end=to_the_end)
+            assert done.disturbed.tolist() == [False, True, False]
+        assert not lift.lift(state, LOWER, self.CONFIG, held=[UPPER]).disturbed.any()
+        np.testing.assert_array_equal(state, before)
+        ball, at_rest = lifting(
+            box((0.0, 0.0, TOP + 0.06), (0.06, 0.2, 0.12)),
+            box((0.1, 0.0, TOP + 0.06), (0.06, 0.2, 0.12)),
+            sphere((0.05, 0.0, TOP + 0.14), 0.035),
+        )
+        assert ball.lift(at_rest, 0, self.CONFIG).disturbed[2]
+
+    def test_an_object_goes_up_at_the_speed_asked_for_until_it_is_clear(self, stack):
+        lift, state = stack
+        heights = lift.lift(state, BESIDE, self.CONFIG).film[:, BESIDE, 2]
+        rising = heights[heights < ASIDE / 2.0]
+        clear = state[UPPER, 2] + 0.03 + CLEARANCE - (state[BESIDE, 2] - 0.025)
+        assert rising[-1] - state[BESIDE, 2] == pytest.approx(clear, abs=0.003)
+        slow = lift.lift(state, BESIDE, replace(self.CONFIG, speed=0.05)).film[:, BESIDE, 2]
+        assert (slow < ASIDE / 2.0).sum() == pytest.approx(2 * len(rising), abs=1)
+
+
+QUICK = ["--set=rehearsal.draws=2", "--set=lift.watch=1.0"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, scene_file):
+    """A run on the crate o1 with the can o2 on it."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    command = ["explore", scene_file, "--views", 2, "--out", folder, "--no-report", "--quiet"]
+    assert run_command(*command, *SMALL) == 0
+    return folder
+
+
+@pytest.mark.slow
+class TestCommands:
+    def test_an_order_is_a_document_or_a_table(self, run, capsys):
+        assert run_command("order", run, "--json", *QUICK) == 0
+        out = capsys.readouterr()
+        document = json.loads(out.out)
+        assert (out.err, document["safe"], document["refusal"]) == ("", True, None)
+        assert [step["object"] for step in document["steps"]] == ["o2", "o1"]
+        for step in document["steps"]:
+            assert step.keys() == {"object", "hold", "safe", "risk", "why"}
+            assert (step["safe"], step["hold"]) == (True, [])
+        assert run_command("order", run, "--goal", "o2", *QUICK) == 0
+        table = capsys.readouterr().out
+        assert "a safe order" in table
+        assert re.search(r"│ 1 │ o2 ", table)
+
+    def test_orders_that_cannot_be_are_errors(self, run, tmp_path, capsys):
+        assert run_command("order", run, "--goal", "o9", *QUICK) == 1
+        assert "o9: is no object of the graph; there are o1, o2" in capsys.readouterr().err
+        assert run_command("order", tmp_path, *QUICK) == 1
+        assert "run.json" in capsys.readouterr().err
+        assert run_command("order", run, "--hands", 3) == 2
+
+    def test_a_scene_is_taken_apart(self, scene_file, tmp_path, capsys):
+        command = ["dismantle", scene_file, "--views", 2, "--json", "--out", tmp_path / "run"]
+        assert run_command(*command, *SMALL, *QUICK) == 0
+        document = json.loads(capsys.readouterr().out)
+        assert (document["success"], document["left"]) == (True, [])
+        assert [(s["object"], s["body"], s["ok"], s["disturbed"]) for s in document["steps"]] == [
+            ("o2", "can", True, []),
+            ("o1", "crate", True, []),
+        ]
+        assert read_run(tmp_path / "run").record["dismantling"] == document
+
+    def test_a_recording_cannot_be_taken_apart(self, recording, capsys, leftovers):
+        assert run_command("dismantle", recording, "--views", 1, *QUICK, "--quiet") == 1
+        assert "no scene that can be simulated" in capsys.readouterr().err

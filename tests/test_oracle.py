@@ -78,6 +78,7 @@ def test_trying_views_changes_nothing_of_the_exploration(explored):
         np.testing.assert_array_equal(one.view.depth, other.view.depth)
 
 
+@pytest.mark.slow
 def test_none_of_the_views_it_tries_would_have_been_better(explored):
     steps, f1 = explored
     config = replace(CONFIG, active=replace(CONFIG.active, max_views=2))
@@ -95,6 +96,7 @@ def test_the_reason_says_from_where_to_where_f1_goes(explored):
     assert re.match(told, steps[0].decision.why)
 
 
+@pytest.mark.slow
 def test_the_default_planner_is_never_a_step_ahead():
     config = replace(CONFIG, active=replace(CONFIG.active, max_views=2), oracle=OracleConfig(candidates=1))
     (first, _), (_, f1) = exploration("oracle", "shelf", config)

@@ -87,6 +87,7 @@ def test_the_default_robot_is_the_humanoid():
     )
 
 
+@pytest.mark.slow
 class TestCommandLine:
     def test_an_arm_explores_with_its_map(self, map_file, tmp_path):
         options = [*SMALL, "--views=2", "--quiet", "--robot", f"arm:{map_file}", "--no-early-stop"]

@@ -20,8 +20,6 @@ from caryatid.evaluation import (
     score_scenes,
 )
 from caryatid.evaluation.scores import (
-    TrueObject,
-    TrueScene,
     assign,
     mask_ious,
     score_matches,
@@ -79,7 +77,7 @@ def random_scene(seed):
 
 
 @given(st.integers(0, 10_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_truth_against_itself_is_one(seed):
     graph = random_scene(seed)
     result = score(graph, as_scene(graph), np.random.default_rng(seed))
@@ -98,7 +96,7 @@ def test_truth_against_itself_is_one(seed):
 
 
 @given(st.integers(0, 10_000), st.integers(0, 10_000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_swapping_graph_and_truth_swaps_precision_and_recall(seed_a, seed_b):
     a, b = random_scene(seed_a), random_scene(seed_b)
     forward = score(a, as_scene(b), np.random.default_rng(0))
@@ -177,30 +175,12 @@ def test_empty_graphs():
     assert score(some, as_scene(empty), np.random.default_rng(0)).f1 == 0.0
 
 
-def test_a_true_object_without_a_solid_costs_recall():
-    truth = TrueScene(("a", "b"), frozenset(), as_scene(tower(1)).objects)
-    truth = TrueScene(("o1", "b"), frozenset(), truth.objects)
-    result = score(SupportGraph(tower(1).objects[1:]), truth, np.random.default_rng(0))
-    assert (result.precision, result.recall) == (1.0, 0.5)
-
-
 def test_volume_iou_of_concentric_balls_is_the_ratio_of_volumes():
     def ball(radius):
         return as_scene(SupportGraph((SceneObject("o1", 1, Sphere(at(), radius)),))).objects
 
     iou = volume_ious(ball(0.08), ball(0.1), 40_000, np.random.default_rng(0))
     assert iou[0, 0] == pytest.approx(0.8**3, abs=0.01)
-
-
-def test_solids_whose_boxes_are_apart_are_not_sampled():
-    def never(points_world):
-        raise AssertionError("asked")
-
-    box = np.array([[0.0, 0, 0], [1, 1, 1]])
-    iou = volume_ious(
-        [TrueObject("a", never, box)], [TrueObject("b", never, box + 2.0)], 10, np.random.default_rng(0)
-    )
-    assert iou.tolist() == [[0.0]]
 
 
 def test_assignment_is_one_to_one_and_drops_poor_pairs():
@@ -218,16 +198,6 @@ def test_the_top_of_a_tilted_table_is_measured_in_its_middle():
     assert top_height(Box(transforms.rigid(lying, (0, 0, 0.7)), np.array([0.04, 1.0, 1.0]))) == pytest.approx(
         0.72
     )
-
-
-def test_the_same_seed_gives_the_same_score():
-    a, b = random_scene(1), as_scene(random_scene(1))
-    shifted = SupportGraph(
-        tuple(SceneObject(o.id, o.label, o.shape.moved(at(x=0.004)), o.role) for o in a.objects), a.supports
-    )
-    first, second = (score(shifted, b, np.random.default_rng(5)) for _ in range(2))
-    assert first == second
-    assert first.mean_iou < 1.0
 
 
 def mask_graph(labels=(1, 2)):
@@ -268,15 +238,8 @@ def test_without_a_true_table_the_extracted_one_is_wrong():
     assert result.edge_precision == 0.5
 
 
-def test_vertices_that_are_not_in_the_frame_cost_recall():
-    labels = np.where(TRUE_LABELS == 5, 1, 0) + np.where(TRUE_LABELS == 7, 2, 0)
-    result = score_masks(mask_graph(), [labels], [TRUE_LABELS], (*VERTICES, "object9", "wall"), EDGES)
-    assert result.vertex_recall == pytest.approx(3 / 5)
-    assert result.vertex_precision == 1.0
-
-
 @given(st.integers(0, 10_000))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_mask_iou_is_what_sets_say(seed):
     rng = np.random.default_rng(seed)
     mine, theirs = ([rng.integers(0, 5, shape) for shape in ((6, 7), (4, 3))] for _ in range(2))
@@ -381,13 +344,6 @@ def test_a_view_is_scored_by_the_pixels_seen_up_to_it(tmp_path):
     assert second.score.mean_iou == 0.5
 
 
-def test_an_organised_cloud_is_scored_against_the_frame_it_comes_from(tmp_path):
-    record(tmp_path / "rec", 1)
-    mine = np.where(TRUE_LABELS == 5, 1, np.where(TRUE_LABELS == 7, 2, 0)).ravel()
-    write_run(tmp_path / "RUN", [mask_graph()], [mine], ["cloud.pcd"])
-    assert evaluate_run(tmp_path / "RUN", tmp_path / "rec")[0].score.f1 == 1.0
-
-
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
@@ -422,8 +378,9 @@ def test_missing_folders_and_truths_are_refused(tmp_path, scene_folder):
         evaluate_run(tmp_path / "RUN", tmp_path / "rec")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared")
-@pytest.mark.parametrize("name", ["arch", "dense00_10", "ycb02_6", "ycb05_9"])
+@pytest.mark.parametrize("name", ["arch", "ycb05_9"])
 def test_a_true_scene_against_itself_is_one(name):
     truth = read_true_scene(SHARED / "scenes" / name)
     gt = json.loads((SHARED / "scenes" / name / "gt.json").read_text())

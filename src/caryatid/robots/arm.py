@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -85,7 +84,7 @@ class ArmRobot(OwnViews):
         self._furniture = furniture
         self._T_world_camera: Array | None = None
         self._sphere: ViewSphere | None = None
-        self._offer: _Offer | None = None
+        self._offer: tuple[ViewSphere, Candidates] | None = None
         if T_world_camera is not None:
             self._T_world_camera = transforms.as_rigid(T_world_camera, "T_world_camera").copy()
 
@@ -132,7 +131,7 @@ class ArmRobot(OwnViews):
             turned = self._in_some_roll(T[None])[1][0]
             how = "; rolled otherwise it does" if turned else ""
             return Unreachable(f"{REASONS[2]}, {distance:.2f} m from the base{how}")
-        if (refused := self.confirm(T)) is not None:
+        if not self._is_at(T) and (refused := self.confirm(T)) is not None:
             return refused
         x_base, forward = self.T_world_base[:3, 0], T[:3, 2]
         base_yaw = float(np.arctan2(x_base[1], x_base[0]))
@@ -146,9 +145,9 @@ class ArmRobot(OwnViews):
 
         They are found once for a sphere; then only the ways are.
         """
-        if self._offer is None or self._offer.sphere is not sphere:
-            self._offer = _Offer(sphere, self._offered(sphere))
-        views = self._offer.candidates
+        if self._offer is None or self._offer[0] is not sphere:
+            self._offer = sphere, self._offered(sphere)
+        views = self._offer[1]
         return views.from_elsewhere(self._way(views.T_world_camera))
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
@@ -171,6 +170,12 @@ class ArmRobot(OwnViews):
         length = float(self._way(T_world_camera[None])[0])
         self._T_world_camera = np.array(T_world_camera, dtype=np.float64)
         return length
+
+    def _is_at(self, T_world_camera: Array) -> bool:
+        try:
+            return np.array_equal(T_world_camera, self.T_world_camera)
+        except PlanningError:
+            return False
 
     def _radius_around(self, centre_world: Array) -> float:
         config = self._config
@@ -244,11 +249,3 @@ class ArmRobot(OwnViews):
                 f"return bool of shape ({len(T_world_camera)},)",
             )
         return answer
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Offer:
-    """What can be reached of a sphere."""
-
-    sphere: ViewSphere
-    candidates: Candidates

@@ -8,8 +8,6 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array
-from scipy.sparse.linalg import spsolve
 
 from caryatid.config import PlausibilityConfig
 from caryatid.geometry import transforms
@@ -18,8 +16,6 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
 from caryatid.support.contacts import Contact, find_contacts, local_frames
 
-_FEW = 100
-"""Gaps up to which a dense matrix is solved faster than a sparse one, whose cost follows their number [1]."""
 REACH = 0.01
 """Gap below an object that touches nothing below it that is closed [m]; as of contacts."""
 MAX_TILT = 25.0
@@ -160,19 +156,10 @@ def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, 
         noise: Variance of a gap that is closed [m²].
     """
     weighted = rows * variance[pairs]
-    if len(pairs) <= _FEW:
-        ends = pairs.ravel()
-        shared = np.where(ends[:, None] == ends, _ends(weighted) @ _ends(rows).T, 0.0)
-        scatter = shared.reshape(len(pairs), 2, len(pairs), 2).sum(axis=(1, 3)) + noise * np.eye(len(pairs))
-        solved = np.linalg.solve(scatter, gaps)
-    else:
-        size = variance.shape[1]
-        columns = (pairs[:, :, None] * size + np.arange(size)).ravel()
-        starts = np.arange(0, rows.size + 1, 2 * size)
-        left, right = (
-            csr_array((a.ravel(), columns, starts), (len(pairs), variance.size)) for a in (weighted, rows)
-        )
-        solved = spsolve((left @ right.T + noise * eye_array(len(pairs))).tocsc(), gaps)
+    ends = pairs.ravel()
+    shared = np.where(ends[:, None] == ends, _ends(weighted) @ _ends(rows).T, 0.0)
+    scatter = shared.reshape(len(pairs), 2, len(pairs), 2).sum(axis=(1, 3)) + noise * np.eye(len(pairs))
+    solved = np.linalg.solve(scatter, gaps)
     change = np.zeros(variance.shape)
     np.add.at(change, pairs, weighted * solved[:, None, None])
     return change
