@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from caryatid.config import ReportConfig
-from caryatid.evaluation.scores import Score
 from caryatid.exploration import Step
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere
@@ -15,10 +14,10 @@ from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
-from caryatid.viz import compose_report, render_html
-from caryatid.viz.wireframes import Projection
+from caryatid.viz.drawings import Projection
+from caryatid.viz.report import Report, render_html
 
-SMALL = ReportConfig(cloud_width=240, sphere_width=80)
+SMALL = ReportConfig(image_width=160)
 K = np.array([[200.0, 0.0, 79.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
 TOP = 0.7
 
@@ -98,10 +97,10 @@ def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
     )
 
 
-def good(f1: float) -> Score:
-    return Score(f1 + 0.02, f1 - 0.02, f1, f1, f1, f1, f1, 0.8)
+def good(f1: float) -> dict[str, float]:
+    return {"precision": f1 + 0.02, "recall": f1 - 0.02, "f1": f1}
 
 
 def render_report(pages, **said) -> str:
     """The HTML of a report of these pages."""
-    return render_html(compose_report(pages, **said))
+    return render_html(Report(pages=pages, **said))

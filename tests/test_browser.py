@@ -80,14 +80,14 @@ def test_the_page_shows_the_scene_and_the_next_view(live, tab):
 
     tab.press("next view")
     tab.wait_for_text("View 1")
-    tab.wait_for_node("/cameras/01")
+    tab.wait_for_node("/cameras/1")
     second = tab.picture()
     assert len(page.moments) == 2
     assert (np.abs(second.astype(int) - first).max(axis=-1) > 16).mean() > 0.01
 
     tab.page.get_by_role("slider").first.press("ArrowLeft")
     tab.wait_for_text("View 0")
-    tab.wait_for_node("/cameras/01", there=False)
+    tab.wait_for_node("/cameras/1", there=False)
     back = tab.picture()
     assert (np.abs(back.astype(int) - second).max(axis=-1) > 16).mean() > 0.01
 
@@ -95,7 +95,7 @@ def test_the_page_shows_the_scene_and_the_next_view(live, tab):
 def test_a_click_on_an_object_says_what_falls_without_it(live, tab):
     page, _ = live
     tab.open(page.url)
-    crate = page.shown.graph["o1"]
+    crate = page.shown.step.graph["o1"]
     side = crate.centre_world + crate.shape.extents[2] / 4.0 * np.array([0.0, 0.0, -1.0])
     tab.settle()
     tab.page.mouse.click(*pixel_of(page, side, tab))
@@ -108,7 +108,7 @@ def test_a_view_is_chosen_by_hand(live, tab):
     page, _ = live
     tab.open(page.url)
     tab.page.get_by_role("checkbox", name="choose the next view by hand").click()
-    moment = page.shown
+    moment = page.shown.step
     planned = moment.decision.T_world_camera
     facing = np.argmax(moment.candidates.directions @ moment.visited[0])
     eye = moment.candidates.T_world_camera[facing][:3, 3]
@@ -117,7 +117,7 @@ def test_a_view_is_chosen_by_hand(live, tab):
     tab.wait_for_text("your view is next")
     tab.press("next view")
     tab.wait_for_text("View 1")
-    taken = page.moments[1].shot.T_world_camera
+    taken = page.moments[1].step.view.T_world_camera
     assert page.moments[0].by_hand
     assert not np.allclose(taken, planned)
     assert np.linalg.norm(taken[:3, 3] - eye) < 0.2

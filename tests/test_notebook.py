@@ -99,16 +99,16 @@ def test_each_is_one_piece_of_markup_that_loads_and_runs_nothing(shown):
     for name, thing in shown.items():
         html = thing._repr_html_()
         assert parsed(html).tag == "div", name
-        assert not re.search(r"<script|javascript:|@import|url\(|\son\w+=|<link|<iframe", html), name
+        assert not re.search(r"<script|javascript:|@import|url\([^#]|\son\w+=|<link|<iframe", html), name
         linked = re.findall(r'(?:href|src)="([^"]*)"', html)
-        assert all(link.startswith("data:image/") for link in linked), name
+        assert all(link.startswith(("data:image/", "#")) for link in linked), name
         assert len(html) < 100_000, name
 
 
 def test_styles_reach_no_further_than_the_cell(scene):
     style = re.search(r"<style>(.*?)</style>", scene._repr_html_(), re.S)[1]
     rules = [rule.strip() for rule in re.split(r"}", style) if rule.strip()]
-    assert len(rules) > 20
+    assert len(rules) > 10
     for rule in rules:
         assert all(
             part.strip().startswith(".caryatid-cell")
@@ -121,7 +121,8 @@ def test_text_takes_the_colour_of_the_page(scene):
     style = re.search(r"<style>(.*?)</style>", scene._repr_html_(), re.S)[1]
     assert "background: #" not in style
     assert not re.search(r"[{;]\s*color:(?!\s*inherit)", style)
-    assert "fill: currentColor" in style
+    assert "--ink: currentColor" in style
+    assert not re.search(r"(?<!, )#1d2126", scene._repr_html_())
 
 
 def test_the_same_is_shown_again_byte_by_byte(scene, steps):
@@ -161,7 +162,7 @@ def test_a_step_says_what_comes_next_or_why_it_stops(shown, steps):
     ("name", "said"),
     [
         ("box", "100 × 200 × 0 mm"),
-        ("cylinder", "⌀ 80 mm, 200 mm long"),
+        ("cylinder", "⌀ 80 × 200 mm"),
         ("sphere", "⌀ 100 mm"),
         ("order", "not safe"),
         ("order", "risk 25%"),

@@ -74,7 +74,7 @@ def test_what_an_index_is_told(built):
     assert told["License-Expression"] == "BSD-3-Clause"
     assert told["Description-Content-Type"] == "text/markdown"
     assert told.get_payload() == (ROOT / "README.md").read_text()
-    extras = {"view", "serve", "ros", "pdf", "benchmark", "cluster", "bench", "docs", "dev", "all"}
+    extras = {"view", "serve", "ros", "benchmark", "cluster", "bench", "docs", "dev", "all"}
     assert set(told.get_all("Provides-Extra")) == extras
     (scripts,) = (name for name in built[0].namelist() if name.endswith("entry_points.txt"))
     assert "caryatid = caryatid.cli:run_from_shell" in built[0].read(scripts).decode()
@@ -107,7 +107,6 @@ MODULES = {
     "view": ["viser"],
     "serve": ["fastapi", "starlette", "pydantic", "uvicorn"],
     "ros": ["rosbags"],
-    "pdf": ["typst"],
     "benchmark": ["pyarrow"],
     "cluster": ["distributed", "dask"],
 }
@@ -153,7 +152,6 @@ WORDS = {
     "view": "view {run}",
     "serve": "serve {folder}/sessions",
     "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
-    "pdf": "report {run} --pdf {folder}/report.pdf",
     "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",
 }
 

@@ -122,7 +122,6 @@ def test_a_value_of_the_wrong_type_says_what_is_wanted(flag, wanted):
         ("active.view_cone=90", "a number from 0 to below 90"),
         ("segmentation.hollow=-1.5", "a number from -1 to 1"),
         ("active.max_views=0", "a whole number from 1 on"),
-        ("report.jpeg_quality=96", "a whole number from 1 to 95"),
         ("voxels.extent=[1, 0, 1]", "a list of 3 numbers, each above 0"),
         ("robot.pitch=[-100, 20]", "a list of 2 numbers, each from -90 to 90"),
         ("robot.pitch=[20, -60]", "a list of 2 numbers, in rising order"),

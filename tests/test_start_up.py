@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import caryatid
-import caryatid.exports
 import caryatid.io
 
 HEAVY = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx", "matplotlib", "trimesh", "PIL", "jinja2")
@@ -88,7 +87,7 @@ def declared(package):
     return {alias.name: node.module for node in imports for alias in node.names}
 
 
-@pytest.mark.parametrize("package", [caryatid, caryatid.io, caryatid.exports])
+@pytest.mark.parametrize("package", [caryatid, caryatid.io])
 def test_names_come_from_where_type_checkers_are_told(package):
     names = declared(package)
     assert names

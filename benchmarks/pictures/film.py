@@ -39,8 +39,8 @@ from caryatid.simulation import ground_truth, load_scene
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.setup import Simulation, make_simulation
 from caryatid.viz import colours
-from caryatid.viz.layout import arrange
-from caryatid.viz.svg import keep_apart
+from caryatid.viz.drawings import keep_apart
+from caryatid.viz.graph_drawing import arrange
 
 OUT = Path(__file__).parents[2] / "docs/pictures/explore.gif"
 SCENE, SEED = "clutter", 0

@@ -20,7 +20,7 @@ from caryatid.simulation.camera import intrinsics, pixel_rays, render
 from caryatid.simulation.setup import Simulation
 from caryatid.simulation.world import SimulatedScene, quaternion, static_boxes, table_top
 from caryatid.viz import colours
-from caryatid.viz.wireframes import Projection
+from caryatid.viz.drawings import Projection
 
 FINE = 2
 """Rays a pixel along each side."""

@@ -23,7 +23,7 @@ from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 from caryatid.viz import colours
-from caryatid.viz.layout import arrange
+from caryatid.viz.graph_drawing import arrange
 
 HALO = (patheffects.withStroke(linewidth=3.5, foreground="white"),)
 """Sets letters and lines off from what is behind them."""

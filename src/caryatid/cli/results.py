@@ -120,21 +120,22 @@ class ReportCommand(Command):
     def __call__(self) -> None:
         """Run the command."""
         from caryatid.cli.output import Progress, write_json
-        from caryatid.evaluation.scores import Score
         from caryatid.io.runs import read_run
         from caryatid.io.staging import write_file
         from caryatid.steps import read_config, read_steps
-        from caryatid.viz import compose_report, draw_view, render_html, render_pdf
+        from caryatid.viz import Report, draw_view, render_html, render_pdf
+        from caryatid.viz.strip import read_figures
 
         run = read_run(self.run)
         config = read_config(run)
         settings = {"source": run.record["source"], "seed": run.record["seed"]} | run.record["options"]
         settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
-        report = compose_report(
+        report = Report(
+            f"caryatid: {Path(run.record['source']).name}",
             [draw_view(step, config.report) for step in read_steps(run)],
-            title=f"caryatid: {Path(run.record['source']).name}",
-            settings=settings,
-            scores=[Score(**score) for score in run.record.get("scores", ())] or None,
+            settings,
+            run.record.get("scores", ()),
+            read_figures(run.folder),
         )
         files = {} if self.pdf is None else {self.pdf: render_pdf(report)}
         files[self.run / "report.html"] = render_html(report).encode()
@@ -169,7 +170,7 @@ class Export(Command):
         """Run the command."""
         config = self.settings.settings()
         from caryatid.cli.output import Progress, summary, write_json
-        from caryatid.exports.writing import export_graph, format_of
+        from caryatid.exports import export_graph, format_of
         from caryatid.io.graph_json import read_graph
         from caryatid.io.runs import read_run
 

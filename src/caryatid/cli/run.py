@@ -399,7 +399,7 @@ class _Run:
         if self.source is not None and self.source.truth is not None:
             newest = score(step.graph, self.source.truth, np.random.default_rng(0))
         if self.watcher is not None and self.source is not None:
-            self.watcher.show(step, self.source, None if newest is None else newest.f1)
+            self.watcher.show(step, None if newest is None else newest.f1)
         page = [draw_view(step, self.config.report)] if self.report else []
         if self.writer is not None:
             write_step(self.writer, step)
@@ -428,8 +428,10 @@ class _Run:
         """
         if self.writer is not None:
             html = self._html(options, strip) if self.report and not self.interrupted else None
+            from caryatid.viz.strip import stored_figures
+
             record = self._record(options, self.writer.views) | dict(more or {})
-            self.writer.finish(self.newest.graph, record, html)
+            self.writer.finish(self.newest.graph, record, html, stored_figures(strip))
         if self.interrupted and self.writer is not None:
             kept = "1 view is" if self.writer.views == 1 else f"{self.writer.views} views are"
             out = self.writer.folder
@@ -438,15 +440,12 @@ class _Run:
             raise KeyboardInterrupt
 
     def _html(self, options: Mapping[str, Any], strip: tuple[Figure, ...]) -> str:
-        from caryatid.viz import compose_report, render_html
+        from caryatid.viz import Report, render_html
 
         settings = {"source": self.given, "seed": self.options.modelling.seed} | dict(options)
         settings |= {"fusion": self.config.fusion.method, "views": self.config.active.max_views}
-        title = f"caryatid: {self.name}"
-        report = compose_report(
-            self.pages, title=title, settings=settings, scores=self.scores or None, strip=strip
-        )
-        return render_html(report)
+        scores = [asdict(score) for score in self.scores]
+        return render_html(Report(f"caryatid: {self.name}", self.pages, settings, scores, strip))
 
     def _record(self, options: Mapping[str, Any], views: int) -> dict[str, Any]:
         """What run.json holds."""

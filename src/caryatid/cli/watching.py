@@ -8,10 +8,8 @@ from contextlib import contextmanager
 from caryatid.cli.output import Progress
 from caryatid.config import Config
 from caryatid.exploration import Step
-from caryatid.sources import Source
-from caryatid.viewer.apart import PageApart
-from caryatid.viewer.loop import standing_of
-from caryatid.viewer.moments import moment_of_step
+from caryatid.viewer.drawing import Moment
+from caryatid.viewer.process import PageProcess
 
 PORT = 8770
 """Where the page is, or at the next port that is free; that of `caryatid view`."""
@@ -22,21 +20,19 @@ class Watcher:
 
     Args:
         page: Where.
-        config: All settings.
 
     Attributes:
         ended: The exploration came to its end by itself.
     """
 
-    def __init__(self, page: PageApart, config: Config) -> None:
-        self._page, self._config = page, config
+    def __init__(self, page: PageProcess) -> None:
+        self._page = page
         self.ended = False
 
-    def show(self, step: Step, source: Source, score: float | None) -> None:
+    def show(self, step: Step, score: float | None) -> None:
         """Show a step; F1 is shown where it is known."""
         self.ended = step.stop is not None
-        standing = standing_of(source.robot, self._config)
-        self._page.add(moment_of_step(step, robot=standing, score=score))
+        self._page.add(Moment(step, score))
 
 
 @contextmanager
@@ -49,11 +45,11 @@ def watched(name: str, config: Config, progress: Progress, wait: Callable[[], No
         progress: Told where the page is.
         wait: Returns when the page may be closed.
     """
-    page = PageApart(f"caryatid: {name}", config.support, port=PORT)
+    page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
     progress.say(f"{name} at {page.url}")
     page.open_browser()
     try:
-        watcher = Watcher(page, config)
+        watcher = Watcher(page)
         yield watcher
         if watcher.ended:
             progress.say(f"the page stays at {page.url}; Ctrl-C ends")

@@ -46,20 +46,6 @@ class ReportConfig(Stage):
 
     image_width: Count = 640
     """Width camera images are reduced to [px]; a report of ten views stays below 8 MB."""
-    thumbnail_width: Count = 320
-    """Width camera images are reduced to in the contact sheet [px]; a third of a page at 120 dots an inch."""
-    jpeg_quality: Annotated[int, Range(1, 95)] = 82
-    """Quality of camera images, 1 … 95."""
-    cloud_width: Count = 720
-    """Width of the pictures of the cloud [px]."""
-    cloud_points: Count = 200_000
-    """Points drawn at the most, evenly picked; 0.1 s."""
-    point_size: Positive = 0.0075
-    """Side of a point as drawn [m], the surface's twice that; half more than the spacing leaves no gaps."""
-    sphere_width: Count = 260
-    """Width of the painted view sphere [px]; one cell of 40,000 is 2 px."""
-    hidden: NotNegative = 0.02
-    """A line further than this behind what is seen is drawn as hidden [m]; registration error and noise."""
 
 
 @dataclass(frozen=True, slots=True)

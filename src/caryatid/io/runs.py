@@ -102,7 +102,7 @@ class RunWriter:
         graph: SupportGraph,
         record: Mapping[str, Any],
         report: str | None = None,
-        stored: str | None = None,
+        files: Mapping[str, bytes] | None = None,
     ) -> None:
         """Write the rest and put the folder in its place.
 
@@ -110,7 +110,7 @@ class RunWriter:
             graph: The final fused graph.
             record: For run.json: settings, seed, versions, source, timings [s], angle and path travelled.
             report: Text of report.html.
-            stored: Text of report.json, from which report.html is made again.
+            files: Further files by their paths in the folder.
 
         Raises:
             CaryatidError: No view was added.
@@ -123,8 +123,8 @@ class RunWriter:
         self._staged.write("graph.json", graph_text(graph).encode())
         if report is not None:
             self._staged.write("report.html", report.encode())
-        if stored is not None:
-            self._staged.write("report.json", stored.encode())
+        for path, content in (files or {}).items():
+            self._staged.write(path, content)
         document = {"format": FORMAT, "version": VERSION, "views": self.views} | dict(record)
         self._staged.write("run.json", json_text(document).encode())
         self._staged.publish()

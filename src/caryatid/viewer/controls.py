@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from threading import Event
 from typing import Any, get_args
 
@@ -15,12 +16,8 @@ from caryatid.errors import CaryatidError, in_one_line
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 from caryatid.runtime.threads import cores
-from caryatid.simulation.camera import SimulatedCamera
-from caryatid.viewer.loop import Loop
-from caryatid.viewer.moments import Moment
+from caryatid.viewer.loop import Loop, candidate_under, taken_apart
 from caryatid.viewer.page import Page
-from caryatid.viewer.removal import Picture, lifts_in_physics, lifts_told, pictured
-from caryatid.viewer.steering import candidate_under
 
 PICTURE_TIME = 0.12
 """How long each picture of a lift is shown [s]."""
@@ -89,7 +86,7 @@ class Controls:
             hint = "Find a safe order to take everything away, and play it"
             self._dismantle = self._button("dismantle", self.dismantle, hint, 7)
         self._pause.disabled = True
-        self._planner.on_update(lambda _: self._do("planning anew", self._replan))
+        self._planner.on_update(lambda _: self._do("planning again", self._replan))
         self._fusion.on_update(lambda _: self._do("taking the same views again", self._fuse_anew))
         self._by_hand.on_update(lambda _: self._listen(self._by_hand.value))
 
@@ -99,7 +96,7 @@ class Controls:
         return button
 
     def dismantle(self) -> None:
-        """Find a safe order and play it: in physics where there is a simulation, else as it is told."""
+        """Find a safe order and play it: in physics where there is a simulation, else as the order says."""
         if self._loop.moments and not self._running.is_set():
             self._running.set()
             self._do("rehearsing lifts", self._take_apart)
@@ -173,16 +170,11 @@ class Controls:
             scene.on_click()(self._pointed)
 
     def _pointed(self, event: Any) -> None:
-        moment = self._loop.moments[-1] if self._loop.moments else None
-        if moment is None or moment.sphere is None or moment.candidates is None:
+        step = self._loop.moments[-1].step if self._loop.moments else None
+        if step is None or step.candidates is None:
             return
-        index = candidate_under(
-            np.array(event.ray_origin),
-            np.array(event.ray_direction),
-            moment.sphere,
-            moment.candidates,
-            WITHIN,
-        )
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        index = candidate_under(origin, direction, step.sphere, step.candidates, WITHIN)
         if index is not None:
             self.choose(index)
 
@@ -193,33 +185,23 @@ class Controls:
     def _choose(self, index: int) -> str:
         planned = self._loop.planned
         chosen = self._loop.choose(index)
-        if isinstance(chosen, str):
-            return chosen
         self._page.add(chosen)
-        if planned is None or chosen.decision is None:
+        if planned is None or chosen.step.decision is None:
             return "your view is next"
-        yours = chosen.decision.score
+        yours = chosen.step.decision.score
         return f"your view is next: score {yours:.2f}, the choice of {self._loop.planner} {planned.score:.2f}"
 
     def _take_apart(self) -> str:
         moment, config = self._loop.moments[-1], self._loop.config
         with self._page.working:
-            order = plan_order(moment.graph, config, seed=self._seed, threads=cores())
+            order = plan_order(moment.step.graph, config, seed=self._seed, threads=cores())
         said = ""
-        for picture in self._pictures(moment, order.steps):
+        for step, done in taken_apart(moment.step, order.steps, self._loop.source, config):
             if not self._running.is_set() or self._closed:
                 return "paused"
-            self._page.stage(pictured(moment, picture))
-            if picture.done:
-                harm = f", {', '.join(picture.disturbed)} disturbed" if picture.disturbed else ""
-                said = f"{picture.number + 1} of {len(order.steps)} taken: {picture.step.object_id}{harm}"
+            self._page.stage(replace(moment, step=step))
+            if done:
+                said = done
                 self._page.say(said)
             time.sleep(PICTURE_TIME)
         return f"{order.refusal or 'a safe order'}; {said}"
-
-    def _pictures(self, moment: Moment, steps: Any) -> Iterator[Picture]:
-        source = self._loop.source
-        camera = source.camera
-        if isinstance(camera, SimulatedCamera) and source.truth is not None:
-            return lifts_in_physics(camera.scene, moment.graph, source.truth, steps, self._loop.config)
-        return lifts_told(steps)

@@ -1,4 +1,4 @@
-"""The active vision loop taken turn by turn, with planner, fusion and next view in a person's hand."""
+"""The active vision loop worked by a person, turn by turn, and an order of removal played."""
 
 from __future__ import annotations
 
@@ -7,27 +7,30 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from caryatid.config import Config, FusionMethod, SegmentationMethod
-from caryatid.errors import CaryatidError
+from caryatid.errors import PlanningError
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
-from caryatid.exploration import Step, explore
-from caryatid.graph import SupportGraph
-from caryatid.objects.fusion import changed
-from caryatid.planning.decision import Decision
-from caryatid.planning.planners import ORACLE, make_planner
-from caryatid.robots import Posture, Robot, refusal_of
-from caryatid.robots.arm import ArmRobot
-from caryatid.robots.recording import RecordingRobot
-from caryatid.viewer.moments import Moment, Standing, moment_of_step
-from caryatid.viewer.steering import SteeredRobot, SwitchedPlanner, planned_anew, taken_by_hand
+from caryatid.exploration import Explorer, Step, reason_to_stop
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
+from caryatid.manipulation.order import TakeStep
+from caryatid.planning.decision import Decision, Planner
+from caryatid.planning.planners import ORACLE
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.lifting import ASIDE
+from caryatid.viewer.drawing import Moment
 
 if TYPE_CHECKING:
+    from caryatid.planning.candidates import Candidates
+    from caryatid.sensing.view_sphere import ViewSphere
     from caryatid.sources import Source
 
-ENDLESS = 100_000
-"""Views the loop underneath may take [1]: it is the person who ends it."""
+PICTURES, RISE = 8, 0.5
+"""Pictures of a lift that is not simulated, and how far up such a lift goes [m]."""
 
 
 class Loop:
@@ -36,15 +39,17 @@ class Loop:
     It does not end by itself as `explore` does, but says when that would have: see `pause`.
 
     Args:
-        open_source: Opens what is explored, anew each time, for some settings.
+        open_source: Opens what is explored, again each time, for some settings.
         config: All settings; `config.active.max_views` is when it says that it would pause.
         planner: Name of who chooses the next view.
-        segmentation: Where parts come from.
+        segmentation: Where segments come from.
         seed: Seed of every random choice.
 
     Attributes:
         source: What is explored.
         config: All settings.
+        planner: Name of who chooses the next view.
+        planned: What the planner chose, also where a person has chosen otherwise.
         moments: What came of each view.
         ended: Why no further view can be taken, or None.
         pause: Why `explore` would have ended after the newest view, or None.
@@ -63,45 +68,36 @@ class Loop:
         seed: int = 0,
     ) -> None:
         self._open_source, self._segmentation, self._seed = open_source, segmentation, seed
-        self._began_with = planner
-        self._planner_name = planner
+        self._began_with = self.planner = planner
         self.config = config
         self._begin()
 
     def _begin(self) -> None:
-        config = self.config
-        self.source = source = self._open_source(config)
-        chooser, camera = planner_for(
+        self.source = source = self._open_source(self.config)
+        self._first, camera = planner_for(
             self._began_with,
             source.camera,
             source.truth,
-            config,
+            self.config,
             segmentation=self._segmentation,
             seed=self._seed,
         )
-        self._first = chooser
-        self._planner = SwitchedPlanner(chooser)
-        self._robot = SteeredRobot(source.robot)
-        self._steps = explore(
+        self._explorer = Explorer(
             camera,
-            self._robot,
-            planner=self._planner,
-            config=replace(config, active=replace(config.active, max_views=ENDLESS)),
+            source.robot,
+            planner=self._planner(),
+            config=self.config,
             segmentation=self._segmentation,
             seed=self._seed,
-            early_stop=False,
         )
         self.moments: list[Moment] = []
+        self.planned: Decision | None = None
         self.ended: str | None = None
         self.pause: str | None = None
-        self._planned: Decision | None = None
-        if self._planner_name != self._began_with:
-            self._planner.planner = make_planner(self._planner_name)
 
-    @property
-    def planner(self) -> str:
-        """Name of who chooses the next view."""
-        return self._planner_name
+    def _planner(self) -> Planner | str:
+        """The planner in charge; there is an oracle only if the loop began with it."""
+        return self._first if self.planner in (self._began_with, ORACLE) else self.planner
 
     @property
     def fusion(self) -> FusionMethod:
@@ -109,62 +105,44 @@ class Loop:
         return self.config.fusion.method
 
     def turn(self) -> Moment | None:
-        """Go to the next view, take it, and plan; None where no further view can be taken.
+        """Go to the next view, look and plan; return what came of it, or None where no view can be taken.
 
         Raises:
-            CaryatidError: The view cannot be used; no further one can be taken then.
+            CaryatidError: The view cannot be used.
         """
         if self.ended is not None:
             return None
-        before = self.moments[-1].graph if self.moments else SupportGraph()
-        try:
-            step = next(self._steps, None)
-        except CaryatidError as error:
-            self.ended = str(error)
-            raise
-        if step is None:
-            self.ended = self.ended or "there is no further view"
-            return None
-        moment = self._moment(step)
-        self._planned = step.decision
-        self.moments.append(moment)
-        self.ended = step.stop
-        self.pause = step.stop or self._would_stop(before, step.graph)
-        return moment
-
-    def retrace(self, earlier: Sequence[Moment]) -> Iterator[Moment]:
-        """Take the views of some moments, from the first on, whoever chooses others now.
-
-        Yields:
-            What came of each view.
-        """
-        for before in earlier:
-            moment = self.turn()
-            if moment is None:
-                return
-            goes_to = before.decision
-            own = moment.decision
-            if before is not earlier[-1] and goes_to is not None and not _same_view(own, goes_to):
-                self._robot.go_instead(goes_to.T_world_camera)
-                moment = self.moments[-1] = moment.going_to(goes_to, by_hand=before.by_hand)
-            yield moment
+        if self.moments:
+            self._explorer.go()
+        self._explorer.look()
+        step = self._explorer.plan()
+        f1 = None
+        if self.source.truth is not None:
+            f1 = score(step.graph, self.source.truth, np.random.default_rng(0)).f1
+        self.moments.append(Moment(step, f1))
+        self.planned, self.ended = step.decision, step.stop
+        self.pause = step.stop or reason_to_stop(step.index + 1, self._explorer.changed, self.config.active)
+        return self.moments[-1]
 
     def use_planner(self, name: str) -> Moment | None:
-        """Let another planner choose, the next view already; the newest moment, with its choice.
+        """Let another planner choose, already the next view; the newest moment, with its choice.
 
         Raises:
             CaryatidError: There is no such planner, or it can choose no view.
         """
-        oracle = name == ORACLE and self._began_with == ORACLE
-        self._planner.planner = self._first if oracle else make_planner(name)
-        self._planner_name = name
-        state = self._planner.state
-        if state is None or not self.moments or self.ended is not None:
+        self.planner = name
+        self._explorer.use_planner(self._planner())
+        if not self.moments or self.ended is not None:
             return None
-        return self._go_to(planned_anew(state, self._planner.planner, self._robot, self._seed))
+        step = self._explorer.plan()
+        if step.decision is None:
+            raise PlanningError(step.stop or "no view can be chosen")
+        self.planned = step.decision
+        self.moments[-1] = replace(self.moments[-1], step=step, by_hand=False)
+        return self.moments[-1]
 
     def use_fusion(self, method: FusionMethod) -> Iterator[Moment]:
-        """Begin anew with another fusion and take the same views again.
+        """Begin again with another fusion and take the same views again.
 
         Yields:
             What came of each view.
@@ -172,64 +150,147 @@ class Loop:
         earlier = self.moments
         self.config = replace(self.config, fusion=replace(self.config.fusion, method=method))
         self._begin()
-        yield from self.retrace(earlier)
+        for before in earlier:
+            moment = self.turn()
+            if moment is None:
+                return
+            own, taken = moment.step.decision, before.step.decision
+            if taken is None or before is earlier[-1]:
+                yield moment
+            elif own is None or not np.array_equal(own.T_world_camera, taken.T_world_camera):
+                yield self._go_to(taken, by_hand=before.by_hand)
+            else:
+                yield moment
 
-    def rate(self, index: int) -> Decision | None:
-        """What going to a candidate would be worth, by the planner's figures."""
-        state, planned = self._planner.state, self._planned
-        if state is None or planned is None or index >= len(state.candidates):
-            return None
-        return taken_by_hand(state, index, planned)
+    def choose(self, index: int) -> Moment:
+        """Go to this candidate next, whatever the planner says.
 
-    def choose(self, index: int) -> Moment | str:
-        """Go to this candidate next, whatever the planner says; the newest moment, or why it cannot be."""
-        decision = self.rate(index)
-        if decision is None:
-            return "there is no next view to choose"
-        refused = refusal_of(self._robot, decision.T_world_camera)
-        if refused is not None:
-            return refused.reason
-        return self._go_to(decision, by_hand=True)
+        Raises:
+            PlanningError: There is no next view to choose, or the robot cannot take it.
+        """
+        return self._go_to(self._explorer.alternative(index), by_hand=True)
 
-    @property
-    def planned(self) -> Decision | None:
-        """What the planner chose, also where a person has chosen otherwise."""
-        return self._planned
-
-    def _go_to(self, decision: Decision, *, by_hand: bool = False) -> Moment:
-        self._robot.go_instead(decision.T_world_camera)
-        if not by_hand:
-            self._planned = decision
-        self.moments[-1] = self.moments[-1].going_to(decision, by_hand=by_hand)
+    def _go_to(self, decision: Decision, *, by_hand: bool) -> Moment:
+        step = self._explorer.choose(decision)
+        self.moments[-1] = replace(self.moments[-1], step=step, by_hand=by_hand)
         return self.moments[-1]
 
-    def _moment(self, step: Step) -> Moment:
-        f1 = None
-        if self.source.truth is not None:
-            f1 = score(step.graph, self.source.truth, np.random.default_rng(0)).f1
-        standing = standing_of(self.source.robot, self.config)
-        return moment_of_step(step, robot=standing, score=f1)
 
-    def _would_stop(self, before: SupportGraph, after: SupportGraph) -> str | None:
-        views = len(self.moments)
-        if views == self.config.active.max_views:
-            return f"{views} views were asked for"
-        if views > 1 and not changed(before, after, self.config.fusion):
-            return "the last view changed nothing"
+def candidate_under(
+    origin_world: Array, direction_world: Array, sphere: ViewSphere, candidates: Candidates, within: float
+) -> int | None:
+    """Which candidate a ray from the eye points at, where it first meets the sphere or else behind.
+
+    Args:
+        origin_world: The eye (3,) [m].
+        direction_world: Where the ray goes (3,).
+        sphere: The view sphere.
+        candidates: The views on it that can be reached.
+        within: How far off the candidate may be, at the sphere's centre [rad].
+    """
+    if len(candidates) == 0:
         return None
-
-
-def _same_view(own: Decision | None, other: Decision) -> bool:
-    """Whether the loop goes there by itself; poses from a file are rounded, its own are not."""
-    return own is not None and np.allclose(own.T_world_camera, other.T_world_camera, atol=1e-6)
-
-
-def standing_of(robot: Robot, config: Config) -> Standing | None:
-    """How a robot stands where it is, or None where that is not known."""
-    if isinstance(robot, RecordingRobot):
+    ray = direction_world / np.linalg.norm(direction_world)
+    offset = origin_world - sphere.centre_world
+    along = float(offset @ ray)
+    reach = along**2 - float(offset @ offset) + sphere.radius**2
+    if reach < 0.0:
         return None
-    posture = robot.solve(robot.T_world_camera)
-    if not isinstance(posture, Posture):
-        return None
-    arm = isinstance(robot, ArmRobot)
-    return Standing(posture, robot.T_world_camera, config.robot.footprint, arm)
+    for distance in (-along - np.sqrt(reach), -along + np.sqrt(reach)):
+        if distance > 0.0:
+            cosine = candidates.directions @ ((offset + distance * ray) / sphere.radius)
+            best = int(np.argmax(cosine))
+            if np.arccos(np.clip(cosine[best], -1.0, 1.0)) <= within:
+                return best
+    return None
+
+
+def taken_apart(
+    step: Step, steps: Sequence[TakeStep], source: Source, config: Config
+) -> Iterator[tuple[Step, str]]:
+    """Play an order: in physics where the source is simulated, else as the order says.
+
+    Shapes that have moved leave their points behind, and so their points are not shown.
+
+    Args:
+        step: What is known.
+        steps: The order.
+        source: What was explored.
+        config: How lifts go.
+
+    Yields:
+        Several pictures of each lift, with what came of it where it is done, else an empty text.
+    """
+    gone: set[str] = set()
+    camera = source.camera
+    simulated = isinstance(camera, SimulatedCamera) and source.truth is not None
+    lifts = _lifts_in_physics(step, steps, source, config) if simulated else _lifts_as_ordered(steps)
+    for number, (taken, moved, disturbed) in enumerate(lifts):
+        for T_world_world in moved:
+            yield _without(step, gone, taken.object_id, T_world_world), ""
+        gone.add(taken.object_id)
+        harm = f", {', '.join(disturbed)} disturbed" if disturbed else ""
+        text = f"{number + 1} of {len(steps)} taken: {taken.object_id}{harm}"
+        last = {} if not moved else {i: T for i, T in moved[-1].items() if i != taken.object_id}
+        yield _without(step, gone, taken.object_id, last), text
+
+
+Lift = tuple[TakeStep, list[dict[str, Array]], tuple[str, ...]]
+"""What is taken, how far each object has moved (4, 4) by id in each picture, and what was disturbed."""
+
+
+def _lifts_in_physics(
+    step: Step, steps: Sequence[TakeStep], source: Source, config: Config
+) -> Iterator[Lift]:
+    """Take the scene apart in physics; the extracted shapes move as the bodies they stand for do."""
+    camera, truth = source.camera, source.truth
+    if not isinstance(camera, SimulatedCamera) or truth is None:
+        return
+    bodies = bodies_of(step.graph, truth)
+    names = list(camera.scene.object_bodies.values())
+    began = transforms.invert(_transforms(poses_of(camera.scene)))
+    for taken in dismantle(camera.scene, steps, bodies, config):
+        lifted = names.index(taken.body or names[0])
+        pictures = []
+        for state in taken.film:
+            if state[lifted, 2] < ASIDE / 2.0:
+                now = _transforms(state) @ began
+                pictures.append({i: now[names.index(body)] for i, body in bodies.items()})
+        yield taken.step, pictures, taken.disturbed
+
+
+def _lifts_as_ordered(steps: Sequence[TakeStep]) -> Iterator[Lift]:
+    """Take objects straight up, where there is no physics to ask."""
+    for step in steps:
+        heights = np.linspace(0.0, RISE, PICTURES)[1:]
+        yield step, [{step.object_id: transforms.rigid(np.eye(3), (0.0, 0.0, h))} for h in heights], ()
+
+
+def _without(step: Step, gone: set[str], lifted: str, T_world_world: dict[str, Array]) -> Step:
+    """A step as it looks while an object is being lifted and others are gone."""
+    graph = step.graph
+    objects = tuple(
+        replace(o, shape=o.shape.moved(T_world_world[o.id])) if o.id in T_world_world else o
+        for o in graph.objects
+        if o.id not in gone
+    )
+    supports = tuple(
+        replace(s, contact_world=None, normal_world=None)
+        for s in graph.supports
+        if not {s.supporter, s.supported} & {lifted, *gone}
+    )
+    moved = {i for i, T in T_world_world.items() if np.abs(T - np.eye(4)).max() > 2e-3}
+    away = [o.label for o in graph.objects if o.id in gone | moved]
+    cloud = step.cloud
+    if away and cloud.labels is not None:
+        cloud = cloud.select(~np.isin(cloud.labels, away))
+    shown = replace(graph, objects=objects, supports=supports)
+    return replace(step, graph=shown, cloud=cloud, decision=None, candidates=None)
+
+
+def _transforms(state: Array) -> Array:
+    """Poses (N, 4, 4) of a state (N, 7): positions and quaternions, w first."""
+    T = np.tile(np.eye(4), (len(state), 1, 1))
+    T[:, :3, 3] = state[:, :3]
+    T[:, :3, :3] = Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
+    return T

@@ -7,6 +7,7 @@ import logging
 import webbrowser
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from html import escape
 from threading import RLock
 from typing import Any
@@ -18,10 +19,8 @@ from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
 from caryatid.support.relations import predict_removal
-from caryatid.viewer import words
-from caryatid.viewer.canvas import Canvas
-from caryatid.viewer.drawing import LAYERS, draw_moment
-from caryatid.viewer.moments import Moment
+from caryatid.viewer import panels
+from caryatid.viewer.drawing import LAYERS, Moment, SceneDrawing, reduced
 from caryatid.viz.colours import SERIES
 
 POINT_SIZE = 0.003
@@ -78,7 +77,7 @@ class Page:
         self._pending: Future[None] | None = None
         server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=ACCENT)
         server.scene.set_up_direction("+z")
-        self._canvas = Canvas(server, LAYERS, self.choose)
+        self._drawing = SceneDrawing(server, self.choose)
         self._distance = NEAR if small else FAR
         self._build(small)
 
@@ -98,13 +97,13 @@ class Page:
         return self._moments[self._shown] if self._moments else None
 
     @property
-    def canvas(self) -> Canvas:
+    def drawing(self) -> SceneDrawing:
         """The scene in the page."""
-        return self._canvas
+        return self._drawing
 
     def say(self, text: str) -> None:
         """Say something at the top of the page, in place of what was said before."""
-        self._notice.content = words.in_page(f"<p>{escape(text)}</p>")
+        self._notice.content = panels.in_page(f"<p>{escape(text)}</p>")
         self._notice.visible = bool(text)
 
     def open_browser(self) -> None:
@@ -114,8 +113,9 @@ class Page:
     def add(self, moment: Moment) -> None:
         """Add a moment, or put it in place of that of the same view; who looks at the newest goes along."""
         newest = self._shown == len(self._moments) - 1
-        if moment.index < len(self._moments):
-            self._moments[moment.index] = moment
+        moment = replace(moment, step=reduced(moment.step))
+        if moment.step.index < len(self._moments):
+            self._moments[moment.step.index] = moment
         else:
             self._moments.append(moment)
             if newest:
@@ -186,9 +186,9 @@ class Page:
             self._graph = gui.add_html("")
         self._scores = panel.add_tab("F1")
         with self._scores:
-            self._no_chart = gui.add_html(words.in_page("<p>The truth is not known here.</p>"))
+            self._no_chart = gui.add_html(panels.in_page("<p>The truth is not known here.</p>"))
         with panel.add_tab("key"):
-            gui.add_html(words.tell_key())
+            gui.add_html(panels.describe_signs())
         self._chart: Any = None
         if not small:
             gui.main_panel.dock_right()
@@ -196,26 +196,22 @@ class Page:
         panel.set_width(BESIDE)
         about = gui.add_panel()
         with about.add_tab("object"):
-            self._about = gui.add_html(words.in_page(words.NOTHING_CHOSEN))
+            self._about = gui.add_html(panels.in_page(panels.NOTHING_CHOSEN))
         about.dock_below(panel)
         if small:
             panel.minimize()
 
     def _layer(self, name: str) -> None:
         box = self._server.gui.add_checkbox(name, True)
-        box.on_update(lambda _: self._canvas.show_layer(name, box.value))
+        box.on_update(lambda _: self._drawing.show_layer(name, box.value))
 
     def _look_at(self, moment: Moment) -> None:
         """Have the eye begin over the shoulder of the first camera, or before the middle of what is there."""
         camera = self._server.initial_camera
-        if moment.sphere is not None:
-            centre = moment.sphere.centre_world
-        else:
-            things = [o.centre_world for o in moment.graph.objects]
-            centre = np.mean(things, axis=0) if things else np.zeros(3)
+        centre = moment.step.sphere.centre_world
         backward = np.array([-1.0, -0.7, 0.0])
-        if len(moment.visited):
-            x, y = moment.visited[0][:2]
+        if len(moment.step.visited):
+            x, y = moment.step.visited[0][:2]
             backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
         backward /= max(float(np.linalg.norm(backward)), 1e-9)
         camera.look_at = centre
@@ -225,37 +221,34 @@ class Page:
     def _draw(self) -> None:
         moment, chosen = self._staged or self.shown, self._chosen
         if moment is None:
-            self._canvas.show({})
             return
-        shots = [m.shot for m in self._moments[: self._shown + 1] if m.shot is not None]
-        self._canvas.show(
-            draw_moment(
-                moment,
-                shots,
-                chosen=chosen,
-                point_size=self._size.value / 1000.0,
-                true_colours=self._true_colours.value,
-            )
+        self._drawing.show(
+            moment,
+            [m.step for m in self._moments[: self._shown + 1]],
+            chosen=chosen,
+            point_size=self._size.value / 1000.0,
+            true_colours=self._true_colours.value,
         )
         last = len(self._moments) - 1
         self._slider.max = max(last, 1)
         self._slider.disabled = last == 0
         self._slider.value = self._shown
-        self._told.content = words.tell_view(moment, len(self._moments))
-        if moment.graph is not self._graph_drawn:
-            self._graph_drawn = moment.graph
-            self._graph.content = words.tell_graph(moment.graph)
+        self._told.content = panels.describe_view(moment, len(self._moments))
+        graph = moment.step.graph
+        if graph is not self._graph_drawn:
+            self._graph_drawn = graph
+            self._graph.content = panels.describe_graph(graph)
         self._draw_scores()
         if chosen:
             self._about.content = self._object(moment, chosen)
 
     def _object(self, moment: Moment, chosen: str) -> str:
-        item = next((o for o in moment.graph.objects if o.id == chosen), None)
+        item = next((o for o in moment.step.graph.objects if o.id == chosen), None)
         effects = None
         if item is not None and item.role == "object":
             with self.working:
-                effects = predict_removal(moment.graph, chosen, self._support)
-        return words.tell_object(moment, chosen, effects)
+                effects = predict_removal(moment.step.graph, chosen, self._support)
+        return panels.describe_object(moment.step.graph, chosen, effects)
 
     def _draw_scores(self) -> None:
         scores = [np.nan if m.score is None else m.score for m in self._moments]

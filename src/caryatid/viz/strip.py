@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from caryatid.config import Config
 from caryatid.geometry import transforms
@@ -14,18 +18,13 @@ from caryatid.manipulation.dismantling import Taken, posed, poses_of
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.world import SimulatedScene
-from caryatid.viz import svg
-from caryatid.viz.images import name_on, tinted
-from caryatid.viz.page import Figure
+from caryatid.viz.drawings import draw_pixels, name_on, picture_png, tinted
+from caryatid.viz.report import Figure
 
 HEADROOM = 0.25
 """Room above the objects that a picture shows [m]: the lifted one is to be seen."""
 AROUND = 0.07
 """Room around the objects' middles, as a share of their distance [1]: 10 cm at 1.5 m."""
-TAG_SIZE = 28.0
-"""Height of letters on a picture 640 px wide [px]."""
-HALF_WAY = 0.5
-"""A lift that does no harm is shown when so much of it is done [1]; one that does, at its end."""
 
 
 def draw_lifts(
@@ -35,7 +34,7 @@ def draw_lifts(
     T_world_camera: Array,
     config: Config,
 ) -> tuple[Figure, ...]:
-    """Draw each lift as it looked on the way up, bodies in the colours of the objects they were found as.
+    """Draw each lift as it looked half way up, or at its end where it did harm, in the objects' colours.
 
     Args:
         scene: The scene in physics.
@@ -51,30 +50,21 @@ def draw_lifts(
     for label, name in scene.object_bodies.items():
         label_of[label] = found[name].label if name in found else 0
     K = _zoomed(intrinsics(config.sensor), poses_of(scene)[:, :3], T_world_camera, config)
+    stride = max(1, round(2 * config.sensor.width / config.report.image_width))
     figures = []
     for number, t in enumerate(taken, start=1):
         if t.body is None:
             continue
         rising = np.flatnonzero(t.film[:, names.index(t.body), 2] < ASIDE / 2.0)
-        moment = t.film[rising[int((len(rising) - 1) * HALF_WAY)]] if t.ok else t.film[-1]
+        moment = t.film[rising[(len(rising) - 1) // 2]] if t.ok else t.film[-1]
         image = render(posed(scene, moment), T_world_camera, K, config.sensor)
-        step = max(1, round(2 * config.sensor.width / config.report.image_width))
-        labels = label_of[image.labels][::step, ::step]
-        height, width = labels.shape
-        pixels = tinted(image.rgb[::step, ::step], labels, width)
+        labels = label_of[image.labels][::stride, ::stride]
+        pixels = tinted(image.rgb[::stride, ::stride], labels, labels.shape[1])
         tags = [tag for item in found.values() if (tag := name_on(item, labels)) is not None]
-        picture = svg.picture(
-            width,
-            height,
-            svg.raster(pixels, 0, 0, width, height, jpeg=config.report.jpeg_quality),
-            svg.tags(tags, (0, 0, width, height), TAG_SIZE * width / 640.0),
-            name=f"lift {number}: {t.step.object_id}",
-        )
+        picture = draw_pixels(pixels, tags, f"lift {number}")
         held = f", {', '.join(t.step.hold)} held" if t.held else ""
         outcome = "Nothing else moved" if t.ok else f"{', '.join(t.disturbed)} moved"
-        figures.append(
-            Figure("camera", picture, f"{number}: {t.step.object_id}{held}", f"{outcome}; {t.step.why}.")
-        )
+        figures.append(Figure(f"{number}: {t.step.object_id}{held}", picture, f"{outcome}; {t.step.why}."))
     return tuple(figures)
 
 
@@ -89,3 +79,27 @@ def _zoomed(K: Array, positions_world: Array, T_world_camera: Array, config: Con
     zoomed[[0, 1], [0, 1]] = np.min(size / (high - low))
     zoomed[:2, 2] = size / 2.0 - zoomed[0, 0] * (low + high) / 2.0
     return zoomed
+
+
+def stored_figures(figures: Sequence[Figure]) -> dict[str, bytes]:
+    """The pictures of lifts as files of a run folder: `lifts/NN.png`, with headings and captions in them."""
+    files = {}
+    for number, figure in enumerate(figures, start=1):
+        text = PngInfo()
+        text.add_itxt("heading", figure.heading)
+        text.add_itxt("caption", figure.caption)
+        buffer = io.BytesIO()
+        Image.open(io.BytesIO(picture_png(figure.picture))).save(buffer, "PNG", pnginfo=text)
+        files[f"lifts/{number:02d}.png"] = buffer.getvalue()
+    return files
+
+
+def read_figures(folder: Path) -> tuple[Figure, ...]:
+    """Read back what `stored_figures` gave; none where there are none."""
+    figures = []
+    for path in sorted((folder / "lifts").glob("*.png")):
+        with Image.open(path) as image:
+            pixels, text = np.asarray(image.convert("RGB")), image.info
+        picture = draw_pixels(pixels, (), f"lift {path.stem}")
+        figures.append(Figure(text.get("heading", ""), picture, text.get("caption", "")))
+    return tuple(figures)

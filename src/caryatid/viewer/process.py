@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import subprocess
-import sys
 import webbrowser
-from dataclasses import asdict
 from importlib.util import find_spec
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from queue import SimpleQueue
 from threading import Thread
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
-from caryatid.viewer.moments import Moment
+from caryatid.viewer.drawing import Moment, reduced
 from caryatid.viewer.page import Page, needs_viser
-from caryatid.viewer.wire import MomentReader, MomentWriter
 
-BEHIND = 10
-"""How far drawing stands behind the loop where cores are short, as `nice` counts."""
+NICENESS = 10
+"""Of the drawing process: where cores are scarce, the loop goes first."""
 
 
-class PageApart:
+class PageProcess:
     """A page like `Page`, to which moments can be added and no more.
 
     Args:
@@ -42,16 +39,17 @@ class PageApart:
     def __init__(self, title: str, support: SupportConfig, *, host: str = "127.0.0.1", port: int = 0) -> None:
         if find_spec("viser") is None:
             raise needs_viser()
-        told = json.dumps({"title": title, "support": asdict(support), "host": host, "port": port})
-        command = [sys.executable, "-m", "caryatid.viewer.apart", told]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self.url = self._process.stdout.readline().decode().strip()
-        if not self.url:
-            self._process.wait()
-            raise InputError("viewer", f"cannot be served at {host}:{port}", "choose another address")
-        self._writer = MomentWriter(self._process.stdin)
+        context = get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, title, support, host, port), daemon=True)
+        self._process.start()
+        theirs.close()
+        try:
+            self.url: str = self._connection.recv()
+        except EOFError:
+            raise InputError(
+                "viewer", f"cannot be served at {host}:{port}", "choose another address"
+            ) from None
         self._queue: SimpleQueue[Moment | None] = SimpleQueue()
         self._sender = Thread(target=self._send, name="viewer", daemon=True)
         self._sender.start()
@@ -68,31 +66,27 @@ class PageApart:
         """Stop serving the page, once all that was added has been sent."""
         self._queue.put(None)
         self._sender.join()
-        self._process.communicate()
+        self._connection.close()
+        self._process.join()
 
     def _send(self) -> None:
         while (moment := self._queue.get()) is not None:
             try:
-                self._writer.write(moment)
+                self._connection.send(Moment(reduced(moment.step), moment.score, moment.by_hand))
             except OSError:
                 return
 
 
-def main() -> int:
-    """Serve a page and show the moments that come on stdin, until there are no more."""
+def _serve(connection: Connection, title: str, support: SupportConfig, host: str, port: int) -> None:
+    """Serve a page and show the moments that come, until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
-        os.nice(BEHIND)
-    told = json.loads(sys.argv[1])
-    page = Page(told["title"], SupportConfig(**told["support"]), host=told["host"], port=told["port"])
-    sys.stdout.write(f"{page.url}\n")
-    sys.stdout.flush()
-    reader = MomentReader(sys.stdin.buffer)
-    while (moment := reader.read()) is not None:
-        page.add(moment)
+        os.nice(NICENESS)
+    page = Page(title, support, host=host, port=port)
+    connection.send(page.url)
+    while True:
+        try:
+            page.add(connection.recv())
+        except EOFError:
+            break
     page.close()
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

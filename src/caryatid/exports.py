@@ -1,0 +1,338 @@
+"""A scene model for other programs: MJCF, URDF, glTF, GraphML and DOT."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+import numpy as np
+
+from caryatid.config import ExportConfig
+from caryatid.config.choices import ExportFormat
+from caryatid.errors import InputError
+from caryatid.geometry.shapes import Cylinder, Shape, Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject, SupportGraph
+from caryatid.io.staging import write_file
+from caryatid.viz.colours import ink_on, object_colour, rgb
+
+if TYPE_CHECKING:
+    import mujoco
+    from trimesh.visual.material import PBRMaterial
+
+ENDINGS: Final[dict[ExportFormat, tuple[str, ...]]] = {
+    "mjcf": (".xml",),
+    "urdf": (".urdf",),
+    "gltf": (".glb", ".gltf"),
+    "graphml": (".graphml",),
+    "dot": (".dot", ".gv"),
+}
+"""How files of each format end."""
+
+
+_ROOT = "world"
+"""Name of a URDF's root link."""
+
+
+_Z_UP = "z_up"
+"""Name of the node whose frame is caryatid's world; the file itself has y up, as glTF wants."""
+_T_FILE_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+
+def format_of(path: Path) -> ExportFormat:
+    """The format a file's name ends in.
+
+    Raises:
+        InputError: None does.
+    """
+    for format_, endings in ENDINGS.items():
+        if path.suffix.lower() in endings:
+            return format_
+    known = ", ".join(ending for endings in ENDINGS.values() for ending in endings)
+    raise InputError(path, "does not say which format it is to have", f"end its name in one of {known}")
+
+
+def export_graph(
+    graph: SupportGraph,
+    path: str | Path,
+    format_: ExportFormat | None = None,
+    config: ExportConfig | None = None,
+) -> None:
+    """Write a scene model to a file, whole or not at all; a file already there is replaced.
+
+    Args:
+        graph: The scene model.
+        path: The file.
+        format_: Its format; None takes it from the file's name.
+        config: Density, friction and how fine meshes are.
+
+    Raises:
+        InputError: The name does not end as the format's do, there is nothing to export, or the file cannot
+            be written.
+    """
+    path = Path(path)
+    chosen = format_ or format_of(path)
+    if path.suffix.lower() not in ENDINGS[chosen]:
+        endings = " or ".join(ENDINGS[chosen])
+        raise InputError(path, f"does not end as {chosen} does", f"end its name in {endings}")
+    if not graph.objects:
+        raise InputError("the scene model", "holds no objects", "nothing was written")
+    content = _content(graph, path, chosen, config or ExportConfig())
+    write_file(path, content)
+
+
+def _content(graph: SupportGraph, path: Path, format_: ExportFormat, config: ExportConfig) -> bytes:
+    match format_:
+        case "mjcf":
+            return to_mjcf(graph, config).encode()
+        case "urdf":
+            return to_urdf(graph, config).encode()
+        case "gltf":
+            return to_gltf(graph, config, binary=path.suffix.lower() == ".glb")
+        case "graphml":
+            return to_graphml(graph).encode()
+        case "dot":
+            return to_dot(graph).encode()
+
+
+def to_mjcf(graph: SupportGraph, config: ExportConfig) -> str:
+    """Write a scene model as MJCF: the static body `table`, and a free body for each object, named by its id.
+
+    It is a scene caryatid explores, too. Shapes that were fitted may overlap or hover by millimetres: objects
+    settle by about as much when it is simulated.
+
+    Args:
+        graph: The scene model.
+        config: Density and friction.
+
+    Raises:
+        InputError: MuJoCo does not take the model, because of a name for example.
+    """
+    import mujoco
+
+    from caryatid.simulation.world import Solid, add_solid
+
+    spec = mujoco.MjSpec()
+    spec.modelname = "caryatid"
+    spec.option.impratio = 10.0
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    try:
+        for item in graph.objects:
+            if item.role == "support_surface":
+                _add_surface(spec, item)
+            else:
+                add_solid(spec, item.id, Solid(item.shape, config.density, config.friction), _rgba(item))
+        spec.compile()
+        text: str = spec.to_xml()
+        mujoco.MjModel.from_xml_string(text)
+    except ValueError as error:
+        reason = f"MuJoCo does not take it ({' '.join(str(error).split())})"
+        raise InputError("the scene model", reason, "rename objects in graph.json") from error
+    return text
+
+
+def to_urdf(graph: SupportGraph, config: ExportConfig) -> str:
+    """Write a scene model as URDF: a link for each object, called as its id, fixed to the link `world`.
+
+    Args:
+        graph: The scene model.
+        config: Density.
+
+    Raises:
+        InputError: An object is called `world`.
+    """
+    robot = Element("robot", name="caryatid")
+    SubElement(robot, "link", name=_ROOT)
+    for item in graph.objects:
+        if item.id == _ROOT:
+            raise InputError("the scene model", f"an object is called '{_ROOT}'", "rename it in graph.json")
+        link = SubElement(robot, "link", name=item.id)
+        _add_inertia(link, item.shape, config.density)
+        for part in ("visual", "collision"):
+            geometry = SubElement(SubElement(link, part), "geometry")
+            SubElement(geometry, *_urdf_shape(item.shape))
+        material = SubElement(link[1], "material", name=f"colour of {item.id}")
+        SubElement(material, "color", rgba=_numbers(_rgba(item)))
+        joint = SubElement(robot, "joint", name=f"{_ROOT}_to_{item.id}", type="fixed")
+        SubElement(joint, "parent", link=_ROOT)
+        SubElement(joint, "child", link=item.id)
+        T_world_object = item.shape.T_world_object
+        SubElement(joint, "origin", xyz=_numbers(T_world_object[:3, 3]), rpy=_numbers(_rpy(T_world_object)))
+    indent(robot)
+    return tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _add_surface(spec: mujoco.MjSpec, item: SceneObject) -> None:
+    import mujoco
+
+    from caryatid.simulation.world import TABLE, quaternion
+
+    T_world_object = item.shape.T_world_object
+    table = spec.worldbody.add_body(
+        name=TABLE, pos=T_world_object[:3, 3], quat=quaternion(T_world_object[:3, :3])
+    )
+    table.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=item.shape.extents / 2.0, rgba=_rgba(item))
+
+
+def _urdf_shape(shape: Shape) -> tuple[str, dict[str, str]]:
+    match shape:
+        case Cylinder():
+            return "cylinder", {"radius": f"{shape.radius:.9g}", "length": f"{shape.height:.9g}"}
+        case Sphere():
+            return "sphere", {"radius": f"{shape.radius:.9g}"}
+    return "box", {"size": _numbers(shape.extents)}
+
+
+def _add_inertia(link: Element, shape: Shape, density: float) -> None:
+    mass = density * shape.volume
+    inertial = SubElement(link, "inertial")
+    SubElement(inertial, "mass", value=f"{mass:.9g}")
+    diagonal = dict(zip(("ixx", "iyy", "izz"), (f"{mass * m:.9g}" for m in shape.moments), strict=True))
+    products: Mapping[str, str] = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
+    SubElement(inertial, "inertia", {**diagonal, **products})
+
+
+def _rpy(T_world_object: Array) -> Array:
+    """Roll, pitch and yaw (3,) [rad] about the world's x, y and z."""
+    from scipy.spatial.transform import Rotation
+
+    with warnings.catch_warnings():
+        # Straight up or down there are many; scipy says so and takes one.
+        warnings.simplefilter("ignore", UserWarning)
+        angles: Array = Rotation.from_matrix(T_world_object[:3, :3]).as_euler("xyz")
+    return angles
+
+
+def _rgba(item: SceneObject) -> tuple[float, float, float, float]:
+    """The report's colour of an object, 0 … 1."""
+    red, green, blue = rgb(object_colour(item.label))
+    return red / 255.0, green / 255.0, blue / 255.0, 1.0
+
+
+def _numbers(values: Array | tuple[float, ...]) -> str:
+    return " ".join(f"{value + 0.0:.9g}" for value in values)
+
+
+def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -> bytes:
+    """Write a scene model as glTF: under the node `z_up` a node for each object, called as its id.
+
+    Objects have the report's colours. Shape, size and role are in each mesh's extras.
+
+    Args:
+        graph: The scene model.
+        config: How fine meshes are.
+        binary: As one binary file (`.glb`), not as JSON (`.gltf`).
+    """
+    import trimesh
+    from trimesh.exchange.gltf import export_glb, export_gltf
+
+    scene = trimesh.Scene(base_frame="file")
+    scene.graph.update(frame_from="file", frame_to=_Z_UP, matrix=_T_FILE_WORLD)
+    for item in graph.objects:
+        mesh = item.shape.mesh(config.corners)
+        mesh.visual = trimesh.visual.TextureVisuals(material=_material(item))
+        mesh.metadata = {"role": item.role, "shape": item.shape.kind, "size": item.shape.size}
+        T_world_object = item.shape.T_world_object
+        scene.add_geometry(
+            mesh, node_name=item.id, geom_name=item.id, parent_node_name=_Z_UP, transform=T_world_object
+        )
+    if binary:
+        data: bytes = export_glb(scene)
+        return data
+    files = export_gltf(scene, embed_buffers=True)
+    text: bytes = files["model.gltf"]
+    return text
+
+
+def _material(item: SceneObject) -> PBRMaterial:
+    from trimesh.visual.material import PBRMaterial
+
+    return PBRMaterial(
+        name=item.id,
+        baseColorFactor=[*rgb(object_colour(item.label)), 255],
+        metallicFactor=0.0,
+        roughnessFactor=0.8,
+    )
+
+
+def to_graphml(graph: SupportGraph) -> str:
+    """Write the support graph as GraphML; edges run from supporter to supported.
+
+    Vertices have role, label, shape, size [m], centre x, y, z [m] and in how many views they were found;
+    edges have kind, certain, and in how many views they were found.
+
+    Args:
+        graph: The graph.
+    """
+    import networkx as nx
+
+    plain = nx.DiGraph()
+    for item in graph.objects:
+        x, y, z = (float(value) for value in item.centre_world)
+        size = item.shape.size
+        lengths = size.values() if isinstance(size, Mapping) else size
+        plain.add_node(
+            item.id,
+            role=item.role,
+            label=item.label,
+            shape=item.shape.kind,
+            size=" ".join(f"{length:.6g}" for length in lengths),
+            x=x,
+            y=y,
+            z=z,
+            colour=object_colour(item.label),
+            occurrences=item.occurrences,
+            opportunities=item.opportunities,
+        )
+    for support in graph.supports:
+        plain.add_edge(
+            *support.pair,
+            kind=support.kind,
+            certain=support.certain,
+            occurrences=support.occurrences,
+            opportunities=support.opportunities,
+        )
+    return "\n".join(nx.generate_graphml(plain)) + "\n"
+
+
+def to_dot(graph: SupportGraph) -> str:
+    """Write the support graph as DOT, to be drawn as the report draws it: the table below, doubt in dashes.
+
+    Args:
+        graph: The graph.
+    """
+    lines = ["digraph supports {", "  rankdir=BT;", '  node [style=filled, fontname="sans-serif"];']
+    for item in graph.objects:
+        colour = object_colour(item.label)
+        attributes: dict[str, Any] = {
+            "label": item.id if item.role == "object" else f"{item.id} · support surface",
+            "shape": {"cylinder": "cylinder", "sphere": "circle"}.get(item.shape.kind, "box"),
+            "fillcolor": colour,
+            "fontcolor": ink_on(colour),
+            "tooltip": f"{item.shape.kind}, found in {item.occurrences} of {item.opportunities} views",
+        }
+        lines.append(f"  {_quoted(item.id)} [{_listed(attributes)}];")
+    for support in graph.supports:
+        attributes = {
+            "style": "solid" if support.certain else "dashed",
+            "tooltip": f"{support.kind}, found in {support.occurrences} of {support.opportunities} views",
+        }
+        if support.kind != "bottom-up":
+            attributes["label"] = support.kind
+        ends = " -> ".join(_quoted(name) for name in support.pair)
+        lines.append(f"  {ends} [{_listed(attributes)}];")
+    return "\n".join([*lines, "}"]) + "\n"
+
+
+def _listed(attributes: Mapping[str, str]) -> str:
+    return ", ".join(f"{name}={_quoted(value)}" for name, value in attributes.items())
+
+
+def _quoted(text: str) -> str:
+    """A quoted string of DOT: backslashes begin escapes in what is shown, quotes end it."""
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + " ".join(escaped.splitlines()) + '"'
