@@ -120,7 +120,7 @@ def test_a_value_of_the_wrong_type_says_what_is_wanted(flag, wanted):
         ("fit.confidence=1", "a number above 0 and below 1"),
         ("fusion.keep_share=1.01", "a number from 0 to 1"),
         ("active.view_cone=90", "a number from 0 to below 90"),
-        ("segmentation.hollow=-1.5", "a number from -1 to 1"),
+        ("registration.min_cosine=-1.5", "a number from -1 to 1"),
         ("active.max_views=0", "a whole number from 1 on"),
         ("voxels.extent=[1, 0, 1]", "a list of 3 numbers, each above 0"),
         ("robot.pitch=[-100, 20]", "a list of 2 numbers, each from -90 to 90"),
@@ -137,7 +137,7 @@ def test_a_value_out_of_its_range_says_what_the_range_is(flag, wanted):
 
 
 @pytest.mark.parametrize(
-    "flag", ["noise.translation=0", "fusion.keep_share=1", "segmentation.gap=0", "robot.pitch=[10, 10]"]
+    "flag", ["noise.translation=0", "fusion.keep_share=1", "split.rounds=0", "robot.pitch=[10, 10]"]
 )
 def test_the_ends_of_a_range_belong_to_it(flag):
     read_settings(None, [flag])
