@@ -1,28 +1,26 @@
-"""Kernels are compiled once, all of them, beforehand; and what happens where that cannot be."""
+"""Kernels are compiled once, beforehand, and work is shared out among threads."""
 
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
-from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
-from conftest import SMALL, run_command
+from numba import njit
 
 from caryatid.runtime import compiling
-from caryatid.runtime.compiling import compile_kernels, compile_share, listed
-from caryatid.scene import Scene
+from caryatid.runtime.compiling import compile_kernels
+from caryatid.runtime.parallel import for_each
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+SOURCE = "from numba import njit\n@njit(cache=True)\ndef f(x):\n    return x\n"
 
-AFTERWARDS = """
+REHEARSED = """
 import json, sys
 from numba.core import event
 from caryatid.runtime.compiling import compile_kernels
@@ -33,252 +31,176 @@ compile_kernels(said.append)
 class Late(event.Listener):
     def on_start(self, happening):
         kernel = happening.data["dispatcher"].py_func
-        late.append(f"{kernel.__module__}.{kernel.__name__}{happening.data['args']}")
+        late.append(f"{kernel.__module__}.{kernel.__name__}")
 
     def on_end(self, happening):
         pass
 
 event.register("numba:compile", Late())
-if len(sys.argv) > 1:
-    sys.path.append(sys.argv[1])
-    import compiling
-    compiling.rehearse()
+from caryatid.simulation.rehearsal import rehearse
+rehearse(0)
 compile_kernels(said.append)
-print(json.dumps([said, late]))
+print(json.dumps([said, [name for name in late if name.startswith("caryatid")]]))
 """
 
 
-def python(code, *arguments, **environment):
-    done = subprocess.run(
-        [sys.executable, "-c", code, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        env=os.environ | environment,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+@pytest.mark.slow
+def test_two_processes_compile_all_kernels_once(tmp_path):
+    """Both begin with an empty cache; one compiles, the other waits, and neither compiles anything later."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", REHEARSED], env=environment, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+    results = [json.loads(process.communicate(timeout=1800)[0].splitlines()[-1]) for process in both]
+    assert [process.returncode for process in both] == [0, 0]
+    assert sorted(len(said) for said, _ in results) == [0, 1]
+    assert [late for _, late in results] == [[], []]
 
 
-def test_what_is_compiled_beforehand_is_all_that_is_called(tmp_path):
-    """Where this fails, `python benchmarks/compiling.py --write` writes the list anew."""
-    said, late = python(AFTERWARDS, BENCHMARKS, NUMBA_CACHE_DIR=str(tmp_path))
-    assert said == ["compiling kernels, once after installation: 10 to 20 s"]
-    assert late == []
-    assert {file.suffix for file in tmp_path.rglob("*") if file.is_file()} == {
-        ".nbi",
-        ".nbc",
-        ".compiled",
-        ".lock",
-    }
-    assert python(AFTERWARDS, NUMBA_CACHE_DIR=str(tmp_path)) == [[], []]
-
-
-# What is compiled when; with three modules that are not really compiled
+@pytest.mark.slow
+def test_ctrl_c_while_compiling_leaves_no_run_and_no_stamp(tmp_path):
+    cache = tmp_path / "cache"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "caryatid", "explore", "tower", "--out", str(tmp_path / "run")],
+        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)}, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )  # fmt: skip
+    assert process.stderr.readline().startswith("compiling kernels")
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert (process.returncode, said) == (130, "interrupted: nothing was written\n")
+    assert not list(cache.rglob("compiled-*.json"))
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture
-def pretended(tmp_path, monkeypatch):
-    """Modules a, b that calls a's kernels, and c; the lists of what was to be compiled."""
-    sources = {"a": "f = 1", "b": "from caryatid.kernels.a import f", "c": "h = 3"}
-    for name, text in sources.items():
-        (tmp_path / f"{name}.py").write_text(text)
-    signatures = tmp_path / "signatures.json"
-    signatures.write_text(json.dumps({"a.f": ["(int64,)"], "b.g": ["(int64,)"], "c.h": ["(int64,)"]}))
+def package(tmp_path, monkeypatch):
+    """A package of modules a, b that imports a, and c, each with a kernel; a list of the rehearsals."""
     runs = []
-    monkeypatch.setattr(compiling, "HERE", tmp_path)
-    monkeypatch.setattr(compiling, "SIGNATURES", signatures)
-    monkeypatch.setattr(compiling, "CACHE", tmp_path / "cache")
-    monkeypatch.setattr(
-        compiling, "_run_processes", lambda work, kernels: runs.append([k.name for k in kernels])
-    )
-    forget()
-    yield runs
-    forget()
+    for name, imported in (("a", ""), ("b", "from caryatid.a import f\n"), ("c", "")):
+        (tmp_path / f"{name}.py").write_text(imported + SOURCE)
+    monkeypatch.setattr(compiling, "ROOT", tmp_path)
+    monkeypatch.setattr(compiling, "cache_of", lambda folder: tmp_path / "cache")
+    monkeypatch.setattr(compiling, "_run_processes", lambda: runs.append(_indexes(tmp_path)))
+    return runs
 
 
-def forget():
-    """As a new process knows nothing."""
-    listed.cache_clear()
-    compiling._stamps.cache_clear()
+def _indexes(folder):
+    """Modules whose kernels are kept; all are once this returns."""
+    kept = sorted(path.name[0] for path in (folder / "cache").glob("*.nbi"))
+    for name in "abc":
+        (folder / "cache" / f"{name}.f-3.py311.nbi").touch()
+    return kept
 
 
-def test_what_is_compiled_is_not_compiled_again(pretended):
+def test_only_what_changed_and_what_calls_it_is_compiled_again(package, tmp_path):
     said = []
-    for _ in range(3):
+    for _ in range(2):
         compile_kernels(said.append)
-        forget()
-    assert pretended == [["f", "g", "h"]]
-    assert len(said) == 1
+    (tmp_path / "a.py").write_text(SOURCE + "\n")
+    compile_kernels(said.append)
+    (tmp_path / "c.py").write_text(SOURCE + "\n")
+    compile_kernels(said.append)
+    assert package == [[], ["c"], ["a", "b"]]
+    assert said == ["compiling kernels, once after installation: 10 to 20 s"] * 3
 
 
-def test_a_change_is_followed_to_whoever_calls_it(pretended, tmp_path):
-    compile_kernels()
-    (tmp_path / "a.py").write_text("f = 'another'")
-    forget()
-    compile_kernels()
-    (tmp_path / "c.py").write_text("h = 'another'")
-    forget()
-    compile_kernels()
-    called = {"a.f": ["(int64,)"], "b.g": ["(int64,)", "(float64,)"], "c.h": ["(int64,)"]}
-    (tmp_path / "signatures.json").write_text(json.dumps(called))
-    forget()
-    compile_kernels()
-    assert pretended[1:] == [["f", "g"], ["h"], ["g"]]
+def test_an_interrupted_rehearsal_is_repeated(package, monkeypatch):
+    rehearse = compiling._run_processes
 
-
-def test_what_was_there_before_the_last_change_does_not_count(pretended, tmp_path):
-    """Its compiled kernels are gone."""
-    file = tmp_path / "c.py"
-    before, at = file.read_text(), file.stat().st_mtime_ns
-    compile_kernels()
-    for text, when in (("h = 'another'", at + 1), (before, at)):
-        file.write_text(text)
-        os.utime(file, ns=(when, when))
-        forget()
-        compile_kernels()
-    assert pretended[1:] == [["h"], ["h"]]
-
-
-def test_after_an_interrupt_it_starts_again(pretended, monkeypatch):
-    work, calls = compiling._run_processes, []
-
-    def interrupted(*arguments):
-        calls.append(arguments)
-        if len(calls) == 1:
-            raise KeyboardInterrupt
-        work(*arguments)
+    def interrupted():
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(compiling, "_run_processes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         compile_kernels()
+    monkeypatch.setattr(compiling, "_run_processes", rehearse)
     compile_kernels()
-    assert pretended == [["f", "g", "h"]]
+    assert package == [[]]
 
 
-def test_of_two_at_once_one_compiles_and_the_other_waits(pretended, monkeypatch):
-    work, started = compiling._run_processes, threading.Event()
-
-    def slowly(*arguments):
-        started.set()
-        time.sleep(0.5)
-        work(*arguments)
-
-    monkeypatch.setattr(compiling, "_run_processes", slowly)
-    first = threading.Thread(target=compile_kernels)
-    first.start()
-    assert started.wait(10.0)
-    said = []
-    compile_kernels(said.append)
-    assert pretended == [["f", "g", "h"]]
-    assert said == []
-    first.join()
-
-
-@pytest.mark.parametrize("why", ["jit", "child", "frozen", "nowhere"])
-def test_where_it_cannot_be_it_is_left_alone(pretended, monkeypatch, why):
-    match why:
-        case "jit":
+@pytest.mark.parametrize("reason", ["no compiler", "rehearsing", "frozen", "no python"])
+def test_where_nothing_can_be_compiled_beforehand_nothing_is(package, monkeypatch, reason):
+    match reason:
+        case "no compiler":
             monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
-        case "child":
+        case "rehearsing":
             monkeypatch.setenv(compiling.MARK, "1")
         case "frozen":
             monkeypatch.setattr(sys, "frozen", True, raising=False)
-        case "nowhere":
+        case "no python":
             monkeypatch.setattr(sys, "executable", "")
     compile_kernels()
-    assert pretended == []
+    assert package == []
 
 
-def test_a_scene_has_its_kernels_compiled_and_says_so_to_a_log(pretended, caplog):
-    with caplog.at_level(logging.INFO, logger="caryatid"):
-        Scene()
-        Scene()
-    assert pretended == [["f", "g", "h"]]
-    assert [r.message for r in caplog.records] == ["compiling kernels, once after installation: 10 to 20 s"]
-
-
-@pytest.mark.parametrize("option", ["", "--quiet", "--json"])
-def test_a_command_says_so_before_its_first_view(pretended, tmp_path, scene_file, recording, capsys, option):
-    for command in (["explore", scene_file, "--views", 1, *SMALL], ["extract", recording]):
-        (tmp_path / "c.py").write_text(f"h = '{command[0]}'")
-        forget()
-        assert run_command(*command, "--no-report", "--out", tmp_path / "run", *option.split()) == 0
-        first = capsys.readouterr().err.partition("\n")[0]
-        assert first == ("" if option else "compiling kernels, once after installation: 10 to 20 s")
-    assert len(pretended) == 2
-
-
-def test_what_cannot_be_explored_is_said_without_compiling(pretended, tmp_path):
-    for command in ("explore", "extract"):
-        assert run_command(command, tmp_path / "nowhere", "--out", tmp_path / "run") == 1
-    assert pretended == []
-
-
-# Real kernels
-
-
-def test_an_interrupt_leaves_nothing_behind(tmp_path):
-    cache = tmp_path / "cache"
-    process = subprocess.Popen(
-        [sys.executable, "-m", "caryatid", "explore", "tower", "--out", str(tmp_path / "run")],
-        env=os.environ | {"NUMBA_CACHE_DIR": str(cache)},
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    assert process.stderr.readline().startswith("compiling kernels")
-    while not list(cache.rglob("compiling-*/*.log")):
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode == 130
-    assert said == "interrupted: nothing was written\n"
-    assert not list(cache.rglob("compiling-*"))
-    assert not list(cache.rglob("*.compiled"))
-    assert not (tmp_path / "run").exists()
-
-
-def test_processes_that_do_not_start_do_no_harm(tmp_path, monkeypatch):
-    monkeypatch.setattr(compiling, "CACHE", tmp_path)
+def test_processes_that_do_not_start_do_no_harm(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    forget()
-    said = []
-    compile_kernels(said.append)
-    compile_kernels(said.append)
-    forget()
-    assert len(said) == 1
-    assert not list(tmp_path.glob("*.nbc"))
+    compiling._run_processes()
 
 
-def test_a_kernel_that_cannot_be_compiled_does_not_keep_others_from_it(tmp_path, monkeypatch, capsys):
-    good = listed()[-1]
-    signatures = {
-        "nowhere.f": ["(int64,)"],
-        f"{good.module}.nothing": ["(int64,)"],
-        f"{good.module}.{good.name}": list(good.signatures),
-    }
-    monkeypatch.setattr(compiling, "SIGNATURES", tmp_path / "signatures.json")
-    (tmp_path / "signatures.json").write_text(json.dumps(signatures))
-    listed.cache_clear()
-    compile_share(str(tmp_path), ["nowhere", good.module])
-    listed.cache_clear()
-    assert (tmp_path / f"{good.module}.{good.name}").read_text() == str(compiling.CACHE)
-    assert (tmp_path / f"{good.module}.nothing").read_text() == ""
-    assert "nowhere.f: " in capsys.readouterr().err
+# Sharing work out
 
 
-def test_where_compiled_kernels_cannot_be_kept_it_is_said(tmp_path):
-    """As in a folder that cannot be written to, of a user without a home."""
-    done = subprocess.run(
-        [sys.executable, "-m", "caryatid", "explore", "tower", "--out", str(tmp_path / "run")],
-        env=os.environ | {"NUMBA_CACHE_LOCATOR_CLASSES": "ZipCacheLocator"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 1
-    assert done.stderr.startswith("error: NUMBA_CACHE_DIR: compiled kernels cannot be kept")
-    assert done.stderr.count("\n") == 1
+@njit
+def add_scaled(index, data):
+    numbers, factor, results = data
+    results[index] += factor * numbers[index]
+
+
+@njit
+def add(index, data):
+    numbers, factor, results = data
+    results[index] += factor + numbers[index]
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 100])
+def test_each_piece_of_work_is_done_once(count):
+    numbers, results = np.arange(100.0), np.zeros(100)
+    for_each(add_scaled, count, (numbers, 3.0, results))
+    np.testing.assert_array_equal(results, np.where(np.arange(100) < count, 3.0 * numbers, 0.0))
+
+
+def test_two_kinds_of_work_on_the_same_data_are_told_apart():
+    numbers, results = np.arange(10.0), np.zeros(10)
+    for work in (add_scaled, add, add_scaled):
+        for_each(work, 10, (numbers, 3.0, results))
+    np.testing.assert_array_equal(results, 7.0 * numbers + 3.0)
+
+
+KEPT = """
+import sys
+import numpy as np
+from numba import njit
+sys.path.insert(0, sys.argv[1])
+import kinds
+from caryatid.runtime.parallel import for_each
+
+@njit(cache=True)
+def count(index, data):
+    data.results[index] += index
+
+data = getattr(kinds, sys.argv[2])(np.zeros(3))
+for_each(count, 3, data)
+sys.stdout.write(str(data.results.tolist()))
+"""
+
+
+@pytest.mark.slow
+def test_a_kept_kernel_whose_types_were_renamed_is_compiled_again(tmp_path):
+    script = tmp_path / "kept.py"
+    script.write_text(KEPT)
+    for name in ("Before", "Afterwards"):
+        (tmp_path / "kinds.py").write_text(
+            f"from typing import Any, NamedTuple\nclass {name}(NamedTuple):\n    results: Any\n"
+        )
+        done = subprocess.run(
+            [sys.executable, str(script), str(tmp_path), name],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+            capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.stdout == "[0.0, 1.0, 2.0]", done.stderr

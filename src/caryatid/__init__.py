@@ -22,7 +22,11 @@ if TYPE_CHECKING:
 
 __version__ = "0.2.0"
 
-hooks |= {"notebook cell": "caryatid.viz.notebook:draw_cell", "viewer": "caryatid.viewer:show"}
+hooks |= {
+    "notebook cell": "caryatid.viz.notebook:draw_cell",
+    "viewer": "caryatid.viewer:show",
+    "rehearsal": "caryatid.simulation.rehearsal:rehearse",
+}
 
 __all__ = [
     "Box",

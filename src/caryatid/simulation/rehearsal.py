@@ -1,0 +1,71 @@
+"""A rehearsal of all that calls compiled kernels, on small images, so that they are compiled beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from caryatid.config import Config, SegmentationMethod, SensorConfig
+from caryatid.exploration import Step, explore, next_best_view
+from caryatid.fitting.primitives import fit
+from caryatid.planning.planners import BUILT_IN
+from caryatid.scene import Scene
+from caryatid.sensing.views import SUPPORT_LABEL
+from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.setup import Simulation, make_simulation
+
+SENSOR = SensorConfig(width=160, height=120, focal=131.25)
+"""A quarter of the usual image."""
+
+
+def rehearse(number: int) -> None:
+    """Fit shapes, explore with and without given segments, plan with all planners, and take a point cloud.
+
+    Args:
+        number: Which of these comes first; the others follow in turn.
+    """
+    parts = [_explore_by_colour_and_depth, _fit, _explore_with_labels]
+    for n in range(len(parts)):
+        parts[(number + n) % len(parts)]()
+
+
+def _fit() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (600, 3)) * (0.1, 0.2, 0.1)
+    axis = np.argmax(np.abs(points) / (0.1, 0.2, 0.1), axis=1)
+    normals = np.eye(3)[axis] * np.sign(points[np.arange(600), axis])[:, None]
+    points[np.arange(600), axis] = normals.sum(axis=1) * np.array([0.05, 0.1, 0.05])[axis]
+    fit(points, normals, config=Config().fit, rng=rng)
+
+
+def _explore_by_colour_and_depth() -> None:
+    simulation, steps = _explore("dense-12-0", "auto")
+    scene = Scene(_config(), segmentation="auto")
+    for step in steps:
+        if step.view is not None:
+            scene.update(step.view)
+    for planner in BUILT_IN:
+        next_best_view(scene, simulation.robot, planner=planner)
+
+
+def _explore_with_labels() -> None:
+    _, steps = _explore("tower", "labels")
+    cloud = steps[0].cloud
+    labels = cloud.labels
+    Scene(_config()).update(replace(cloud, labels=None))
+    if labels is not None:
+        Scene(_config()).update(replace(cloud, labels=np.where(labels == SUPPORT_LABEL, 0, labels)))
+
+
+def _explore(name: str, segmentation: SegmentationMethod) -> tuple[Simulation, list[Step]]:
+    config = _config()
+    simulation = make_simulation(load_scene(name), config, noise="carmine", seed=0)
+    return simulation, list(
+        explore(simulation.camera, simulation.robot, config=config, segmentation=segmentation)
+    )
+
+
+def _config() -> Config:
+    config = Config()
+    return replace(config, sensor=SENSOR, active=replace(config.active, sphere_points=4000, max_views=3))
