@@ -9,8 +9,12 @@ from raycast import K, from_the_side, table_scene
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.sensing.clouds import estimate_normals, oriented_points, thin
-from caryatid.sensing.local_planes import local_surface, local_surface_reference
+from caryatid.sensing.clouds import (
+    estimate_normals,
+    local_surface,
+    oriented_points,
+    thin,
+)
 from caryatid.sensing.views import View
 
 CONFIG = CloudConfig()
@@ -60,24 +64,6 @@ def test_given_normals_are_used():
     view = View(depth=np.full((48, 64), 1.0, dtype=np.float32), K=K, normals_camera=given)
     _, normals, _ = oriented_points(view, CONFIG)
     np.testing.assert_array_equal(normals, given.reshape(-1, 3))
-
-
-def test_local_surface_kernel_equals_its_reference():
-    depth = table_scene(from_the_side(), spheres=[SPHERE], sigma=0.001).depth[150:270, 200:360]
-    inverse = np.where(depth > 0, 1.0 / np.where(depth > 0, depth, 1.0), 0.0).astype(np.float32)
-    inverse[::7, ::5] = 0.0
-    for radius in (2, 4):
-        fast = local_surface(inverse, radius, 0.01, 0.004)
-        smoothed, directions, noise = local_surface_reference(inverse, K, radius, 0.01, 0.004)
-        assert fast.noise == pytest.approx(noise, rel=1e-3)
-        known = fast.planes[2] > 0.0
-        assert known.mean() > 0.9
-        points, normals = fast.oriented(np.flatnonzero(known), K, np.eye(4))
-        alike = np.isclose(normals, directions[known], atol=2e-3).all(axis=-1)
-        alike &= np.isclose(1.0 / points[:, 2], smoothed[known], atol=1e-5)
-        # Two windows that vary alike but for rounding may be chosen differently.
-        assert alike.mean() > 0.999
-        assert (known == (smoothed > 0.0)).mean() > 0.999
 
 
 def test_oriented_planes_lie_on_the_pixels_rays_in_the_world():

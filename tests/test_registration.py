@@ -12,8 +12,7 @@ from synthetic import TABLE_TOP, box, cylinder, direction, moved, sphere, surfac
 from caryatid.config import RegistrationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.sensing.joint_registration import ViewRegistration
-from caryatid.sensing.registration import twist_transform
+from caryatid.sensing.registration import ViewRegistration, twist_transform
 from caryatid.sensing.surfels import even_sample, surfels_of
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 

@@ -11,16 +11,12 @@ import pytest
 from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
-from caryatid.sensing.solids import filled_reference
 from caryatid.sensing.views import View
-from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
-from caryatid.sensing.voxel_map_kernels import (
-    enter_view,
-    enter_view_reference,
-    states_of,
-    states_of_reference,
-    voxels_at,
-    voxels_at_reference,
+from caryatid.sensing.voxel_map import (
+    FREE,
+    OCCUPIED,
+    UNKNOWN,
+    VoxelMap,
 )
 
 K = np.array([[100.0, 0.0, 79.5], [0.0, 100.0, 59.5], [0.0, 0.0, 1.0]])
@@ -34,80 +30,12 @@ def wall_view(distance: float = 1.0, noise: np.ndarray | float = 0.0) -> View:
     return View(depth, K, T_world_camera)
 
 
-def random_counts(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Hits and passes of a small map, full ones too."""
-    hits = rng.choice([0, 0, 0, 1, 2, 255], (13, 17, 11)).astype(np.uint8)
-    return hits, rng.choice([0, 1, 2, 5, 255], hits.shape).astype(np.uint8)
-
-
-def a_view(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    """Depth, pinhole matrix and pose of a small image of scattered readings, some missing, some far."""
-    depth = rng.uniform(0.2, 2.0, (23, 31)).astype(np.float32)
-    depth[rng.random(depth.shape) < 0.2] = 0.0
-    K = np.array([[30.0, 0.0, 15.2], [0.0, 28.0, 11.1], [0.0, 0.0, 1.0]])
-    return depth, K, transforms.look_at(rng.uniform(-0.8, 0.8, 3), rng.uniform(-0.2, 0.2, 3))
-
-
-@pytest.mark.parametrize("stride", [1, 2, 3])
-def test_entering_a_view_agrees_with_its_reference(stride: int):
-    rng = np.random.default_rng(stride)
-    for _ in range(3):
-        hits, passes = random_counts(rng)
-        args = (hits, passes, *a_view(rng), np.array([-0.3, -0.4, -0.2]), 0.05, stride, 0.07, 1.1)
-        before = hits.copy(), passes.copy()
-        compiled, reference = enter_view(*args), enter_view_reference(*args)
-        for counted, right, old in zip(compiled, reference, before, strict=True):
-            np.testing.assert_array_equal(counted, right)
-            assert 5 < (counted != old).sum() < 0.9 * old.size
-        np.testing.assert_array_equal((hits, passes), before)
-
-
-def test_states_agree_with_their_reference():
-    rng = np.random.default_rng(0)
-    table = np.full((256, 256), FREE, dtype=np.int8)
-    table[0, 0] = UNKNOWN
-    table[:, 1:] = rng.choice([FREE, OCCUPIED], (256, 255))
-    for _ in range(3):
-        hits, passes = random_counts(rng)
-        states, occupied = states_of(hits, passes, table, OCCUPIED)
-        expected = states_of_reference(hits, passes, table, OCCUPIED)
-        np.testing.assert_array_equal(states, expected[0])
-        np.testing.assert_array_equal(occupied, expected[1])
-        assert len(np.unique(states)) == 3
-
-
-def test_the_voxels_of_points_agree_with_their_reference():
-    points = np.random.default_rng(0).uniform(-1.0, 1.0, (500, 3))
-    args = (points, np.array([-0.3, -0.4, -0.2]), 0.05, (13, 17, 11))
-    index = voxels_at(*args)
-    np.testing.assert_array_equal(index, voxels_at_reference(*args))
-    assert 10 < (index >= 0).sum() < 490
-
-
 def shapes_about(rng: np.random.Generator) -> list:
     """Shapes in and about the map of `random_counts`, turned; one far away."""
     T = [transforms.rigid(transforms.random_rotation(rng), rng.uniform(-0.4, 0.5, 3)) for _ in range(6)]
     boxes = [Box(t, rng.uniform(0.05, 0.5, 3)) for t in T[:2]]
     cylinders = [Cylinder(t, 0.12, 0.3) for t in T[2:4]]
     return [*boxes, *cylinders, Sphere(T[4], 0.15), Sphere(transforms.rigid(np.eye(3), (9.0, 0.0, 0.0)), 0.2)]
-
-
-def test_what_is_solid_agrees_with_its_reference():
-    rng = np.random.default_rng(0)
-    for shapes in ([], shapes_about(rng), shapes_about(rng)):
-        hits, passes = random_counts(rng)
-        hits[:4], hits[:, :, 9:] = 0, 0
-        voxels = VoxelMap(np.array([-0.3, -0.4, -0.2]), hits, passes, VoxelConfig(size=0.05))
-        solid = voxels.solid(shapes)
-        whole = filled_reference(voxels.states == OCCUPIED, shapes, voxels.origin_world, 0.05)
-        low = np.rint((solid.origin_world - voxels.origin_world) / 0.05).astype(int)
-        window = tuple(slice(a, a + n) for a, n in zip(low, solid.grid.shape, strict=True))
-        np.testing.assert_array_equal(solid.grid, whole[window])
-        assert solid.grid.sum() == whole.sum() > 100
-        assert shapes or solid.grid.shape == (9, 17, 9)
-        centres = voxels.centres_world(np.indices(hits.shape).reshape(3, -1).T)
-        np.testing.assert_array_equal(solid.holds(centres), whole.ravel() > 0)
-        assert not solid.holds(centres + 5.0).any()
 
 
 THREADED = """

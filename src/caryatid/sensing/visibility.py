@@ -1,4 +1,4 @@
-"""Compiled: what cameras see of points in a scene, beside the plain NumPy reference."""
+"""Visibility: what cameras see of points in a scene, and what a view says about a shape it should show."""
 
 from __future__ import annotations
 
@@ -8,14 +8,23 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.geometry.rays import Grid, room, traverse, traversed_reference
+from caryatid.geometry import transforms
+from caryatid.geometry.rays import Grid, room, traverse
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import for_each
+from caryatid.sensing.views import View
 
 SHARES = 64
 """Parts the work is dealt out to in turn, so that every thread has as much to do [1]."""
 EYES = 128
 """Cameras of one piece of work, all with one point [1]."""
+SPACING = 0.01
+"""Spacing of the points on a shape that are looked for in the view [m]."""
+BEHIND = 0.02
+"""A reading this far behind such a point contradicts it [m]; 2σ of registration and depth together."""
+CONTRADICTING = 0.5
+"""Share of the points that must be contradicted for the view to speak against the object [1]."""
 
 
 class Sights(NamedTuple):
@@ -139,32 +148,24 @@ def _hide(sights: Sights, found: NDArray[np.int32], p: int, first: int, end: int
             worth[n] = 0.0
 
 
-def shown_reference(
-    solid: Grid,
-    origin: Array,
-    size: float,
-    points: Array,
-    normals: Array,
-    before: Array,
-    weights: Array,
-    eyes: Array,
-    axes: Array,
-    clearance: float,
-    good: float,
-    cone: float,
-) -> Array:
-    """Do the same as `shown`, ray by ray from all crossings with the grid's planes."""
-    worth = np.zeros((len(points), eyes.shape[1]))
-    for p, (point, normal) in enumerate(zip(points, normals, strict=True)):
-        for c, (eye, axis) in enumerate(zip(eyes.T, axes.T, strict=True)):
-            length = float(np.linalg.norm(eye - point))
-            ray = (eye - point) / max(length, 1e-6)
-            facing = min(float(normal @ ray) / good, 1.0) if normal.any() else 1.0
-            if -float(axis @ ray) < cone or facing <= before[p]:
-                continue
-            if length > clearance:
-                voxels = traversed_reference(solid.shape, point, eye, clearance / length, 1.0, origin, size)
-                if solid[tuple(voxels.T)].any():
-                    continue
-            worth[p, c] = weights[p] * (facing - before[p])
-    return worth
+def seen_through(shape: Shape, view: View) -> bool:
+    """Whether a view looks through most of where the shape should be.
+
+    Args:
+        shape: In the world frame.
+        view: A view with a pose.
+    """
+    points_world, normals_world = shape.surface(SPACING)
+    eye_world = view.pose[:3, 3]
+    facing = np.sum((eye_world - points_world) * normals_world, axis=1) > 0.0
+    p = transforms.transform(transforms.invert(view.pose), points_world[facing])
+    p = p[p[:, 2] > 1e-3]
+    u = np.rint(p[:, 0] / p[:, 2] * view.K[0, 0] + view.K[0, 2]).astype(np.intp)
+    v = np.rint(p[:, 1] / p[:, 2] * view.K[1, 1] + view.K[1, 2]).astype(np.intp)
+    height, width = view.depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    depth = view.depth[v[inside], u[inside]]
+    read = depth > 0.0
+    if not read.any():
+        return False
+    return bool((depth[read] > p[inside, 2][read] + BEHIND).mean() > CONTRADICTING)

@@ -1,4 +1,4 @@
-"""Partners are the nearest patches, and what they say of poses is what plain NumPy makes of them."""
+"""Correspondences between views: found only within reach, alike on any number of threads, well derived."""
 
 from __future__ import annotations
 
@@ -8,9 +8,13 @@ import pytest
 
 from caryatid.geometry import transforms
 from caryatid.runtime.parallel import for_each
-from caryatid.sensing.correspondences import CHUNK, Search, find_partners, index_patches
-from caryatid.sensing.gauss_newton import normal_equations, step_down
-from caryatid.sensing.registration import twist_transform
+from caryatid.sensing.registration import (
+    CHUNK,
+    Search,
+    find_partners,
+    index_patches,
+    step_down,
+)
 
 EDGE, MIN_COSINE, NORMAL_REACH, NOISE = 0.05, 0.9, 0.05, 0.001
 PIVOT = np.array([0.02, -0.01, 0.03])
@@ -68,36 +72,6 @@ def found(*args, **options):
     return rows[rows[:, 7] > 0.0]
 
 
-def found_reference(reach, pairs=((0, 2), (1, 2), (0, 1)), stride=1):
-    rows = []
-    for still, moving in pairs:
-        T, S = twist_transform(TWISTS[moving], PIVOT), twist_transform(TWISTS[still], PIVOT)
-        others = patches(still)
-        q, m = transforms.transform(S, others[:, :3]), transforms.rotate(S, others[:, 3:6])
-        for sample in patches(moving)[:130:stride]:
-            p, n = transforms.transform(T, sample[:3]), transforms.rotate(T, sample[3:6])
-            apart, cosine = np.linalg.norm(q - p, axis=1), m @ n
-            cost = apart**2 + 2.0 * NORMAL_REACH**2 * (1.0 - cosine)
-            cost[(apart >= reach) | (cosine <= MIN_COSINE) | (others[:, 7] != sample[7])] = np.inf
-            k = int(np.argmin(cost))
-            if np.isfinite(cost[k]):
-                between, middle = transforms.unit(n + m[k]), 0.5 * (p + q[k]) - PIVOT
-                variance = sample[6] + others[k, 6] + NOISE**2
-                rows.append([*between, *np.cross(middle, between), np.dot(p - q[k], between), 1.0 / variance])
-    return np.array(rows)
-
-
-@pytest.mark.parametrize("reach", [0.012, 0.03, 0.05, 0.1])
-def test_partners_are_the_nearest_patches(reach):
-    expected = found_reference(reach)
-    assert len(expected) > 10
-    np.testing.assert_allclose(found(reach), expected, rtol=1e-9, atol=1e-12)
-
-
-def test_every_so_many_patches_look_for_partners():
-    np.testing.assert_allclose(found(0.05, stride=3), found_reference(0.05, stride=3), rtol=1e-9, atol=1e-12)
-
-
 def test_patches_beyond_each_other_find_nothing():
     away = TWISTS + np.array([[0.0] * 6, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], [0.0] * 6])
     search = searched(0.1, tasks([(1, 2)]))
@@ -138,42 +112,6 @@ def test_distances_change_as_the_derivative_says():
         assert same.sum() > 0.9 * (after[:, 7] > 0.0).sum()
         # Normals that differ by several degrees make the derivative a little less than exact.
         np.testing.assert_allclose(after[same, 6], expected[: len(after)][same], atol=6e-7)
-
-
-def equations_reference(rows, step, outlier):
-    rows = rows[rows[:, 7] > 0.0]
-    J, distance = rows[:, :6], rows[:, 6] + rows[:, :6] @ step
-    weight = rows[:, 7] / (1.0 + (distance / outlier) ** 2) ** 2
-    misfit = np.minimum(np.abs(distance), outlier).sum()
-    return len(rows), misfit, J.T @ (weight * distance), J.T @ (weight[:, None] * J)
-
-
-def test_normal_equations_are_those_of_robust_least_squares():
-    chunks = tasks([(0, 2), (1, 2)])
-    rows, group = searched(0.05, chunks).rows, chunks[:, 3]
-    sums = normal_equations(rows, group, 2, 0.01)
-    for pair in range(2):
-        of_pair = rows[group == pair].reshape(-1, 8)
-        count, misfit, gradient, matrix = equations_reference(of_pair, np.zeros(6), 0.01)
-        assert sums[pair, 0] == count
-        np.testing.assert_allclose(sums[pair, 1], misfit)
-        np.testing.assert_allclose(sums[pair, 2:8], gradient, rtol=1e-9)
-        np.testing.assert_allclose(sums[pair, 8:], matrix[np.triu_indices(6)], rtol=1e-9)
-
-
-@pytest.mark.parametrize("settled", [0.0, 1.0])
-def test_steps_are_gauss_newton_with_a_prior_until_they_are_small(settled):
-    rows, twist = searched(0.05, tasks([(0, 2), (1, 2)])).rows, TWISTS[2]
-    information = np.diag([1e4, 2e4, 3e4, 1e3, 2e3, 3e3])
-    result = step_down(rows, twist, information, 0.2, 0.01, 2, settled)
-    rows, step = rows.reshape(-1, 8), np.zeros(6)
-    np.testing.assert_allclose(result[6:8], equations_reference(rows, step, 0.01)[:2])
-    for _ in range(1 if settled else 2):
-        _, _, gradient, matrix = equations_reference(rows, step, 0.01)
-        prior = information @ (twist + step)
-        step = step - np.linalg.solve(information + 0.2 * matrix, prior + 0.2 * gradient)
-    np.testing.assert_allclose(result[:6], step, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(result[8:], equations_reference(rows, step, 0.01)[:2])
 
 
 def test_without_steps_nothing_moves():
