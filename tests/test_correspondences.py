@@ -11,7 +11,7 @@ from caryatid.runtime.parallel import for_each
 from caryatid.sensing.registration import (
     CHUNK,
     Search,
-    find_partners,
+    find_correspondences,
     index_patches,
     step_down,
 )
@@ -59,7 +59,7 @@ def searched(reach, chunks, twists=TWISTS, shares=None):
     settings = (EDGE, reach, MIN_COSINE, NORMAL_REACH, NOISE)
     shares, rows = shares or len(chunks), np.zeros((len(chunks), CHUNK, 8))
     search = Search(*views(), chunks, shares, twists, PIVOT, *settings, rows)
-    for_each(find_partners, shares, search)
+    for_each(find_correspondences, shares, search)
     return search
 
 
@@ -77,7 +77,7 @@ def test_patches_beyond_each_other_find_nothing():
     search = searched(0.1, tasks([(1, 2)]))
     assert search.rows.any()
     # What an earlier search found is gone.
-    for_each(find_partners, search.shares, search._replace(twists=away))
+    for_each(find_correspondences, search.shares, search._replace(twists=away))
     assert not search.rows.any()
 
 

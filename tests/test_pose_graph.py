@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from caryatid.sensing.pose_graph import Ties
+from caryatid.sensing.pose_graph import PoseEdges
 
 STILL, MOVING = np.array([0, 0, 1, 2]), np.array([1, 2, 2, 3])
 
@@ -16,7 +16,7 @@ def positive(rng, count):
 
 def ties(rng):
     number = len(STILL)
-    return Ties(
+    return PoseEdges(
         *(STILL, MOVING, 0.1 * rng.normal(size=(number, 6)), np.array([100, 100, 50, 50])),
         *(np.array([80.0, 20.0, 10.0, 50.0]), np.array([0.08, 0.02, 0.01, 0.1])),
         *(rng.normal(size=(number, 6)), positive(rng, number)),
@@ -62,7 +62,7 @@ def test_pairs_are_stale_when_they_moved_against_each_other():
     stale = graph.stale(twists, 1e-6)
     np.testing.assert_array_equal(stale, [False, False, True, False])
     np.testing.assert_array_equal(graph.stale(twists + 0.5, 1e-6), stale)
-    assert not Ties.none().stale(twists, 1e-6).any()
+    assert not PoseEdges.none().stale(twists, 1e-6).any()
 
 
 def test_partners_are_counted_for_views_and_pairs():
@@ -82,4 +82,4 @@ def test_pairs_are_taken_out_and_put_together():
     both = rest.joined(graph.select(graph.moving == 1))
     np.testing.assert_array_equal(both.still, [0, 2, 0])
     np.testing.assert_array_equal(both.information, graph.information[[1, 3, 0]])
-    assert len(Ties.none().joined(Ties.none()).found) == 0
+    assert len(PoseEdges.none().joined(PoseEdges.none()).found) == 0

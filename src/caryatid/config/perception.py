@@ -69,57 +69,16 @@ class RegistrationConfig(Stage):
     """Expected error of a reported orientation, per axis, about the camera [deg]."""
     noise: Positive = 0.001
     """Expected distance of one patch to its partner's plane beside the spread of their readings [m]."""
-    independent: Share = 0.1
-    """Share of the partners that err independently [1]: neighbouring patches err alike."""
     spacing: Positive = 0.01
     """Size of the patches of objects that readings are averaged over [m]; a dozen pixels at 1.5 m."""
     spacing_far: Positive = 0.03
     """Size of the patches of the support surface [m]."""
-    min_readings: Count = 4
-    """Patches of fewer readings are left out [1]: rims, and sides seen at a grazing angle."""
-    min_share: Share = 0.33
-    """Where few pixels make a patch, this share of what the fullest ones have will do [1]."""
-    min_flatness: Share = 0.97
-    """Length of the mean of a patch's normals at least [1]; less is an edge."""
-    plane_rounds: WholeNumber = 4
-    """Rounds of the robust fit of planes to sides [1]."""
-    flat: Positive = 0.0015
-    """Distance of a patch from its side's plane at which it counts a quarter in it [m]."""
-    flat_share: Share = 0.7
-    """Share of a side's patches that must lie in its plane for the side to be flat [1]."""
-    min_side: NotNegative = 0.006
-    """Standard deviation of a flat side's patches along its shorter direction at least [m]; 2 cm wide."""
-    min_patches: Count = 6
-    """Sides of fewer patches are left out [1]; blurred edges."""
     sample: Count = 600
     """Patches of a view that look for partners in another [1]."""
-    descent: Count = 250
-    """Patches that look for partners while a new view is laid onto all earlier ones together [1]; its pose is
-    then made exact with the whole samples."""
     reaches: tuple[Positive, ...] = (0.1, 0.05, 0.025)
     """Partners further away are none [m], coarse to fine."""
-    rounds: Count = 3
-    """Rounds of matching at each reach [1]."""
-    steps: WholeNumber = 4
-    """Gauss-Newton steps between two rounds of matching at the most [1]."""
-    converged: NotNegative = 0.1
-    """Steps below this share of the distance at which partners lose their weight end a round, and the rounds
-    [1]; what is left, the next reach or the joint solution takes."""
-    normal_reach: Positive = 0.05
-    """How far apart [m] directions at right angles count when partners are looked for, by 1/√2."""
-    min_cosine: Cosine = 0.9
-    """Cosine of the angle between the normals of partners at least [1]."""
-    outlier: Positive = 0.3
-    """Share of the reach beyond which distances lose their weight [1]."""
     min_points: Count = 100
     """Fewer partners determine no pose [1]."""
-    exact: NotNegative = 0.0003
-    """A view that fits better than this as reported is not moved [m]; exact ones leave 0.1 mm, noisy 1 mm."""
-    settled: NotNegative = 0.0003
-    """Views whose points would move less than this stay where they are [m]."""
-    rematch: NotNegative = 0.002
-    """Partners are looked for anew between views that moved by more than this against each other [m, rad];
-    a quarter of the distance at which they lose their weight."""
     kept: Count = 12
     """Views that later ones are laid onto and that move with them [1]; 30° apart on a full turn."""
     max_translation: NotNegative = 0.1

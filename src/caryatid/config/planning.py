@@ -38,10 +38,6 @@ class VoxelConfig(Stage):
     """Occupancy one view with a reading in a voxel speaks for [1]; the usual sensor model."""
     miss: Likelihood = 0.4
     """Occupancy one view that looks through a voxel speaks for [1]; the usual sensor model."""
-    clamp: Annotated[tuple[Likelihood, Likelihood], Rising()] = (0.12, 0.97)
-    """Lowest and highest occupancy of a voxel the volumetric planners reckon with [1]; the usual ones."""
-    readings: Count = 5
-    """Images one view stands for in that occupancy [1]; as many misses reach the clamp."""
 
 
 @dataclass(frozen=True, slots=True)

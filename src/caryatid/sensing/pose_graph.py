@@ -14,7 +14,7 @@ Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Ties:
+class PoseEdges:
     """What pairs of views say of each other's poses, by the partners that patches of one have in the other.
 
     Half the sum of the partners' squared distances over their variance is quadratic in the twist of one view
@@ -42,7 +42,7 @@ class Ties:
     information: Array
 
     @classmethod
-    def none(cls) -> Ties:
+    def none(cls) -> PoseEdges:
         """No pairs."""
         number, nothing = np.zeros(0, dtype=np.intp), np.zeros(0)
         return cls(
@@ -50,16 +50,16 @@ class Ties:
             *(nothing, nothing, np.zeros((0, 6)), np.zeros((0, 6, 6))),
         )
 
-    def select(self, keep: NDArray[np.bool_]) -> Ties:
+    def select(self, keep: NDArray[np.bool_]) -> PoseEdges:
         """Return the pairs picked by a mask (E,)."""
-        return Ties(*(values[keep] for values in self._arrays()))
+        return PoseEdges(*(values[keep] for values in self._arrays()))
 
-    def joined(self, other: Ties) -> Ties:
+    def joined(self, other: PoseEdges) -> PoseEdges:
         """Return these pairs and others."""
         both = zip(self._arrays(), other._arrays(), strict=True)
-        return Ties(*(np.concatenate(values) for values in both))
+        return PoseEdges(*(np.concatenate(values) for values in both))
 
-    def among(self, views: Index) -> Ties:
+    def among(self, views: Index) -> PoseEdges:
         """Return the pairs of two of these views."""
         return self.select(np.isin(self.still, views) & np.isin(self.moving, views))
 

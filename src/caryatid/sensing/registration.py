@@ -20,8 +20,8 @@ from caryatid.geometry import transforms
 from caryatid.geometry.points import solve_positive
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import for_each
-from caryatid.sensing.pose_graph import Index, Ties
-from caryatid.sensing.surfels import Surfels, even_sample, surfels_of
+from caryatid.sensing.pose_graph import Index, PoseEdges
+from caryatid.sensing.surfels import MIN_COSINE, Surfels, even_sample, surfels_of
 from caryatid.sensing.views import Cloud
 
 COLUMNS = 8
@@ -30,6 +30,14 @@ BUCKETS = 4096
 """Lists a view's patches are kept in, by a hash of label and cell [1]; more patches make longer lists."""
 CHUNK = 50
 """Patches one task looks for partners of [1]; who does which task changes no result."""
+OUTLIER = 0.3
+"""Share of the reach beyond which distances lose their weight [1]."""
+INDEPENDENT = 0.1
+"""Share of the partners that err independently [1]: neighbouring patches err alike."""
+ROUNDS = 3
+"""Rounds of matching at each reach, and of the joint solution [1]."""
+NORMAL_REACH = 0.05
+"""How far apart [m] directions at right angles count when partners are looked for, by 1/√2."""
 
 
 @njit(cache=True)
@@ -106,7 +114,7 @@ class Search(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def find_partners(share: int, search: Search) -> None:
+def find_correspondences(share: int, search: Search) -> None:
     """Look for the patch of another view that is nearest in place and direction, and linearise the distance.
 
     Distance is along the mean of both normals, and its derivative by a move of either view that about the
@@ -370,7 +378,7 @@ class RegisteredView:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Descent:
+class Refinement:
     """Where a view came to lie.
 
     Attributes:
@@ -386,7 +394,7 @@ class Descent:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Gathering:
+class ViewSet:
     """Several views put together, to look for partners between them.
 
     Attributes:
@@ -404,7 +412,7 @@ class Gathering:
     first: NDArray[np.int64]
 
     @classmethod
-    def of(cls, views: Mapping[int, RegisteredView]) -> Gathering:
+    def of(cls, views: Mapping[int, RegisteredView]) -> ViewSet:
         """Put views together.
 
         Args:
@@ -432,7 +440,7 @@ class Gathering:
         pivot_world: Array,
         outlier: float,
         config: RegistrationConfig,
-    ) -> Ties:
+    ) -> PoseEdges:
         """Find the partners of views' whole samples in other views, within the shortest reach.
 
         Args:
@@ -445,18 +453,18 @@ class Gathering:
         """
         tasks, pairs, asked = self._tasks(still, moving, 1)
         search = self._search(tasks, len(tasks), twists, pivot_world, config.reaches[-1], config)
-        for_each(find_partners, search.shares, search)
+        for_each(find_correspondences, search.shares, search)
         sums = normal_equations(search.rows, pairs, len(still), outlier)
-        sums[:, 2:] *= config.independent
+        sums[:, 2:] *= INDEPENDENT
         information = np.empty((len(sums), 6, 6))
         information[:, UPPER[0], UPPER[1]] = sums[:, 8:]
         information[:, UPPER[1], UPPER[0]] = sums[:, 8:]
         apart = twists[moving] - twists[still]
-        return Ties(still, moving, apart, asked, sums[:, 0], sums[:, 1], sums[:, 2:8], information)
+        return PoseEdges(still, moving, apart, asked, sums[:, 0], sums[:, 1], sums[:, 2:8], information)
 
     def descend(
         self, twists: Array, information: Array, pivot_world: Array, reach: float, config: RegistrationConfig
-    ) -> Descent:
+    ) -> Refinement:
         """Move the last view such that partners come to lie in each other's planes; the others stay.
 
         Gauss–Newton on the robust, symmetric point-to-plane distance, maximum a posteriori.
@@ -471,24 +479,27 @@ class Gathering:
         """
         others, new = self.numbers[:-1], self.numbers[-1:]
         size = int(self.first[-1] - self.first[-2])
-        stride = max(1, size * len(others) // config.descent)
+        # 250 patches will do here; the pose is then made exact with the whole samples.
+        stride = max(1, size * len(others) // 250)
         tasks, _, asked = self._tasks(others, np.repeat(new, len(others)), stride)
-        outlier = config.outlier * reach
+        outlier = OUTLIER * reach
+        # What a step this small leaves, the next reach or the joint solution takes.
+        converged = 0.1 * outlier
         search = self._search(tasks, 1, twists, pivot_world, reach, config)
         twist, ends = search.twists[-1], []
-        for _ in range(config.rounds):
-            for_each(find_partners, search.shares, search)
+        for _ in range(ROUNDS):
+            for_each(find_correspondences, search.shares, search)
             result = step_down(
-                *(search.rows, twist, information, min(1.0, stride * config.independent), outlier),
-                *(config.steps, config.converged * outlier),
+                *(search.rows, twist, information, min(1.0, stride * INDEPENDENT), outlier),
+                *(4, converged),
             )
             twist += result[:6]
             ends += [result[6:8], result[8:]]
-            if np.abs(result[:6]).max() < config.converged * outlier:
+            if np.abs(result[:6]).max() < converged:
                 break
         total = max(int(asked.sum()), 1)
         before, after = (float(far + (total - found) * outlier) / total for found, far in (ends[0], ends[-1]))
-        return Descent(twist, before, after)
+        return Refinement(twist, before, after)
 
     def _search(
         self,
@@ -502,14 +513,14 @@ class Gathering:
         """Tasks (R, 5) in so many shares, and place for what they find; twists of all views (≥ V, 6)."""
         return Search(
             *(self.patches, self.starts, self.samples, tasks, shares, twists[self.numbers], pivot_world),
-            *(_edge(config), reach, config.min_cosine, config.normal_reach, config.noise),
+            *(_edge(config), reach, MIN_COSINE, NORMAL_REACH, config.noise),
             np.zeros((len(tasks), CHUNK, 8)),
         )
 
     def _tasks(
         self, still: Index, moving: Index, stride: int
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Tasks (R, 5) for `find_partners`, the pair (R,) each is of, and how many patches (E,) they ask."""
+        """Tasks (R, 5) of a search, the pair (R,) each is of, and how many patches (E,) they ask."""
         still, moving = np.searchsorted(self.numbers, still), np.searchsorted(self.numbers, moving)
         first, last = self.first[moving], self.first[moving + 1]
         asked = -((first - last) // stride)
@@ -560,7 +571,7 @@ EXACT = ("reference", "fits as reported")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Placement:
+class PoseEstimate:
     """Where a view is, better than it was reported.
 
     Attributes:
@@ -587,21 +598,21 @@ class ViewRegistration:
         config: Expected errors and limits.
 
     Attributes:
-        placements: One for each view.
+        estimates: One for each view.
     """
 
     def __init__(self, pivot_world: Array, config: RegistrationConfig) -> None:
-        self.placements: list[Placement] = []
+        self.estimates: list[PoseEstimate] = []
         self._pivot = pivot_world
         self._config = config
         self._views: dict[int, RegisteredView] = {}
         self._twists = np.zeros((0, 6))
-        self._ties = Ties.none()
+        self._edges = PoseEdges.none()
 
     def copy(self) -> ViewRegistration:
         """Return a registration that knows the same and goes on by itself; the views so far are shared."""
         other = copy.copy(self)
-        other.placements = self.placements.copy()
+        other.estimates = self.estimates.copy()
         other._views = self._views.copy()
         return other
 
@@ -616,107 +627,109 @@ class ViewRegistration:
             How the new view is to be moved and, on top of what they were moved before, earlier ones: view →
             transform (4, 4) of the world.
         """
-        config, new = self._config, len(self.placements)
+        config, new = self._config, len(self.estimates)
         surfels = surfels_of(cloud, config, same_labels=same_labels)
         view = RegisteredView.of(surfels, cloud.viewpoint_world, self._pivot, config)
         self._views[new] = view
         self._twists = np.concatenate([self._twists, np.zeros((1, 6))])
-        gathering = Gathering.of(self._views)
-        outcome = self._laid(gathering)
+        view_set = ViewSet.of(self._views)
+        outcome = self._laid(view_set)
         known: Array = np.zeros((6, 6))
         if outcome not in EXACT:
             known = np.asarray(np.linalg.inv(view.information), dtype=np.float64)
-        self.placements.append(Placement(np.zeros(6), outcome, known, np.zeros(6), np.eye(6)))
+        self.estimates.append(PoseEstimate(np.zeros(6), outcome, known, np.zeros(6), np.eye(6)))
         if outcome == "beyond the limits":
             self._let_go([new])
         elif outcome not in EXACT:
-            self._refine(gathering)
-        moves = self._moves(gathering)
+            self._refine(view_set)
+        moves = self._moves(view_set)
         if len(self._views) > config.kept:
             self._let_go([self._least_missed()])
         return moves
 
-    def _laid(self, gathering: Gathering) -> Outcome:
+    def _laid(self, view_set: ViewSet) -> Outcome:
         """Lay the newest view onto those that are kept, from where it was reported and coarse to fine."""
         config, reach = self._config, self._config.reaches[-1]
-        outlier = config.outlier * reach
+        outlier = OUTLIER * reach
         *others, new = self._views
         if not others:
             return "reference"
-        exact = [v for v in others if self.placements[v].outcome in EXACT]
-        right = self._matched(gathering, exact, [new], reach)
+        exact = [v for v in others if self.estimates[v].outcome in EXACT]
+        right = self._matched(view_set, exact, [new], reach)
         found = float(right.found.sum())
-        if found >= config.min_points and float(right.misfit.sum()) < config.exact * found:
+        # Exact views leave a tenth of the noise, noisy ones all of it.
+        if found >= config.min_points and float(right.misfit.sum()) < 0.3 * config.noise * found:
             rest = [v for v in others if v not in exact]
-            self._ties = self._ties.joined(right).joined(self._matched(gathering, rest, [new], outlier))
+            self._edges = self._edges.joined(right).joined(self._matched(view_set, rest, [new], outlier))
             return "fits as reported"
 
         reported, information = self._twists, self._views[new].information
-        best = fine = gathering.descend(reported, information, self._pivot, reach, config)
+        best = fine = view_set.descend(reported, information, self._pivot, reach, config)
         twists = reported.copy()
         for wide in config.reaches[:-1]:
-            twists[new] = gathering.descend(twists, information, self._pivot, wide, config).twist
+            twists[new] = view_set.descend(twists, information, self._pivot, wide, config).twist
         if np.abs(twists[new] - fine.twist).max() > outlier:
-            coarse = gathering.descend(twists, information, self._pivot, reach, config)
+            coarse = view_set.descend(twists, information, self._pivot, reach, config)
             best = coarse if coarse.misfit < fine.misfit else fine
         better = best.misfit < fine.misfit_before
         outcome: Outcome = "aligned" if better else "no better"
         if better:
             twists[new] = best.twist
             self._twists = twists
-        ties = self._matched(gathering, others, [new], outlier)
-        if ties.found.sum() < config.min_points:
+        edges = self._matched(view_set, others, [new], outlier)
+        if edges.found.sum() < config.min_points:
             outcome = "too few partners"
         elif better and self._too_far(best.twist):
             outcome = "beyond the limits"
         if better and outcome != "aligned":
             self._twists = reported
-            ties = self._matched(gathering, others, [new], outlier)
-        self._ties = self._ties.joined(ties)
+            edges = self._matched(view_set, others, [new], outlier)
+        self._edges = self._edges.joined(edges)
         return outcome
 
     def _matched(
         self,
-        gathering: Gathering,
+        view_set: ViewSet,
         still: Sequence[int] | Index,
         moving: Sequence[int] | Index,
         outlier: float,
-    ) -> Ties:
+    ) -> PoseEdges:
         """What pairs of views say of each other where they are, from the whole of their samples."""
         first, second = np.broadcast_arrays(np.asarray(still, np.intp), np.asarray(moving, np.intp))
-        return gathering.match(first, second, self._twists, self._pivot, outlier, self._config)
+        return view_set.match(first, second, self._twists, self._pivot, outlier, self._config)
 
     def _too_far(self, twist: Array) -> bool:
         config = self._config
         turn = np.linalg.norm(twist[3:]) > np.radians(config.max_rotation)
         return bool(turn or np.linalg.norm(twist[:3]) > config.max_translation)
 
-    def _refine(self, gathering: Gathering) -> None:
+    def _refine(self, view_set: ViewSet) -> None:
         """Move all kept views together that are not exact, unless that lays them worse; note what is known.
 
         Views that few partners tie to the others stay where they are.
         """
-        config, outlier = self._config, self._config.outlier * self._config.reaches[-1]
-        before = self._twists, self._ties
-        for _ in range(config.rounds):
+        config, outlier = self._config, OUTLIER * self._config.reaches[-1]
+        before = self._twists, self._edges
+        for _ in range(ROUNDS):
             free, hessian = self._solve()
             if len(free) == 0:
                 return
-            stale = self._ties.stale(self._twists, config.rematch)
+            # A quarter of the distance at which partners lose their weight.
+            stale = self._edges.stale(self._twists, 2.0 * config.noise)
             if not stale.any():
                 break
-            old = self._ties.select(stale)
-            anew = self._matched(gathering, old.still, old.moving, outlier)
-            self._ties = self._ties.select(~stale).joined(anew)
-        if self._ties.mean_misfit(outlier) > before[1].mean_misfit(outlier) + config.settled:
-            self._twists, self._ties = before[0], before[1].among(np.array(list(self._views)))
+            old = self._edges.select(stale)
+            anew = self._matched(view_set, old.still, old.moving, outlier)
+            self._edges = self._edges.select(~stale).joined(anew)
+        if self._edges.mean_misfit(outlier) > before[1].mean_misfit(outlier) + 0.3 * config.noise:
+            self._twists, self._edges = before[0], before[1].among(np.array(list(self._views)))
         covariances, informations = _blocks(np.asarray(np.linalg.inv(hessian), np.float64)), _blocks(hessian)
         reported = np.stack([self._views[v].information for v in free])
         for v, covariance, determined, directions in zip(
             free, covariances, *_determined(reported, informations), strict=True
         ):
-            self.placements[v] = replace(
-                self.placements[v], covariance=covariance, determined=determined, directions=directions
+            self.estimates[v] = replace(
+                self.estimates[v], covariance=covariance, determined=determined, directions=directions
             )
 
     def _solve(self) -> tuple[list[int], Array]:
@@ -726,43 +739,43 @@ class ViewRegistration:
             The views that were free to move, and the inverse covariance of their twists.
         """
         while True:
-            enough = self._ties.partners(len(self._twists)) >= self._config.min_points
-            free = [v for v in self._views if enough[v] and self.placements[v].outcome not in EXACT]
+            enough = self._edges.partners(len(self._twists)) >= self._config.min_points
+            free = [v for v in self._views if enough[v] and self.estimates[v].outcome not in EXACT]
             informations = np.array([self._views[v].information for v in free]).reshape(-1, 6, 6)
-            twists, hessian = self._ties.solve(self._twists, np.array(free, dtype=np.intp), informations)
+            twists, hessian = self._edges.solve(self._twists, np.array(free, dtype=np.intp), informations)
             far = [v for v in free if self._too_far(twists[v])]
             if not far:
                 self._twists = twists
                 return free, hessian
             self._let_go(far)
 
-    def _moves(self, gathering: Gathering) -> dict[int, Array]:
+    def _moves(self, view_set: ViewSet) -> dict[int, Array]:
         """How views are to be moved now: the newest, and those whose points moved since they last were."""
-        numbers = gathering.numbers.tolist()
-        told = np.stack([self.placements[v].twist for v in numbers])
+        numbers = view_set.numbers.tolist()
+        told = np.stack([self.estimates[v].twist for v in numbers])
         T, T_told = (twist_transform(t, self._pivot) for t in (self._twists[numbers], told))
-        moves = {}
+        moves, settled = {}, 0.3 * self._config.noise
         for v, now, then in zip(numbers, T, T_told, strict=True):
-            change = gathering.sample(v)[:, :3] @ (now - then)[:3, :3].T + (now - then)[:3, 3]
-            if v == numbers[-1] or np.einsum("ni,ni->n", change, change).max() > self._config.settled**2:
+            change = view_set.sample(v)[:, :3] @ (now - then)[:3, :3].T + (now - then)[:3, 3]
+            if v == numbers[-1] or np.einsum("ni,ni->n", change, change).max() > settled**2:
                 moves[v] = now @ transforms.invert(then)
-                self.placements[v] = replace(self.placements[v], twist=self._twists[v])
+                self.estimates[v] = replace(self.estimates[v], twist=self._twists[v])
         return moves
 
     def _let_go(self, views: Sequence[int]) -> None:
         """Let views stay where they are from now on, and lay no others onto them."""
         for v in views:
             del self._views[v]
-        self._ties = self._ties.among(np.array(list(self._views)))
+        self._edges = self._edges.among(np.array(list(self._views)))
 
     def _least_missed(self) -> int:
         """The kept view whose surfaces another one shows best; the first that nothing ties to any, if any."""
         kept = list(self._views)
-        partners = self._ties.partners(len(self._twists))
+        partners = self._edges.partners(len(self._twists))
         loose = [v for v in kept[1:] if partners[v] < self._config.min_points]
         if loose:
             return loose[0]
-        shared = self._ties.shared(np.array(kept))
+        shared = self._edges.shared(np.array(kept))
         pair = divmod(int(np.argmax(shared)), len(kept))
         return kept[max((k for k in pair if k > 0), key=lambda k: shared[k].sum())]
 

@@ -22,6 +22,8 @@ OFFSET = 1 << 20
 """Added to a cell's number along an axis, so that three of 21 bits make one key: 10 km of 1 cm cells."""
 MASK = 2 * OFFSET - 1
 """Its bits."""
+MIN_COSINE = 0.9
+"""Cosine of the angle between normals that agree at least [1]."""
 
 
 class Readings(NamedTuple):
@@ -379,12 +381,14 @@ def surfels_of(cloud: Cloud, config: RegistrationConfig, *, same_labels: bool) -
         SUPPORT_LABEL,
     )
     far = kinds // 6 == SUPPORT_LABEL
-    enough = np.full(len(far), float(config.min_readings))
+    # Rims, and sides at a grazing angle, have few readings; in coarse images all patches have.
+    enough = np.full(len(far), 4.0)
     for alike in (far, ~far):
         if alike.any():
             fullest = np.percentile(rows[alike, 0], 90.0)
-            enough[alike] = min(config.min_readings, config.min_share * fullest)
-    keep = np.flatnonzero((rows[:, 7] > config.min_flatness) & (rows[:, 0] >= enough))
+            enough[alike] = min(4, 0.33 * fullest)
+    # Where the mean of the normals is shorter, there is an edge.
+    keep = np.flatnonzero((rows[:, 7] > 0.97) & (rows[:, 0] >= enough))
     keep = keep[np.lexsort((kinds[keep], voxels[keep]))]
     labels = kinds[keep] // 6 if same_labels else np.where(far[keep], SUPPORT_LABEL, 1)
     _, sides = np.unique(kinds[keep], return_inverse=True)
@@ -403,16 +407,17 @@ def _flattened(surfels: Surfels, config: RegistrationConfig) -> Surfels:
     """
     side, normals = surfels.sides, surfels.normals_world.copy()
     patches = np.bincount(side)
-    planes, widths, heights = fit_planes(
-        surfels.points_world, side, len(patches), config.flat, config.plane_rounds
-    )
+    tolerance = 1.5 * config.noise
+    planes, widths, heights = fit_planes(surfels.points_world, side, len(patches), tolerance, rounds=4)
     plane = planes[side]
     agreement = np.sum(plane * normals, axis=1)
-    lies_in = (np.abs(heights) < 2.0 * config.flat) & (np.abs(agreement) > config.min_cosine)
+    lies_in = (np.abs(heights) < 2.0 * tolerance) & (np.abs(agreement) > MIN_COSINE)
     share = np.bincount(side, lies_in) / np.maximum(patches, 1)
-    flat = ((share > config.flat_share) & (widths > config.min_side**2))[side]
+    # A flat side is 2 cm wide at least: its patches have a standard deviation of 6 mm.
+    flat = ((share > 0.7) & (widths > 0.006**2))[side]
     normals[flat] = (plane * np.where(agreement < 0.0, -1.0, 1.0)[:, None])[flat]
-    keep = (~flat | lies_in) & (patches >= config.min_patches)[side]
+    # Sides of fewer than six patches are blurred edges.
+    keep = (~flat | lies_in) & (patches >= 6)[side]
     return Surfels(
         surfels.points_world[keep], normals[keep], surfels.labels[keep], side[keep], surfels.variance[keep]
     )

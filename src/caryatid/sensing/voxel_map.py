@@ -385,10 +385,11 @@ class VoxelMap:
     def occupancy(self) -> NDArray[np.float32]:
         """Probability (X, Y, Z) that a voxel is occupied: 0.5 where nothing is known, else within the clamp.
 
-        A view weighs as much as `config.readings` readings.
+        A view weighs as much as five images of a moving camera, from which the usual clamp is: as many misses
+        reach its lower end.
         """
-        low, high = (np.log(p / (1.0 - p)) for p in self.config.clamp)
-        log_odds = np.clip(self.config.readings * _log_odds(self.config), low, high)
+        low, high = (np.log(p / (1.0 - p)) for p in (0.12, 0.97))
+        log_odds = np.clip(5.0 * _log_odds(self.config), low, high)
         return self._looked_up((1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32))
 
     @property
