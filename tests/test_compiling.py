@@ -83,6 +83,7 @@ def package(tmp_path, monkeypatch):
     runs = []
     for name, imported in (("a", ""), ("b", "from caryatid.a import f\n"), ("c", "")):
         (tmp_path / f"{name}.py").write_text(imported + SOURCE)
+    monkeypatch.delenv(compiling.MARK, raising=False)
     monkeypatch.setattr(compiling, "ROOT", tmp_path)
     monkeypatch.setattr(compiling, "cache_of", lambda folder: tmp_path / "cache")
     monkeypatch.setattr(compiling, "_run_processes", lambda: runs.append(_indexes(tmp_path)))
