@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from caryatid.config.ranges import Angle, Cosine, Count, NotNegative, Positive, Share, Stage, WholeNumber
+from caryatid.config.ranges import Angle, Count, NotNegative, Positive, Share, Stage, WholeNumber
 
 
 @dataclass(frozen=True, slots=True)
