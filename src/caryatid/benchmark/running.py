@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -11,6 +12,7 @@ from concurrent.futures import (
     CancelledError,
     Future,
     ProcessPoolExecutor,
+    ThreadPoolExecutor,
     as_completed,
     wait,
 )
@@ -107,13 +109,23 @@ def connect(address: str, patience: float = PATIENCE) -> Client:
         InputError: dask.distributed is not installed, or no scheduler answers.
     """
     try:
-        from distributed import Client
+        from distributed import Client, Security
+        from distributed.comm import connect as open_connection
     except ImportError:
         raise InputError("--scheduler", "needs dask.distributed", 'pip install "caryatid[cluster]"') from None
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are reported here
+
+    async def greet() -> None:
+        """Fail soon where a client would go on trying."""
+        secrets = Security().get_connection_args("client")
+        connection = open_connection(address, patience, **secrets)
+        await (await asyncio.wait_for(connection, patience)).close()
+
     try:
         if not address:
             raise ValueError("the address is empty")
+        with ThreadPoolExecutor(1) as thread:
+            thread.submit(asyncio.run, greet()).result()
         return Client(address, timeout=patience, set_as_default=False)
     except (OSError, ImportError, ValueError, TypeError, RuntimeError, MemoryError) as error:
         raise InputError(
