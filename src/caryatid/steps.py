@@ -18,7 +18,6 @@ from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
 from caryatid.exploration import RobotPose, Step
 from caryatid.io.graph_json import read_graph
-from caryatid.io.json_files import field
 from caryatid.io.runs import Run, RunWriter
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
@@ -98,7 +97,7 @@ def read_config(run: Run) -> Config:
         InputError: run.json holds no settings, or they are not valid.
     """
     path = str(run.folder / "run.json")
-    return changed_settings(Config(), field(run.record, "settings", dict, path), path)
+    return changed_settings(Config(), run.record.get("settings", {}), path)
 
 
 def check_steps(run: Run) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -166,87 +165,6 @@ def _sentence(error: Any) -> str:
     return f"{where}'{last}' is {_shown(error['input'])}: {message}"
 
 
-def field(
-    document: Mapping[str, Any], key: str, kind: type | tuple[type, ...], source: str, **default: Any
-) -> Any:
-    """Return one key of a JSON object, checked for its type.
-
-    Args:
-        document: The object.
-        key: The key.
-        kind: The types allowed; a bool is no number here.
-        source: What to call the object in the error.
-        **default: `default=…` where the key may be missing.
-
-    Raises:
-        InputError: The key is missing or of another type.
-    """
-    if key not in document:
-        if "default" in default:
-            return default["default"]
-        raise InputError(source, f"the key '{key}' is missing", "add it")
-    value = document[key]
-    kinds = kind if isinstance(kind, tuple) else (kind,)
-    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-        names = " or ".join(_NAMES.get(k, k.__name__) for k in kinds)
-        raise InputError(source, f"'{key}' is {_shown(value)}, not {names}", "correct it")
-    return value
-
-
-def numbers(value: Any, shape: tuple[int, ...], source: str) -> Array:
-    """Turn nested JSON lists of finite numbers into an array (...) of the given shape.
-
-    Args:
-        value: What a JSON document holds.
-        shape: Sizes, such as (4, 4).
-        source: What to call it in the error.
-
-    Raises:
-        InputError: Another shape, or an entry that is no finite number.
-    """
-    expected = "×".join(map(str, shape)) + " finite numbers"
-    if not _all_numbers(value):
-        raise InputError(source, f"{_shown(value)} is not {expected}", "correct it")
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (ValueError, OverflowError) as error:
-        raise InputError(source, f"{_shown(value)} is not {expected}", "correct it") from error
-    if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(source, f"{_shown(value)} is not {expected}", "correct it")
-    return array
-
-
-def rigid_transform(value: Any, source: str) -> Array:
-    """Turn a nested list into a rigid transform (4, 4).
-
-    Raises:
-        InputError: No 4×4 finite numbers, or no rigid transform.
-    """
-    return transforms.as_rigid(numbers(value, (4, 4), source), source)
-
-
-def number(document: Mapping[str, Any], key: str, source: str, **default: Any) -> float:
-    """Return one finite number of a JSON object.
-
-    Args:
-        document: The object.
-        key: Of the number.
-        source: What to call the object in the error.
-        **default: `default=…`, the number where the key is missing.
-
-    Raises:
-        InputError: The key is missing or holds no finite number.
-    """
-    value = field(document, key, (int, float), source, **default)
-    try:
-        result = float(value)
-    except OverflowError:
-        result = math.inf
-    if not math.isfinite(result):
-        raise InputError(source, f"'{key}' is {_shown(value)}, not finite", "correct it")
-    return result
-
-
 def _all_numbers(value: Any) -> bool:
     if isinstance(value, list):
         return all(_all_numbers(item) for item in value)
@@ -260,13 +178,3 @@ def _refuse_constant(constant: str) -> float:
 def _shown(value: Any) -> str:
     text = json.dumps(value, ensure_ascii=False, default=str)
     return text if len(text) <= 40 else text[:37] + "…"
-
-
-_NAMES: Final[Mapping[type, str]] = {
-    dict: "an object",
-    list: "a list",
-    str: "a text",
-    int: "a whole number",
-    float: "a number",
-    bool: "true or false",
-}
