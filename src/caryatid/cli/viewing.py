@@ -14,7 +14,6 @@ from caryatid.config import Config
 from caryatid.io.json_files import json_text
 from caryatid.io.runs import is_run, read_run
 from caryatid.runtime.compiling import compile_kernels
-from caryatid.runtime.interrupts import interruptible
 from caryatid.sources import open_source
 from caryatid.steps import read_config, read_steps
 from caryatid.viewer.controls import Controls
@@ -47,8 +46,7 @@ def run_viewer(options: View, config: Config) -> int:
 def wait_for_interrupt() -> None:
     """Return at Ctrl-C."""
     try:
-        with interruptible():
-            Event().wait()
+        Event().wait()
     except KeyboardInterrupt:
         return
 

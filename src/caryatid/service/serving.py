@@ -15,7 +15,6 @@ from caryatid.errors import InputError
 from caryatid.io.json_files import json_text
 from caryatid.io.staging import write_errors
 from caryatid.runtime.compiling import compile_kernels
-from caryatid.runtime.interrupts import interruptible
 from caryatid.service.app import make_app
 from caryatid.service.pool import SessionPool
 
@@ -47,7 +46,6 @@ def check_token(host: str, token: str | None) -> None:
         )
 
 
-@interruptible()
 def run_service(
     folder: Path,
     config: Config,
