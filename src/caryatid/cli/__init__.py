@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command()
         sys.stdout.flush()
     except KeyboardInterrupt as stop:
-        sys.stderr.write(f"interrupted: {stop or 'nothing was written'}\n")
+        sys.stderr.write(f"interrupted: {str(stop) or 'nothing was written'}\n")
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
