@@ -13,7 +13,7 @@ import pytest
 from conftest import without_labels
 
 import caryatid as ct
-from caryatid.geometry.shapes import Shape
+from caryatid.geometry.shapes import KINDS
 from caryatid.geometry.transforms import look_at
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.manipulation.order import Order, TakeStep
@@ -91,7 +91,7 @@ def words(html):
 
 def test_every_kind_that_shows_itself_is_tried_here(shown):
     # By name: a class with slots is made twice.
-    kinds = {kind.__qualname__ for base in (Pictured, Shape) for kind in base.__subclasses__()} - {"Shape"}
+    kinds = {kind.__qualname__ for kind in (*Pictured.__subclasses__(), *KINDS.values())} - {"Shape"}
     assert kinds == {type(thing).__qualname__ for thing in shown.values()}
 
 

@@ -190,7 +190,7 @@ def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
     """Outline on the ground (M, 2) [m] of what lies within `depth` of a shape's extreme point that way."""
     if shape.kind == "sphere":
         return polygons.hull(_ball_cap(shape, direction_world, depth))
-    corners, edges = _SOLIDS[shape.kind]
+    corners, edges = _SOLIDS.get(shape.kind, _SOLIDS["box"])
     corners_world = transforms.transform(shape.T_world_object, corners * (shape.extents / 2.0))
     return polygons.cap(corners_world, edges, direction_world, depth)
 

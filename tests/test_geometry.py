@@ -1,0 +1,426 @@
+"""Shapes, polygons, rays and points: what they promise, tried against SciPy, shapely and plain sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import shapely
+from scipy.spatial import ConvexHull, cKDTree
+from synthetic import random_motion
+
+from caryatid.errors import InputError
+from caryatid.geometry import transforms
+from caryatid.geometry.points import last_in_voxels, most_central, quantile, select, solve_positive
+from caryatid.geometry.polygons import area, cap, hull, intersection, nearest_on_border
+from caryatid.geometry.rays import room, traverse, traversed_reference
+from caryatid.geometry.shapes import (
+    KINDS,
+    Box,
+    Cylinder,
+    Primitives,
+    Shape,
+    Sphere,
+    fibonacci_sphere,
+    from_size,
+)
+
+T = random_motion(np.random.default_rng(1))
+SOLIDS = [Box(T, np.array([0.06, 0.1, 0.14])), Cylinder(T, 0.04, 0.11), Sphere(T, 0.05)]
+
+each = pytest.mark.parametrize("shape", SOLIDS, ids=lambda s: s.kind)
+
+
+def around(shape, count: int = 20_000, seed: int = 0):
+    """Points in a cube about the shape, and its volume."""
+    side = 1.4 * float(np.linalg.norm(shape.extents))
+    local = np.random.default_rng(seed).uniform(-side / 2, side / 2, (count, 3))
+    return local + shape.T_world_object[:3, 3], side**3
+
+
+@each
+def test_the_surface_lies_at_distance_zero_with_outward_normals(shape):
+    points, normals = shape.surface(0.005)
+    np.testing.assert_allclose(shape.signed_distance(points), 0.0, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    for step in (-1e-4, 0.002):
+        np.testing.assert_allclose(shape.signed_distance(points + step * normals), step, atol=1e-12)
+
+
+@each
+def test_the_surface_is_sampled_all_over_as_densely_as_asked(shape):
+    spacing = 0.006
+    coarse, _ = shape.surface(spacing)
+    fine, _ = shape.surface(spacing / 8.0)
+    gap, _ = cKDTree(coarse).query(fine)
+    assert gap.max() < 1.1 * spacing
+    nearest, _ = cKDTree(coarse).query(coarse, k=2)
+    assert np.median(nearest[:, 1]) > 0.5 * spacing
+
+
+@each
+def test_distances_are_those_to_the_nearest_point_of_the_surface(shape):
+    surface, _ = shape.surface(0.002)
+    points, _ = around(shape, 400)
+    gap, _ = cKDTree(surface).query(points)
+    np.testing.assert_allclose(np.abs(shape.signed_distance(points)), gap, atol=0.0021)
+
+
+@each
+def test_the_volume_is_that_of_the_points_inside(shape):
+    points, cube = around(shape)
+    share = (shape.signed_distance(points) < 0.0).mean()
+    sigma = np.sqrt(share * (1.0 - share) / len(points))
+    assert shape.volume == pytest.approx(cube * share, abs=4.0 * sigma * cube)
+
+
+@each
+def test_the_support_function_reaches_as_far_as_the_surface(shape):
+    directions = fibonacci_sphere(100)
+    points, _ = shape.surface(0.001)
+    reach = ((points - shape.T_world_object[:3, 3]) @ directions.T).max(axis=0)
+    np.testing.assert_allclose(shape.support(directions), reach, atol=0.0012)
+    assert (shape.support(directions) >= reach - 1e-12).all()
+
+
+@each
+def test_the_extents_are_the_reach_along_its_own_axes(shape):
+    axes = shape.T_world_object[:3, :3].T
+    np.testing.assert_allclose(2.0 * shape.support(axes), shape.extents)
+
+
+@each
+def test_the_outline_spans_the_shape(shape):
+    hull = ConvexHull(shape.outline())
+    assert hull.volume == pytest.approx(shape.volume, rel=0.03)
+    assert shape.signed_distance(shape.outline()).max() < 1e-9
+
+
+@each
+def test_a_moved_shape_is_the_same_shape_elsewhere(shape):
+    motion = random_motion(np.random.default_rng(2))
+    points, _ = around(shape, 100)
+    there = shape.moved(motion)
+    assert there.size == shape.size
+    np.testing.assert_allclose(
+        there.signed_distance(transforms.transform(motion, points)), shape.signed_distance(points), atol=1e-12
+    )
+
+
+@each
+def test_name_and_size_give_the_shape_again(shape):
+    again = from_size(shape.kind, shape.T_world_object, shape.size, "graph.json")
+    assert type(again) is type(shape)
+    np.testing.assert_array_equal(again.extents, shape.extents)
+    np.testing.assert_array_equal(again.T_world_object, shape.T_world_object)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"),
+    [
+        ("cone", {"radius": 0.1, "height": 0.1}),
+        ("box", [0.1, 0.2]),
+        ("box", ["wide", 0.1, 0.1]),
+        ("box", {"radius": 0.1}),
+        ("cylinder", {"radius": 0.1}),
+        ("sphere", [0.1]),
+        ("sphere", {"radius": None}),
+    ],
+)
+def test_sizes_that_do_not_fit_the_shape_are_refused(kind, size):
+    with pytest.raises(InputError, match=f"no shape '{kind}'") as caught:
+        from_size(kind, np.eye(4), size, "graph.json")
+    assert "a cylinder {radius, height}" in str(caught.value)
+
+
+def test_a_shape_is_not_put_at_a_pose_that_is_none():
+    with pytest.raises(InputError, match="T_world_object"):
+        from_size("sphere", 2.0 * np.eye(4), {"radius": 0.1}, "graph.json")
+
+
+def test_the_fibonacci_sphere_is_even():
+    directions = fibonacci_sphere(2000)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
+    gap, _ = cKDTree(directions).query(directions, k=2)
+    # Each has a cell of 4π/2000: neighbours are about its width apart, nowhere half or twice that.
+    width = np.sqrt(4.0 * np.pi / 2000)
+    assert gap[:, 1].min() > 0.5 * width
+    assert gap[:, 1].max() < 1.2 * width
+
+
+@each
+def test_gradients_point_away_from_the_surface(shape):
+    points, _ = around(shape, 200)
+    distances, outward = Primitives.of([shape]).gradient(0, points)
+    np.testing.assert_allclose(distances, shape.signed_distance(points), atol=1e-12)
+    steps = shape.signed_distance(points + 1e-7 * outward) - distances
+    np.testing.assert_allclose(steps, 1e-7, atol=1e-9)
+
+
+def test_the_bounds_of_many_shapes_are_those_of_each():
+    low, high = Primitives.of(SOLIDS).bounds()
+    for k, shape in enumerate(SOLIDS):
+        reach = shape.support(np.eye(3))
+        np.testing.assert_allclose(high[k] - low[k], 2.0 * reach)
+    assert Primitives.of([]).bounds()[0].shape == (0, 3)
+
+
+@each
+def test_meshes_and_lines_lie_on_the_surface(shape):
+    corners = transforms.transform(shape.T_world_object, shape.mesh().vertices)
+    lines = np.concatenate(shape.lines(np.array([1.0, 2.0, 3.0])))
+    for points in (corners, lines):
+        np.testing.assert_allclose(shape.signed_distance(points), 0.0, atol=1e-9)
+    assert shape.mesh().volume == pytest.approx(shape.volume, rel=0.02)
+
+
+@pytest.fixture
+def prism():
+    """A kind of shape from outside the package: a straight hexagonal prism."""
+
+    @dataclass(frozen=True, eq=False, slots=True, repr=False)
+    class Prism(Shape):
+        T_world_object: np.ndarray
+        radius: float
+        height: float
+        kind: ClassVar[str] = "prism"
+
+        @property
+        def extents(self):
+            return np.array([2.0 * self.radius, np.sqrt(3.0) * self.radius, self.height])
+
+        @classmethod
+        def from_extents(cls, T_world_object, extents):
+            return cls(T_world_object, float(extents[0]) / 2.0, float(extents[2]))
+
+        def outline(self):
+            angle = np.pi / 3.0 * np.arange(6)
+            ring = self.radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(6)], axis=1)
+            end = np.array([0.0, 0.0, self.height / 2.0])
+            return transforms.transform(self.T_world_object, np.concatenate([ring + end, ring - end]))
+
+    yield Prism(T, 0.05, 0.12)
+    del KINDS["prism"]
+
+
+def test_a_kind_of_shape_from_outside_works_in_files_exports_and_drawings(prism, tmp_path):
+    from caryatid.config import Config
+    from caryatid.exports import to_gltf, to_urdf
+    from caryatid.graph import SceneObject
+    from caryatid.io.graph_json import graph_text, read_graph
+    from caryatid.support.relations import infer
+
+    config = Config()
+    standing = prism.from_extents(transforms.rigid(np.eye(3), (0.0, 0.0, 0.06)), prism.extents)
+    table = SceneObject(
+        "o0",
+        0,
+        Box(transforms.rigid(np.eye(3), (0, 0, -0.05)), np.array([1.0, 1.0, 0.1])),
+        role="support_surface",
+    )
+    graph = infer([table, SceneObject("o1", 1, standing)], config.support)
+    assert graph.support("o0", "o1") is not None
+    (tmp_path / "graph.json").write_text(graph_text(graph))
+    again = read_graph(tmp_path / "graph.json").objects[1].shape
+    assert type(again) is type(prism)
+    assert again.size == {"radius": 0.05, "height": 0.12}
+    assert prism.volume == pytest.approx(1.5 * np.sqrt(3.0) * 0.05**2 * 0.12)
+    assert "prism" in repr(prism).lower()
+    assert len(prism.lines(np.array([1.0, 1.0, 1.0]))) >= 18
+    assert to_gltf(graph, config.export)
+    assert "o1" in to_urdf(graph, config.export)
+
+
+def test_kernels_numerics_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    numbers = rng.normal(size=101)
+    assert select(numbers.copy(), 7) == np.sort(numbers)[7]
+    for share in (0.0, 0.3, 0.505, 1.0):
+        assert quantile(numbers.copy(), share) == pytest.approx(np.quantile(numbers, share))
+    A = rng.normal(size=(9, 9))
+    A, b = A @ A.T + np.eye(9), rng.normal(size=9)
+    np.testing.assert_allclose(solve_positive(A.copy(), b), np.linalg.solve(A, b))
+    assert np.isnan(solve_positive(np.diag([1.0, -1.0]), np.ones(2))).any()
+
+
+SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+CUBE = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+CUBE_EDGES = np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
+
+
+def random_polygon(rng, middle=(0.0, 0.0)):
+    return hull(rng.normal(size=(int(rng.integers(3, 40)), 2)) + middle)
+
+
+def turned(polygon):
+    """The same polygon, its corners counted from another one."""
+    return np.roll(polygon, len(polygon) // 2, axis=0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 50, 300])
+def test_the_hull_is_the_one_of_shapely(count):
+    rng = np.random.default_rng(count)
+    points = rng.normal(size=(count, 2))
+    points = np.concatenate([points, points[: count // 2]])
+    expected = shapely.MultiPoint(points).convex_hull
+    corners = hull(points)
+    assert {tuple(c) for c in corners} == {tuple(c) for c in shapely.get_coordinates(expected)}
+    assert area(corners) == pytest.approx(expected.area)
+    if count > 2:
+        assert shapely.LinearRing(corners).is_ccw
+
+
+def test_the_hull_looks_at_the_ground_only_and_leaves_the_points_alone():
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    before = points.copy()
+    np.testing.assert_array_equal(hull(points), hull(points[:, :2].copy()))
+    np.testing.assert_array_equal(points, before)
+
+
+def test_hulls_without_area():
+    line = np.arange(9)[:, None] * (0.5, 0.25)
+    for often in (1, 2, 30):
+        assert {tuple(c) for c in hull(np.tile(line, (often, 1)))} == {(0.0, 0.0), (4.0, 2.0)}
+        assert hull(np.ones((5 * often, 2))).tolist() == [[1.0, 1.0]]
+    assert hull(np.empty((0, 2))).shape == (0, 2)
+    assert area(hull(line)) == area(hull(np.ones((5, 2)))) == area(np.empty((0, 2))) == 0.0
+
+
+def test_the_hull_goes_round_a_square_with_points_on_its_sides():
+    grid = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 5)] * 2), axis=-1).reshape(-1, 2)
+    assert {tuple(c) for c in hull(grid)} == {tuple(c) for c in SQUARE}
+    assert len(hull(grid)) == 4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_intersection_is_the_one_of_shapely(seed):
+    rng = np.random.default_rng(seed)
+    a, b = random_polygon(rng), random_polygon(rng, rng.uniform(-3.0, 3.0, 2))
+    expected = shapely.Polygon(a).intersection(shapely.Polygon(b))
+    for common in (intersection(a, b), intersection(b, a), intersection(turned(a), turned(b))):
+        assert area(common) == pytest.approx(expected.area, abs=1e-12)
+        if expected.area > 0.0:
+            assert shapely.Polygon(common).symmetric_difference(expected).area < 1e-9
+
+
+def test_intersections_of_polygons_inside_beside_and_equal():
+    inner = 0.5 * SQUARE + 0.2
+    for common in (intersection(SQUARE, inner), intersection(inner, SQUARE)):
+        assert area(common) == pytest.approx(0.25)
+    assert area(intersection(SQUARE, SQUARE)) == pytest.approx(1.0)
+    assert area(intersection(SQUARE, SQUARE + (1.0, 0.0))) == 0.0
+    assert len(intersection(SQUARE, SQUARE + 2.0)) == 0
+    for nothing in (SQUARE[:0], SQUARE[:1], SQUARE[:2]):
+        assert area(intersection(SQUARE, nothing)) == area(intersection(nothing, SQUARE)) == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_nearest_point_of_the_border_is_the_one_of_shapely(seed):
+    rng = np.random.default_rng(seed)
+    polygon = random_polygon(rng)
+    for corners in (polygon, polygon[:2], polygon[:1]):
+        exact = shapely.Polygon(corners) if len(corners) > 2 else shapely.MultiPoint(corners).convex_hull
+        border = exact.exterior if len(corners) > 2 else exact
+        for x, y in rng.normal(size=(20, 2)):
+            distance, near_x, near_y, inside = nearest_on_border(corners, x, y)
+            point = shapely.Point(x, y)
+            assert distance == pytest.approx(border.distance(point))
+            assert np.hypot(near_x - x, near_y - y) == pytest.approx(distance)
+            assert border.distance(shapely.Point(near_x, near_y)) < 1e-12
+            assert inside == (len(corners) > 2 and exact.contains(point))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_cap_is_what_lies_near_the_outermost_point(seed):
+    """Against the hull of all segments between corners, cut off by the plane."""
+    rng = np.random.default_rng(seed)
+    corners = (CUBE * rng.uniform(0.02, 0.2, 3)) @ transforms.random_rotation(rng).T + rng.normal(size=3)
+    direction = transforms.unit(rng.normal(size=3))
+    depth = rng.uniform(0.001, 0.2)
+    reach = corners @ direction
+    kept = [corners[reach >= reach.max() - depth]]
+    for i in range(8):
+        for j in range(8):
+            share = (reach[i] - (reach.max() - depth)) / (reach[i] - reach[j]) if i != j else -1.0
+            if 0.0 <= share <= 1.0:
+                kept.append(corners[None, i] + share * (corners[j] - corners[i]))
+    expected = shapely.MultiPoint(np.concatenate(kept)[:, :2]).convex_hull
+    found = shapely.Polygon(cap(corners, CUBE_EDGES, direction, depth))
+    assert found.symmetric_difference(expected).area < 1e-9 * expected.area + 1e-15
+
+
+def test_a_cap_deeper_than_the_solid_is_all_of_it():
+    whole = cap(CUBE, CUBE_EDGES, np.array([0.6, 0.0, 0.8]), np.inf)
+    assert area(whole) == pytest.approx(4.0)
+
+
+GRID = (13, 17, 11)
+
+
+def rays(rng: np.random.Generator) -> np.ndarray:
+    """Starts and directions (N, 2, 3) in voxels: any, along the axes, within one voxel."""
+    starts, ends = rng.uniform(-8.0, 25.0, (2, 600, 3))
+    ends[:60] = starts[:60]
+    ends[np.arange(60), np.arange(60) % 3] += rng.uniform(-30.0, 30.0, 60)
+    starts[:60, 0] = starts[:60, 0] % 13
+    ends[60:90] = starts[60:90] + rng.uniform(-1e-3, 1e-3, (30, 3))
+    return np.stack([starts, ends - starts], axis=1)
+
+
+def voxels(start: np.ndarray, ray: np.ndarray, t_from: float, t_to: float) -> np.ndarray:
+    """Flat indices of the voxels a ray traverses, in its order, each once."""
+    found = room(GRID)
+    slabs = traverse(found, GRID, tuple(start.tolist()), tuple(ray.tolist()), t_from, t_to)
+    met = found[:, :slabs].T.ravel()
+    return met[np.sort(np.unique(met, return_index=True)[1])]
+
+
+@pytest.mark.parametrize(("t_from", "t_to"), [(0.0, 1.0), (0.3, 0.8), (0.6, 0.6)])
+def test_a_ray_meets_the_voxels_of_the_reference_one_after_the_other(t_from: float, t_to: float):
+    met = 0
+    for start, ray in rays(np.random.default_rng(0)):
+        reference = traversed_reference(GRID, start, start + ray, t_from, t_to, np.zeros(3), 1.0)
+        right = np.ravel_multi_index(tuple(reference.T), GRID)
+        np.testing.assert_array_equal(voxels(start, ray, t_from, t_to), right)
+        met += len(right)
+    assert met > 2000 or t_from == t_to
+
+
+def test_a_ray_without_length_meets_nothing():
+    assert len(voxels(np.full(3, 4.5), np.zeros(3), 0.2, 0.2)) == 0
+    assert len(voxels(np.full(3, -4.5), np.zeros(3), 0.0, 1.0)) == 0
+
+
+def test_rays_out_of_the_far_corner_stay_within_the_grid():
+    for ray in ([-13.0, -17.0, -11.0], [-13.0, -1.0, -1.0], [0.0, -17.0, 0.0], [-1e-9, -1.0, -11.0]):
+        met = voxels(np.array(GRID, dtype=float), np.array(ray), 0.0, 2.0)
+        assert met.min(initial=0) >= 0
+        assert met.max(initial=0) < np.prod(GRID)
+
+
+EDGES = np.array([0.0, 0.02, 0.05])
+
+
+@pytest.fixture
+def points():
+    rng = np.random.default_rng(0)
+    return rng.uniform(-0.15, 0.15, size=(4000, 3)) * (1.0, 1.0, 0.2)
+
+
+def test_of_points_as_near_to_the_mean_the_first_is_kept():
+    twice = np.repeat([[0.005, 0.005, 0.005], [0.013, 0.005, 0.005]], [2, 2], axis=0)
+    assert most_central(twice, np.ones(4, dtype=np.int32), EDGES).tolist() == [0]
+
+
+def test_nothing_is_kept_of_nothing():
+    assert len(most_central(np.zeros((0, 3)), np.zeros(0, dtype=np.int32), EDGES)) == 0
+    assert len(most_central(np.zeros((5, 3)), np.zeros(5, dtype=np.int32), EDGES)) == 0
+    assert len(last_in_voxels(np.zeros((0, 3)), 0.02, 3)) == 0
+
+
+def test_the_last_points_of_each_voxel_stay(points):
+    voxel = np.floor(points / 0.03).astype(int)
+    later = [(voxel[i:] == voxel[i]).all(axis=1).sum() for i in range(len(points))]
+    np.testing.assert_array_equal(last_in_voxels(points, 0.03, 4), np.flatnonzero(np.array(later) <= 4))
