@@ -95,17 +95,6 @@ def test_every_view_has_its_graph_labels_pose_and_choice(kept_run):
     assert "next" not in run.views[1].record
 
 
-def test_the_report_is_one_file_that_needs_no_network(kept_run):
-    text = (kept_run / "report.html").read_text()
-    assert text.lstrip().lower().startswith("<!doctype html>")
-    assert not re.search(r"""(?:src|href)\s*=\s*["']?(?:https?:)?//""", text)
-
-
-def test_without_a_report_there_is_none(tmp_path, scene_file):
-    explored(scene_file, tmp_path / "run", "--views", 1, "--no-report")
-    assert not (tmp_path / "run/report.html").exists()
-
-
 # Sources
 
 
@@ -121,12 +110,6 @@ def test_a_built_in_scene_is_explored_by_name(tmp_path):
     labels = {"table": "o0"} | {body: f"o{k}" for k, body in scene.object_bodies.items()}
     truth = {(labels[e["supporter"]], labels[e["supported"]]) for e in ground_truth(scene).edges}
     assert {(a, b) for a, b, _ in found} == truth
-
-
-def test_a_scene_folder_is_explored_like_its_file(tmp_path, scene_file):
-    a = explored(scene_file, tmp_path / "a", "--views", 1, "--no-report")
-    b = explored(scene_file.parent, tmp_path / "b", "--views", 1, "--no-report")
-    assert graph_files(a.folder) == graph_files(b.folder)
 
 
 def test_a_recording_is_explored_where_it_was_recorded(tmp_path, recording):
@@ -177,13 +160,6 @@ def test_labels_that_number_parts_are_divided(tmp_path, points, write_pcd):
     cloud = write_pcd(points[0], points[1] * 10 + (points[1] > 0) * 3)
     assert run_command("extract", cloud, "--label-divisor", 10, "--out", tmp_path / "run") == 0
     assert {o.id for o in read_run(tmp_path / "run").graph.objects} == {"o0", "o1", "o2"}
-
-
-def test_a_ply_cloud_is_extracted_without_labels(tmp_path, points, write_ply):
-    assert run_command("extract", write_ply(points[0]), "--out", tmp_path / "run") == 0
-    run = read_run(tmp_path / "run")
-    assert run.graph.support_surface is not None
-    assert len(run.views[0].load_labels()) == len(points[0])
 
 
 # evaluate, demo, config
@@ -276,10 +252,6 @@ def test_flag_goes_before_file_before_default(tmp_path, scene_file):
 # How often it looks
 
 
-def test_views_count_the_first_one(tmp_path, scene_file):
-    assert len(explored(scene_file, tmp_path / "run", "--views", 1, "--no-report").views) == 1
-
-
 def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recording):
     stops, goes_on = (
         explored(recording, tmp_path / name, "--no-report", "--set=fusion.settled=0.1", *options)
@@ -290,7 +262,7 @@ def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recor
     assert len(goes_on.views) == 3
 
 
-@pytest.mark.parametrize("planner", BUILT_IN)
+@pytest.mark.parametrize("planner", ["support", "random"])
 def test_the_same_seed_gives_the_same_graphs_byte_for_byte(tmp_path, scene_file, planner):
     options = ["--views", 2, "--no-report", "--noise", "carmine", "--planner", planner, "--seed"]
     first, again, other = (
@@ -315,11 +287,10 @@ def test_with_json_stdout_holds_one_document_and_nothing_else(tmp_path, scene_fi
         assert said.err == ""
 
 
-@pytest.mark.parametrize("command", ["explore", "demo", "extract"])
+@pytest.mark.parametrize("command", ["explore", "extract"])
 def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, recording, capsys, command):
     options = {
         "explore": [scene_file, "--views", 2, *SMALL],
-        "demo": ["--scene", "tower", "--views", 2, *SMALL],
         "extract": [recording],
     }
     stages = ["capture", "segment", "register", "map", "fit", "infer", "fuse"]
@@ -352,21 +323,6 @@ def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, r
     assert [view["fit"] for view in profile["views"]] == [timing["fit"] for timing in timings]
     thought = [sum(v for k, v in view.items() if k not in ("view", "capture")) for view in profile["views"]]
     assert profile["turn"]["highest"] == pytest.approx(max(thought))
-
-
-def test_without_a_profile_there_is_none(tmp_path, scene_file, capsys):
-    command = ["explore", scene_file, "--views", 1, "--no-report", *SMALL, "--out", tmp_path / "run"]
-    assert run_command(*command, "--json") == 0
-    assert json.loads(capsys.readouterr().out).keys() == {"run", "graph"}
-    assert run_command(*command) == 0
-    assert capsys.readouterr().out == ""
-
-
-def test_quiet_says_nothing(tmp_path, scene_file, recording, capsys):
-    explored(scene_file, tmp_path / "a", "--views", 1, "--quiet")
-    assert run_command("extract", recording, "--out", tmp_path / "b", "--quiet") == 0
-    said = capsys.readouterr()
-    assert said.out == said.err == ""
 
 
 def test_progress_names_new_objects_and_what_holds_them(tmp_path, scene_file, capsys):

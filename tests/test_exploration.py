@@ -99,7 +99,7 @@ def test_the_reason_of_a_choice_is_told(steps):
         np.testing.assert_array_equal(poses[step.decision.index], step.decision.T_world_camera)
 
 
-@pytest.mark.parametrize("planner", ["support", "attention", "paper", "random"])
+@pytest.mark.parametrize("planner", ["paper", "random"])
 def test_every_planner_goes_by_its_name(planner):
     steps = exploration(planner=planner, early_stop=False)
     assert len(steps) == 3

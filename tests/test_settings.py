@@ -41,10 +41,6 @@ def test_a_flag_beats_the_file_and_the_file_the_default(file):
     assert replace(config, fit=FitConfig()) == Config()
 
 
-def test_of_two_flags_the_later_one_holds():
-    assert read_settings(None, ["fit.steps=3", "fit.steps=4"]).fit.steps == 4
-
-
 def test_what_was_there_is_started_from_and_stays():
     base = replace(Config(), fit=replace(FitConfig(), steps=7))
     config = read_settings(None, ["fit.polish=1"], base)
