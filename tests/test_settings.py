@@ -116,7 +116,6 @@ def test_a_value_of_the_wrong_type_says_what_is_wanted(flag, wanted):
         ("fit.confidence=1", "a number above 0 and below 1"),
         ("fusion.keep_share=1.01", "a number from 0 to 1"),
         ("active.view_cone=90", "a number from 0 to below 90"),
-        ("registration.min_cosine=-1.5", "a number from -1 to 1"),
         ("active.max_views=0", "a whole number from 1 on"),
         ("voxels.extent=[1, 0, 1]", "a list of 3 numbers, each above 0"),
         ("robot.pitch=[-100, 20]", "a list of 2 numbers, each from -90 to 90"),
