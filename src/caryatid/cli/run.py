@@ -445,7 +445,7 @@ class _Run:
         settings = {"source": self.given, "seed": self.options.modelling.seed} | dict(options)
         settings |= {"fusion": self.config.fusion.method, "views": self.config.active.max_views}
         scores = [asdict(score) for score in self.scores]
-        return render_html(Report(f"caryatid: {self.name}", self.pages, settings, scores, strip))
+        return render_html(Report(f"caryatid: {Path(self.given).name}", self.pages, settings, scores, strip))
 
     def _record(self, options: Mapping[str, Any], views: int) -> dict[str, Any]:
         """What run.json holds."""
