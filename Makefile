@@ -35,7 +35,7 @@ check: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-	$(BIN)/lint-imports --contract rooms
+	$(BIN)/lint-imports
 
 notebooks: install
 	$(BIN)/python docs/notebooks/execute.py

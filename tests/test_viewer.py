@@ -233,7 +233,7 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(moment, opening, 
 
 def _waiting(monkeypatch, meanwhile):
     """Have the command, where it would wait for Ctrl-C, do something else."""
-    monkeypatch.setattr("caryatid.cli.viewing.wait_for_interrupt", meanwhile)
+    monkeypatch.setattr("caryatid.cli.watching.wait_for_interrupt", meanwhile)
 
 
 def test_view_serves_a_run_to_this_machine_until_it_is_stopped(run_folder, monkeypatch, capsys):

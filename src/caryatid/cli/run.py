@@ -325,8 +325,7 @@ def _compile(progress: Progress) -> None:
 
 
 def _watched(source: str, config: Config, progress: Progress) -> AbstractContextManager[Watcher]:
-    from caryatid.cli.viewing import wait_for_interrupt
-    from caryatid.cli.watching import watched
+    from caryatid.cli.watching import wait_for_interrupt, watched
 
     return watched(source, config, progress, wait_for_interrupt)
 

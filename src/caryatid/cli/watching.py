@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import Event
 
 from caryatid.cli.output import Progress
 from caryatid.config import Config
@@ -13,6 +14,14 @@ from caryatid.viewer.process import PageProcess
 
 PORT = 8770
 """Where the page is, or at the next port that is free; that of `caryatid view`."""
+
+
+def wait_for_interrupt() -> None:
+    """Return at Ctrl-C."""
+    try:
+        Event().wait()
+    except KeyboardInterrupt:
+        return
 
 
 class Watcher:
