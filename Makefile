@@ -69,10 +69,10 @@ docs: $(VENV)/.docs
 	@echo "open docs/_build/html/index.html"
 
 pictures: install
-	$(BIN)/python benchmarks/pictures/concepts.py
+	$(BIN)/python benchmarks/pictures.py concepts
 
 gif: install
-	$(BIN)/python benchmarks/pictures/film.py
+	$(BIN)/python benchmarks/pictures.py film
 
 format: install
 	$(BIN)/ruff check --fix-only .

@@ -27,9 +27,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from measures import Measure, gate, write_baseline
+from measures import Measure, gate, show, write_baseline
 from rich.console import Console
-from rich.table import Table
 from scipy.spatial import cKDTree
 
 from caryatid.config import FitConfig
@@ -115,10 +114,15 @@ def half_view(shape: Shape, count: int, sigma: float, rng: np.random.Generator) 
     weight = np.where(cosine > np.cos(STEEPEST), cosine, 0.0)
     chosen = rng.choice(len(dense), count, replace=False, p=weight / weight.sum())
     points = dense[chosen] + sigma * rng.normal(size=(count, 3))
+    return points, normals_of(points, np.broadcast_to(view, points.shape)), view
+
+
+def normals_of(points: Array, outward: Array) -> Array:
+    """Normals (N, 3) of planes through each point's neighbours, on the side of the outward ones (N, 3)."""
     _, near = cKDTree(points).query(points, NEIGHBOURS)
     spread = points[near] - points[near].mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.einsum("nki,nkj->nij", spread, spread))[1][:, :, 0]
-    return points, np.where((normals @ view < 0.0)[:, None], -normals, normals), view
+    return np.where((np.sum(normals * outward, axis=1) < 0.0)[:, None], -normals, normals)
 
 
 def dense_surface(shape: Shape, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
@@ -204,20 +208,6 @@ def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
     return found
 
 
-def show(found: list[Measure], console: Console) -> None:
-    """Print the figures beside their targets."""
-    table = Table(title="fits of half views")
-    for column in ("measure", "value", "unit", "target"):
-        table.add_column(column)
-    for m in found:
-        target = TARGETS.get(m.name)
-        missed = target is not None and (m.value < target if m.better == "higher" else m.value > target)
-        sign = "≥" if m.better == "higher" else "≤"
-        text = "" if target is None else f"{sign} {target:g}" + (" missed" if missed else "")
-        table.add_row(m.name, f"{m.value:.3f}", m.unit, text)
-    console.print(table)
-
-
 def main() -> int:
     """Run the measurement."""
     args = tyro.cli(Args)
@@ -231,7 +221,7 @@ def main() -> int:
             found += measures(prefix, trials)
             if args.verbose:
                 show_worst(trials, console)
-    show(found, console)
+    show("fits of half views", found, TARGETS, console)
     if args.update:
         write_baseline(found, BASELINE)
     return gate(found, BASELINE, console) if args.gate else 0

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.console import Console
+from rich.table import Table
 
 
 @dataclass(frozen=True)
@@ -61,3 +62,16 @@ def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
             )
     console.print("gate: " + (f"{failed} measures are worse" if failed else "nothing is worse"))
     return min(failed, 1)
+
+
+def show(title: str, measures: Iterable[Measure], targets: Mapping[str, float], console: Console) -> None:
+    """Print measures beside what is asked for."""
+    table = Table(title=title)
+    for column in ("measure", "value", "unit", "± tolerated", "asked for"):
+        table.add_column(column)
+    for m in measures:
+        target, sign = targets.get(m.name), "≥" if m.better == "higher" else "≤"
+        missed = target is not None and (m.value < target if m.better == "higher" else m.value > target)
+        asked = "" if target is None else f"{sign} {target:g}" + (" missed" if missed else "")
+        table.add_row(m.name, f"{m.value:.3f}", m.unit, f"{m.tolerance:.3g}", asked)
+    console.print(table)

@@ -24,19 +24,22 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from episodes import THREADS, family
+from accuracy import EASY
 from measures import Measure, gate, write_baseline
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
-from suites import BUILT_IN
 
+from caryatid.benchmark.episodes import family
+from caryatid.benchmark.running import THREADS
 from caryatid.config import Config, NoiseModel
 from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.scores import assign, mask_ious
 from caryatid.sensing.views import View
 
+BUILT_IN = (*EASY, *(f"dense-{size}-{seed}" for seed, size in enumerate(range(10, 18, 2), start=1)))
+"""What is segmented where no sources are given."""
 BASELINE = Path(__file__).with_name("segmentation_baseline.json")
 LEAST_PIXELS = 200
 """True objects with fewer readings are not asked for, nor are parts of them invented [px]; 2 cm at 1 m."""

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import os
-import sys
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
+from chromium import browser, chromium
 
 from caryatid.geometry import transforms
 from caryatid.sources import open_source
 from caryatid.viewer.controls import Controls
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.page import Page
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
-
-from browser import browser, chromium
 
 pytest.importorskip("viser")
 pytest.importorskip("playwright")

@@ -14,10 +14,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
-import kill
-import load
+import durability
+from durability import Starter, depth_png, labels_png, views_around
 from robot_client import RobotClient
-from sessions import Starter, depth_png, labels_png, views_around
 
 from caryatid.sessions import Session
 
@@ -30,19 +29,19 @@ def around():
 
 
 def test_however_adding_is_killed_no_view_is_lost(tmp_path, around):
-    tally = kill.kill_adding(tmp_path, around, kills=12, seed=2)
+    tally = durability.kill_adding(tmp_path, around, kills=12, seed=2)
     assert tally["kept"] + tally["not kept"] == 12
     assert tally["acknowledged"]
 
 
 def test_however_a_service_is_killed_no_view_is_lost(tmp_path, around):
-    tally = kill.kill_serving(tmp_path, around, kills=8, seed=1)
+    tally = durability.kill_serving(tmp_path, around, kills=8, seed=1)
     assert tally["kills"] == 8
     assert tally["acknowledged"] >= 2
 
 
 def test_many_clients_at_once_lose_nothing(tmp_path, around):
-    outcome = load.put_load(tmp_path, around * 2, clients=4, sessions=2, options=("--open-sessions", 1))
+    outcome = durability.put_load(tmp_path, around * 2, clients=4, sessions=2, options=("--open-sessions", 1))
     assert sorted(n for order in outcome.order.values() for n in order) == list(range(16))
     assert all(len(order) == 8 for order in outcome.order.values())
 
@@ -51,7 +50,7 @@ def test_many_clients_at_once_lose_nothing(tmp_path, around):
 def test_a_service_that_is_told_to_stop_finishes_the_view_in_hand(tmp_path, around, number):
     starter = Starter()
     process = starter.start(["serve", tmp_path / "s", "--port", 0, "--json"], tmp_path / "said")
-    robot = RobotClient(kill._address(tmp_path / "said"))
+    robot = RobotClient(durability.address_of(tmp_path / "said"))
     robot.begin("table", segmentation="labels")
     view, answers = around[0], []
     thread = threading.Thread(

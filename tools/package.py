@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -21,44 +20,28 @@ VERSIONS = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text
 
 def find_python(wanted: str) -> Path | None:
     """Find an interpreter of a version, such as 3.12: this one, on the PATH, or one of pyenv or uv."""
-    for candidate in _candidates(wanted):
+    candidates = [sys.executable, shutil.which(f"python{wanted}")]
+    pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
+    for home in (pyenv, Path.home() / ".local/share/uv/python"):
+        candidates += [str(path) for path in sorted(home.glob(f"*{wanted}*/bin/python"), reverse=True)]
+    for candidate in filter(None, candidates):
         code = "import sys; print('%d.%d' % sys.version_info[:2])"
-        try:
-            told = subprocess.run([candidate, "-c", code], capture_output=True, text=True, check=False)
-        except OSError:
-            continue
-        if told.returncode == 0 and told.stdout.strip() == wanted:
+        told = subprocess.run([candidate, "-c", code], capture_output=True, text=True, check=False)
+        if told.stdout.strip() == wanted:
             return Path(candidate)
     return None
-
-
-def _candidates(wanted: str) -> Iterator[str]:
-    yield sys.executable
-    if found := shutil.which(f"python{wanted}"):
-        yield found
-    homes = (Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions",
-             Path.home() / ".local/share/uv/python")  # fmt: skip
-    for home in homes:
-        yield from (str(path) for path in sorted(home.glob(f"*{wanted}*/bin/python"), reverse=True))
-
-
-def build(folder: Path) -> tuple[Path, Path]:
-    """Build wheel and sdist, the wheel from the sdist, and see whether an index would show them well."""
-    run(sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT))
-    (wheel,), (sdist,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
-    run(sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist))
-    return wheel, sdist
 
 
 def try_out(python: Path, distribution: Path, folder: Path) -> dict[str, object]:
     """Install a distribution in a new environment, and try it in an empty folder."""
     begun = time.monotonic()
     run(str(python), "-m", "venv", str(folder / "venv"))
-    pip = str(folder / "venv/bin/python"), "-m", "pip", "--disable-pip-version-check", "--quiet"
+    installed_python = str(folder / "venv/bin/python")
+    pip = installed_python, "-m", "pip", "--disable-pip-version-check", "--quiet"
     run(*pip, "install", "--constraint", str(ROOT / "constraints.txt"), str(distribution))
     installed = time.monotonic() - begun
     (folder / "empty").mkdir()
-    said = run(str(folder / "venv/bin/python"), "-I", str(ROOT / "tools/smoke.py"), cwd=folder / "empty")
+    said = run(installed_python, "-I", str(ROOT / "tools/smoke.py"), cwd=folder / "empty")
     size = sum(f.stat().st_size for f in (folder / "venv").rglob("*") if f.is_file() and not f.is_symlink())
     told: dict[str, object] = json.loads(said.splitlines()[-1])
     return told | {"install seconds": round(installed, 1), "environment MB": round(size / 1e6)}
@@ -81,7 +64,9 @@ def main() -> None:
     parser.add_argument("--python", action="append", help="only this version, say 3.12; may be repeated")
     options = parser.parse_args()
     shutil.rmtree(options.out, ignore_errors=True)
-    wheel, sdist = build(options.out)
+    run(sys.executable, "-m", "build", "--outdir", str(options.out), str(ROOT))
+    (wheel,), (sdist,) = options.out.glob("*.whl"), options.out.glob("*.tar.gz")
+    run(sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist))
     for file in (wheel, sdist):
         print(f"{file.name}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
     tried = 0

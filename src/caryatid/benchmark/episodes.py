@@ -37,7 +37,7 @@ REMOVAL_VIEWS = (1, 3, 5, 10)
 """Views after which a scene is taken apart, by what is known then."""
 
 Row = dict[str, float]
-"""What was measured after one view: `view` (from 1) and `MEASURES`."""
+"""What was measured after one view: `view` (from 1), `MEASURES` and `counts`."""
 SCORES = (
     "precision", "recall", "f1", "vertex_precision", "vertex_recall", "vertex_f1", "edge_precision",
     "edge_recall", "edge_f1", "mean_iou",
@@ -195,6 +195,11 @@ def take_apart(
     return float(all(ok)), float(np.mean(ok))
 
 
+def counts(true: int, graph: SupportGraph, found: Score) -> Row:
+    """Numbers of true objects, of extracted ones and of those that are both, the table left out."""
+    return {"objects": true, "returned": len(graph.objects) - 1, "matched": len(found.ious)}
+
+
 def _rows(episode: Episode) -> list[Row]:
     config = settings_of(episode)
     scene, truth = open_scene(episode.scene, episode.content)
@@ -218,7 +223,8 @@ def _rows(episode: Episode) -> list[Row]:
         seed=episode.seed,
         early_stop=False,
     ):
-        row = _row(step, score(step.graph, truth, np.random.default_rng(SEED)), planning)
+        found = score(step.graph, truth, np.random.default_rng(SEED))
+        row = _row(step, found, planning) | counts(len(truth.objects), step.graph, found)
         if episode.order and row["view"] in REMOVAL_VIEWS:
             taken = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
         rows.append(row | {"unharmed": taken[0], "lifts": taken[1]})

@@ -273,7 +273,7 @@ def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
 
 
 def sensor_azimuth(cloud: Cloud, T_world_camera: NDArray[np.float64] | None) -> float:
-    """Return the direction [rad] from the scene to the sensor; where unknown, that of the world's −x."""
+    """Direction [rad] from the scene to the sensor at a pose (4, 4); where unknown, the world's −x."""
     backward = np.array([-1.0, 0.0, 0.0])
     if T_world_camera is not None:
         backward = -T_world_camera[:3, 2]

@@ -1,4 +1,4 @@
-"""A headless Chromium for tests, pictures and figures of the viewer, cut off from all but this machine."""
+"""A headless Chromium for tests of the viewer, cut off from all but this machine."""
 
 from __future__ import annotations
 

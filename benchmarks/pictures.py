@@ -1,0 +1,292 @@
+"""The documentation's pictures: each stage of the loop on one scene, and the film of README.md.
+
+    python benchmarks/pictures.py concepts [--names shapes graph]
+    python benchmarks/pictures.py film
+
+The same command draws the same pictures, byte for byte, with the drawings of reports (`caryatid.viz`).
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from caryatid import Config, Step, explore
+from caryatid.errors import CaryatidError
+from caryatid.evaluation.scores import score
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.geometry import transforms
+from caryatid.graph import Support, SupportGraph
+from caryatid.manipulation.dismantling import bodies_of, dismantle
+from caryatid.manipulation.order import plan_order
+from caryatid.planning.decision import PlanningState
+from caryatid.planning.planners import make_planner
+from caryatid.scene import Scene
+from caryatid.sensing.views import View
+from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.truth import ground_truth
+from caryatid.simulation.world import SimulatedScene, box, build_spec, cylinder, scene_from_spec, sphere
+from caryatid.viz.drawings import (
+    Picture,
+    Projection,
+    draw_cloud,
+    draw_image,
+    draw_sphere,
+    own_style,
+    stage,
+)
+from caryatid.viz.graph_drawing import draw_graph
+from caryatid.viz.strip import draw_lifts
+
+PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+TITLE = 24.0
+"""Height of a line of text above a picture [px]."""
+PLANE, NORMAL = 0.042, 0.05
+"""Half the side of a separating plane and the length of its normal as drawn [m]."""
+LOOK, KNOW, CHOOSE, END = 900, 2000, 2200, 4000
+"""How long what was seen, what is known, what is chosen, and the end stand in the film [ms]."""
+SOLIDS = (
+    box((0.1, 0.2, 0.28), at=(-0.08, 0.14, 0.14), density=1200.0, friction=0.1),
+    box((0.02, 0.09, 0.24), at=(-0.169, 0.14, 0.1215), turn=(0.0, 14.0, 0.0), friction=0.1),
+    box((0.12, 0.12, 0.07), at=(0.08, 0.14, 0.035)),
+    cylinder(0.035, 0.09, at=(0.08, 0.14, 0.115)),
+    box((0.11, 0.1, 0.1), at=(0.0, -0.07, 0.05)),
+    box((0.07, 0.36, 0.02), at=(0.0, -0.19, 0.11), density=500.0),
+    cylinder(0.04, 0.08, at=(0.0, -0.06, 0.16), density=3000.0),
+    sphere(0.035, at=(-0.1, -0.2, 0.035)),
+)
+"""A tall box, a board that leans on it, a stack behind it; a beam on a block, held by a weight; a ball."""
+Titled = tuple[Picture, str]
+
+
+def sheet(pictures: Sequence[Titled], width: int, columns: int, heading: str = "") -> Image.Image:
+    """Put pictures with their titles on one page, in rows of cells of this width [px]."""
+    rows = [pictures[k : k + columns] for k in range(0, len(pictures), columns)]
+    heights = [TITLE + max(width * p.height / p.width for p, _ in row) for row in rows]
+    top = 1.4 * TITLE if heading else 0.0
+    size = np.array([columns * width, sum(heights) + top])
+    with own_style():
+        figure = Figure(figsize=tuple(size / 100.0), dpi=100)
+        figure.text(0.01, 1.0 - 0.5 * top / size[1], heading, va="center", fontsize=10)
+        for row, height in zip(rows, heights, strict=True):
+            for column, (picture, title) in enumerate(row):
+                tall = width * picture.height / picture.width
+                middle = (column + 0.5) / columns
+                figure.text(middle, 1.0 - (top + TITLE / 2) / size[1], title, ha="center", va="center")
+                bottom = 1.0 - (top + TITLE + tall) / size[1]
+                picture.draw(figure, (column / columns + 0.005, bottom, 0.99 / columns, tall / size[1]))
+            top += height
+        content = io.BytesIO()
+        figure.savefig(content, format="png", metadata={"Software": None})
+    return Image.open(content).convert("RGB")
+
+
+def story() -> tuple[SimulatedScene, Config, tuple[Step, ...]]:
+    """The concepts' scene and its four views."""
+    config = Config()
+    config = replace(config, active=replace(config.active, max_views=4))
+    scene = scene_from_spec(build_spec(SOLIDS, "concepts"), "concepts", "concepts", least=1.0)
+    simulation = make_simulation(scene, config, noise="carmine", seed=0)
+    steps = explore(simulation.camera, simulation.robot, config=config, segmentation="auto", early_stop=False)
+    return scene, config, tuple(steps)
+
+
+def plain(view: View, labels: NDArray[np.int32] | None = None, graph: SupportGraph | None = None) -> Picture:
+    """A view, and its segments where labels are given, without the shapes."""
+    none = np.zeros(view.depth.shape, np.int32)
+    return draw_image(
+        view, none if labels is None else labels, graph or SupportGraph(), view.depth.shape[1], small=True
+    )
+
+
+def planes(step: Step, supports: Sequence[Support]) -> Picture:
+    """A view with the separating planes of supports and their normals."""
+    view = step.view
+    assert view is not None
+    base, projection = plain(view), Projection(view.pose, view.K, view.depth)
+
+    def draw(figure: Any, where: tuple[float, float, float, float]) -> None:
+        base.draw(figure, where)
+        height, width = view.depth.shape
+        axes, unit = stage(figure, where, (width, height))
+        for support in supports:
+            at, normal = support.contact_world, support.normal_world
+            if at is None or normal is None:
+                continue
+            colour = "#3b4252" if support.certain else "#d55e00"
+            u = transforms.perpendicular(normal)
+            v = np.cross(normal, u)
+            corners = [at + PLANE * (a * u + b * v) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+            axes.fill(*projection.project(np.array(corners))[0].T, color=colour, alpha=0.5)
+            foot, head = projection.project(np.stack([at, at + NORMAL * normal]))[0]
+            style = {
+                "arrowstyle": "-|>",
+                "color": colour,
+                "linewidth": 3.0 * unit,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            }
+            axes.annotate("", tuple(head), tuple(foot), arrowprops=style)
+
+    return Picture(f"separating planes of {len(supports)} supports", base.width, base.height, draw)
+
+
+def azimuth_of(view: View) -> float:
+    """Direction about the vertical a view looks from [rad]."""
+    return float(np.arctan2(-view.pose[1, 2], -view.pose[0, 2]))
+
+
+def concepts() -> dict[str, Image.Image]:
+    """A picture of each stage of the loop."""
+    scene, config, steps = story()
+    first, last = steps[0], steps[-1]
+    views = [step.view for step in steps if step.view is not None]
+    empty, side = SupportGraph(), azimuth_of(views[0]) - 0.5
+    pale = replace(views[0], rgb=None)
+    known = Scene(config, segmentation="auto")
+    known.update(views[0])
+    assert known.voxels is not None
+    assert first.candidates is not None
+    state = PlanningState(
+        first.graph, first.sphere, known.voxels, first.visited, first.candidates, config.active
+    )
+    paper = replace(first, decision=make_planner("attention").plan(state, np.random.default_rng(0)))
+    order = plan_order(last.graph, config)
+    bodies = bodies_of(last.graph, true_scene_from_simulation(scene, ground_truth(scene)))
+    taken = list(dismantle(scene, order.steps, bodies, config))
+    supports = last.graph.supports
+    lifts = draw_lifts(scene, taken, last.graph, views[0].pose, config)
+    pages: dict[str, tuple[Sequence[Titled], int, int]] = {
+        "view": ([(plain(views[0]), "colour"), (plain(pale), "depth, near is light")], 480, 2),
+        "parts": ([(plain(views[0], first.labels, first.graph), "the segments on the table")], 640, 1),
+        "shapes": (
+            [
+                (draw_cloud(first.cloud, empty, side), "points of the first view, from the side"),
+                (draw_cloud(first.cloud, first.graph, side), "the shapes that explain them"),
+            ], 560, 2,
+        ),
+        "contacts": (
+            [
+                (planes(last, [s for s in supports if s.certain]), "certain supports: planes and normals"),
+                (planes(last, [s for s in supports if not s.certain]), "uncertain: leaning, held from above"),
+            ], 560, 2,
+        ),
+        "graph": (
+            [
+                (draw_cloud(last.cloud, last.graph, azimuth_of(views[-1])), "the shapes after four views"),
+                (draw_graph(last.graph), "what holds up what: certain, and uncertain (dashed)"),
+            ], 560, 2,
+        ),
+        "fusion": ([(draw_graph(steps[k].graph), f"after view {k + 1}") for k in (0, 1, 3)], 420, 3),
+        "interest": ([(draw_sphere(paper), "points of interest and their saliency")], 880, 1),
+        "next": (
+            [
+                (draw_sphere(first), "what each view would show, less the way there"),
+                (plain(views[1]), "the view that was chosen"),
+            ], 620, 2,
+        ),
+        "order": ([(f.picture, f.heading) for f in lifts], 280, 4),
+    }  # fmt: skip
+    return {name: sheet(*page) for name, page in pages.items()}
+
+
+def film() -> tuple[list[Image.Image], list[int]]:
+    """Explore a scene; frames of what is seen, known and chosen, and how long each stands [ms]."""
+    scene, config = load_scene("clutter"), Config()
+    truth = true_scene_from_simulation(scene, ground_truth(scene))
+    simulation = make_simulation(scene, config, noise="carmine", seed=0)
+    images, times, graph = [], [], SupportGraph()
+
+    def add(step: Step, phase: str, time: int, *, found: bool) -> None:
+        view, number = step.view, step.index + 1
+        assert view is not None
+        seen = plain(view, step.labels, step.graph) if found else plain(view)
+        pictures = [
+            (seen, "what the camera sees"),
+            (draw_cloud(step.cloud, graph, azimuth_of(view) - 0.4), "what is known: points and shapes"),
+            (draw_sphere(step if time == CHOOSE else replace(step, decision=None)), "where to look from"),
+            (draw_graph(graph), "the support graph"),
+        ]
+        f1 = score(graph, truth, np.random.default_rng(0)).f1 if graph.objects else 0.0
+        images.append(sheet(pictures, 400, 2, f"view {number} · F1 {f1:.2f} · {phase}"))
+        times.append(time)
+
+    for step in explore(simulation.camera, simulation.robot, config=config, seed=0):
+        add(step, "look", LOOK, found=False)
+        graph = step.graph
+        add(step, "fit shapes, infer what supports what, fuse", KNOW, found=True)
+        if step.decision is None:
+            add(step, f"done: {step.stop}", END, found=True)
+            break
+        add(
+            step,
+            textwrap.shorten(f"next view: {step.decision.why}", 90, placeholder=" …"),
+            CHOOSE,
+            found=True,
+        )
+    width, height = images[0].width, max(image.height for image in images)
+    pages = [Image.new("RGB", (width, height), "white") for _ in images]
+    for page, image in zip(pages, images, strict=True):
+        page.paste(image)
+    return pages, times
+
+
+@dataclass(frozen=True)
+class Concepts:
+    """Draw the pictures of docs/concepts.md."""
+
+    names: tuple[str, ...] = ()
+    """Pictures. [default: all]"""
+    out: Path = PICTURES / "concepts"
+    """Folder to write to."""
+
+    def run(self) -> None:
+        """Draw and write."""
+        drawn = concepts()
+        if unknown := sorted({*self.names} - {*drawn}):
+            raise CaryatidError(f"there is no picture '{unknown[0]}'; there are {', '.join(drawn)}")
+        self.out.mkdir(parents=True, exist_ok=True)
+        for name in self.names or drawn:
+            image = drawn[name].quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+            image.save(self.out / f"{name}.png", optimize=True)
+
+
+@dataclass(frozen=True)
+class Film:
+    """Draw the film of README.md: a robot explores; what it sees, what it knows, where it looks next."""
+
+    out: Path = PICTURES / "explore.gif"
+    """GIF to write."""
+
+    def run(self) -> None:
+        """Draw and write."""
+        images, times = film()
+        none = Image.Dither.NONE
+        flat = [image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=none) for image in images]
+        flat[0].save(self.out, save_all=True, append_images=flat[1:], duration=times, loop=0, optimize=False)
+        sys.stdout.write(f"{self.out.name}: {len(flat)} frames, {self.out.stat().st_size / 1e6:.2f} MB\n")
+
+
+def main() -> None:
+    """Draw."""
+    commands: dict[str, Any] = {"concepts": Concepts, "film": Film}
+    tyro.extras.subcommand_cli_from_dict(commands).run()
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except CaryatidError as error:
+        sys.exit(f"error: {error}")
