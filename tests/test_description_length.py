@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from synthetic import box, cylinder, motion_about_vertical, sphere, surface_points
-from test_degenerate_fits import POINTS
-from test_degenerate_fits import UP as NORMALS
+from test_fitting import BROKEN_POINTS as POINTS
+from test_fitting import UP as NORMALS
 
 from caryatid.config import Config, ExplanationConfig, FitConfig, SplitConfig, VoxelConfig
 from caryatid.geometry import transforms

@@ -43,9 +43,9 @@ def test_a_flag_beats_the_file_and_the_file_the_default(file):
 
 def test_what_was_there_is_started_from_and_stays():
     base = replace(Config(), fit=replace(FitConfig(), steps=7))
-    config = read_settings(None, ["fit.polish=1"], base)
-    assert (config.fit.steps, config.fit.polish) == (7, 1)
-    assert base.fit.polish == FitConfig().polish
+    config = read_settings(None, ["fit.hypotheses=1"], base)
+    assert (config.fit.steps, config.fit.hypotheses) == (7, 1)
+    assert base.fit.hypotheses == FitConfig().hypotheses
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_a_value_of_the_wrong_type_says_what_is_wanted(flag, wanted):
         ("voxels.size=0", "a number above 0"),
         ("voxels.size=-0.01", "a number above 0"),
         ("noise.translation=-1", "a number from 0 on"),
-        ("fit.confidence=1", "a number above 0 and below 1"),
+        ("voxels.hit=1", "a number above 0 and below 1"),
         ("fusion.keep_share=1.01", "a number from 0 to 1"),
         ("active.view_cone=90", "a number from 0 to below 90"),
         ("active.max_views=0", "a whole number from 1 on"),

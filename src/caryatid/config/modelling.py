@@ -10,7 +10,6 @@ from caryatid.config.ranges import (
     Angle,
     Count,
     Factor,
-    Likelihood,
     NotNegative,
     Positive,
     Share,
@@ -27,8 +26,6 @@ class FitConfig(Stage):
     """Shapes that are tried; the paper's three."""
     hypotheses: Count = 100
     """RANSAC hypotheses a shape at the most [1]; the predecessor's iterations."""
-    confidence: Likelihood = 0.99
-    """RANSAC stops when a better sample is less likely than 1 − confidence [1]."""
     max_points: Count = 800
     """Points a shape is judged by [1]; 1.5 cm apart on the largest objects, as far as bare places count."""
     search_points: Count = 250
@@ -47,39 +44,14 @@ class FitConfig(Stage):
     """Shortest extent [m]; below the sensor's resolution."""
     max_radius: Positive = 0.15
     """Largest radius of cylinder and sphere [m]."""
-    size_penalty: NotNegative = 0.0125
-    """Added to the mean residual [m] per square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
-    shrink: NotNegative = 2e-5
-    """Pull on every extent in the search [m]: keeps sides that hold no points near; the last fit has none."""
-    trim: Share = 0.005
-    """Share of the points beyond each end of an extent that count as noise in the search [1]."""
-    side_share: Share = 0.02
-    """Share of the points that must lie on a side for it to count as seen [1]."""
     normal_weight: NotNegative = 0.004
     """What a normal turned by 90° costs in model choice [m]: as much as half the registration error."""
-    bare_weight: NotNegative = 0.003
-    """What seen sides without any point near them cost in model choice [m]; a share of them in proportion."""
-    bare_spacing: Positive = 0.008
-    """Spacing of the samples that look for points near a side [m]; 2 to 3 pixels at 1.5 m."""
-    final_points: Count = 3500
-    """Points the last refinement of the chosen shape looks at [1]; of 3 mm of noise, four points
-    sharing an error, they leave 0.1 mm on a side: far less than the error of registration."""
-    opening: NotNegative = 0.05
-    """How far unseen sides are moved out of the way for it [m]; beyond all noise."""
-    face_width: Positive = 3.0
-    """Points within as many standard deviations of a face are the face's [1]; 99.7 % of them."""
-    stray: Positive = 1e-3
-    """Density of stray points beyond a face's rim, as a share of that on the face [1]."""
     correlated: Positive = 4.0
     """Neighbouring points that share one error [1]: depth is smoothed over 2 × 2 pixels."""
     registration: NotNegative = 0.002
     """Standard deviation of where views are laid [m], which no number of points averages out."""
     rim: NotNegative = 0.003
     """The same of where points end beside a depth edge [m]: one pixel at 1.5 m."""
-    free_weight: NotNegative = 0.01
-    """What an inside seen free costs in model choice [m]; a share of it in proportion."""
-    free_inset: NotNegative = 1.2
-    """How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
     max_residual: Positive = 0.008
     """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
 

@@ -1,6 +1,6 @@
 """Compiled costs of explanations: points as one of a shape's surface, and the space inside it.
 
-`explanation` says what they mean; the tests hold a NumPy reference.
+`objects.description_length` says what they mean.
 """
 
 from __future__ import annotations
@@ -10,8 +10,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.geometry import BOX, CYLINDER
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import Array
+from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 
 @njit(cache=True, error_model="numpy")
@@ -51,29 +53,27 @@ def point_costs(
     return costs
 
 
-@njit(cache=True, error_model="numpy")
-def count_inside(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    states: NDArray[np.int8],
-    origin: NDArray[np.float64],
-    size: float,
-    wanted: int,
-) -> tuple[int, int]:
-    """How many cubes of a voxel's size lie inside a shape, and how many of them in voxels of one state.
+def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]:
+    """Of the space well inside a shape, how much there is and how much was seen free [voxels].
 
     Args:
-        kind: Code of the shape.
-        R: Axes (3, 3), columns = x, y, z of the object.
-        centre: (3,) [m].
-        half: Half extents (3,) [m] along the axes.
-        states: State (X, Y, Z) of each voxel; outside the grid it is 0.
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        size: Edge of a voxel [m].
-        wanted: The state that counts.
+        shape: In the world frame.
+        voxels: What has been seen.
+        inset: How far inside the surface to begin [m]; a surface voxel may be half free.
+
+    Returns:
+        Cubes of a voxel's size in all, none where the shape is too thin, and those in voxels seen free.
     """
+    kind, R, centre, half = Primitives.of([shape]).row(0)
+    inside, free = count_inside(
+        kind, R, centre, half - inset, voxels.states, voxels.origin_world, voxels.config.size, FREE
+    )
+    return int(inside), int(free)
+
+
+@njit(cache=True, error_model="numpy")
+def count_inside(kind, R, centre, half, states, origin, size, wanted):  # type: ignore[no-untyped-def]
+    """How many cubes of a voxel's size lie inside a shape, and how many of them in voxels of one state."""
     inside = matching = 0
     steps = np.empty(3, np.intp)
     for a in range(3):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile, solve_positive
@@ -21,24 +20,15 @@ CONVERGED = 1e-4
 """Least squares end with a step that lowers the cost by less than this share; the rest is far below noise."""
 ROUGHLY = 1e-3
 """The same where another refinement follows."""
+SHRINK = 2e-5
+"""Pull on every extent in the search [m]: keeps sides that hold no points near; the last fit has none."""
 
 
-@njit(cache=True, error_model="numpy")
-def levenberg_marquardt(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-    steps: int,
-    min_extent: float,
-    shrink: float,
-    robust_width: float,
-    noise_floor: float,
-    ridge: NDArray[np.float64],
-    converged: float,
-) -> None:
-    """Minimise the Geman–McClure cost of signed distances; of points to a shape.
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def levenberg_marquardt(  # type: ignore[no-untyped-def]
+    kind, R, centre, half, points, steps, min_extent, shrink, converged
+):
+    """Minimise the Geman–McClure cost of signed distances of points to a shape.
 
     Args:
         kind: Code of the shape.
@@ -46,12 +36,9 @@ def levenberg_marquardt(
         centre: (3,) [m] at the start; replaced.
         half: Half extents (3,) [m] at the start; replaced.
         points: (N, 3) [m].
-        steps: Steps at the most.
+        steps: Maximum number of steps.
         min_extent: Least extent [m].
         shrink: Pull on the extents [m].
-        robust_width: Residuals beyond this many robust standard deviations lose most of their weight.
-        noise_floor: Least standard deviation the weights assume [m].
-        ridge: Added to the diagonal (9,), times the damping.
         converged: Share of the cost that the last step lowers it by at the most.
     """
     columns, size = np.empty(9, np.intp), 0
@@ -66,9 +53,8 @@ def levenberg_marquardt(
     distance, absolute = np.empty(len(points)), np.empty(len(points))
     write_distances(kind, R, centre, half, points, distance)
     for _ in range(steps):
-        for i in range(len(points)):
-            absolute[i] = abs(distance[i])
-        scale = robust_width * max(1.4826 * quantile(absolute, 0.5), noise_floor)
+        absolute[:] = np.abs(distance)
+        scale = ROBUST_WIDTH * max(1.4826 * quantile(absolute, 0.5), NOISE_FLOOR)
         normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
         cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
         improved = False
@@ -78,17 +64,14 @@ def levenberg_marquardt(
                 g[a] = -(g_all[columns[a]] + (shrink / 2.0 if a >= 6 else 0.0))
                 for b in range(size):
                     H[a, b] = H_all[columns[a], columns[b]]
-                H[a, a] += damping * (H[a, a] + ridge[a])
+                H[a, a] += damping * (H[a, a] + RIDGE[a])
             step = solve_positive(H, g)
             _stepped(kind, R, centre, half, step, columns, min_extent, R_trial, centre_trial, half_trial)
             write_distances(kind, R_trial, centre_trial, half_trial, points, distance)
             trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half_trial)
             if trial_cost < cost:
                 improved = True
-                for a in range(3):
-                    centre[a], half[a] = centre_trial[a], half_trial[a]
-                    for b in range(3):
-                        R[a, b] = R_trial[a, b]
+                R[:], centre[:], half[:] = R_trial, centre_trial, half_trial
                 break
             damping *= 6.0
         if not improved:
@@ -98,17 +81,8 @@ def levenberg_marquardt(
             break
 
 
-@njit(cache=True, error_model="numpy")
-def normal_equations(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-    scale: float,
-    H: NDArray[np.float64],
-    g: NDArray[np.float64],
-) -> None:
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def normal_equations(kind, R, centre, half, points, scale, H, g):  # type: ignore[no-untyped-def]
     """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
 
     Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
@@ -125,10 +99,7 @@ def normal_equations(
         g: Written to (9,).
     """
     J = np.empty(9)
-    for a in range(9):
-        g[a] = J[a] = 0.0
-        for b in range(9):
-            H[a, b] = 0.0
+    H[:], g[:], J[:] = 0.0, 0.0, 0.0
     share = 1.0 / len(points)
     hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
@@ -155,18 +126,9 @@ def normal_equations(
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _stepped(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    step: NDArray[np.float64],
-    columns: NDArray[np.intp],
-    min_extent: float,
-    turned: NDArray[np.float64],
-    moved: NDArray[np.float64],
-    grown: NDArray[np.float64],
-) -> None:
+def _stepped(  # type: ignore[no-untyped-def]
+    kind, R, centre, half, step, columns, min_extent, turned, moved, grown
+):
     """Write the shape after a step in its own frame, shortened to 3 cm and 0.3 rad, no extent too short."""
     longest = 1.0
     for a in range(len(step)):
@@ -195,7 +157,7 @@ def _stepped(
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
+def _robust_cost(distance, scale):  # type: ignore[no-untyped-def]
     total = 0.0
     for d in distance:
         squared = (d / scale) ** 2
@@ -204,7 +166,7 @@ def _robust_cost(distance: NDArray[np.float64], scale: float) -> float:
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _sum_of_sizes(kind: int, half: NDArray[np.float64]) -> float:
+def _sum_of_sizes(kind, half):  # type: ignore[no-untyped-def]
     if kind == SPHERE:
         return half[0]
     if kind == CYLINDER:

@@ -4,31 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
-from caryatid.fitting.free_space import free_share
-from caryatid.fitting.hidden_faces import Polish, polish
-from caryatid.fitting.jobs import FitJob, RefineJob, bare_one, judge_one, refine_one, search_one
-from caryatid.fitting.least_squares import (
-    CONVERGED,
-    NOISE_FLOOR,
-    RIDGE,
-    ROBUST_WIDTH,
-    ROUGHLY,
-)
+from caryatid.fitting.explaining import free_inside
+from caryatid.fitting.hidden_faces import Seen, close_hidden_faces
+from caryatid.fitting.least_squares import CONVERGED, ROUGHLY, SHRINK, levenberg_marquardt
+from caryatid.fitting.scoring import bare_share, draw_in, misfit
+from caryatid.fitting.search import of_one_face, search
 from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry import SPHERE
 from caryatid.geometry.shapes import KINDS, Shape
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.runtime.parallel import for_each
 from caryatid.sensing.voxel_map import VoxelMap
 
-Seen = tuple[bool, bool, bool, bool, bool, bool]
-
-SETTINGS = tuple(name for name in FitJob._fields if hasattr(FitConfig, name))
-"""What the kernels are told of the settings."""
+PROMISING = 2.0
+"""Kinds of shape that cost more than so many times the best one after the first refinement get no second one
+[1]: that ends where a step gains a thousandth, so no more of them can halve what is left."""
+HOPEFUL = 4.0
+"""The same where only the first start of each kind is refined yet [1]: the others may halve what it found,
+and twice the best may still win."""
+SIZE_PENALTY = 0.0125
+"""Cost [m] per square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
+SIDE_SHARE = 0.02
+"""Share of the points that must lie on a side for it to count as seen [1]."""
+BARE_WEIGHT = 0.003
+"""Cost of seen sides without any point near them [m]; a share of them in proportion."""
+FREE_WEIGHT = 0.01
+"""Cost of a shape whose whole inside was seen free [m]; a share of it in proportion."""
+FREE_INSET = 1.2
+"""How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,15 +73,6 @@ class FitFailure:
     """
 
     reason: str
-
-
-PROMISING = 2.0
-"""Kinds of shape that cost more than so many times the best one after the first refinement get no second one
-[1]: that ends where a step gains a thousandth, so no more of them can halve what is left."""
-
-HOPEFUL = 4.0
-"""The same where only the first start of each kind is refined yet [1]: the others may halve what it found,
-and twice the best may still win."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -144,29 +145,36 @@ def fit_many(
         rngs: Source of the samples of each object.
         space: What has been seen free, where points are in the world frame: shapes do not fill it.
     """
-    results: list[Fit | FitFailure] = []
-    chosen: list[Polish] = []
     finite = [o.finite() for o in objects]
-    for part, found in zip(finite, _candidates(finite, config, rngs), strict=True):
-        if not found:
-            results.append(FitFailure(_failure_reason(len(part), config)))
-            continue
-        best = found[0] if space is None else _least_free(found, space, config)
-        results.append(best)
-        chosen.append(Polish(best.shape, best.seen, part.points))
-    polished = iter(polish(chosen, config))
-    for number, result in enumerate(results):
-        if isinstance(result, Fit):
-            last = next(polished)
-            results[number] = replace(
-                result,
-                shape=last.shape,
-                residual=last.residual,
-                inliers=last.inliers,
-                poor=last.residual > config.max_residual,
-                uncertainty=last.uncertainty,
+    chosen = [_least_free(fits, space) if fits else None for fits in _candidates(finite, config, rngs)]
+    found = [(f.shape, f.seen, o.points) for o, f in zip(finite, chosen, strict=True) if f]
+    closed = iter(close_hidden_faces(found, config))
+    results: list[Fit | FitFailure] = []
+    for points, best in zip(finite, chosen, strict=True):
+        if best:
+            shape, residual, inliers, uncertainty = next(closed)
+            best = replace(best, shape=shape, residual=residual, inliers=inliers, uncertainty=uncertainty)
+            results.append(replace(best, poor=residual > config.max_residual))
+        elif len(points) < config.min_points:
+            results.append(
+                FitFailure(f"{len(points)} points are fewer than the {config.min_points} a shape needs")
             )
+        else:
+            results.append(FitFailure(f"every shape exceeds the longest extent of {config.max_extent:g} m"))
     return results
+
+
+def _least_free(fits: Sequence[Fit], space: VoxelMap | None) -> Fit:
+    """Of fits in order of their cost, the cheapest once it pays for what it fills of the space seen free."""
+    best, least = fits[0], np.inf
+    for f in fits:
+        if space is None or f.cost >= least:
+            break
+        inside, free = free_inside(f.shape, space, FREE_INSET * space.config.size)
+        cost = f.cost + FREE_WEIGHT * (free / max(inside, 1))
+        if cost < least:
+            best, least = f, cost
+    return best
 
 
 def candidates(
@@ -177,6 +185,110 @@ def candidates(
     Arguments as of `fit_many`.
     """
     return _candidates([o.finite() for o in objects], config, rngs)
+
+
+class FitJob(NamedTuple):
+    """Shapes of several kinds are fitted to the points of each of several objects, some of each kind.
+
+    Object p and kind k have the shapes s = (p · K + k) · S … + S − 1.
+
+    Attributes:
+        rows: Which of the shapes are improved (M,).
+        kinds: Codes of the kinds (K,).
+        first: Index of each object's first point, and the number of all points (P + 1,).
+        points: (N, 3) [m], object after object, each about its own origin.
+        normals: Unit normals (N, 3).
+        every: Search and refinement look at every so many points of each object (P,).
+        samples: Indices (P, K, B, 2) of the pairs of those points that hypotheses are made from.
+        threshold, …, normal_weight: Settings by their names in `FitConfig`.
+        converged: See `levenberg_marquardt`.
+        R: Axes (P · K, S, 3, 3).
+        centre: (P · K, S, 3) [m].
+        half: Half extents (P · K, S, 3) [m].
+        seen: Sides -x, +x, -y, +y, -z, +z that points bear out (P · K, S, 6).
+        cost: What model choice compares (P · K, S) [m]; of a shape that was not found it is infinite.
+        residual: Mean truncated distance (P · K, S) [m].
+        inliers: Share of the points within the threshold (P · K, S).
+    """
+
+    rows: NDArray[np.intp]
+    kinds: NDArray[np.intp]
+    first: NDArray[np.intp]
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    every: NDArray[np.intp]
+    samples: NDArray[np.intp]
+    threshold: float
+    max_radius: float
+    max_extent: float
+    min_extent: float
+    min_points: int
+    steps: int
+    normal_weight: float
+    converged: float
+    R: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    half: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+    cost: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    inliers: NDArray[np.float64]
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def search_one(group: int, job: FitJob) -> None:
+    """Find shapes of one kind for one object to start from; those found have a cost of 0."""
+    owner, number = group // len(job.kinds), group % len(job.kinds)
+    kind, every = job.kinds[number], job.every[owner]
+    some = job.points[job.first[owner] : job.first[owner + 1] : every].copy()
+    facing = job.normals[job.first[owner] : job.first[owner + 1] : every].copy()
+    R, centre, half, cost = job.R[group], job.centre[group], job.half[group], job.cost[group]
+    count = search(
+        kind, some, facing, job.samples[owner, number], job.threshold, job.max_radius, job.max_extent,
+        R, centre, half, cost,
+    )  # fmt: skip
+    if kind != SPHERE and of_one_face(
+        kind, some, facing, job.min_extent, job.max_radius, job.max_extent,
+        R[count], centre[count], half[count],
+    ):  # fmt: skip
+        count += 1
+    for k in range(len(cost)):
+        cost[k] = 0.0 if k < count else np.inf
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def improve_one(index: int, job: FitJob) -> None:
+    """Refine one of the shapes, draw in the sides no point bears out, and judge it by all the points."""
+    row = job.rows[index]
+    group, k = row // job.cost.shape[1], row % job.cost.shape[1]
+    owner, kind = group // len(job.kinds), job.kinds[group % len(job.kinds)]
+    points = job.points[job.first[owner] : job.first[owner + 1]]
+    normals = job.normals[job.first[owner] : job.first[owner + 1]]
+    R, centre, half = job.R[group, k], job.centre[group, k], job.half[group, k]
+    some = points[:: job.every[owner]].copy()
+    levenberg_marquardt(kind, R, centre, half, some, job.steps, job.min_extent, SHRINK, job.converged)
+    least = max(job.min_points / 3.0, SIDE_SHARE * len(points))
+    draw_in(kind, R, centre, half, points, normals, job.threshold, least, job.min_extent, job.seen[group, k])
+    residual, turned, inliers = misfit(kind, R, centre, half, points, normals, job.threshold)
+    size = 4.0 * (half[0] ** 2 + half[1] ** 2 + half[2] ** 2) / 3.0
+    job.cost[group, k] = residual + job.normal_weight * turned + SIZE_PENALTY * size
+    job.residual[group, k], job.inliers[group, k] = residual, inliers
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def bare_one(index: int, job: FitJob) -> None:
+    """Have one of the shapes pay for sides that should have been seen but are bare."""
+    row = job.rows[index]
+    group, k = row // job.cost.shape[1], row % job.cost.shape[1]
+    owner, kind = group // len(job.kinds), job.kinds[group % len(job.kinds)]
+    points = job.points[job.first[owner] : job.first[owner + 1]]
+    job.cost[group, k] += BARE_WEIGHT * bare_share(
+        kind, job.R[group, k], job.centre[group, k], job.half[group, k], job.seen[group, k], points,
+    )  # fmt: skip
+
+
+SETTINGS = tuple(name for name in FitJob._fields if hasattr(FitConfig, name))
+"""What the kernels need to know of the settings."""
 
 
 def _candidates(
@@ -200,14 +312,24 @@ def _candidates(
         searched = -(-len(part) // every[-1])
         samples.append(rng.integers(0, searched, size=(len(kinds), config.hypotheses, 2)))
     origins = [part.points.mean(axis=0) for part in parts]
-    job = _job(
+    shapes = len(parts) * len(kinds), config.polish + 1
+    job = FitJob(
+        np.zeros(0, dtype=np.intp),
         kinds,
         np.cumsum([0, *(len(part) for part in parts)]),
         np.concatenate([part.points - origin for part, origin in zip(parts, origins, strict=True)]),
         np.concatenate([part.normals for part in parts]),
         np.array(every),
         np.stack(samples),
-        config,
+        **{name: getattr(config, name) for name in SETTINGS},
+        converged=ROUGHLY,
+        R=np.empty((*shapes, 3, 3)),
+        centre=np.empty((*shapes, 3)),
+        half=np.empty((*shapes, 3)),
+        seen=np.zeros((*shapes, 6), dtype=np.bool_),
+        cost=np.full(shapes, np.inf),
+        residual=np.empty(shapes),
+        inliers=np.empty(shapes),
     )
     best = _fitted(job, config)
     for number, (k, origin) in enumerate(zip(large, origins, strict=True)):
@@ -226,12 +348,12 @@ def _fitted(job: FitJob, config: FitConfig) -> NDArray[np.intp]:
     for_each(search_one, groups, job)
     # The first start of each kind tells which kinds' other starts are worth refining.
     started = job.cost < np.inf
-    _improve(job, np.flatnonzero(started[:, 0]) * room, job.every, ROUGHLY, config)
+    _improve(job, np.flatnonzero(started[:, 0]) * room)
     started[:, 0] = False
     first = np.zeros(groups, dtype=np.intp)
     started &= (_promising(job, first, HOPEFUL, config) | ~_within(job, first, config))[:, None]
     job.cost[:, 1:] = np.where(started[:, 1:], 0.0, np.inf)
-    _improve(job, np.flatnonzero(started), job.every, ROUGHLY, config)
+    _improve(job, np.flatnonzero(started))
     best = np.argmin(job.cost, axis=1)
     promising = _promising(job, best, PROMISING, config)
     found = np.flatnonzero(promising)
@@ -239,7 +361,7 @@ def _fitted(job: FitJob, config: FitConfig) -> NDArray[np.intp]:
     last = (best + 1) % room
     for part in (job.R, job.centre, job.half):
         part[found, last[found]] = part[found, best[found]]
-    _improve(job, found * room + last[found], np.ones_like(job.every), CONVERGED, config)
+    _improve(job._replace(every=np.ones_like(job.every), converged=CONVERGED), found * room + last[found])
     better = found[job.cost[found, last[found]] < job.cost[found, best[found]]]
     best[better] = last[better]
     best[~_within(job, best, config)] = -1
@@ -248,32 +370,9 @@ def _fitted(job: FitJob, config: FitConfig) -> NDArray[np.intp]:
     return best
 
 
-def _improve(
-    job: FitJob, rows: NDArray[np.intp], every: NDArray[np.intp], converged: float, config: FitConfig
-) -> None:
-    """Refine some of a job's shapes on every so many points of their objects (P,), and judge them by all."""
-    groups, room = job.cost.shape
-    each = groups // len(every) * room
-    refined = RefineJob(
-        rows,
-        np.tile(np.repeat(job.kinds, room), len(every)),
-        np.repeat(job.first[:-1], each),
-        np.repeat(job.first[1:], each),
-        np.repeat(every, each),
-        job.points,
-        RIDGE,
-        config.steps,
-        config.min_extent,
-        config.shrink,
-        ROBUST_WIDTH,
-        NOISE_FLOOR,
-        converged,
-        job.R.reshape(-1, 3, 3),
-        job.centre.reshape(-1, 3),
-        job.half.reshape(-1, 3),
-    )
-    for_each(refine_one, len(rows), refined)
-    for_each(judge_one, len(rows), job._replace(rows=rows))
+def _improve(job: FitJob, rows: NDArray[np.intp]) -> None:
+    """Refine and judge some of a job's shapes."""
+    for_each(improve_one, len(rows), job._replace(rows=rows))
     job.cost[np.isnan(job.cost)] = np.inf
 
 
@@ -291,49 +390,6 @@ def _within(job: FitJob, best: NDArray[np.intp], config: FitConfig) -> NDArray[n
     return np.asarray(fits & (job.cost[every, best] < np.inf))
 
 
-def _least_free(found: Sequence[Fit], space: VoxelMap, config: FitConfig) -> Fit:
-    """The fit of least cost (ascending) once it pays for what it fills of the space seen free."""
-    inset = config.free_inset * space.config.size
-    best, least = found[0], np.inf
-    for f in found:
-        if f.cost >= least:
-            break
-        cost = f.cost + config.free_weight * free_share(f.shape, space, inset)
-        if cost < least:
-            best, least = f, cost
-    return best
-
-
-def _job(
-    kinds: NDArray[np.intp],
-    first: NDArray[np.intp],
-    points: Array,
-    normals: Array,
-    every: NDArray[np.intp],
-    samples: NDArray[np.intp],
-    config: FitConfig,
-) -> FitJob:
-    """Objects' points, and room for the shapes that are tried."""
-    shapes = len(every) * len(kinds), config.polish + 1
-    return FitJob(
-        np.zeros(0, dtype=np.intp),
-        kinds,
-        first,
-        points,
-        normals,
-        every,
-        samples,
-        **{name: getattr(config, name) for name in SETTINGS},
-        R=np.empty((*shapes, 3, 3)),
-        centre=np.empty((*shapes, 3)),
-        half=np.empty((*shapes, 3)),
-        seen=np.zeros((*shapes, 6), dtype=np.bool_),
-        cost=np.full(shapes, np.inf),
-        residual=np.empty(shapes),
-        inliers=np.empty(shapes),
-    )
-
-
 def _row(job: FitJob, row: tuple[int, int], kind: str, origin: Array, config: FitConfig) -> Fit:
     """One of a job's shapes as a fit, in the frame of the object's points before they were centred."""
     s = [bool(b) for b in job.seen[row]]
@@ -346,9 +402,3 @@ def _row(job: FitJob, row: tuple[int, int], kind: str, origin: Array, config: Fi
         float(job.cost[row]),
         residual > config.max_residual,
     )
-
-
-def _failure_reason(count: int, config: FitConfig) -> str:
-    if count < config.min_points:
-        return f"{count} points are fewer than the {config.min_points} a shape needs"
-    return f"every shape exceeds the longest extent of {config.max_extent:g} m"

@@ -1,38 +1,27 @@
-"""Compiled judgement of a fitted shape: which sides points bear out, and what it costs to believe in it.
-
-The tests hold a NumPy reference.
-"""
+"""Compiled judgement of a fitted shape: which sides points bear out, and what it costs to believe in it."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from caryatid.fitting.search import TRIM
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
 from caryatid.geometry.signed_distance import gradient, local
 
+BARE_SPACING = 0.008
+"""Spacing of the samples that look for points near a side [m]; a point within twice that is near one."""
 FACING = 0.7
 """A point bears out the side whose outward normal its own gradient follows with this cosine [1]; 45°."""
 AGREE = 0.5
 """Least cosine between a point's normal and the shape's there [1]."""
 
 
-@njit(cache=True, error_model="numpy")
-def draw_in(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    threshold: float,
-    least: float,
-    trim: float,
-    min_extent: float,
-    seen: NDArray[np.bool_],
-) -> None:
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def draw_in(  # type: ignore[no-untyped-def]
+    kind, R, centre, half, points, normals, threshold, least, min_extent, seen
+):
     """Find the sides that points bear out, and move the others inwards to where the points end.
 
     Args:
@@ -44,7 +33,6 @@ def draw_in(
         normals: Unit normals (N, 3).
         threshold: Points nearer to the surface are the shape's [m].
         least: Points that bear out a side at the least.
-        trim: Share of the points beyond each end that count as noise.
         min_extent: Least extent [m].
         seen: Whether the sides -x, +x, -y, +y, -z, +z are (6,); written to.
     """
@@ -88,24 +76,16 @@ def draw_in(
         reach = near_points[axis, :near]
         low, high = -half[axis], half[axis]
         if not seen[2 * axis]:
-            low = min(max(low, quantile(reach, trim)), high - min_extent)
+            low = min(max(low, quantile(reach, TRIM)), high - min_extent)
         if not seen[2 * axis + 1]:
-            high = max(min(high, quantile(reach, 1.0 - trim)), low + min_extent)
+            high = max(min(high, quantile(reach, 1.0 - TRIM)), low + min_extent)
         half[axis], shift[axis] = (high - low) / 2.0, (high + low) / 2.0
     for a in range(3):
         centre[a] += R[a, 0] * shift[0] + R[a, 1] * shift[1] + R[a, 2] * shift[2]
 
 
-@njit(cache=True, error_model="numpy")
-def misfit(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    threshold: float,
-) -> tuple[float, float, float]:
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def misfit(kind, R, centre, half, points, normals, threshold):  # type: ignore[no-untyped-def]
     """How badly a shape explains oriented points.
 
     Args:
@@ -138,16 +118,8 @@ def misfit(
     return away / count, turned / count, inliers / count
 
 
-@njit(cache=True, error_model="numpy")
-def bare_share(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    seen: NDArray[np.bool_],
-    points: NDArray[np.float64],
-    spacing: float,
-) -> float:
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def bare_share(kind, R, centre, half, seen, points):  # type: ignore[no-untyped-def]
     """Share of the seen sides' area that has no point near it: a side that was seen should be seen whole.
 
     Args:
@@ -157,7 +129,6 @@ def bare_share(
         half: Half extents (3,) [m].
         seen: Which sides (6,) are seen.
         points: (N, 3) [m].
-        spacing: Of the samples on the surface [m]; a point within twice that is near.
     """
     own = np.empty((len(points), 3))
     for i in range(len(points)):
@@ -165,13 +136,13 @@ def bare_share(
             own[i, a] = 0.0
             for b in range(3):
                 own[i, a] += R[b, a] * (points[i, b] - centre[b])
-    squared = 4.0 * spacing * spacing
+    squared = 4.0 * BARE_SPACING * BARE_SPACING
     samples = bare = last = 0
     for side in range(6):
         if not seen[side]:
             continue
         axis, sign = side // 2, 2 * (side % 2) - 1
-        places = _samples(kind, half, axis, sign, spacing)
+        places = _samples(kind, half, axis, sign, BARE_SPACING)
         samples += len(places)
         for k in range(len(places)):
             u, v, w = places[k, 0], places[k, 1], places[k, 2]
@@ -187,7 +158,7 @@ def bare_share(
     return bare / samples if samples > 0 else 1.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _samples(kind, half, axis, sign, spacing):  # type: ignore[no-untyped-def]
     """Points (M, 3) [m] about `spacing` apart on one side, in the object's frame.
 

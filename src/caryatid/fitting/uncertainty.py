@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
-from caryatid.geometry import BOX, CYLINDER, SPHERE
+from caryatid.geometry import BOX, SPHERE
 from caryatid.geometry.transforms import Array
 
-_SIZE_COLUMNS = np.zeros((3, 3), dtype=np.intp)
+_SIZE_COLUMNS = np.array([(6, 6, 6), (6, 6, 8), (6, 7, 8)])
 """Column of the normal equations that holds the half extent along x, y, z, by the code of the kind."""
-_SIZE_COLUMNS[BOX], _SIZE_COLUMNS[CYLINDER], _SIZE_COLUMNS[SPHERE] = (6, 7, 8), (6, 6, 8), (6, 6, 6)
 _TURN = 1.0
 """Standard deviation of a rotation that nothing determines [rad]."""
 
@@ -57,23 +56,24 @@ def estimate(
     """Standard deviations of several shapes from the normal equations of their last fits.
 
     Args:
-        kinds: Code (P,) of each shape's kind, of `kernels.fitting`.
+        kinds: Code (P,) of each shape's kind.
         seen: Which sides (P, 6) points bear out.
         unseen: Standard deviation (P, 6) [m] of the sides that no point bears out.
         normal_matrices: Sum over the points of the products of their derivatives (P, 9, 9), unseen sides out
-            of the way; rows and columns as of `kernels.fitting.normal_equations`.
+            of the way; rows and columns as of `least_squares.normal_equations`.
         sigma: Robust standard deviation (P,) [m] of the points' distances to the shape.
         config: How many points share an error, and the error of registration.
     """
     information = normal_matrices / (config.correlated * sigma[:, None, None] ** 2)
     prior = np.array([config.max_extent] * 3 + [_TURN] * 3 + [config.max_extent] * 3)
     covariance = np.linalg.inv(information + np.diag(prior**-2.0))
-    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    # Rounding may leave a variance a little below zero.
+    variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
     rows, axes, columns = np.arange(len(kinds))[:, None], np.arange(3), _SIZE_COLUMNS[kinds]
     centre, half, both = variance[:, :3], variance[rows, columns], covariance[rows, axes, columns]
     borne_out = _borne_out(kinds, seen)
-    low = np.where(borne_out[:, 0::2], centre + half - 2.0 * both, unseen[:, 0::2] ** 2)
-    high = np.where(borne_out[:, 1::2], centre + half + 2.0 * both, unseen[:, 1::2] ** 2)
+    low = np.where(borne_out[:, 0::2], np.maximum(centre + half - 2.0 * both, 0.0), unseen[:, 0::2] ** 2)
+    high = np.where(borne_out[:, 1::2], np.maximum(centre + half + 2.0 * both, 0.0), unseen[:, 1::2] ** 2)
     determined = borne_out[:, 0::2] & borne_out[:, 1::2]
     floor = config.registration**2
     position = np.sqrt(np.where(determined, centre, (low + high) / 4.0) + floor)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import ExplanationConfig, FitConfig
 from caryatid.fitting import explaining as kernels
-from caryatid.fitting.free_space import free_inside
+from caryatid.fitting.explaining import free_inside
 from caryatid.fitting.primitives import Oriented, candidates
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array

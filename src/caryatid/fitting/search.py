@@ -1,0 +1,305 @@
+"""Compiled model search: shapes through two oriented points, the best of many by MSAC; and of one face.
+
+Axes R (3, 3), centre (3,) and half extents (3,) [m] of what is found are written to the arrays passed in.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from caryatid.geometry import BOX, CYLINDER
+from caryatid.geometry.points import quantile
+from caryatid.geometry.signed_distance import local, signed_distance
+
+CONFIDENCE = 0.99
+"""The search stops when a better sample is less likely than 1 − this [1]."""
+BATCH = 25
+"""Hypotheses drawn between two looks at the stopping rule."""
+TRIM = 0.005
+"""Share of the points beyond each end of an extent that count as noise [1]."""
+LEAST_EXTENT, LEAST_RADIUS = 1e-4, 1e-3
+"""Extents of hypotheses are no shorter [m], points on one plane have none across it; no radius is smaller."""
+LEAST_SINE = (0.1, 0.3, 0.5)
+"""Least sine of the angle between two normals that determine a sphere, a cylinder and a box [1]."""
+AGREEING = float(np.cos(np.radians(25.0)))
+"""Least cosine between normals of one face [1]."""
+TURN = 3.0
+"""Step between the directions tried for the sides of a flat box [deg]; least squares do the rest."""
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def search(  # type: ignore[no-untyped-def]
+    kind, points, normals, samples, threshold, max_radius, max_extent, R, centre, half, cost
+):
+    """Score hypotheses until a better one has become unlikely; keep the best, the best first (MSAC).
+
+    Args:
+        kind: Code of the shape.
+        points: (N, 3) [m].
+        normals: Unit normals (N, 3).
+        samples: Indices (B, 2) of the two points each hypothesis is made from, in the order they are tried.
+        threshold: Where distances are truncated [m].
+        max_radius: [m].
+        max_extent: [m].
+        R: Axes (K + 1, 3, 3) of the K best, columns = x, y, z; written to, the last one is for trials.
+        centre: (K + 1, 3) [m]; written to.
+        half: Half extents (K + 1, 3) [m]; written to.
+        cost: Mean truncated squared distances (K + 1,) in units of the threshold; written to.
+
+    Returns:
+        How many there are, at most K.
+    """
+    count, keep = len(points), len(R) - 1
+    for k in range(keep + 1):
+        cost[k] = np.inf
+    most_inliers = found = 0
+    for b in range(len(samples)):
+        i, j = samples[b]
+        valid = _hypothesis(
+            kind, points, normals, i, j, max_radius, max_extent, R[keep], centre[keep], half[keep]
+        )
+        if valid:
+            limit = cost[keep - 1] * count
+            total, inliers = _msac(kind, R[keep], centre[keep], half[keep], points, threshold, limit)
+            if inliers > 0 and total < limit:
+                place = keep
+                cost[keep] = total / count
+                while place > 0 and cost[place] < cost[place - 1]:
+                    _swap(place, R, centre, half, cost)
+                    place -= 1
+                found = min(found + 1, keep)
+                if place == 0:
+                    most_inliers = inliers
+        if (b + 1) % BATCH == 0 and found > 0:
+            hit = min(max((most_inliers / count) ** 2, 1e-9), 1.0 - 1e-9)
+            if b + 1 >= keep * np.log(1.0 - CONFIDENCE) / np.log(1.0 - hit):
+                break
+    return found
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _swap(k, R, centre, half, cost):  # type: ignore[no-untyped-def]
+    """Exchange a hypothesis and the one before it."""
+    cost[k], cost[k - 1] = cost[k - 1], cost[k]
+    for a in range(3):
+        centre[k, a], centre[k - 1, a] = centre[k - 1, a], centre[k, a]
+        half[k, a], half[k - 1, a] = half[k - 1, a], half[k, a]
+        for b in range(3):
+            R[k, a, b], R[k - 1, a, b] = R[k - 1, a, b], R[k, a, b]
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def of_one_face(  # type: ignore[no-untyped-def]
+    kind, points, normals, min_extent, max_radius, max_extent, R, centre, half
+):
+    """Make a box or a cylinder for points of one face: their main normal, and what holds them along it.
+
+    A box has the least rectangle around them, a cylinder the circle that reaches as far. Returns whether it
+    is within the limits; arguments as of `search`.
+    """
+    (x, y, z), on_face = _main_normal(normals)
+    if not x * x + y * y + z * z > 0.0:
+        return False
+    ux, uy, uz = _across(points, x, y, z)
+    _set_axes(R, ux, uy, uz, x, y, z, 0)
+    if kind == BOX:
+        best, least = 0.0, np.inf
+        for step in range(int(90.0 / TURN)):
+            angle = np.radians(step * TURN)
+            area = 1.0
+            for quarter in range(2):
+                c, s = np.cos(angle + quarter * np.pi / 2.0), np.sin(angle + quarter * np.pi / 2.0)
+                low, high = _range(points, *_turned(R, c, s))
+                area *= high - low
+            if area < least:
+                best, least = angle, area
+        ux, uy, uz = _turned(R, np.cos(best), np.sin(best))
+        _set_axes(R, ux, uy, uz, x, y, z, 0)
+    low, high = np.empty(3), np.empty(3)
+    for a in range(3):
+        low[a], high[a] = _range(points, R[0, a], R[1, a], R[2, a])
+    heights = np.empty(len(points))
+    count = 0
+    for i in range(len(points)):
+        if on_face[i]:
+            heights[count] = points[i, 0] * x + points[i, 1] * y + points[i, 2] * z
+            count += 1
+    high[2] = quantile(heights[:count], 0.5)
+    low[2] = min(low[2], high[2] - min_extent)
+    centre[:] = 0.0
+    for a in range(3):
+        half[a] = (high[a] - low[a]) / 2.0
+        for b in range(3):
+            centre[a] += R[a, b] * (low[b] + high[b]) / 2.0
+    if kind == BOX:
+        return 2.0 * half.max() <= max_extent
+    half[0] = half[1] = (half[0] + half[1]) / 2.0
+    return LEAST_RADIUS < half[0] <= max_radius and 2.0 * half[2] <= max_extent
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _msac(kind, R, centre, half, points, threshold, limit):  # type: ignore[no-untyped-def]
+    """Sum of truncated squared distances in units of the threshold, and how many points lie within it.
+
+    Ends early, with what it has, once the sum exceeds the limit.
+    """
+    total, inliers = 0.0, 0
+    for i in range(len(points)):
+        x, y, z = local(R, centre, points, i)
+        off = signed_distance(kind, x, y, z, half[0], half[1], half[2]) / threshold
+        if abs(off) < 1.0:
+            total += off * off
+            inliers += 1
+        else:
+            total += 1.0
+            if total > limit:
+                break
+    return total, inliers
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _hypothesis(  # type: ignore[no-untyped-def]
+    kind, points, normals, i, j, max_radius, max_extent, R, centre, half
+):
+    """Make a shape of two oriented points; what they leave open is as long as all points reach.
+
+    A box has adjacent faces through them; a cylinder has them on its mantle, its axis where the lines along
+    their normals come closest; so does the centre of a sphere. Returns whether it is within the limits.
+    """
+    ax, ay, az = normals[i, 0], normals[i, 1], normals[i, 2]
+    bx, by, bz = normals[j, 0], normals[j, 1], normals[j, 2]
+    if kind == BOX:
+        along = ax * bx + ay * by + az * bz
+        ux, uy, uz = bx - along * ax, by - along * ay, bz - along * az
+        sine = np.sqrt(ux * ux + uy * uy + uz * uz)
+        if sine <= LEAST_SINE[kind]:
+            return False
+        _set_axes(R, ux / sine, uy / sine, uz / sine, ax, ay, az, 1)
+        centre[:] = 0.0
+        for a in range(3):
+            low, high = _range(points, R[0, a], R[1, a], R[2, a])
+            half[a] = max(high - low, LEAST_EXTENT) / 2.0
+            for b in range(3):
+                centre[b] += R[b, a] * (low + high) / 2.0
+        return 2.0 * max(half[0], half[1], half[2]) <= max_extent
+    x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    sine = np.sqrt(x * x + y * y + z * z)
+    if sine <= LEAST_SINE[kind]:
+        return False
+    x, y, z = x / sine, y / sine, z / sine
+    gx, gy, gz = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+    tx, ty, tz = bx - ax, by - ay, bz - az
+    # The turn of the normals is across the axis, so the gap along it adds nothing.
+    radius = (gx * tx + gy * ty + gz * tz) / max(tx * tx + ty * ty + tz * tz, 1e-12)
+    if not LEAST_RADIUS < radius <= max_radius:
+        return False
+    _set_axes(R, ax, ay, az, x, y, z, 0)
+    cx = (points[i, 0] + points[j, 0] - radius * (ax + bx)) / 2.0
+    cy = (points[i, 1] + points[j, 1] - radius * (ay + by)) / 2.0
+    cz = (points[i, 2] + points[j, 2] - radius * (az + bz)) / 2.0
+    half[:] = radius
+    level = 0.0
+    if kind == CYLINDER:
+        low, high = _range(points, x, y, z)
+        half[2] = max(high - low, LEAST_EXTENT) / 2.0
+        level = (low + high) / 2.0 - (cx * x + cy * y + cz * z)
+    centre[0], centre[1], centre[2] = cx + level * x, cy + level * y, cz + level * z
+    return kind != CYLINDER or 2.0 * half[2] <= max_extent
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _set_axes(R, ux, uy, uz, x, y, z, column):  # type: ignore[no-untyped-def]
+    """Set right-handed axes (3, 3): z, a unit vector across it as x or y (column 0 or 1), and the third."""
+    R[0, column], R[1, column], R[2, column] = ux, uy, uz
+    R[0, 2], R[1, 2], R[2, 2] = x, y, z
+    sign = 1.0 - 2.0 * column
+    R[0, 1 - column] = sign * (y * uz - z * uy)
+    R[1, 1 - column] = sign * (z * ux - x * uz)
+    R[2, 1 - column] = sign * (x * uy - y * ux)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _turned(R, c, s):  # type: ignore[no-untyped-def]
+    """The direction between the first two axes by cosine and sine."""
+    return c * R[0, 0] + s * R[0, 1], c * R[1, 0] + s * R[1, 1], c * R[2, 0] + s * R[2, 1]
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _range(points, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Least and greatest coordinate [m] of points (N, 3) along a direction, a share at each end left out."""
+    beyond = min(int(TRIM * len(points)), (len(points) - 1) // 2)
+    least, greatest = np.full(beyond + 1, np.inf), np.full(beyond + 1, -np.inf)
+    for i in range(len(points)):
+        c = points[i, 0] * dx + points[i, 1] * dy + points[i, 2] * dz
+        if c < least[beyond]:
+            k = beyond
+            while k > 0 and least[k - 1] > c:
+                least[k] = least[k - 1]
+                k -= 1
+            least[k] = c
+        if c > greatest[beyond]:
+            k = beyond
+            while k > 0 and greatest[k - 1] < c:
+                greatest[k] = greatest[k - 1]
+                k -= 1
+            greatest[k] = c
+    return least[beyond], greatest[beyond]
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _main_normal(normals):  # type: ignore[no-untyped-def]
+    """The direction most normals (N, 3) agree on, their mean, and which do (N,)."""
+    count = len(normals)
+    best, most = 0, 0
+    for i in range(count):
+        agreeing = 0
+        for j in range(count):
+            agreeing += _cosine(normals, i, j) > AGREEING
+        if agreeing > most:
+            best, most = i, agreeing
+    u = v = w = 0.0
+    agree = np.empty(count, np.bool_)
+    for j in range(count):
+        agree[j] = _cosine(normals, best, j) > AGREEING
+        if agree[j]:
+            u, v, w = u + normals[j, 0], v + normals[j, 1], w + normals[j, 2]
+    length = np.sqrt(u * u + v * v + w * w)
+    return (u / length, v / length, w / length), agree
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _cosine(normals, i, j):  # type: ignore[no-untyped-def]
+    return normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _across(points, x, y, z):  # type: ignore[no-untyped-def]
+    """A direction across an axis that turns with the points: to the first one well off their middle."""
+    count = len(points)
+    mx = my = mz = 0.0
+    for i in range(count):
+        mx, my, mz = mx + points[i, 0] / count, my + points[i, 1] / count, mz + points[i, 2] / count
+    farthest = 0.0
+    for turn in range(2):
+        for i in range(count):
+            u, v, w = points[i, 0] - mx, points[i, 1] - my, points[i, 2] - mz
+            along = u * x + v * y + w * z
+            u, v, w = u - along * x, v - along * y, w - along * z
+            reach = np.sqrt(u * u + v * v + w * w)
+            if turn == 0:
+                farthest = max(farthest, reach)
+            elif reach > 0.5 * farthest:
+                return u / reach, v / reach, w / reach
+        if farthest < 1e-6:
+            break
+    # Points on the axis leave it open: across the world axis that is least along it.
+    u, v, w = 0.0, 0.0, 1.0
+    if abs(x) <= abs(y) and abs(x) <= abs(z):
+        u, v, w = 1.0, 0.0, 0.0
+    elif abs(y) <= abs(z):
+        u, v, w = 0.0, 1.0, 0.0
+    along = u * x + v * y + w * z
+    u, v, w = u - along * x, v - along * y, w - along * z
+    length = np.sqrt(u * u + v * v + w * w)
+    return u / length, v / length, w / length
