@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -181,12 +182,18 @@ def test_an_object_that_is_no_primitive_is_not_cut_into_ones():
     assert divided(points, np.concatenate([outward, -outward])) is None
 
 
-def test_a_view_that_is_off_by_three_sigma_leaves_a_layer_and_no_second_object():
-    for seed in range(4):
+@pytest.mark.slow
+def test_a_view_that_is_off_leaves_a_layer_and_no_second_object():
+    """By 3σ of registration in no case; a millimetre more is as good as two objects to some samples."""
+    apart = {0.006: 0, 0.007: 0}
+    for off, seed in product(apart, range(8)):
         points, normals, _ = points_of([STACKED[0]], seed=seed)
         top = normals[:, 2] > 0.9
-        layer = points[top] + np.array([0.0, 0.0, 0.006])
-        assert divided(np.concatenate([points, layer]), np.concatenate([normals, normals[top]])) is None
+        layer = points[top] + np.array([0.0, 0.0, off])
+        groups = divided(np.concatenate([points, layer]), np.concatenate([normals, normals[top]]))
+        apart[off] += groups is not None
+    assert apart[0.006] == 0
+    assert apart[0.007] <= 1
 
 
 def test_the_division_turns_with_the_scene():

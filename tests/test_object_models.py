@@ -9,6 +9,7 @@ import pytest
 from synthetic import box, cylinder, surface_points
 
 from caryatid.config import Config
+from caryatid.fitting.primitives import FitFailure
 from caryatid.geometry import transforms
 from caryatid.objects.models import ObjectModels, ObjectPoints, joined
 from caryatid.segmentation.observation import Observation
@@ -62,6 +63,18 @@ def test_two_labels_of_one_object_are_united(models):
     assert len(given_up) == 1
     assert [o.shape.kind for o in models.objects()] == ["box"]
     np.testing.assert_allclose(np.sort(models.objects()[0].shape.extents), np.sort(CRATE.extents), atol=0.005)
+
+
+def test_two_united_without_a_shape_that_fits_are_not_looked_up_again(models, monkeypatch):
+    models.fit_all(models.add(observation_of((1, 3)), 0))
+    models.fit_all(models.add(observation_of((2,), (CRATE,), seed=3), 1))
+    counts = {k: len(models.points.of(k)) for k in (1, 2)}
+    failure = FitFailure("too few points")
+    monkeypatch.setattr("caryatid.objects.models.fit_many", lambda parts, **_: [failure] * len(parts))
+    ((old, new),) = models.unite({1, 2, 3}).items()
+    assert {old, new} == {1, 2}
+    assert len(models.points.of(new)) == sum(counts.values())
+    assert [o.label for o in models.objects()] == [3]
 
 
 def test_the_newest_view_alone_is_fitted_on_demand(models):

@@ -14,7 +14,7 @@ from caryatid.config import CloudConfig, FitConfig, SegmentationConfig, SurfaceC
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
 from caryatid.segmentation.lccp import cluster_by_mean, convex_parts, hollowness
-from caryatid.segmentation.segments import occlusion_gaps, segment, segment_cloud
+from caryatid.segmentation.segments import cut_by_colour, occlusion_gaps, segment, segment_cloud
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points, thin
 from caryatid.sensing.views import Cloud, View
@@ -294,6 +294,41 @@ def test_a_gap_is_hidden_only_by_what_is_nearer():
     assert occlusion_gaps(labels, inverse, 0.01, 5)[1, 2] == 0
     inverse[0, 15] = 0.4
     assert occlusion_gaps(labels, inverse, 0.01, 20)[1, 2] == 0
+
+
+RED, BLUE = np.array([200, 30, 30], np.uint8), np.array([30, 30, 200], np.uint8)
+PART = np.zeros((40, 60), dtype=np.int32)
+PART[5:35, 5:55] = 1
+
+
+def halves(slope=0.0, bulge=0.0):
+    """An image red left of a line, or of a bulging one, and blue right of it."""
+    v, u = np.mgrid[:40, :60].astype(float)
+    border = 30.0 + slope * (v - 20.0) + bulge * ((v - 20.0) / 15.0) ** 2
+    return np.where((u < border)[..., None], RED, BLUE)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.5, -0.7])
+def test_plain_halves_with_a_straight_border_are_two_in_any_shade(slope):
+    shade = np.linspace(0.6, 1.0, 40)[:, None, None]
+    noise = np.random.default_rng(0).normal(scale=2.0, size=(40, 60, 3))
+    cut = cut_by_colour(PART, np.clip(halves(slope) * shade + noise, 0, 255).astype(np.uint8), 40)
+    assert np.unique(cut).tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(cut > 0, PART > 0)
+    assert len(np.unique(cut[:, 8])) == len(np.unique(cut[:, 52])) == 2
+
+
+def test_bent_borders_prints_and_borders_between_parts_cut_nothing():
+    printed = halves()
+    squares = np.random.default_rng(0).integers(0, 255, size=(8, 12, 3), dtype=np.uint8)
+    printed[:, :30] = np.repeat(np.repeat(squares, 5, axis=0), 5, axis=1)[:, :30]
+    spotted = np.broadcast_to(RED, (40, 60, 3)).copy()
+    spotted[15:25, 20:30] = BLUE
+    for image in (halves(bulge=-22.0), printed, spotted):
+        np.testing.assert_array_equal(cut_by_colour(PART, image, 40), PART)
+    two = PART.copy()
+    two[5:35, 30:55] = 2
+    np.testing.assert_array_equal(cut_by_colour(two, halves(), 40), two)
 
 
 def test_what_is_over_the_table_goes_by_height_and_outline():

@@ -38,6 +38,10 @@ CRUMB = 8
 """Fewer points off the rest of their side go to the other side [1]; 2 cm square of them."""
 PATCHES = 3
 """Largest patches a single shape does not explain that are tried as objects of their own [1]."""
+LAYER = 0.009
+"""Points within this of a surface may be of it [m]; a view that is off by 3σ leaves a layer of them."""
+LAYER_SHARE = 0.8
+"""Share of an object's points in such a layer, or inside the other, for it to be no object [1]."""
 FINALISTS = 2
 """Best hypotheses that are settled with full fits [1]."""
 SMOOTH = 0.8
@@ -132,7 +136,17 @@ def _best_two(
     finalists = [starts[k] for _, k in tried]
     settled = _settled(evidence, finalists, near, config.split.rounds, config, rng)
     better = [two for two in settled if two is not None and two.cost < whole.cost]
+    better = [two for two in better if not _is_layer(evidence, two)]
     return min(better, key=lambda two: two.cost, default=None)
+
+
+def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
+    """Whether one side is only a layer of points on the other's surface, left by a view that is off."""
+    sides = evidence.points[two.second], evidence.points[~two.second]
+    return any(
+        other.shape is not None and float((other.shape.signed_distance(side) < LAYER).mean()) >= LAYER_SHARE
+        for side, other in zip(sides, two.explanations, strict=True)
+    )
 
 
 def _settled(

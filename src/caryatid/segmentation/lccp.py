@@ -6,10 +6,9 @@ import heapq
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import dijkstra
 
 from caryatid.config import SegmentationConfig
 from caryatid.geometry import transforms
@@ -18,7 +17,7 @@ from caryatid.sensing.clouds import thin
 
 Index = NDArray[np.intp]
 
-TOUCHING = [(0, 1), (1, 0), (1, 1), (1, -1)]
+TOUCHING = ((0, 1), (1, 0), (1, 1), (1, -1))
 """Rows down and columns right of a sample's later neighbours, diagonals too."""
 EDGES_ACROSS = 3.0
 """Sample edges that cross a border for each sample along it, on a grid with diagonals."""
@@ -54,36 +53,52 @@ def grid_edges(
         Pairs (E, 2) on one surface, and pairs (F, 2) at a step.
     """
     number = np.where(places, np.cumsum(places).reshape(places.shape) - 1, -1)
-    around = np.pad(number, GAP, constant_values=-1)
-    height, width = number.shape
-
-    def neighbour(down: int, right: int) -> Index:
-        return around[GAP + down : GAP + down + height, GAP + right : GAP + right + width]
-
     offset = np.einsum("ij,ij->i", normals, points)
     planes = normals / np.where(offset == 0.0, np.inf, offset)[:, None]
-    inverse_depth = 1.0 / points[:, 2]
-    edges, steps = [], []
-    for down, right in TOUCHING + [way for k in range(2, GAP + 1) for way in ((0, k), (k, 0))]:
-        other = neighbour(down, right)
-        paired = (number >= 0) & (other >= 0)
-        for k in range(1, max(down, right)):
-            paired &= neighbour(min(k, down), min(k, right)) < 0
-        i, j = number[paired], other[paired]
-        between = points[j] - points[i]
-        rise = np.maximum(
-            np.einsum("ij,ij->i", normals[i], between), -np.einsum("ij,ij->i", normals[j], between)
-        )
-        off = np.minimum(
-            np.abs(np.einsum("ij,ij->i", planes[i], points[j]) - 1.0) * inverse_depth[j],
-            np.abs(np.einsum("ij,ij->i", planes[j], points[i]) - 1.0) * inverse_depth[i],
-        )
-        one = (off <= edge_jump) & (np.abs(inverse_depth[i] - inverse_depth[j]) <= MAX_JUMP)
-        pairs = np.column_stack([i, j])
-        steps.append(pairs[~one & (rise > MIN_RISE)])
-        if (down, right) in TOUCHING:
-            edges.append(pairs[one])
-    return np.concatenate(edges), np.concatenate(steps)
+    ways = np.array([*TOUCHING, *(way for k in range(2, GAP + 1) for way in ((0, k), (k, 0)))])
+    edges = np.empty((len(TOUCHING) * len(points), 2), dtype=np.intp)
+    steps = np.empty((len(ways) * len(points), 2), dtype=np.intp)
+    counts = _find_pairs(number, points, normals, planes, ways, edge_jump, edges, steps)
+    return edges[: counts[0]], steps[: counts[1]]
+
+
+@njit(cache=True, error_model="numpy")
+def _find_pairs(number, points, normals, planes, ways, edge_jump, edges, steps):  # type: ignore[no-untyped-def]
+    """Write the pairs that `grid_edges` returns, and say how many there are of each."""
+    height, width = number.shape
+    edge_count = step_count = 0
+    for place in range(height * width):
+        row, col = place // width, place % width
+        i = number[row, col]
+        if i < 0:
+            continue
+        for k in range(len(ways)):
+            down, right = ways[k]
+            if row + down >= height or col + right < 0 or col + right >= width:
+                continue
+            j = number[row + down, col + right]
+            for between in range(1, max(down, right)):
+                if number[row + min(between, down), col + min(between, right)] >= 0:
+                    j = -1
+            if j < 0:
+                continue
+            rise_i = rise_j = from_i = from_j = 0.0
+            for axis in range(3):
+                way = points[j, axis] - points[i, axis]
+                rise_j += normals[i, axis] * way
+                rise_i -= normals[j, axis] * way
+                from_i += planes[i, axis] * points[j, axis]
+                from_j += planes[j, axis] * points[i, axis]
+            first, second = 1.0 / points[i, 2], 1.0 / points[j, 2]
+            off = min(abs(from_i - 1.0) * second, abs(from_j - 1.0) * first)
+            if abs(first - second) <= MAX_JUMP and off <= edge_jump:
+                if k < len(TOUCHING):
+                    edges[edge_count, 0], edges[edge_count, 1] = i, j
+                    edge_count += 1
+            elif max(rise_i, rise_j) > MIN_RISE:
+                steps[step_count, 0], steps[step_count, 1] = i, j
+                step_count += 1
+    return edge_count, step_count
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -126,9 +141,8 @@ def convex_parts(
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)
-    ends, others = np.take(points, edges, axis=0), np.take(normals, edges, axis=0)
-    distances = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=-1)
-    turns = 1.0 - np.einsum("ij,ij->i", others[:, 0], others[:, 1])
+    distances, turns = np.empty(len(edges)), np.empty(len(edges))
+    _measure_edges(points, normals, edges, distances, turns)
     costs = distances / config.surfel + config.crease * turns
     surfels = gather_surfels(points, normals, edges, costs, thin(points, config.surfel))
     count = len(surfels.sizes)
@@ -142,6 +156,18 @@ def convex_parts(
     part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
     large = np.bincount(part + 1)[1:] >= config.min_size
     return number_by_appearance(np.where((part >= 0) & np.append(large, False)[part], part, -1))
+
+
+@njit(cache=True)
+def _measure_edges(points, normals, edges, lengths, turns):  # type: ignore[no-untyped-def]
+    """Write how long each edge (E,) is [m] and how far the normal turns along it: 1 − cosine."""
+    for e in range(len(edges)):
+        i, j = edges[e]
+        square, cosine = 0.0, 0.0
+        for axis in range(3):
+            square += (points[i, axis] - points[j, axis]) ** 2
+            cosine += normals[i, axis] * normals[j, axis]
+        lengths[e], turns[e] = np.sqrt(square), 1.0 - cosine
 
 
 def gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, seeds: Index) -> Surfels:
@@ -163,11 +189,38 @@ def gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, se
 
 def _nearest_seeds(count: int, edges: Index, costs: Array, seeds: Index) -> Index:
     """For each of the nodes, the number of the seed (S,) nearest along the edges (E, 2), −1 = none."""
-    graph = coo_array((np.maximum(costs, 1e-12), edges.T), shape=(count, count)).tocsr()
-    sources = dijkstra(graph, directed=False, indices=seeds, min_only=True, return_predecessors=True)[2]
-    number = np.full(count + 1, -1)
-    number[seeds] = np.arange(len(seeds))
-    return np.asarray(number[np.where(sources < 0, count, sources)])
+    start = np.concatenate([[0], np.cumsum(np.bincount(edges.ravel(), minlength=count))])
+    distance, owner = np.full(count, np.inf), np.full(count, -1)
+    distance[seeds], owner[seeds] = 0.0, np.arange(len(seeds))
+    _spread_seeds(edges, costs, start, distance, owner)
+    return owner
+
+
+@njit(cache=True)
+def _spread_seeds(edges, costs, start, distance, owner):  # type: ignore[no-untyped-def]
+    """Relax edges in sweeps back and forth until nothing changes (Bellman and Ford); faster than a heap here.
+
+    The neighbours of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them.
+    """
+    neighbour, length = np.empty(2 * len(edges), dtype=np.intp), np.empty(2 * len(edges))
+    free = start[:-1].copy()
+    for e in range(len(edges)):
+        for k in range(2):
+            at = free[edges[e, k]]
+            free[edges[e, k]] += 1
+            neighbour[at], length[at] = edges[e, 1 - k], costs[e]
+    count = len(distance)
+    changed, forward = True, True
+    while changed:
+        changed = False
+        for step in range(count):
+            node = step if forward else count - 1 - step
+            for at in range(start[node], start[node + 1]):
+                through = distance[neighbour[at]] + length[at]
+                if through < distance[node]:
+                    distance[node], owner[node] = through, owner[neighbour[at]]
+                    changed = True
+        forward = not forward
 
 
 def count_borders(owner: Index, edges: Index, owners: int) -> tuple[Index, Array]:
@@ -226,33 +279,69 @@ def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array)
     Returns:
         Cluster of each node (N,): the number of one of its nodes.
     """
-    borders: list[dict[int, tuple[float, float]]] = [{} for _ in range(count)]
-    heap: list[tuple[float, int, int, float]] = []
-    for (i, j), weight, length in zip(pairs.tolist(), attraction.tolist(), lengths.tolist(), strict=True):
-        borders[i][j] = borders[j][i] = (weight * length, length)
-        if weight > 0.0:
-            heap.append((-weight, i, j, length))
+    node = np.array(pairs, dtype=np.intp).ravel()
+    return _roots(_merge_all(count, node, attraction, attraction * lengths, np.array(lengths, dtype=float)))
+
+
+@njit(cache=True, error_model="numpy")
+def _merge_all(count, node, attraction, total, length):  # type: ignore[no-untyped-def]
+    """Do as `cluster_by_mean` says, and return the cluster that each node was merged into.
+
+    The sides 2e and 2e + 1 of border e lie at the nodes `node` (2B,). `first` (N,) is the first side at each
+    node and `after` (2B,) the next at the same one, −1 = none; `degree` (N,) is how many there are. `total`
+    (B,) is attraction times length, and 0 the `length` of a border that is no more.
+    """
+    first, after, degree = np.full(count, -1), np.full(len(node), -1), np.zeros(count, dtype=np.intp)
+    parent, shared = np.arange(count), np.full(count, -1)
+    for side in range(len(node)):
+        after[side] = first[node[side]]
+        first[node[side]] = side
+        degree[node[side]] += 1
+    heap = [(0.0, 0, 0, 0, 0.0) for _ in range(0)]
+    for e in range(len(total)):
+        i, j = node[2 * e], node[2 * e + 1]
+        if attraction[e] > 0.0:
+            heap.append((-attraction[e], min(i, j), max(i, j), e, length[e]))
     heapq.heapify(heap)
-    parent = np.arange(count)
-    while heap:
-        _, i, j, length = heapq.heappop(heap)
-        if parent[i] != i or parent[j] != j or borders[i][j][1] != length:
+    while len(heap) > 0:
+        _, i, j, e, known_length = heapq.heappop(heap)
+        if parent[i] != i or parent[j] != j or length[e] != known_length:
             continue
-        if len(borders[i]) < len(borders[j]):
+        if degree[i] < degree[j]:
             i, j = j, i
         parent[j] = i
-        del borders[i][j]
-        for k, (total, size) in borders[j].items():
-            if k == i:
-                continue
-            del borders[k][j]
-            known_total, known_size = borders[i].get(k, (0.0, 0.0))
-            total, size = known_total + total, known_size + size
-            borders[i][k] = borders[k][i] = (total, size)
-            if total > 0.0:
-                heapq.heappush(heap, (-total / size, min(i, k), max(i, k), size))
-        borders[j] = {}
-    return _roots(parent)
+        length[e] = 0.0
+        degree[i] -= 1
+        side = first[i]
+        while side >= 0:
+            if length[side >> 1] > 0.0:
+                shared[node[side ^ 1]] = side >> 1
+            side = after[side]
+        side = first[j]
+        while side >= 0:
+            following, border, other = after[side], side >> 1, node[side ^ 1]
+            if length[border] > 0.0:
+                joint = shared[other]
+                if joint < 0:
+                    joint = border
+                    node[side] = i
+                    after[side] = first[i]
+                    first[i] = side
+                    degree[i] += 1
+                else:
+                    total[joint] += total[border]
+                    length[joint] += length[border]
+                    length[border] = 0.0
+                    degree[other] -= 1
+                if total[joint] > 0.0:
+                    mean = total[joint] / length[joint]
+                    heapq.heappush(heap, (-mean, min(i, other), max(i, other), joint, length[joint]))
+            side = following
+        side = first[i]
+        while side >= 0:
+            shared[node[side ^ 1]] = -1
+            side = after[side]
+    return parent
 
 
 def _absorb_slivers(

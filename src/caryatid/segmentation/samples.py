@@ -49,6 +49,7 @@ class Samples:
         normals_camera: Unit normals (N, 3).
         height: Over the support surface (N,) [m].
         depth: Readings (H, W) [m], 0 = none; of all that is seen, not of the foreground only.
+        rgb: Colours (H, W, 3), or None.
         K: Pinhole matrix (3, 3) of the grid [px].
     """
 
@@ -58,6 +59,7 @@ class Samples:
     normals_camera: Array
     height: Array
     depth: NDArray[np.float32]
+    rgb: NDArray[np.uint8] | None
     K: Array
 
     def patch(self, own: NDArray[np.bool_] | NDArray[np.intp]) -> Array:
@@ -82,12 +84,41 @@ def find_foreground(
         config: Heights, and the margin around the surface's outline.
         clouds: Working range.
     """
-    foreground = (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
-    points = _rays(view.K, *np.nonzero(foreground)) * view.depth[foreground][:, None]
-    if view.T_world_camera is not None:
-        surface = surface.moved(transforms.invert(view.T_world_camera))
-    foreground[foreground] = surface.over(points, config.clearance, config.max_height, config.margin)
+    T = np.eye(4) if view.T_world_camera is None else transforms.invert(view.T_world_camera)
+    surface = surface.moved(T)
+    up, corners = surface.normal_world, surface.outline_world
+    outward = np.cross(transforms.unit(np.roll(corners, -1, axis=0) - corners), up)
+    sides = np.column_stack([outward, -np.einsum("ij,ij->i", outward, corners)])
+    planes = np.concatenate([np.append(up, -up @ surface.point_world)[None], sides])
+    height, width = view.depth.shape
+    x, y = (np.arange(width) - view.K[0, 2]) / view.K[0, 0], (np.arange(height) - view.K[1, 2]) / view.K[1, 1]
+    limits = clouds.min_depth, clouds.max_depth, config.clearance, config.max_height, config.margin
+    foreground = np.zeros(view.depth.shape, dtype=np.bool_)
+    _find_over(view.depth, x, y, planes, np.array(limits), foreground)
     return foreground
+
+
+@njit(cache=True)
+def _find_over(depth, x, y, planes, limits, over):  # type: ignore[no-untyped-def]
+    """Mark pixels (H, W) over the first plane and not outside the other ones, n·p + d = 0 (M, 4).
+
+    Limits (5,) are least and greatest depth and height and the greatest distance outside; a pixel's ray has
+    the slopes x (W,) and y (H,).
+    """
+    low, high = np.float32(limits[0]), np.float32(limits[1])
+    for row in range(len(y)):
+        for col in range(len(x)):
+            z = depth[row, col]
+            if not low <= z <= high:
+                continue
+            height = z * (planes[0, 0] * x[col] + planes[0, 1] * y[row] + planes[0, 2]) + planes[0, 3]
+            if not limits[2] < height < limits[3]:
+                continue
+            inside = True
+            for k in range(1, len(planes)):
+                slope = planes[k, 0] * x[col] + planes[k, 1] * y[row] + planes[k, 2]
+                inside = inside and z * slope + planes[k, 3] <= limits[4]
+            over[row, col] = inside
 
 
 def take_samples(
@@ -133,7 +164,8 @@ def take_samples(
     K[:2] /= config.stride
     T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
     height = surface.height(transforms.transform(T, points))
-    return Samples(grid, places, points, normals, height, depth, K)
+    rgb = None if view.rgb is None else view.rgb[grid]
+    return Samples(grid, places, points, normals, height, depth, rgb, K)
 
 
 def _rays(K: Array, row: NDArray[np.intp], column: NDArray[np.intp]) -> Array:

@@ -1,13 +1,16 @@
-"""Automatic segmentation: what stands on the support surface, cut into convex parts, parts merged again."""
+"""Automatic segmentation: what stands on the support surface, in convex parts of one colour, some merged."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
@@ -31,6 +34,14 @@ Mask = NDArray[np.bool_]
 
 NEIGHBOURS = 10
 """Nearest points a point of an unorganised cloud is joined to [1]."""
+PLAIN_COLOUR = 0.02
+"""Usual distance of the shares of red, green and blue from their mean up to which a piece is plain [1]."""
+OTHER_COLOUR = 0.08
+"""Distance between the mean shares beyond which two plain colours differ [1]; four times their spread."""
+PLAIN_SHARE = 0.9
+"""Least share of a part that its plain pieces make up where it is cut between them [1]."""
+BORDER_BEND = 0.25
+"""Greatest width over length of a border between colours that is straight [1]; round bodies bend it."""
 HOLLOW = 0.2
 """Mean cosine between normals and the way inwards that makes a part the inside of something [1]; a bowl's
 has 0.6, flat faces and their noise 0.05."""
@@ -91,6 +102,8 @@ def segment(
     part = convex_parts(points, normals, edges, config, steps)
     wide = wide_parts(samples.image(part))
     part = number_by_appearance(np.where(wide[part], part, 0) - 1)
+    if samples.rgb is not None:
+        part = cut_by_colour(samples.image(part), samples.rgb, config.min_size)[samples.places]
     part = number_by_appearance(merge_occluded(samples, part, config, fit_config, rng) - 1)
     labels[samples.grid] = samples.image(part)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
@@ -143,20 +156,99 @@ def spread_labels(
         jump: Difference in depth beyond which neighbours lie on two surfaces, at 1 m and times z² [m].
         rounds: How often, each a pixel further.
     """
+    labels = labels.copy()
+    waiting = np.flatnonzero(foreground & (labels == 0))
+    _spread(labels, waiting, np.ascontiguousarray(depth), np.float32(jump), np.array(TURNS), rounds)
+    return labels
+
+
+@njit(cache=True)
+def _spread(labels, waiting, depth, jump, turns, rounds):  # type: ignore[no-untyped-def]
+    """Label the waiting places (N,), which are in ascending order."""
     height, width = labels.shape
-    around = [
-        (slice(1 + down, 1 + down + height), slice(1 + right, 1 + right + width)) for down, right in TURNS
-    ]
-    padded, result = np.pad(depth, 1), np.pad(labels, 1)
-    own = result[1:-1, 1:-1]
-    joined = [
-        foreground & (np.abs(depth - padded[there]) <= np.float32(jump) * depth * padded[there])
-        for there in around
-    ]
-    for _ in range(rounds):
-        for there, one in zip(around, joined, strict=True):
-            own[...] = np.where(one & (own == 0), result[there], own)
-    return own
+    left = len(waiting)
+    for turn in range(4 * rounds):
+        down, right = turns[turn % 4]
+        for step in range(left):
+            # Against the direction labels are taken from, so that none moves on in the same turn.
+            place = waiting[step] if down + right > 0 else waiting[left - 1 - step]
+            row, col = place // width, place % width
+            v, u = row + down, col + right
+            if v < 0 or v >= height or u < 0 or u >= width or labels[v, u] == 0:
+                continue
+            z, other = depth[row, col], depth[v, u]
+            if abs(z - other) <= jump * z * other:
+                labels[row, col] = labels[v, u]
+        kept = 0
+        for step in range(left):
+            place = waiting[step]
+            if labels[place // width, place % width] == 0:
+                waiting[kept] = place
+                kept += 1
+        left = kept
+
+
+def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labels:
+    """Cut parts that consist of plainly coloured pieces with straight borders, and of nothing else.
+
+    This tells flush boxes apart. A printed box has more colours, or borders all over; it stays whole.
+
+    Args:
+        labels: Parts (H, W), 1 … n, 0 = none.
+        rgb: Colours (H, W, 3).
+        min_size: Pixels a piece needs.
+
+    Returns:
+        Parts (H, W); pieces that are cut off have numbers above n.
+    """
+    result = labels.copy()
+    shares: Array = rgb.astype(np.float64) + 1.0
+    shares /= shares.sum(axis=-1, keepdims=True)  # Shading leaves the shares of the colours as they are.
+    patch = _colour_patches(labels, shares)
+    for part in range(1, int(labels.max(initial=0)) + 1):
+        own = labels == part
+        patches, sizes = np.unique(patch[own], return_counts=True)
+        pieces, in_pieces = patches[sizes >= min_size], sizes[sizes >= min_size].sum()
+        if len(pieces) < 2 or in_pieces < PLAIN_SHARE * np.count_nonzero(own):
+            continue
+        colours = [shares[patch == piece] for piece in pieces]
+        if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours) > PLAIN_COLOUR:
+            continue
+        loose = ~np.isin(patch, pieces)
+        nearest = ndimage.distance_transform_edt(loose, return_distances=False, return_indices=True)
+        piece_of = np.where(own, patch[tuple(nearest)], -1)
+        if _borders_are_clean(piece_of, {k: c.mean(axis=0) for k, c in zip(pieces, colours, strict=True)}):
+            for piece in pieces[1:]:
+                result[piece_of == piece] = result.max() + 1
+    return result
+
+
+def _colour_patches(labels: Labels, shares: Array) -> NDArray[np.intp]:
+    """Connected patches (H, W) of one part (H, W) in which the colours (H, W, 3) of neighbours are alike."""
+    place = np.arange(labels.size).reshape(labels.shape)
+    pairs = []
+    for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        one = (labels[here] == labels[there]) & (labels[here] > 0)
+        step = np.linalg.norm(shares[here][one] - shares[there][one], axis=-1)
+        alike = step < OTHER_COLOUR / 2.0
+        pairs.append(np.stack([place[here][one][alike], place[there][one][alike]]))
+    ends = np.concatenate(pairs, axis=1)
+    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(labels.size, labels.size))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp).reshape(labels.shape)
+
+
+def _borders_are_clean(piece_of: NDArray[np.intp], colours: dict[int, Array]) -> bool:
+    """Whether pieces (H, W) that touch differ in colour, along borders that are straight."""
+    for first, second in combinations(colours, 2):
+        border = np.argwhere(ndimage.binary_dilation(piece_of == second) & (piece_of == first))
+        if len(border) < 3:
+            continue
+        bend, length = np.sqrt(np.linalg.eigvalsh(np.cov(border.T)))
+        if np.linalg.norm(colours[first] - colours[second]) <= OTHER_COLOUR:
+            return False
+        if bend > 1.0 + BORDER_BEND * length:
+            return False
+    return True
 
 
 def merge_occluded(
