@@ -11,13 +11,12 @@ from test_docs import ROOT, blocks
 
 from caryatid.config import ActiveVisionConfig, ArmConfig, Config, RobotConfig
 from caryatid.errors import InputError, PlanningError
-from caryatid.exploration import explore, next_best_view
+from caryatid.exploration import explore
 from caryatid.geometry import transforms
 from caryatid.robots import Posture, Unreachable, home_view
 from caryatid.robots.arm import RADII, RADIUS_SHARE, REASONS, UNCONFIRMED, ArmRobot
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.reachability import sample_reachability
-from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation import load_scene
 from caryatid.simulation.camera import SimulatedCamera
@@ -62,13 +61,6 @@ class TestViewSphere:
         share = RADIUS_SHARE
         assert count(chosen) > (share - 0.05) * most
         assert count(chosen + 0.1) < share * most
-
-    def test_equal_ends_fix_the_radius_without_asking(self):
-        def refuse(T_base_camera):
-            raise AssertionError("asked")
-
-        fixed = replace(CONFIG, radius=(0.62, 0.62))
-        assert arm(refuse, config=fixed).view_sphere(PROPOSED).radius == 0.62
 
     def test_its_own_answer_is_answered_with_itself(self):
         robot = arm(centre_world=(0.1, 0.0, 0.8))
@@ -175,16 +167,6 @@ class TestSolve:
         with pytest.raises(PlanningError, match="cannot go to this view"):
             arm(never).move_to(transforms.look_at(eye, TOP))
 
-    def test_where_it_is_is_taken_as_it_is(self):
-        class Real(ArmRobot):
-            def move_to(self, T_world_camera):
-                raise AssertionError("moved")
-
-        here = transforms.look_at((5.0, 0.0, 1.2), TOP)
-        np.testing.assert_array_equal(Real(never, BASE, T_world_camera=here).T_world_camera, here)
-        with pytest.raises(InputError, match="T_world_camera"):
-            Real(never, BASE, T_world_camera=np.ones((4, 4)))
-
     def test_a_base_that_is_no_pose_is_refused(self):
         with pytest.raises(InputError, match="T_world_base"):
             arm(T_world_base=2.0 * BASE)
@@ -224,32 +206,6 @@ class TestExploring:
         assert steps[-1].path_travelled > 0.3
         assert len(steps[-1].graph.objects) > 3
 
-    def test_a_robot_of_four_members_is_on_the_sphere_of_the_settings(self):
-        class Plain:
-            """A robot that inherits nothing, and knows no posture."""
-
-            def __init__(self, other):
-                self.T_world_camera, self._other = other.T_world_camera, other
-
-            def solve(self, T_world_camera):
-                return Unreachable("the arm itself knows")
-
-            def candidates(self, sphere):
-                return self._other.candidates(sphere)
-
-            def move_to(self, T_world_camera):
-                self.T_world_camera = T_world_camera
-                return self._other.move_to(T_world_camera)
-
-        def run(wrap):
-            stage = make_simulation(load_scene("tower"), self.SETTINGS, noise="none", seed=0)
-            return list(explore(stage.camera, wrap(stage.robot), config=self.SETTINGS, early_stop=False))
-
-        plain, humanoid = run(Plain), run(lambda robot: robot)
-        for one, other in zip(plain, humanoid, strict=True):
-            assert one.sphere.radius == self.SETTINGS.active.sphere_radius
-            np.testing.assert_array_equal(one.view.T_world_camera, other.view.T_world_camera)
-
     def test_where_nothing_is_in_reach_it_stops_with_reasons_and_counts(self):
         stage = self.stage()
         stage.robot._reachable = never
@@ -261,30 +217,6 @@ class TestExploring:
             PlanningError, match=rf"no view of the sphere can be reached: .*{REASONS[2]} \(\d"
         ):
             self.stage(never)
-
-    def test_a_view_the_arm_does_not_confirm_is_given_up_for_another(self):
-        asked = []
-
-        def confirm(T_base_camera):
-            asked.append(T_base_camera)
-            return len(asked) > 3
-
-        stage = self.stage()
-        step = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
-        stage.robot._confirm = confirm
-        scene = Scene(self.SETTINGS)
-        scene.update(stage.camera.fork().capture(stage.robot.T_world_camera))
-        decision = next_best_view(scene, stage.robot)
-        base = stage.robot.T_world_base
-        np.testing.assert_allclose(base @ asked[0], step.decision.T_world_camera)
-        np.testing.assert_allclose(base @ asked[3], decision.T_world_camera)
-        eyes = np.array(asked)[:, :3, 3]
-        assert len(np.unique(eyes.round(6), axis=0)) == 4
-
-        stage.robot._confirm = lambda T: len(asked) > 4 or asked.append(T)
-        refused = next(explore(stage.camera, stage.robot, config=self.SETTINGS))
-        assert refused.candidates.rejected[UNCONFIRMED] == 1
-        assert len(refused.candidates) == len(step.candidates) - 1
 
     def test_an_arm_that_confirms_nothing_stops(self):
         stage = self.stage()

@@ -63,6 +63,7 @@ def explored():
     return exploration("oracle")
 
 
+@pytest.mark.slow
 def test_what_it_predicts_is_what_comes(explored):
     steps, f1 = explored
     assert len(steps) == 3
@@ -70,6 +71,7 @@ def test_what_it_predicts_is_what_comes(explored):
     assert f1[1] > f1[0]
 
 
+@pytest.mark.slow
 def test_trying_views_changes_nothing_of_the_exploration(explored):
     steps, _ = explored
     again, _ = exploration(Chosen(s.decision.index for s in steps[:-1]))
@@ -90,6 +92,7 @@ def test_none_of_the_views_it_tries_would_have_been_better(explored):
     assert min(others) < max(others)
 
 
+@pytest.mark.slow
 def test_the_reason_says_from_where_to_where_f1_goes(explored):
     steps, f1 = explored
     told = rf"F1 goes from {f1[0]:.2f} to {f1[1]:.2f}, the best of [89] views"
@@ -97,17 +100,6 @@ def test_the_reason_says_from_where_to_where_f1_goes(explored):
 
 
 @pytest.mark.slow
-def test_the_default_planner_is_never_a_step_ahead():
-    config = replace(CONFIG, active=replace(CONFIG.active, max_views=2), oracle=OracleConfig(candidates=1))
-    (first, _), (_, f1) = exploration("oracle", "shelf", config)
-    (default, _), (_, f1_default) = exploration(make_planner("support"), "shelf", config)
-    (lone,) = spread_out(first.candidates.directions, first.visited, 1)
-    assert lone != default.decision.index
-    _, (_, f1_lone) = exploration(Chosen([lone]), "shelf", config)
-    assert f1 == max(f1_default, f1_lone)
-    assert f1_default != f1_lone
-
-
 def test_of_equal_views_it_takes_the_one_that_shows_most_unseen_surface():
     """Where any overlap makes an object a true one, F1 is 1 from everywhere."""
     config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, min_iou=0.0))
@@ -142,11 +134,7 @@ def test_another_exploration_than_its_own_is_refused(wrong):
         list(steps)
 
 
-def test_by_its_name_alone_it_is_not_to_be_had():
-    with pytest.raises(InputError, match=r"'oracle' needs a simulated scene.*OraclePlanner"):
-        make_planner("oracle")
-
-
+@pytest.mark.slow
 def test_the_command_line_has_it_for_scenes_and_not_for_recordings(tmp_path, scene_file, recording, capsys):
     options = ["--planner", "oracle", "--views", 2, "--no-report", "--quiet", "--no-early-stop"]
     small = ["--set=sensor.width=160", "--set=sensor.height=120", "--set=sensor.focal=131.25"]

@@ -63,10 +63,6 @@ def test_a_robot_of_another_package_is_found_by_its_entry_point(surroundings, mo
         find_robot("yours")
 
 
-def test_a_robot_is_found_in_a_module(surroundings):
-    assert isinstance(find_robot("test_robots:make_arm")(surroundings), ArmRobot)
-
-
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -108,22 +104,6 @@ class TestCommandLine:
         assert "the hand does not reach there (" in said
         assert not (tmp_path / "run").exists()
 
-    def test_a_callable_of_ones_own(self, tmp_path):
-        own = ["--robot", "test_robots:make_arm"]
-        assert run_command("explore", "tower", "--out", tmp_path / "run", *own, *QUICK) == 0
-
-    @pytest.mark.parametrize(
-        ("robot", "status", "message"),
-        [
-            ("centaur", 2, "there is no robot 'centaur'"),
-            ("arm:none.npz", 1, "none.npz: the file is missing"),
-            ("none:arm", 1, "'none:arm' cannot be imported"),
-        ],
-    )
-    def test_a_robot_there_is_not(self, tmp_path, capsys, robot, status, message):
-        assert run_command("explore", "tower", "--out", tmp_path / "run", "--robot", robot, *QUICK) == status
-        assert message in " ".join(capsys.readouterr().err.replace("│", " ").split())
-
     def test_a_recording_has_no_robot(self, kept_recording, tmp_path, capsys):
         arm = ["--robot", "test_robots:make_arm", "--views=2", "--no-report", "--quiet"]
         assert run_command("explore", kept_recording, "--out", tmp_path / "run", *arm) == 1
@@ -146,8 +126,3 @@ class TestCommandLine:
         assert isinstance(arm.solve(T), Posture)
         sphere = arm.view_sphere(ViewSphere.around(centre, config.active))
         assert np.isclose(np.linalg.norm(T[:3, 3] - centre), sphere.radius)
-
-    def test_a_session_of_no_robot_is_not_begun(self, tmp_path, capsys):
-        assert run_command("session", "new", tmp_path / "table", "--robot", "arm:none.npz") == 1
-        assert "none.npz: the file is missing" in " ".join(capsys.readouterr().err.split())
-        assert not (tmp_path / "table").exists()

@@ -35,22 +35,14 @@ CELLS = 4096
 """Cells of true surface along each axis around the world's origin [1]; 41 m of 1 cm."""
 
 
-class WatchedCamera:
-    """A camera that passes views through and remembers them.
-
-    Args:
-        camera: Takes the views.
-
-    Attributes:
-        taken: True pose (4, 4) and view of each capture that nobody has asked about yet.
-    """
+class _WatchedCamera:
+    """A camera that remembers pose (4, 4) and view of each capture that nobody has asked about yet."""
 
     def __init__(self, camera: SimulatedCamera) -> None:
         self.taken: list[tuple[Array, View]] = []
         self._camera = camera
 
     def capture(self, T_world_camera: Array) -> View:
-        """Take a view from a pose (4, 4)."""
         view = self._camera.capture(T_world_camera)
         self.taken.append((T_world_camera, view))
         return view
@@ -88,7 +80,7 @@ class OraclePlanner:
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
     ) -> None:
-        self.camera = WatchedCamera(camera)
+        self.camera = _WatchedCamera(camera)
         self._simulated = camera
         self._truth = truth
         self._config = config or Config()
@@ -121,14 +113,10 @@ class OraclePlanner:
                 break
         index = int(tried[best])
         cost = float(path_cost(state)[index])
-        area = float(unseen[best]) * SURFACE_CELL**2
-        now = self._f1(self._scene.graph)
-        why = (
-            f"F1 goes from {now:.2f} to {reached:.2f}, the best of {len(tried)} views; "
-            f"{1e4 * area:.0f} cm² of surface come into sight"
-        )
-        T_world_camera = candidates.T_world_camera[index]
-        return Decision(T_world_camera, index, reached, cost, reached - cost, why)
+        area, now = float(unseen[best]) * SURFACE_CELL**2, self._f1(self._scene.graph)
+        why = f"F1 goes from {now:.2f} to {reached:.2f}, the best of {len(tried)} views; "
+        why += f"{1e4 * area:.0f} cm² of surface come into sight"
+        return Decision(candidates.T_world_camera[index], index, reached, cost, reached - cost, why)
 
     def _catch_up(self, state: PlanningState) -> None:
         """Learn what the exploration has seen since the last decision."""
@@ -187,15 +175,7 @@ def planner_for(
     segmentation: SegmentationMethod | None,
     seed: int,
 ) -> tuple[Planner, Camera]:
-    """Make a planner by its name, `oracle` too, and the camera to explore with.
-
-    Args:
-        name: Of the planner.
-        camera: Gives the views.
-        truth: What is really there, where known.
-        config: All settings of the exploration.
-        segmentation: That of the exploration.
-        seed: That of the exploration.
+    """Make a planner by its name, `oracle` too where the truth is known, and the camera to explore with.
 
     Raises:
         InputError: There is no such planner, or it is the oracle and nothing is simulated.

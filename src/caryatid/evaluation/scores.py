@@ -106,26 +106,15 @@ def score(
 def score_scenes(
     found: TrueScene, truth: TrueScene, rng: np.random.Generator, config: EvaluationConfig | None = None
 ) -> Score:
-    """Score one scene of solids against another; a scene against itself scores 1.
-
-    Args:
-        found: What was extracted.
-        truth: The true scene.
-        rng: Draws the points volumes are measured with.
-        config: Least IoU, tolerance of the table's height, points a pair.
-    """
+    """Score one scene of solids against another as `score` does; a scene against itself scores 1."""
     config = config or EvaluationConfig()
     iou = volume_ious(found.objects, truth.objects, config.samples, rng)
     pairs = assign(iou, config.min_iou)
     ious = {found.objects[i].name: float(iou[i, j]) for i, j in pairs}
     matches = {found.objects[i].name: truth.objects[j].name for i, j in pairs}
-    if (
-        found.table is not None
-        and truth.table is not None
-        and found.table_top is not None
-        and truth.table_top is not None
-        and abs(found.table_top - truth.table_top) <= config.table_tolerance
-    ):
+    tops = [t.table_top for t in (found, truth) if t.table_top is not None]
+    same = len(tops) == 2 and abs(tops[0] - tops[1]) <= config.table_tolerance
+    if same and found.table is not None and truth.table is not None:
         matches[found.table] = truth.table
     return score_matches(found.vertices, found.edges, truth.vertices, truth.edges, matches, ious)
 
@@ -178,29 +167,20 @@ def score_matches(
     matches: Mapping[str, str],
     ious: Mapping[str, float],
 ) -> Score:
-    """Eqs. 4 and 5 once it is known which extracted vertex is which true one.
-
-    Args:
-        found_vertices: Extracted vertices.
-        found_edges: Extracted directed pairs.
-        vertices: True vertices.
-        edges: True directed pairs.
-        matches: Extracted vertex to true vertex, one-to-one.
-        ious: IoU of each matched object [1].
-    """
-    true_vertices = len(matches)
-    true_edges = sum((matches.get(a), matches.get(b)) in edges for a, b in found_edges)
-    true_both = true_vertices + true_edges
-    precision = _ratio(true_both, len(found_vertices) + len(found_edges), len(vertices) + len(edges))
-    recall = _ratio(true_both, len(vertices) + len(edges), len(found_vertices) + len(found_edges))
+    """Eqs. 4 and 5 once it is known which extracted vertex is which true one, one-to-one."""
+    v, e = len(matches), sum((matches.get(a), matches.get(b)) in edges for a, b in found_edges)
+    claims, facts = (len(found_vertices), len(found_edges)), (len(vertices), len(edges))
+    precision, recall = _ratios(v + e, sum(claims), sum(facts))
+    vertex_precision, vertex_recall = _ratios(v, claims[0], facts[0])
+    edge_precision, edge_recall = _ratios(e, claims[1], facts[1])
     return Score(
         precision=precision,
         recall=recall,
         f1=2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0,
-        vertex_precision=_ratio(true_vertices, len(found_vertices), len(vertices)),
-        vertex_recall=_ratio(true_vertices, len(vertices), len(found_vertices)),
-        edge_precision=_ratio(true_edges, len(found_edges), len(edges)),
-        edge_recall=_ratio(true_edges, len(edges), len(found_edges)),
+        vertex_precision=vertex_precision,
+        vertex_recall=vertex_recall,
+        edge_precision=edge_precision,
+        edge_recall=edge_recall,
         mean_iou=float(np.mean(list(ious.values()))) if ious else 0.0,
         matches=dict(matches),
         ious=dict(ious),
@@ -254,12 +234,9 @@ def mask_ious(
         InputError: Images differ in number or size.
     """
     if [a.size for a in labels] != [b.size for b in true_labels]:
-        raise InputError(
-            "labels",
-            f"the run has label images of {[a.shape for a in labels]}, the truth of "
-            f"{[b.shape for b in true_labels]}",
-            "give the truth of the frames the run was made from",
-        )
+        shapes, true_shapes = [a.shape for a in labels], [b.shape for b in true_labels]
+        why = f"the run has label images of {shapes}, the truth of {true_shapes}"
+        raise InputError("labels", why, "give the truth of the frames the run was made from")
     intersection = np.zeros((len(found) + 1, len(true) + 1))
     for image, true_image in zip(labels, true_labels, strict=True):
         row, column = _order(image, found), _order(true_image, true)
@@ -270,15 +247,7 @@ def mask_ious(
 
 
 def assign(iou: Array, min_iou: float) -> list[tuple[int, int]]:
-    """Pair rows with columns one-to-one for the largest sum (Hungarian), then drop pairs below `min_iou`.
-
-    Args:
-        iou: (F, T) [1].
-        min_iou: Pairs below this are no pairs [1].
-
-    Returns:
-        Pairs (row, column), by row.
-    """
+    """Pair rows with columns of IoUs (F, T) for the largest sum (Hungarian); drop pairs below the least."""
     rows, columns = linear_sum_assignment(iou, maximize=True)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if iou[i, j] >= min_iou]
 
@@ -315,10 +284,10 @@ def _solid(name: str, shape: Shape) -> TrueObject:
     )
 
 
-def _ratio(true: int, claimed: int, other: int) -> float:
-    if claimed == 0:
-        return 1.0 if other == 0 else 0.0
-    return true / claimed
+def _ratios(right: int, claimed: int, true: int) -> tuple[float, float]:
+    """Precision and recall of some that are right, of those claimed and those that are true."""
+    nothing = 1.0 if claimed == true == 0 else 0.0
+    return right / claimed if claimed else nothing, right / true if true else nothing
 
 
 def _object_number(name: str) -> int:

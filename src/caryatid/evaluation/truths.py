@@ -11,8 +11,8 @@ import numpy as np
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueObject, TrueScene, score, score_masks
-from caryatid.io.bop import RecordedFrame, Recording, read_recording
-from caryatid.io.runs import Run, RunView, read_run
+from caryatid.io.bop import read_recording
+from caryatid.io.runs import read_run
 from caryatid.simulation import world
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import GroundTruth, read_truth
@@ -36,26 +36,13 @@ class ViewScore:
 
     def to_json(self) -> dict[str, int | float]:
         """One entry of `views` in what `caryatid evaluate --json` writes."""
-        s = self.score
-        return {
-            "view": self.view,
-            "precision": s.precision,
-            "recall": s.recall,
-            "f1": s.f1,
-            "edge_precision": s.edge_precision,
-            "edge_recall": s.edge_recall,
-            "vertex_precision": s.vertex_precision,
-            "vertex_recall": s.vertex_recall,
-            "mean_iou": s.mean_iou,
-        }
+        figures = ["precision", "recall", "f1", "edge_precision", "edge_recall"]
+        figures += ["vertex_precision", "vertex_recall", "mean_iou"]
+        return {"view": self.view} | {name: getattr(self.score, name) for name in figures}
 
 
 def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth) -> TrueScene:
     """Build the truth of a simulated scene: solids from the model, edges from gt.json.
-
-    Args:
-        scene: The settled scene.
-        truth: Its ground truth.
 
     Raises:
         InputError: The truth names a body the scene does not have.
@@ -68,21 +55,13 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth) -> Tru
             f"gt.json names '{unknown[0]}', which is no body of the scene",
             f"the bodies are {', '.join((scene.table, *labels))}",
         )
-    return TrueScene(
-        vertices=truth.vertices,
-        edges=frozenset(truth.pairs),
-        objects=tuple(
-            TrueObject(
-                name,
-                partial(world.contains, scene, labels[name]),
-                np.stack(world.bounds(scene, labels[name])),
-            )
-            for name in truth.vertices
-            if name in labels
-        ),
-        table=scene.table if scene.table in truth.vertices else None,
-        table_top=world.table_top(scene).height,
-    )
+    objects = []
+    for name in [name for name in truth.vertices if name in labels]:
+        contains = partial(world.contains, scene, labels[name])
+        objects.append(TrueObject(name, contains, np.stack(world.bounds(scene, labels[name]))))
+    table = scene.table if scene.table in truth.vertices else None
+    height = world.table_top(scene).height
+    return TrueScene(truth.vertices, frozenset(truth.pairs), tuple(objects), table, height)
 
 
 def read_true_scene(folder: Path) -> TrueScene:
@@ -114,32 +93,18 @@ def evaluate_run(
         raise InputError(folder, "is no folder", "give a scene folder or a recording with gt.json")
     if (folder / "scene.xml").is_file():
         scene = read_true_scene(folder)
-        return tuple(
-            ViewScore(view.index, score(view.graph, scene, np.random.default_rng(SEED), config))
-            for view in run.views
-        )
-    if not (folder / "scene_camera.json").is_file():
-        raise InputError(
-            folder, "has neither scene.xml nor scene_camera.json", "give a scene folder or a recording"
-        )
-    return _score_recording(run, read_truth(folder / "gt.json"), read_recording(folder), config)
-
-
-def _score_recording(
-    run: Run, truth: GroundTruth, recording: Recording, config: EvaluationConfig | None
-) -> tuple[ViewScore, ...]:
-    labels = [view.load_labels() for view in run.views]
-    true_labels = [_frame_of(view, recording).load_labels() for view in run.views]
-    scores = []
-    for view in run.views:
-        seen = slice(0, view.index + 1)
-        result = score_masks(
-            view.graph, labels[seen], true_labels[seen], truth.vertices, frozenset(truth.pairs), config
-        )
-        scores.append(ViewScore(view.index, result))
-    return tuple(scores)
-
-
-def _frame_of(view: RunView, recording: Recording) -> RecordedFrame:
-    """Frame a view was made from; a recording of one frame needs no names."""
-    return recording.frames[0] if len(recording) == 1 else recording.frame(view.name)
+        scores = [score(view.graph, scene, np.random.default_rng(SEED), config) for view in run.views]
+    elif (folder / "scene_camera.json").is_file():
+        truth, recording = read_truth(folder / "gt.json"), read_recording(folder)
+        # A recording of one frame needs no names.
+        lone = recording.frames[0] if len(recording) == 1 else None
+        true_labels = [(lone or recording.frame(view.name)).load_labels() for view in run.views]
+        labels, edges = [view.load_labels() for view in run.views], frozenset(truth.pairs)
+        scores = [
+            score_masks(view.graph, labels[:n], true_labels[:n], truth.vertices, edges, config)
+            for n, view in enumerate(run.views, 1)
+        ]
+    else:
+        why = "has neither scene.xml nor scene_camera.json"
+        raise InputError(folder, why, "give a scene folder or a recording")
+    return tuple(ViewScore(view.index, result) for view, result in zip(run.views, scores, strict=True))

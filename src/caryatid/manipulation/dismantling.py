@@ -46,13 +46,7 @@ class Taken:
 
 
 def bodies_of(graph: SupportGraph, truth: TrueScene, seed: int = 0) -> dict[str, str]:
-    """Body each extracted object stands for, by id: what a hand that reaches for it would take hold of.
-
-    Args:
-        graph: What has been extracted.
-        truth: The true scene; its vertices are bodies.
-        seed: Seed of the points that overlaps are measured with.
-    """
+    """Body each extracted object stands for, by id: what a hand that reaches for it would take hold of."""
     found = score(graph, truth, np.random.default_rng(seed), replace(EvaluationConfig(), min_iou=LEAST_IOU))
     table = graph.support_surface
     return {i: body for i, body in found.matches.items() if table is None or i != table.id}
@@ -90,13 +84,7 @@ def dismantle(
 
 
 def dismantling_record(order: Order, taken: Sequence[Taken], left: Sequence[str]) -> dict[str, Any]:
-    """What came of an order.
-
-    Args:
-        order: The order.
-        taken: Each of its steps, done.
-        left: Names of the bodies that nobody took.
-    """
+    """What came of an order whose steps were done; `left` names the bodies that nobody took."""
     steps = [
         t.step.to_json() | {"body": t.body, "held": list(t.held), "ok": t.ok, "disturbed": list(t.disturbed)}
         for t in taken
@@ -121,12 +109,7 @@ def poses_of(scene: SimulatedScene) -> Array:
 
 
 def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
-    """Return a scene with its objects elsewhere, for pictures.
-
-    Args:
-        scene: Whose objects they are.
-        state: Positions [m] and quaternions (N, 7), w first.
-    """
+    """Return a scene with its objects in another state (N, 7), as of `poses_of`, for pictures."""
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.data.qpos
     data.qpos[_addresses(scene)] = state

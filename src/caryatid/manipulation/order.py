@@ -36,13 +36,8 @@ class TakeStep:
 
     def to_json(self) -> dict[str, Any]:
         """One entry of `steps` in what `--json` writes."""
-        return {
-            "object": self.object_id,
-            "hold": list(self.hold),
-            "safe": self.safe,
-            "risk": self.risk,
-            "why": self.why,
-        }
+        hold = list(self.hold)
+        return {"object": self.object_id, "hold": hold, "safe": self.safe, "risk": self.risk, "why": self.why}
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,11 +118,8 @@ def plan_order(
 
 def order_record(order: Order) -> dict[str, Any]:
     """An order: its steps, whether it is safe, and why not."""
-    return {
-        "steps": [step.to_json() for step in order.steps],
-        "safe": order.safe,
-        "refusal": order.refusal or None,
-    }
+    steps = [step.to_json() for step in order.steps]
+    return {"steps": steps, "safe": order.safe, "refusal": order.refusal or None}
 
 
 def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:
@@ -179,11 +171,9 @@ def _step(graph: SupportGraph, option: _Option, rehearsal: Rehearsal) -> TakeSte
     left = [i for i in carried if i in rehearsal.left()]
     what = f"supports {', '.join(left)}" if left else "supports nothing that is left"
     with_hold = f" while {', '.join(option.hold)} is held" if option.hold else ""
-    if trial.risk == 0.0:
-        why = f"it {what}; lifting it{with_hold} disturbed nothing in {draws} rehearsals"
-    else:
-        worst = ", ".join(f"{i} in {s * draws:.0f}" for i, s in trial.harmed.items())
-        why = f"it {what}; lifting it{with_hold} disturbed {worst} of {draws} rehearsals"
+    worst = ", ".join(f"{i} in {s * draws:.0f}" for i, s in trial.harmed.items())
+    harm = f"nothing in {draws} rehearsals" if trial.risk == 0.0 else f"{worst} of {draws} rehearsals"
+    why = f"it {what}; lifting it{with_hold} disturbed {harm}"
     return TakeStep(option.object_id, option.hold, trial.risk == 0.0, trial.risk, why)
 
 

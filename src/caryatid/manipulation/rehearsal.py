@@ -92,39 +92,29 @@ class Rehearsal:
     @property
     def restless(self) -> dict[str, float]:
         """In what share of the scenes each object did not stay where it was seen [1]; the others left out."""
-        shares = np.mean([scene.restless for scene in self._scenes], axis=0)
-        return {i: float(s) for i, s in zip(self.ids, shares, strict=True) if s > 0.0}
+        return self._shares([scene.restless for scene in self._scenes])
 
     def left(self) -> list[str]:
         """Ids of the objects that have not been taken yet."""
         return [i for k, i in enumerate(self.ids) if self._states[0][k, 2] < ASIDE / 2.0]
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> Trial:
-        """Lift an object in every scene; nothing is changed by it, and asked again it is not done again.
-
-        Args:
-            object_id: Which.
-            hold: Objects that are held where they are meanwhile.
-        """
+        """Lift an object in every scene, others being held; nothing changes, and it is done only once."""
         asked = (object_id, *sorted(hold))
         if asked not in self._trials:
-            self._trials[asked] = self._tried(object_id, hold)
+            lifts = self._each(lambda k: self._lift(k, object_id, hold))
+            harm = [lift.disturbed | self._bereft(k, object_id, hold) for k, lift in enumerate(lifts)]
+            risk = float(np.any(harm, axis=1).mean())
+            self._trials[asked] = Trial(risk, self._shares(harm), tuple(lifts))
         return self._trials[asked]
 
-    def _tried(self, object_id: str, hold: Collection[str]) -> Trial:
-        lifts = self._each(lambda k: self._lift(k, object_id, hold))
-        harm = np.array([lift.disturbed | self._bereft(k, object_id, hold) for k, lift in enumerate(lifts)])
-        shares = harm.mean(axis=0)
-        harmed = {i: float(s) for i, s in zip(self.ids, shares, strict=True) if s > 0.0}
-        return Trial(float(harm.any(axis=1).mean()), harmed, tuple(lifts))
+    def _shares(self, which: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
+        """In what share of the scenes each object (N,) is one of some, by id; 0 left out."""
+        shares = np.mean(which, axis=0)
+        return {i: float(s) for i, s in zip(self.ids, shares, strict=True) if s > 0.0}
 
     def take(self, object_id: str, trial: Trial) -> None:
-        """Go on without an object that has been lifted: where others moved, they are put back.
-
-        Args:
-            object_id: Which.
-            trial: How its lift went.
-        """
+        """Go on without an object whose lift was tried: where others moved, they are put back."""
         index = self.ids.index(object_id)
         self._trials.clear()
         for k, (lift, scene) in enumerate(zip(trial.lifts, self._scenes, strict=True)):

@@ -25,12 +25,7 @@ class Looks:
     nearest: NDArray[np.intp]
 
     def without(self, left_out: NDArray[np.bool_], directions: Array) -> Looks:
-        """Leave some of the chosen (C,) out; unit directions (N, 3) tell which is nearest now.
-
-        Args:
-            left_out: Which of the chosen (C,).
-            directions: Unit vectors (N, 3) of all views.
-        """
+        """Leave some of the chosen (C,) out; directions (N, 3) of all views tell which is nearest now."""
         kept = np.flatnonzero(~left_out)
         place = np.full(len(self.chosen), -1)
         place[kept] = np.arange(len(kept))
@@ -85,19 +80,12 @@ class Candidates:
         return self._looks[count]
 
     def without(self, index: int, reason: str) -> Candidates:
-        """Return the other views, one more being refused for a reason.
-
-        Args:
-            index: Which is left out.
-            reason: Why, for `rejected`.
-        """
-        T_world_camera, directions, way = (
-            np.delete(of_each, index, axis=0)
-            for of_each in (self.T_world_camera, self.directions, self.path_length)
-        )
+        """Return the other views, the one at an index being refused for a reason."""
+        fields = (self.T_world_camera, self.directions, self.path_length)
+        poses, directions, way = (np.delete(of_each, index, axis=0) for of_each in fields)
         indices = None if self.indices is None else np.delete(self.indices, index)
         rejected = self.rejected | {reason: self.rejected.get(reason, 0) + 1}
-        return Candidates(T_world_camera, directions, way, rejected, indices)
+        return Candidates(poses, directions, way, rejected, indices)
 
     def from_elsewhere(self, path_length: Array) -> Candidates:
         """Return the same views as they are to a robot with another way (N,) [m] to each."""

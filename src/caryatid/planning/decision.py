@@ -119,9 +119,6 @@ class Planner(Protocol):
 def check_candidates(state: PlanningState) -> None:
     """Raise PlanningError, with the reasons, where no view can be reached.
 
-    Args:
-        state: What is known.
-
     Raises:
         PlanningError: There is none.
     """
@@ -185,13 +182,7 @@ def decide(
 
 
 def go_to(state: PlanningState, index: int, why: str) -> Decision:
-    """Take a candidate whatever there is to see: the decision of planners that do not look at the scene.
-
-    Args:
-        state: What is known.
-        index: Which of the candidates.
-        why: One sentence for a person to read.
-    """
+    """Take a candidate by its index: the decision of planners that do not look at the scene."""
     cost = float(path_cost(state)[index])
     return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
 

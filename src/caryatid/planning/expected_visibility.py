@@ -13,7 +13,7 @@ from caryatid.config import ActiveVisionConfig
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SceneObject, SupportGraph
+from caryatid.graph import SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.visibility import shown
 from caryatid.sensing.voxel_map import Solid, VoxelMap
@@ -21,22 +21,16 @@ from caryatid.support.stability import ground_outline
 
 SPACE = "unseen space"
 """What a sample of unseen space is about."""
-
 SURFACE_SAMPLES = 400
 """Points on the fitted shapes that are tested for being seen [1]."""
-
 SAMPLE_CLEARANCE = 0.025
 """Length of a surface point's line of sight that does not count [m]; its own surface, 2½ voxels."""
-
 GOOD_INCIDENCE = 60.0
 """A surface met at less than this from its normal is seen as well as can be [deg]."""
-
 SPACE_SPACING = 0.04
 """Spacing of the points in unseen space that are tested for being seen [m]."""
-
 SPACE_WEIGHT = 0.5
 """Worth of all the space on the table against all surfaces of objects [1]; little of it holds any."""
-
 HEAP_WEIGHT = 1.0
 """Worth of the space among the objects against all their surfaces [1]; objects hide in it."""
 
@@ -77,16 +71,13 @@ def surface_samples(graph: SupportGraph, solid: Solid) -> Samples:
 
     Every object weighs the same, small or large: each is one vertex of the graph. What touches another
     shape or the table can never be seen and is left out.
-
-    Args:
-        graph: The objects.
-        solid: What was seen occupied, and the shapes.
     """
     objects = [o for o in graph.objects if o.role == "object"]
     if not objects:
         return _nothing()
     size = solid.voxels.config.size
-    areas = np.array([_area(o) for o in objects])
+    x, y, z = np.array([o.shape.extents for o in objects]).T
+    areas = 2.0 * (x * y + y * z + z * x)
     spacings = np.maximum(np.sqrt(areas * len(objects) / SURFACE_SAMPLES), size)
     points, normals, counts = Primitives.of([o.shape for o in objects]).surface(spacings)
     subjects = np.repeat(np.arange(len(objects)), counts)
@@ -126,10 +117,6 @@ def space_samples(graph: SupportGraph, solid: Solid) -> Samples:
     stands there has to be carried. All of the table unseen up to there weighs `SPACE_WEIGHT`; the
     space among the objects, over the convex hull of their outlines, weighs `HEAP_WEIGHT` beside: what
     holds up a heap, or leans on it, is in there.
-
-    Args:
-        graph: The objects and the table.
-        solid: What was seen occupied, and the shapes.
     """
     table = graph.support_surface
     corners = space_above(graph, solid.voxels)
@@ -159,28 +146,12 @@ def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
     return Samples(positions, np.zeros_like(positions), saliency / total, np.arange(len(points)), names)
 
 
-def weighted(samples: Samples, weight: float | Array) -> Samples:
-    """Scale all weights, by one number or each by its own (K,).
-
-    Args:
-        samples: The samples.
-        weight: One number, or one for each (K,).
-    """
-    return replace(samples, weights=samples.weights * weight)
-
-
 def visibility(samples: Samples, T_world_camera: Array, solid: Solid, config: ActiveVisionConfig) -> Array:
     """How well each camera (T, 4, 4) sees each sample: (K, T) from 0 hidden to 1.
 
     A sample is seen when its line of sight is free and within the image; surface turned away by more than
     `GOOD_INCIDENCE` is seen less well, as the cosine. Lines of sight are all free where
     `config.occlusion` is `ignore`.
-
-    Args:
-        samples: K of them.
-        T_world_camera: Poses (T, 4, 4).
-        solid: What blocks lines of sight.
-        config: Image, incidence, and how occlusion is treated.
     """
     alike = replace(samples, weights=np.ones_like(samples.weights))
     return shown_anew(alike, np.zeros_like(samples.weights), T_world_camera, solid, config)
@@ -191,14 +162,7 @@ def shown_anew(
 ) -> Array:
     """Worth (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).
 
-    Lines of sight that could show nothing new are not followed.
-
-    Args:
-        samples: K of them.
-        before: How well they were seen before (K,), 0 … 1.
-        T_world_camera: Poses (T, 4, 4).
-        solid: What blocks lines of sight.
-        config: Image, incidence, and how occlusion is treated.
+    Lines of sight that could show nothing new are not followed; `before` is from 0 to 1.
     """
     see_through = config.occlusion == "ignore"
     return shown(
@@ -218,21 +182,10 @@ def shown_anew(
 
 
 def unseen_shares(samples: Samples, seen: Array) -> Array:
-    """How much of what each sample is about has not been seen (K,): 1 nothing, 0 all of it.
-
-    Args:
-        samples: Points.
-        seen: How well each has been seen (K,), from 0 to 1.
-    """
+    """How much of its subject is left to be seen (K,), by how well each sample was seen (K,), 0 … 1."""
     count = np.bincount(samples.subjects, minlength=len(samples.names))
     left = np.bincount(samples.subjects, weights=1.0 - seen, minlength=len(samples.names))
     return (left / np.maximum(count, 1))[samples.subjects]
-
-
-def _area(subject: SceneObject) -> float:
-    """Surface of the box around a shape [m²]."""
-    x, y, z = subject.shape.extents
-    return float(2.0 * (x * y + y * z + z * x))
 
 
 def _nothing() -> Samples:
@@ -241,19 +194,9 @@ def _nothing() -> Samples:
 
 @njit(cache=True, error_model="numpy")
 def unseen_space(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-    height: float,
-    T_world_table: Array,
-    half: NDArray[np.float64],
-    heap: NDArray[np.float64],
-    states: NDArray[np.int8],
-    origin: Array,
-    solid: NDArray[np.int8],
-    solid_origin: Array,
-    size: float,
-) -> tuple[Array, Array, Array]:
+    x: Array, y: Array, z: Array, height: float, T_world_table: Array, half: Array, heap: Array,
+    states: NDArray[np.int8], origin: Array, solid: NDArray[np.int8], solid_origin: Array, size: float,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Pick the points of a lattice that are over a table, in voxels no view has seen, and in nothing solid.
 
     Args:
@@ -298,11 +241,8 @@ def unseen_space(
                     points[count, 0], points[count, 1], points[count, 2] = a, b, c
                     on_table[count], in_heap[count] = lowness, among * lowness
                     count += 1
-    return (
-        points[:count],
-        on_table[:count] / max(table_total, 1e-9),
-        in_heap[:count] / max(heap_total, 1e-9),
-    )
+    on_table, in_heap = on_table[:count] / max(table_total, 1e-9), in_heap[:count] / max(heap_total, 1e-9)
+    return points[:count], on_table, in_heap
 
 
 @njit(cache=True)

@@ -61,7 +61,8 @@ def points_of_interest(
             continue
         supports = graph.supporters(supported.id)
         if not supports:
-            points.append(_unsupported(supported, sphere, middle))
+            reason = f"nothing is known to support {supported.id}"
+            points.append(_looked_at(supported, sphere, middle, reason))
         for support in supports:
             between = (centres[support.supporter] + centres[support.supported]) / 2.0
             points.append(_relation(support, between, sphere, views, config))
@@ -69,24 +70,15 @@ def points_of_interest(
 
 
 def points_of_doubt(graph: SupportGraph, sphere: ViewSphere, visited: Array) -> list[PointOfInterest]:
-    """Where shapes are physically implausible: one point an object, to be looked at from the largest arc.
-
-    Args:
-        graph: What is known.
-        sphere: The view sphere.
-        visited: Unit directions (V, 3) of the earlier views.
-    """
+    """Where shapes are implausible: a point each, to be looked at from the largest arc of views (V, 3)."""
     middle = largest_arc(visited)
     return [_looked_at(o, sphere, middle, f"{o.id} {o.doubt}") for o in graph.objects if o.doubt]
 
 
 def largest_arc(visited: Array) -> float:
-    """Azimuth [rad] of the middle of the largest arc between views on the horizontal circle.
+    """Azimuth [rad] of the middle of the largest arc between views (V, 3), V ≥ 1, on the horizontal circle.
 
     With one earlier view it is the opposite side. Of arcs of the same size the first from −π upwards counts.
-
-    Args:
-        visited: Unit directions (V, 3), V ≥ 1.
     """
     azimuth = np.sort(np.arctan2(visited[:, 1], visited[:, 0]))
     arc = np.diff(np.append(azimuth, azimuth[0] + 2.0 * np.pi))
@@ -112,12 +104,7 @@ def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) 
 
 
 def surface_point(shape: Shape, towards_world: Array) -> Array:
-    """Where the line from a shape's centre to an outer point (3,) [m] leaves the shape (3,) [m].
-
-    Args:
-        shape: The shape.
-        towards_world: The outer point (3,) [m].
-    """
+    """Where the line from a shape's centre to an outer point (3,) [m] leaves the shape (3,) [m]."""
     centre = shape.T_world_object[:3, 3]
     inside, outside = 0.0, 1.0
     for _ in range(40):
@@ -130,13 +117,7 @@ def surface_point(shape: Shape, towards_world: Array) -> Array:
 
 
 def painted(points: Sequence[PointOfInterest], directions: Array, sigma: float) -> Array:
-    """Saliency each point of interest gives each view (M, K): its own, falling off with the angle.
-
-    Args:
-        points: K points of interest.
-        directions: Unit vectors (M, 3) from the sphere's centre.
-        sigma: Angle of the fall-off [rad].
-    """
+    """Saliency (M, K) points give views in directions (M, 3): their own, falling off with σ [rad]."""
     if not points:
         return np.zeros((len(directions), 0))
     tops = np.stack([p.direction for p in points])
@@ -144,19 +125,9 @@ def painted(points: Sequence[PointOfInterest], directions: Array, sigma: float) 
 
 
 def inhibition_of_return(visited: Array, directions: Array, config: ActiveVisionConfig) -> Array:
-    """The negative saliency (M,) around earlier views that forces the robot to attend new ones.
-
-    Args:
-        visited: Unit directions (V, 3) of the earlier views.
-        directions: Unit directions (M, 3) to be judged.
-        config: How deep and how wide it is.
-    """
+    """The negative saliency (M,) of directions (M, 3) around earlier views (V, 3): they repel."""
     bumps = spread(visited, directions, float(np.deg2rad(config.spread)))
     return -config.inhibition * bumps.max(axis=1, initial=0.0)
-
-
-def _unsupported(subject: SceneObject, sphere: ViewSphere, azimuth: float) -> PointOfInterest:
-    return _looked_at(subject, sphere, azimuth, f"nothing is known to support {subject.id}")
 
 
 def _looked_at(subject: SceneObject, sphere: ViewSphere, azimuth: float, reason: str) -> PointOfInterest:

@@ -65,26 +65,15 @@ class Robot(Protocol):
         ...
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot.
-
-        Args:
-            T_world_camera: Pose of its camera (4, 4).
-        """
+        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot."""
         ...
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Return the views of the sphere that can be reached.
-
-        Args:
-            sphere: The view sphere.
-        """
+        """Return the views of the sphere that can be reached."""
         ...
 
     def move_to(self, T_world_camera: Array) -> float:
-        """Go there and return the length of the way [m].
-
-        Args:
-            T_world_camera: Pose of its camera (4, 4).
+        """Go to a pose (4, 4) of the camera and return the length of the way [m].
 
         Raises:
             PlanningError: The pose cannot be reached.
@@ -161,9 +150,17 @@ def find_robot(name: str) -> RobotMaker:
         InputError: There is none of this name, its file is bad, or its module cannot be imported.
     """
     if name == HUMANOID:
-        return _humanoid
+        from caryatid.robots.humanoid import HumanoidRobot
+
+        return lambda around: HumanoidRobot(around.floor, around.config.robot)
     if name.startswith(ARM):
-        return _arm(name.removeprefix(ARM))
+        from caryatid.robots.arm import ArmRobot
+        from caryatid.robots.reachability import read_reachability
+
+        reachability = read_reachability(name.removeprefix(ARM))
+        return lambda around: ArmRobot(
+            reachability, around.T_world_base, around.config.arm, furniture=around.floor
+        )
     others = offered()
     if name not in others and ":" not in name:
         names = ", ".join([HUMANOID, *sorted(others), f"{ARM}FILE.npz", "module:callable"])
@@ -184,32 +181,17 @@ def located(name: str) -> str:
 
 
 def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
-    """Return the sphere a robot's views lie on: its own where it has one, else the proposed.
-
-    Args:
-        robot: Is asked where it inherits `OwnViews`.
-        proposed: The sphere of the settings around the middle of the table top.
-    """
+    """Return the sphere a robot's views lie on: its own where it inherits `OwnViews`, else the proposed."""
     return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
 
 
 def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
-    """Why a robot, looking closer where it can, does not take a candidate (4, 4), or None.
-
-    Args:
-        robot: Is asked where it inherits `OwnViews`.
-        T_world_camera: The candidate (4, 4).
-    """
+    """Why a robot that inherits `OwnViews` does not take a candidate (4, 4) on a closer look, or None."""
     return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
 
 
 def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
     """Pick the first view: the reachable candidate (4, 4) nearest to `config.home` on its view sphere.
-
-    Args:
-        robot: Says what it can reach.
-        sphere: What it is proposed.
-        config: Where the first view is to be.
 
     Raises:
         PlanningError: No view of the sphere can be reached.
@@ -230,22 +212,3 @@ def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
             return candidates.T_world_camera[index]
         reasons.add(refused.reason)
     raise PlanningError(f"no view of the sphere can be reached: {', '.join(sorted(reasons))}")
-
-
-def _humanoid(around: Surroundings) -> Robot:
-    from caryatid.robots.humanoid import HumanoidRobot
-
-    return HumanoidRobot(around.floor, around.config.robot)
-
-
-def _arm(file: str) -> RobotMaker:
-    """An arm that reaches what its map says, on the base of the settings."""
-    from caryatid.robots.arm import ArmRobot
-    from caryatid.robots.reachability import read_reachability
-
-    reachability = read_reachability(file)
-
-    def make(around: Surroundings) -> Robot:
-        return ArmRobot(reachability, around.T_world_base, around.config.arm, furniture=around.floor)
-
-    return make

@@ -107,8 +107,9 @@ class ArmRobot(OwnViews):
         """
         centre = proposed.centre_world if self._centre is None else self._centre
         if self._sphere is None or not np.array_equal(self._sphere.centre_world, centre):
-            radius = self._radius_around(centre)
-            self._sphere = self._sphere_around(centre, radius, self._config.sphere_points)
+            self._sphere = self._sphere_around(
+                centre, self._radius_around(centre), self._config.sphere_points
+            )
         return self._sphere
 
     def solve(self, T_world_camera: Array, target_world: Array | None = None) -> Posture | Unreachable:
@@ -131,7 +132,9 @@ class ArmRobot(OwnViews):
             turned = self._in_some_roll(T[None])[1][0]
             how = "; rolled otherwise it does" if turned else ""
             return Unreachable(f"{REASONS[2]}, {distance:.2f} m from the base{how}")
-        if not self._is_at(T) and (refused := self.confirm(T)) is not None:
+        here = self._T_world_camera
+        is_there = here is not None and np.array_equal(T, here)
+        if not is_there and (refused := self.confirm(T)) is not None:
             return refused
         x_base, forward = self.T_world_base[:3, 0], T[:3, 2]
         base_yaw = float(np.arctan2(x_base[1], x_base[0]))
@@ -170,12 +173,6 @@ class ArmRobot(OwnViews):
         length = float(self._way(T_world_camera[None])[0])
         self._T_world_camera = np.array(T_world_camera, dtype=np.float64)
         return length
-
-    def _is_at(self, T_world_camera: Array) -> bool:
-        try:
-            return np.array_equal(T_world_camera, self.T_world_camera)
-        except PlanningError:
-            return False
 
     def _radius_around(self, centre_world: Array) -> float:
         config = self._config
@@ -228,19 +225,14 @@ class ArmRobot(OwnViews):
                 break
             rolled = T_world_camera[left]
             if turn != 0.0:
-                rolled = rolled @ transforms.rigid(
-                    transforms.rotation_from_vector((0.0, 0.0, turn)), np.zeros(3)
-                )
+                R = transforms.rotation_from_vector((0.0, 0.0, turn))
+                rolled = rolled @ transforms.rigid(R, np.zeros(3))
             found = self._reaches(rolled)
             held[left[found]], reached[left[found]] = rolled[found], True
         return held, reached
 
     def _reaches(self, T_world_camera: Array) -> NDArray[np.bool_]:
-        """Ask which poses (N, 4, 4) the hand reaches (N,).
-
-        Raises:
-            InputError: The answer is not one bool a pose.
-        """
+        """Ask which poses (N, 4, 4) the hand reaches (N,)."""
         answer = np.asarray(self._reachable(transforms.invert(self.T_world_base) @ T_world_camera))
         if answer.shape != (len(T_world_camera),) or answer.dtype != np.bool_:
             raise InputError(

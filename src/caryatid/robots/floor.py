@@ -94,10 +94,10 @@ class FloorGrid:
             cell: Edge of a cell [m].
             config: Footprint. Heights are not known, so no wall hides anything.
         """
-        distance = scipy.ndimage.distance_transform_edt(~np.pad(occupied, 1)) if occupied.any() else None
         free = np.ones(occupied.shape, dtype=np.bool_)
-        if distance is not None:
-            free = distance[1:-1, 1:-1] * cell >= config.footprint
+        if occupied.any():
+            distance = scipy.ndimage.distance_transform_edt(~np.pad(occupied, 1))[1:-1, 1:-1]
+            free = distance * cell >= config.footprint
         origin = np.asarray(origin_world, dtype=np.float64)
         return cls(free, origin, cell, (np.zeros((0, 4, 4)), np.zeros((0, 3))))
 
@@ -136,12 +136,7 @@ class FloorGrid:
         return lengths
 
     def hidden(self, eyes_world: Array, target_world: Array) -> NDArray[np.bool_]:
-        """Test which eyes (N, 3) have furniture between themselves and a target (3,) [m].
-
-        Args:
-            eyes_world: Camera positions (N, 3) [m].
-            target_world: The view sphere's centre (3,) [m].
-        """
+        """Test which eyes (N, 3) [m] have furniture between themselves and a target (3,) [m]."""
         blocked = np.zeros(len(eyes_world), dtype=np.bool_)
         ray_world = target_world - eyes_world
         length = np.linalg.norm(ray_world, axis=-1)

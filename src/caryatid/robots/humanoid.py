@@ -77,9 +77,8 @@ class HumanoidRobot:
         code = int(reach.code[0])
         if code >= 0:
             return Unreachable(REASONS[code] + self._figures(code, T))
-        return Posture(
-            reach.platform_world[0], float(T[2, 3]), float(reach.head_yaw[0]), float(reach.head_pitch[0])
-        )
+        head_yaw, head_pitch = float(reach.head_yaw[0]), float(reach.head_pitch[0])
+        return Posture(reach.platform_world[0], float(T[2, 3]), head_yaw, head_pitch)
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the views of the sphere that can be reached and see its centre past the furniture.
@@ -105,9 +104,8 @@ class HumanoidRobot:
         good = reach.code < 0
         cells = reach.cell[good]
         lengths = self._path_lengths.ravel()[cells]
-        candidates = Candidates(
-            poses[good], sphere.directions[indices[good]], lengths, rejected, indices[good]
-        )
+        directions = sphere.directions[indices[good]]
+        candidates = Candidates(poses[good], directions, lengths, rejected, indices[good])
         return _Offer(sphere, led_to, candidates, cells)
 
     def move_to(self, T_world_camera: Array) -> float:
@@ -151,24 +149,22 @@ class HumanoidRobot:
             left = left[quality[left] < 3]
 
         tolerance = 1e-9
+        low, high = np.deg2rad(config.pitch)
+        hidden = np.zeros(len(eyes), dtype=np.bool_)
         tests = (
             eyes[:, 2] < config.camera_height[0] - tolerance,
             eyes[:, 2] > config.camera_height[1] + tolerance,
-            (pitch < np.deg2rad(config.pitch[0]) - tolerance)
-            | (pitch > np.deg2rad(config.pitch[1]) + tolerance),
+            (pitch < low - tolerance) | (pitch > high + tolerance),
             roll > np.deg2rad(MAX_ROLL),
-            quality == 0,
-            quality == 1,
-            quality == 2,
-            np.zeros(len(eyes), dtype=np.bool_)
-            if target_world is None
-            else self._floor.hidden(eyes, target_world),
+            *(quality == missing for missing in range(3)),
+            hidden if target_world is None else self._floor.hidden(eyes, target_world),
         )
         refused = np.stack(tests)
         code = np.where(refused.any(axis=0), refused.argmax(axis=0), -1)
         head_yaw = yaws[best]
         yaw = heading - head_yaw
-        platform_world = np.column_stack([eyes[:, :2] - self._forward(yaw), _wrap(yaw)])
+        wrapped = (yaw + np.pi) % (2.0 * np.pi) - np.pi
+        platform_world = np.column_stack([eyes[:, :2] - self._forward(yaw), wrapped])
         return _Reach(code, platform_world, head_yaw, pitch, cell)
 
     def _standing(
@@ -217,8 +213,3 @@ class _Offer:
     led_to: NDArray[np.bool_]
     candidates: Candidates
     cells: NDArray[np.intp]
-
-
-def _wrap(angle: Array) -> Array:
-    """Bring angles into [−π, π) [rad]."""
-    return (angle + np.pi) % (2.0 * np.pi) - np.pi

@@ -124,25 +124,15 @@ def sample_reachability(
 
 
 def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityMap) -> None:
-    """Write a map; the file appears whole or not at all, and the same map gives the same bytes.
-
-    Args:
-        path: The file, `.npz`.
-        reachability: The map.
+    """Write a map as .npz; it appears whole or not at all, and the same map gives the same bytes.
 
     Raises:
         InputError: The file cannot be written.
     """
     buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        format=np.array(FORMAT),
-        version=np.array(VERSION),
-        reached=reachability.reached,
-        origin_base=reachability.origin_base,
-        cell=np.array(reachability.cell),
-        fresh=np.array(reachability.fresh),
-    )
+    content: dict[str, Any] = {"format": FORMAT, "version": VERSION}
+    content |= {name: getattr(reachability, name) for name in ("reached", "origin_base", "cell", "fresh")}
+    np.savez_compressed(buffer, **content)
     write_file(Path(path), buffer.getvalue())
 
 
@@ -172,8 +162,7 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
 class _Bins:
     """The bins of directions (D) and rolls.
 
-    A roll is measured from a vector at right angles to the middle of its direction's bin, not from the
-    level: so it does not turn about itself where the camera looks straight up or down.
+    A roll is measured from a vector at right angles to its bin's middle: so it is known straight down too.
     """
 
     def __init__(self, count: int) -> None:
@@ -193,11 +182,7 @@ class _Bins:
 
 
 def _checked_poses(T_base_camera: ArrayLike, count: int) -> Array:
-    """Poses (M, 4, 4) of the postures that are possible.
-
-    Raises:
-        InputError: There are not as many poses as postures, or they are no rigid transforms.
-    """
+    """Poses (M, 4, 4) of the postures that are possible."""
     poses = np.asarray(T_base_camera, dtype=np.float64)
     if poses.shape != (count, 4, 4):
         raise InputError(

@@ -33,9 +33,8 @@ class RecordingRobot:
     def __init__(self, T_world_cameras: Array | Sequence[Array], start: int = 0) -> None:
         self._recorded = np.array(T_world_cameras, dtype=np.float64).reshape(-1, 4, 4)
         if not 0 <= start < len(self._recorded):
-            raise InputError(
-                "recording", f"has no view {start} of {len(self._recorded)}", "give poses to be at"
-            )
+            why = f"has no view {start} of {len(self._recorded)}"
+            raise InputError("recording", why, "give poses to be at")
         self._used = [start]
 
     @property
@@ -74,10 +73,8 @@ class RecordingRobot:
         left = np.setdiff1d(np.arange(len(self._recorded)), self._used)
         poses = self._recorded[left]
         way = np.linalg.norm(poses[:, :3, 3] - self.T_world_camera[:3, 3], axis=-1)
-        rejected = {
-            "already used": len(self._used),
-            "the recording has no view from there": len(sphere.directions),
-        }
+        nowhere = len(sphere.directions)
+        rejected = {"already used": len(self._used), "the recording has no view from there": nowhere}
         return Candidates(poses, sphere.direction_of(poses), way, rejected)
 
     def move_to(self, T_world_camera: Array) -> float:

@@ -61,8 +61,8 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
         for k in np.flatnonzero(change.any(axis=1)):
             shape = done[k].shape
             done[k] = replace(done[k], shape=_changed(shape, change[k]))
-    said = [doubts.get(k, "") for k in range(len(done))]
-    return [o if o.doubt == doubt else replace(o, doubt=doubt) for o, doubt in zip(done, said, strict=True)]
+    said = [(o, doubts.get(k, "")) for k, o in enumerate(done)]
+    return [o if o.doubt == doubt else replace(o, doubt=doubt) for o, doubt in said]
 
 
 def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) -> SceneObject:
@@ -73,17 +73,13 @@ def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) 
         rng: Source of the draw.
         config: How many standard deviations uncertainty can explain.
     """
-    change = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas) * _sigma(o)
-    return replace(o, shape=_changed(o.shape, change))
+    draw = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas)
+    return replace(o, shape=_changed(o.shape, draw * _sigma(o)))
 
 
 @cache
 def _effect(ties: tuple[int, int, int]) -> Array:
-    """What each of an object's independent variables (9,) does to it.
-
-    Returns:
-        Translation [m], rotation [rad] and change of the half extents [m], in the object's frame (9, 9).
-    """
+    """What each independent variable (9,) does to translation, rotation and half extents (9, 9)."""
     effect = np.zeros((9, 9))
     effect[3:6, 3:6] = np.eye(3)
     for axis, round_ in enumerate(_round(ties)):
@@ -106,8 +102,7 @@ def _round(ties: tuple[int, int, int]) -> list[bool]:
 def _sigma(o: SceneObject) -> Array:
     """Standard deviation of each of an object's independent variables (9,); zero where it cannot change."""
     sigma = np.zeros(9)
-    known = o.uncertainty
-    if known is None or o.role == "support_surface":
+    if (known := o.uncertainty) is None or o.role == "support_surface":
         return sigma
     sigma[0:3], sigma[3:6], sigma[6:9] = known.sides[0::2], known.rotation, known.sides[1::2]
     round_ = sum(_round(o.shape.ties))
@@ -156,18 +151,13 @@ def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, 
         noise: Variance of a gap that is closed [m²].
     """
     weighted = rows * variance[pairs]
-    ends = pairs.ravel()
-    shared = np.where(ends[:, None] == ends, _ends(weighted) @ _ends(rows).T, 0.0)
+    ends, each = pairs.ravel(), (2 * len(pairs), rows.shape[-1])
+    shared = np.where(ends[:, None] == ends, weighted.reshape(each) @ rows.reshape(each).T, 0.0)
     scatter = shared.reshape(len(pairs), 2, len(pairs), 2).sum(axis=(1, 3)) + noise * np.eye(len(pairs))
     solved = np.linalg.solve(scatter, gaps)
     change = np.zeros(variance.shape)
     np.add.at(change, pairs, weighted * solved[:, None, None])
     return change
-
-
-def _ends(rows: Array) -> Array:
-    """Both ends of each pair one after another (2 K, V)."""
-    return rows.reshape(-1, rows.shape[-1])
 
 
 def _changed(shape: Shape, change: Array) -> Shape:

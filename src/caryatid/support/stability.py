@@ -60,9 +60,8 @@ def _prism() -> tuple[Array, NDArray[np.int64]]:
     ring = np.stack([np.cos(angle), np.sin(angle), np.ones(_SIDES)], axis=-1)
     low, after = np.arange(_SIDES) + _SIDES, (np.arange(_SIDES) + 1) % _SIDES
     ends = [(low - _SIDES, low), (low - _SIDES, after), (low, after + _SIDES)]
-    return np.concatenate([ring, ring * (1.0, 1.0, -1.0)]), np.concatenate(
-        [np.stack(e, axis=-1) for e in ends]
-    )
+    edges = np.concatenate([np.stack(e, axis=-1) for e in ends])
+    return np.concatenate([ring, ring * (1.0, 1.0, -1.0)]), edges
 
 
 _SOLIDS = {"box": _cube(), "cylinder": _prism()}
@@ -90,10 +89,8 @@ def contact_patch(
         config: `patch_depth`.
     """
     depth = _touching_depth(shape, config)
-    upper = _cap(shape, -normal_world, depth)
-    patch = polygons.intersection(
-        upper, _cap(other, normal_world, min(depth, _touching_depth(other, config)))
-    )
+    lower = _cap(other, normal_world, min(depth, _touching_depth(other, config)))
+    patch = polygons.intersection(_cap(shape, -normal_world, depth), lower)
     return patch if polygons.area(patch) > _NO_AREA else polygons.hull(points_world)
 
 
@@ -135,14 +132,7 @@ def find_tipping(shape: Shape, polygon: Array) -> Tipping:
 
 
 def assess(shape: Shape, polygon: Array, tipping: Tipping, config: SupportConfig) -> Stability:
-    """Both tests of an object that rests on a support polygon: r_s of eq. 1 and the centre of mass.
-
-    Args:
-        shape: The object.
-        polygon: Its support polygon (N, 2) [m].
-        tipping: How it would tip over it.
-        config: r_s,min, and how far outside the centre of mass may lie.
-    """
+    """Both tests of an object on its support polygon (N, 2) [m]: r_s of eq. 1 and the centre of mass."""
     ratio = min(1.0, polygons.area(polygon) / polygons.area(ground_outline(shape)))
     overhang = tipping.overhang
     return Stability(ratio, overhang, ratio < config.min_area_ratio, overhang > config.overhang)

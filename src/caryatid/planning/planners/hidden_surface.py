@@ -10,6 +10,7 @@ free of what was seen occupied and of the fitted shapes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -28,7 +29,6 @@ from caryatid.planning.expected_visibility import (
     surface_samples,
     unseen_shares,
     visibility,
-    weighted,
 )
 from caryatid.planning.points_of_interest import (
     PointOfInterest,
@@ -84,9 +84,11 @@ def _expected_gain(
     points = relation_samples(relations)
     T_world_visited = state.sphere.poses(state.visited)
     seen = visibility(join([surfaces, points]), T_world_visited, solid, config).max(axis=1, initial=0.0)
-    surfaces = weighted(surfaces, unseen_shares(surfaces, seen[: len(surfaces.weights)]))
+    shares = unseen_shares(surfaces, seen[: len(surfaces.weights)])
+    surfaces = replace(surfaces, weights=surfaces.weights * shares)
     space = space_samples(state.graph, solid)
-    samples = join([surfaces, weighted(points, RELATION_WEIGHT), space])
+    points = replace(points, weights=points.weights * RELATION_WEIGHT)
+    samples = join([surfaces, points, space])
     before = np.concatenate([seen, np.zeros(len(space.weights))])
     return samples, shown_anew(samples, before, T_world_camera, solid, config)
 

@@ -42,10 +42,8 @@ from caryatid.sensing.voxel_map import OCCUPIED, UNKNOWN, VoxelMap
 
 RAY_SPACING = 0.02
 """Spacing of the rays at the sphere's centre [m]; 2 voxels, no object is missed."""
-
 PROXIMITY = 0.1
 """d_max of `proximity-count` [m]; a common object reaches that far behind its seen side."""
-
 COST_WEIGHT = 1.0
 """Weight w of the cost in the utility [1]; the usual one."""
 
@@ -99,11 +97,6 @@ def ray_information(state: PlanningState, T_world_camera: Array, proximity: floa
 
     Without a table or objects there is no box to look into, and nothing is gathered; without a `proximity`,
     d_max [m], nothing is near.
-
-    Args:
-        state: What is known.
-        T_world_camera: Poses (C, 4, 4).
-        proximity: d_max [m].
     """
     corners = space_above(state.graph, state.voxels)
     if corners is None:
@@ -122,9 +115,7 @@ def ray_information(state: PlanningState, T_world_camera: Array, proximity: floa
 def layers(voxels: VoxelMap, proximity: float) -> NDArray[np.float32]:
     """Occupancy [1], its entropy [bit] and nearness of unknown voxels to occupied ones [m] (X, Y, Z, 3).
 
-    Args:
-        voxels: The map.
-        proximity: d_max: nearness is d_max − d where that is more than 0 [m]; 0 where it is not asked for.
+    Nearness is d_max − d where that is more than 0, d_max the `proximity` [m].
     """
     occupancy = voxels.occupancy
     entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
@@ -164,18 +155,8 @@ def _shares(values: Array) -> Array:
     return values / total if total > 0.0 else np.zeros_like(values)
 
 
-class Views(NamedTuple):
-    """Candidate views of a voxel grid.
-
-    Attributes:
-        states: State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied.
-        layers: Occupancy [1], its entropy [bit] and the nearness to a surface of each voxel (X, Y, Z, 3).
-        T_world_camera: Candidates (C, 4, 4).
-        rays_camera: Unit directions (R, 3) of the rays in the camera.
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        size: Edge of a voxel [m].
-        gathered: What the rays of each gather (C, 5), 0 at first; written to.
-    """
+class _Views(NamedTuple):
+    """The arguments of `gather`, and what it returns."""
 
     states: NDArray[np.int8]
     layers: NDArray[np.float32]
@@ -222,24 +203,27 @@ def gather(
     origin: Array,
     size: float,
 ) -> Array:
-    """Sum the information the rays of each candidate gather. Every candidate has a sum of its own.
+    """Sum the information the rays of each candidate gather.
 
-    The arguments are as in `Views`.
+    Args:
+        states: State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied.
+        layers: Occupancy [1], its entropy [bit] and the nearness to a surface of each voxel (X, Y, Z, 3).
+        T_world_camera: Candidates (C, 4, 4).
+        rays_camera: Unit directions (R, 3) of the rays in the camera.
+        origin: Corner (3,) [m] of voxel [0, 0, 0].
+        size: Edge of a voxel [m].
 
     Returns:
         (C, 5), a column each of `VOLUMETRIC`.
     """
     gathered = np.zeros((len(T_world_camera), len(VOLUMETRIC)))
-    for_each(
-        gather_one,
-        len(T_world_camera),
-        Views(states, layers, T_world_camera, rays_camera, origin, size, gathered),
-    )
+    views = _Views(states, layers, T_world_camera, rays_camera, origin, size, gathered)
+    for_each(_gather_one, len(T_world_camera), views)
     return gathered
 
 
 @njit(cache=True)
-def gather_one(c: int, views: Views) -> None:
+def _gather_one(c: int, views: _Views) -> None:
     """Sum what the rays of one candidate gather."""
     T, size, origin = views.T_world_camera[c], views.size, views.origin
     start = ((T[0, 3] - origin[0]) / size, (T[1, 3] - origin[1]) / size, (T[2, 3] - origin[2]) / size)
