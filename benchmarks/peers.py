@@ -1,4 +1,4 @@
-"""What people use today, each behind one call; what cannot be imported says why."""
+"""What people use today, each behind one call; what cannot be imported raises."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import random
 import re
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import cache
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -49,39 +47,8 @@ _NUMBER = r"(-?[\d.]+(?:e[+-]?\d+)?)"
 _TRIPLE = rf"\({_NUMBER}, {_NUMBER}, {_NUMBER}\)"
 
 
-@dataclass(frozen=True, slots=True)
-class Missing:
-    """A peer that is not there.
-
-    Attributes:
-        reason: What its import said.
-    """
-
-    reason: str
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Estimate:
-    """What a fitter says of a shape; None where it says nothing.
-
-    Attributes:
-        axis: Of a cylinder (3,).
-        radius: Of a cylinder or a sphere [m].
-        extents: Of a box (3,) [m], in any order.
-    """
-
-    axis: Array | None = None
-    radius: float | None = None
-    extents: Array | None = None
-
-
-@cache
-def load(module: str) -> Any:
-    """Import a peer; what cannot be imported is `Missing`."""
-    try:
-        return import_module(module)
-    except (ImportError, OSError) as error:
-        return Missing(f"{DISTRIBUTIONS.get(module, module)} cannot be imported: {told(error)}")
+Estimate = dict[str, Any]
+"""What a fitter says of a shape: `axis` (3,), `radius` [m] or `extents` (3,) [m]; or nothing."""
 
 
 def told(error: BaseException) -> str:
@@ -94,23 +61,23 @@ def versions() -> str:
     named = []
     for module, name in DISTRIBUTIONS.items():
         try:
-            named.append(
-                f"{name} {version(name)}" + (" (broken)" if isinstance(load(module), Missing) else "")
-            )
+            named.append(f"{name} {version(name)}")
+            import_module(module)
         except PackageNotFoundError:
             named.append(f"{name} not installed")
+        except (ImportError, OSError):
+            named[-1] += " (broken)"
     return ", ".join(named)
 
 
 def _open3d() -> Any:
     """Open3D, told to say errors only; it warns of every box that cannot be turned."""
-    o3d = load(OPEN3D)
-    if not isinstance(o3d, Missing):
-        o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
+    o3d = import_module(OPEN3D)
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     return o3d
 
 
-def open3d_chain(view: View, max_depth: float) -> Callable[[], int] | Missing:
+def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
     """Open3D from the depth image to a box a cluster.
 
     Args:
@@ -121,8 +88,6 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int] | Missing:
         The call; it returns how many boxes there are.
     """
     o3d = _open3d()
-    if isinstance(o3d, Missing):
-        return o3d
     height, width = view.depth.shape
     K = o3d.camera.PinholeCameraIntrinsic(
         width, height, view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]
@@ -148,37 +113,31 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int] | Missing:
     return chain
 
 
-def open3d_box(points: Array) -> Callable[[], Estimate] | Missing:
+def open3d_box(points: Array) -> Callable[[], Estimate]:
     """Open3D's box of the least volume around points (N, 3) [m]; their conversion is not part of the call."""
     o3d = _open3d()
-    if isinstance(o3d, Missing):
-        return o3d
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    return lambda: Estimate(extents=np.asarray(cloud.get_minimal_oriented_bounding_box().extent))
+    return lambda: {"extents": np.asarray(cloud.get_minimal_oriented_bounding_box().extent)}
 
 
-def pyransac3d_fit(
-    kind: str, points: Array, iterations: int = ITERATIONS
-) -> Callable[[], Estimate] | Missing:
+def pyransac3d_fit(kind: str, points: Array, iterations: int = ITERATIONS) -> Callable[[], Estimate]:
     """pyransac3d's fit of a `box`, `cylinder` or `sphere` to points (N, 3) [m]."""
-    library = load(PYRANSAC3D)
-    if isinstance(library, Missing):
-        return library
+    library = import_module(PYRANSAC3D)
 
     def call() -> Estimate:
         random.seed(0)
         options = {"thresh": THRESHOLD, "maxIteration": iterations}
         if kind == "box":
-            return Estimate(extents=np.asarray(library.Cuboid().fit(points, **options).extents))
+            return {"extents": np.asarray(library.Cuboid().fit(points, **options).extents)}
         if kind == "sphere":
-            return Estimate(radius=float(library.Sphere().fit(points, **options).radius))
+            return {"radius": float(library.Sphere().fit(points, **options).radius)}
         found = library.Cylinder().fit(points, **options)
-        return Estimate(np.asarray(found.axis), float(found.radius))
+        return {"axis": np.asarray(found.axis), "radius": float(found.radius)}
 
     return call
 
 
-def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Estimate] | Missing:
+def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Estimate]:
     """CGAL's efficient RANSAC of a `cylinder` or a `sphere`; with no normals it estimates them first.
 
     Copying the points into CGAL's set, which goes through Python one by one, is not part of the call.
@@ -188,9 +147,7 @@ def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Es
         points: (N, 3) [m].
         normals: Unit normals (N, 3), or None.
     """
-    shapes = load(CGAL)
-    if isinstance(shapes, Missing):
-        return shapes
+    shapes = import_module(CGAL)
     kernel, sets = import_module("CGAL.CGAL_Kernel"), import_module("CGAL.CGAL_Point_set_3")
     processing = import_module("CGAL.CGAL_Point_set_processing_3")
     cloud = sets.Point_set_3()
@@ -208,16 +165,14 @@ def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Es
             cloud, owner, int(CGAL_SHARE * len(points)), THRESHOLD, CGAL_GAP, CGAL_NORMAL, CGAL_MISS,
             False, False, kind == "cylinder", kind == "sphere", False,
         )  # fmt: skip
-        return read_cgal(lines[0]) if len(lines) else Estimate()
+        return _read_cgal(lines[0]) if len(lines) else {}
 
     return call
 
 
-def read_cgal(line: str) -> Estimate:
+def _read_cgal(line: str) -> Estimate:
     """Read one of the lines CGAL describes shapes with."""
     radius = re.search(rf"radius: ?{_NUMBER}", line)
     axis = re.search(rf"axis: {_TRIPLE}", line)
-    return Estimate(
-        None if axis is None else transforms.unit([float(v) for v in axis.groups()]),
-        None if radius is None else float(radius[1]),
-    )
+    found: Estimate = {} if radius is None else {"radius": float(radius[1])}
+    return found if axis is None else found | {"axis": transforms.unit([float(v) for v in axis.groups()])}

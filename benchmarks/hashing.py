@@ -6,7 +6,6 @@ import numpy as np
 from numba import get_num_threads, njit, prange
 from numpy.typing import NDArray
 
-from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import View
 
@@ -19,27 +18,16 @@ MIXER = np.uint64(0x9E3779B97F4A7C15)
 
 
 def hash_voxels(view: View, size: float) -> NDArray[np.int64]:
-    """Keys of the voxels that hold a view's points, each once, in no order.
+    """Keys of the voxels of an edge [m] that hold a view's points, each once, in no order.
 
     Each thread takes a band of the image; then each takes a share of the hashes, and enters the keys that
     have one of them into an open-addressing table of its own.
-
-    Args:
-        view: A view with a pose.
-        size: Edge of a voxel [m]; the grid starts at the world's origin.
     """
     threads = get_num_threads()
     keys, counts = _keys(view.depth, view.K, view.pose, 1.0 / size, threads)
     places = 1 << int(np.ceil(np.log2(max(2 * counts.sum() // threads, 2))))
     tables, taken = _tables(keys, counts, places)
     return np.concatenate([table[: taken[t]] for t, table in enumerate(tables)])
-
-
-def hash_voxels_reference(view: View, size: float) -> NDArray[np.int64]:
-    """The same with NumPy: keys in ascending order."""
-    points_camera = view.points_camera[view.valid]
-    index = np.floor(transforms.transform(view.pose, points_camera) / size).astype(np.int64) + REACH // 2
-    return np.unique((index[:, 0] * REACH + index[:, 1]) * REACH + index[:, 2])
 
 
 @njit(cache=True, parallel=True)
@@ -55,9 +43,7 @@ def _keys(
         count, last = 0, EMPTY
         for v in range(height * t // threads, height * (t + 1) // threads):
             y = (v - K[1, 2]) / K[1, 1]
-            a = T[0, 1] * y + T[0, 2]
-            b = T[1, 1] * y + T[1, 2]
-            c = T[2, 1] * y + T[2, 2]
+            a, b, c = T[0, 1] * y + T[0, 2], T[1, 1] * y + T[1, 2], T[2, 1] * y + T[2, 2]
             for u in range(width):
                 z = depth[v, u]
                 if z > 0.0:

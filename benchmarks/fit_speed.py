@@ -1,0 +1,205 @@
+"""Fits of single shapes against pyransac3d, CGAL and Open3D: time, and how far off the result is."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal
+
+import fits
+import numpy as np
+from peers import (
+    NEIGHBOURS,
+    THRESHOLD,
+    Estimate,
+    cgal_fit,
+    open3d_box,
+    pyransac3d_fit,
+    told,
+)
+from rows import Effort, Row, median, timed, timed_row
+from speed import fit_limit
+
+import caryatid as ct
+from caryatid.config import FitConfig
+from caryatid.fitting.primitives import Fit
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Shape
+from caryatid.geometry.transforms import Array
+from caryatid.sensing.clouds import estimate_normals
+
+Kind = Literal["box", "cylinder", "sphere"]
+Fitter = Callable[[], Estimate]
+RUNS = 3
+"""Runs on each sample, but of pyransac3d, which is slow: one."""
+USUAL, SLOW = 5000, 10_000
+"""Points the targets speak of (only with these errors are taken, and shapes chosen), and fewest with which
+pyransac3d is left out: a cylinder would take it eight seconds."""
+SIGMA = 0.001
+"""Noise of the points along each axis [m]."""
+FIT = replace(fits.ONE_VIEW, threshold=THRESHOLD)
+"""Settings of our fit: every point has an error of its own, and the threshold is everybody's."""
+PYRANSAC3D, CGAL, CGAL_ALONE, MINIMAL = "pyransac3d", "CGAL", "CGAL without normals", "Open3D's minimal box"
+NAMES = {PYRANSAC3D: "pyransac3d", CGAL: "cgal", CGAL_ALONE: "cgal-alone", MINIMAL: "open3d"}
+"""Last part of a row's name."""
+PEERS = {
+    "cylinder": (PYRANSAC3D, CGAL, CGAL_ALONE),
+    "box": (PYRANSAC3D, MINIMAL),
+    "sphere": (PYRANSAC3D, CGAL, CGAL_ALONE),
+}
+UNITS = {"axis": "deg", "radius": "mm", "extents": "mm", "volume": "%"}
+FASTER = {
+    ("cylinder", PYRANSAC3D): 1.0 / 200.0, ("cylinder", CGAL): 2.0, ("box", PYRANSAC3D): 1.0 / 50.0,
+    ("box", MINIMAL): 1.0,
+}  # fmt: skip
+"""Largest share of the peer's time that is asked for where we are told the shape, as the peers are; of CGAL's
+cylinders no less error either."""
+
+
+def measure_fits(kind: Kind, effort: Effort) -> list[Row]:
+    """Rows of one kind of shape, a sample a run; every fitter gets the same ones."""
+    settings = [(count, "one side") for count in effort.points] + [(USUAL, "all around")]
+    return [row for count, side in settings for row in _compare(kind, count, side, effort.runs)]
+
+
+def _compare(kind: Kind, count: int, side: str, runs: int) -> list[Row]:
+    """Rows of our fits beside the peers': time and, with the usual number of points, the errors."""
+    peers = [
+        p
+        for p in PEERS[kind]
+        if not (p == PYRANSAC3D and count >= SLOW) and not (p == CGAL_ALONE and side != "one side")
+    ]
+    variants = ["fit", "choose"] if count == USUAL else ["fit"]
+    seconds: dict[str, list[float]] = defaultdict(list)
+    errors: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    missing: dict[str, str] = {}
+    for seed in range(runs):
+        shape, points, normals, eye = draw(kind, count, side, seed)
+        makers = _fitters(kind, points, normals, eye)
+        for name in [*variants, *(["fit alone"] if CGAL_ALONE in peers else []), *peers]:
+            if name in missing:
+                continue
+            try:
+                call = makers[name]()
+                for _ in range(1 if name == PYRANSAC3D else RUNS):
+                    took, estimate = timed(call, warm=name != PYRANSAC3D)
+                    seconds[name].append(took)
+            except Exception as error:
+                if name not in peers:
+                    raise
+                missing[name] = told(error)
+                continue
+            for quantity, off in errors_of(estimate, shape).items():
+                errors[name][quantity].append(off)
+    where, words = (
+        f"{kind}.{count // 1000}k-{side.replace(' ', '-')}",
+        f"{kind}, {count // 1000}k points, {side}",
+    )
+    rows = []
+    for variant in variants:
+        for peer in peers:
+            if peer == CGAL_ALONE and variant != "fit":
+                continue
+            ours = "fit alone" if peer == CGAL_ALONE else variant
+            name, usual = f"{variant}.{where}.{NAMES[peer]}", count == USUAL
+            theirs = [] if peer in missing else seconds[peer]
+            target = FASTER.get((kind, peer)) if usual and variant == "fit" else None
+            limit, note = fit_limit(count), missing.get(peer, "")
+            row = timed_row(
+                name, words, seconds[ours], peer=peer, theirs=theirs, limit=limit, target=target, note=note
+            )
+            rows.append(row)
+            for quantity, ours_off in errors[ours].items() if usual else ():
+                better = 1.0 if variant == "fit" and (kind, peer) == ("cylinder", CGAL) else None
+                known, lost = _known(ours_off)
+                peer_known, peer_lost = _known([] if peer in missing else errors[peer][quantity])
+                notes = [note] if note else [f"{peer} found nothing in {peer_lost}"] if peer_lost else []
+                notes += [f"ours found another shape in {lost} of {len(ours_off)}"] if lost else []
+                rows.append(
+                    Row(
+                        f"{name}.{quantity}",
+                        f"{words}: error of the {quantity}",
+                        median(known)[0] if known else None,
+                        UNITS[quantity],
+                        median(known)[1] if known else 0.0,
+                        len(known),
+                        peer,
+                        median(peer_known)[0] if peer_known else None,
+                        target=better,
+                        note="; ".join(notes),
+                    )
+                )
+    return rows
+
+
+def _fitters(kind: Kind, points: Array, normals: Array, eye: Array) -> dict[str, Callable[[], Fitter]]:
+    """What makes each fitter of a sample, ours and the peers'."""
+    return {
+        "fit": lambda: _ours(points, normals, replace(FIT, shapes=(kind,))),
+        "choose": lambda: _ours(points, normals, FIT),
+        "fit alone": lambda: _ours(points, eye, replace(FIT, shapes=(kind,))),
+        PYRANSAC3D: lambda: pyransac3d_fit(kind, points),
+        CGAL: lambda: cgal_fit(kind, points, normals),
+        CGAL_ALONE: lambda: cgal_fit(kind, points, None),
+        MINIMAL: lambda: open3d_box(points),
+    }
+
+
+def _known(errors: list[float]) -> tuple[list[float], int]:
+    """The errors where something was found, and how often nothing was."""
+    known = [e for e in errors if not np.isnan(e)]
+    return known, len(errors) - len(known)
+
+
+def draw(kind: Kind, count: int, side: str, seed: int) -> tuple[Shape, Array, Array, Array]:
+    """A shape of table-top size, points (N, 3) on it [m], their normals (N, 3), and an eye (3,) [m].
+
+    What is measured can be seen from the one side: two faces of a box, the mantle of a cylinder.
+    """
+    rng = np.random.default_rng([fits.KINDS.index(kind), count, seed])
+    shape = fits.random_shape(kind, rng)
+    centre = shape.T_world_object[:3, 3]
+    if side == "all around":
+        points, outward = fits.dense_surface(shape, count, rng)
+        points = points + SIGMA * rng.normal(size=points.shape)
+        return shape, points, fits.normals_of(points, outward), centre
+    while True:
+        points, normals, view = fits.half_view(shape, count, SIGMA, rng)
+        facing = np.abs(view @ shape.T_world_object[:3, :3]) > np.cos(fits.STEEPEST)
+        if {"sphere": True, "box": facing.sum() > 1, "cylinder": facing[:2].any()}[kind]:
+            return shape, points, normals, centre + view
+
+
+def _ours(points: Array, normals: Array, config: FitConfig) -> Fitter:
+    """Our fit, behind a call like the peers'; given an eye (3,) for normals it estimates them first."""
+
+    def call() -> Estimate:
+        given = estimate_normals(points, normals, NEIGHBOURS) if normals.ndim == 1 else normals
+        found = ct.fit(points, given, config=config, rng=np.random.default_rng(0))
+        if not isinstance(found, Fit):
+            return {}
+        if isinstance(found.shape, ct.Box):
+            return {"extents": found.shape.extents}
+        axis = {"axis": found.shape.T_world_object[:3, 2]} if isinstance(found.shape, ct.Cylinder) else {}
+        return axis | {"radius": found.shape.extents[0] / 2.0}
+
+    return call
+
+
+def errors_of(estimate: Estimate, shape: Shape) -> dict[str, float]:
+    """How far off: axis [deg], radius and mean of the extents [mm], volume [%]; NaN where nothing is said."""
+    if isinstance(shape, ct.Box):
+        extents = np.sort(estimate.get("extents", np.full(3, np.nan)))
+        off = float(np.abs(extents - np.sort(shape.extents)).mean())
+        return {
+            "extents": 1e3 * off,
+            "volume": 100.0 * abs(float(np.prod(extents) / np.prod(shape.extents)) - 1.0),
+        }
+    radius = 1e3 * abs(float(estimate.get("radius", np.nan)) - float(shape.extents[0]) / 2.0)
+    if isinstance(shape, ct.Sphere):
+        return {"radius": radius}
+    if "axis" not in estimate:
+        return {"axis": np.nan, "radius": radius}
+    angle = float(np.degrees(transforms.angle_between(estimate["axis"], shape.T_world_object[:3, 2])))
+    return {"axis": min(angle, 180.0 - angle), "radius": radius}

@@ -1,1 +1,0 @@
-"""What `benchmarks/bench.py` measures: ours against what people use today and the machine's limit."""

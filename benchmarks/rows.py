@@ -1,0 +1,222 @@
+"""A row of the performance table: our time beside the peer's and the machine's limit, and its target."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import TypeVar
+
+import numba
+import numpy as np
+from measures import Measure
+from numba import njit, prange
+
+from caryatid.geometry.transforms import Array
+
+T = TypeVar("T")
+PAUSE = 0.02
+"""Before each timed run [s]: the threads of what ran before have stopped waiting for more work by then."""
+TOLERANCE, EXPONENT_TOLERANCE = 0.3, 0.15
+"""How much worse a ratio (as a share of itself) or an exponent of growth may become [1]."""
+NOTHING, MISSED = "–", "missed"
+COLUMNS = (
+    ("row", "what", "ours", "spread", "runs", "peer", "theirs")
+    + ("to peer", "pass of", "to limit", "target", "note")
+)  # fmt: skip
+Limit = tuple[float, float]
+"""Bytes read and written, and multiplications and additions, that a stage cannot do without."""
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How many runs, and up to which sizes.
+
+    Attributes:
+        runs: Of each figure at least [1].
+        points: Numbers of points that fits are measured with.
+        widths: Of images [px] for growth with points.
+        objects: On the table.
+        voxels: Their edges [m].
+        views: Seen one after the other [1].
+    """
+
+    runs: int = 7
+    points: tuple[int, ...] = (1000, 5000, 20_000)
+    widths: tuple[int, ...] = (320, 452, 640, 904, 1280)
+    objects: tuple[int, ...] = (5, 10, 20, 40, 70, 100)
+    voxels: tuple[float, ...] = (0.04, 0.02, 0.01, 0.005)
+    views: int = 200
+
+
+FULL = Effort()
+QUICK = Effort(2, (5000,), (320, 640), (5, 10, 20), (0.02, 0.01), 30)
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        name: Of the row, its group before the first dot.
+        what: In words.
+        value: Ours, a median; None where it could not be measured.
+        unit: Of all values: `ms`, `s`, `deg`, `mm`, `%`, `MB`, or `1` for exponents.
+        spread: Between the quartiles of the runs, in the unit.
+        runs: How many the value is the median of.
+        peer: What it is compared with.
+        peer_value: The peer's figure; None where it could not be measured.
+        limit: What bounds it from below: a pass over the data, or arithmetic.
+        limit_value: How little it could be.
+        target: What the value, or where there is a peer the ratio to it, may be at most.
+        note: Why something is missing, or what else was found.
+    """
+
+    name: str
+    what: str
+    value: float | None
+    unit: str = "ms"
+    spread: float = 0.0
+    runs: int = 1
+    peer: str = ""
+    peer_value: float | None = None
+    limit: str = ""
+    limit_value: float | None = None
+    target: float | None = None
+    note: str = ""
+
+    @property
+    def to_peer(self) -> float | None:
+        """Ours in peers: 0.5 is half of it."""
+        return None if self.value is None or not self.peer_value else self.value / self.peer_value
+
+    @property
+    def to_limit(self) -> float | None:
+        """Ours in limits: 1 is the limit."""
+        return None if self.value is None or not self.limit_value else self.value / self.limit_value
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the row is what is asked for; None where nothing is, or it could not be measured."""
+        figure = self.to_peer if self.peer else self.value
+        return None if self.target is None or figure is None else figure <= self.target
+
+    def cells(self) -> tuple[str, ...]:
+        """The columns of the table."""
+        verdict = {True: "met", False: MISSED, None: "not measured"}[self.met]
+        asked = NOTHING
+        if self.target is not None:
+            asked = f"≤ {_ratio(self.target) if self.peer else _figure(self.target, self.unit)} {verdict}"
+        return (
+            self.name,
+            self.what,
+            _figure(self.value, self.unit),
+            _figure(self.spread, self.unit) if self.runs > 1 and self.unit != "1" else NOTHING,
+            str(self.runs),
+            self.peer or NOTHING,
+            _figure(self.peer_value, self.unit),
+            _ratio(self.to_peer),
+            self.limit or NOTHING,
+            _ratio(self.to_limit),
+            asked,
+            self.note or NOTHING,
+        )
+
+
+def timed_row(
+    name: str,
+    what: str,
+    ours: Sequence[float],
+    *,
+    peer: str = "",
+    theirs: Sequence[float] = (),
+    limit: Limit | None = None,
+    target: float | None = None,
+    note: str = "",
+) -> Row:
+    """Make a row, in milliseconds, of runs [s] of ours and of a peer."""
+    value, spread = median(ours)
+    bound, least = ("", None) if limit is None else limit_of(*limit)
+    peer_value = 1e3 * median(theirs)[0] if len(theirs) else None
+    least = None if least is None else 1e3 * least
+    return Row(
+        name, what, 1e3 * value, "ms", 1e3 * spread, len(ours), peer, peer_value, bound, least, target, note
+    )  # fmt: skip
+
+
+def median(values: Sequence[float]) -> tuple[float, float]:
+    """Median of the values, and the distance between their quartiles."""
+    low, middle, high = np.percentile(values, (25.0, 50.0, 75.0))
+    return float(middle), float(high - low)
+
+
+def measures(rows: Iterable[Row]) -> list[Measure]:
+    """What the gate compares: ratios of durations and exponents, much the same on another machine."""
+    found = []
+    for row in rows:
+        for figure, ratio in (("to_peer", row.to_peer), ("to_limit", row.to_limit)):
+            if row.unit == "ms" and ratio is not None:
+                found.append(Measure(f"{row.name}.{figure}", ratio, "1", "lower", TOLERANCE * ratio))
+        if row.unit == "1" and row.value is not None:
+            found.append(Measure(row.name, row.value, "1", "lower", EXPONENT_TOLERANCE))
+    return found
+
+
+def timed(call: Callable[[], T], *, warm: bool = True) -> tuple[float, T]:
+    """Time one call [s] after a pause, called once right before where it is to be warm; also its result."""
+    time.sleep(PAUSE)
+    if warm:
+        call()
+    started = time.perf_counter()
+    result = call()
+    return time.perf_counter() - started, result
+
+
+def in_turns(calls: Mapping[str, Callable[[], object]], runs: int) -> dict[str, list[float]]:
+    """Time calls [s] by name, warm, one after the other and all of them again, so often."""
+    found: dict[str, list[float]] = {name: [] for name in calls}
+    for _ in range(runs):
+        for name, call in calls.items():
+            found[name].append(timed(call)[0])
+    return found
+
+
+@cache
+def machine() -> dict[str, float]:
+    """Bandwidth of the memory [B/s] (triad a = b + s·c), arithmetic [1/s] (product of matrices), threads."""
+    a, b, c = (np.full(16_000_000, v) for v in (0.0, 1.0, 2.0))
+    M = np.random.default_rng(0).normal(size=(1500, 1500))
+    found = in_turns({"triad": lambda: _triad(a, b, c, 3.0), "product": lambda: M @ M}, 9)
+    bandwidth, arithmetic = 3 * a.nbytes / min(found["triad"]), 2 * 1500**3 / min(found["product"])
+    return {"bandwidth": bandwidth, "arithmetic": arithmetic, "threads": numba.get_num_threads()}
+
+
+@njit(parallel=True)
+def _triad(a: Array, b: Array, c: Array, s: float) -> None:
+    for i in prange(len(a)):
+        a[i] = b[i] + s * c[i]
+
+
+def limit_of(size: float, operations: float) -> tuple[str, float]:
+    """What takes longer of moving so many bytes and so many operations, and how long [s]."""
+    passing, computing = size / machine()["bandwidth"], operations / machine()["arithmetic"]
+    count, unit, seconds = (operations, "flop", computing) if computing > passing else (size, "B", passing)
+    power = min(int(np.log10(max(count, 1.0)) // 3), 3)
+    return f"{count / 1e3**power:.3g} {('', 'k', 'M', 'G')[power]}{unit}", seconds
+
+
+def _figure(value: float | None, unit: str) -> str:
+    return NOTHING if value is None else f"{_digits(value)} {'' if unit == '1' else unit}".rstrip()
+
+
+def _ratio(value: float | None) -> str:
+    """Ours in others': below one as a fraction."""
+    if value is None:
+        return NOTHING
+    return f"1/{_digits(1.0 / value)}" if 0.0 < value < 1.0 else f"{_digits(value)} ×"
+
+
+def _digits(value: float) -> str:
+    """Three digits that count, or all those before the point."""
+    return f"{value:,.0f}" if abs(value) >= 99.95 else f"{value:.3g}"

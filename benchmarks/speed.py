@@ -1,0 +1,495 @@
+"""What `bench.py` measures of the loop: the turn and its stages, a decision, the map, start-up and growth."""
+
+from __future__ import annotations
+
+import copy
+import os
+import re
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from hashing import hash_voxels
+from peers import open3d_chain, told
+from rows import PAUSE, Effort, Limit, Row, in_turns, median, timed, timed_row
+
+from caryatid import Config, Scene, SupportGraph, View, next_best_view
+from caryatid.config import SegmentationMethod, SensorConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.geometry.transforms import Array
+from caryatid.planning.decision import PlanningState
+from caryatid.planning.expected_visibility import SURFACE_SAMPLES
+from caryatid.planning.planners import make_planner
+from caryatid.planning.points_of_interest import points_of_interest
+from caryatid.robots import Robot
+from caryatid.runtime.threads import one_blas_thread
+from caryatid.segmentation.observation import MAX_POINTS, UP
+from caryatid.segmentation.segments import segment
+from caryatid.segmentation.support_plane import find_support_surface
+from caryatid.sensing.clouds import oriented_points
+from caryatid.sensing.view_sphere import ViewSphere, direction
+from caryatid.sensing.voxel_map import VoxelMap
+from caryatid.simulation.scenes import load_scene
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.world import (
+    TABLE_HEIGHT,
+    SimulatedScene,
+    Solid,
+    build_spec,
+    scene_from_spec,
+    table_top,
+)
+
+HEAP, VIEWS = "pile-10-1", 8
+"""Scene of ten objects, and views of it: the first one and the seven a median is taken of."""
+ELEVATION, GOLDEN_ANGLE = np.deg2rad(38.0), np.pi * (3.0 - np.sqrt(5.0))
+"""Elevation of the views and azimuth between consecutive ones [rad]: spreads any number all around."""
+PITCH = 0.11
+"""Between places on the table of many objects [m]: a free gap between objects of 4 to 7 cm."""
+SEGMENTATIONS: tuple[SegmentationMethod, ...] = ("auto", "labels")
+SEGMENTS = {"auto": "automatic segments", "labels": "labels given"}
+TARGETS = {"turn.auto": 0.5, "turn.labels": 0.5, "perceive.labels": 0.25}
+SHAPE_NUMBERS = 22
+"""Numbers a fitted shape is told by [1]: pose and size, and how sure each is."""
+OBJECTS, POINTS = 36, 30
+"""Objects on the table and points of interest of Algorithm 1 that a decision is about [1]."""
+PATIENCE = 90.0
+"""How long the views of growth with views may take [s]; those that were done by then count."""
+AXES = {
+    "points": "pixels of the image", "objects": "objects on the table", "views": "views seen",
+    "voxels": "voxels of the map",
+}  # fmt: skip
+IMPORT = "import time; t = time.perf_counter(); import caryatid; print(time.perf_counter() - t)"
+FIRST_VIEWS = """
+import time
+started = time.perf_counter()
+import caryatid as ct
+from caryatid.simulation import load_scene
+from caryatid.simulation.setup import make_simulation
+for segmentation in ("auto", "labels"):
+    simulation = make_simulation(load_scene("clutter"), ct.Config(), noise="carmine", seed=0)
+    scene = ct.Scene(segmentation=segmentation)
+    for _ in range(2):
+        scene.update(simulation.camera.capture(simulation.robot.T_world_camera))
+        simulation.robot.move_to(ct.next_best_view(scene, simulation.robot).T_world_camera)
+print(time.perf_counter() - started)
+"""
+"""What someone does first, in a new process; prints its duration [s]."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Recording:
+    """Views of a scene (V), where the camera truly was (V, 4, 4), and a robot that can be there."""
+
+    config: Config
+    poses: Array
+    views: tuple[View, ...]
+    robot: Robot
+
+
+def record(scene: SimulatedScene, count: int = VIEWS, sensor: SensorConfig | None = None) -> Recording:
+    """Take views from all around, with the noise and the registration error of the simulated camera."""
+    config = replace(Config(), sensor=sensor or SensorConfig())
+    simulation = make_simulation(scene, config, noise="carmine", seed=0)
+    poses = _ring(scene, simulation.robot, config, count)
+    views = tuple(simulation.camera.capture(T) for T in poses)
+    return Recording(config, poses, views, simulation.robot)
+
+
+def _ring(scene: SimulatedScene, robot: Robot, config: Config, count: int) -> Array:
+    """Poses (V, 4, 4) around the table that the robot reaches, the first where it stands."""
+    top = table_top(scene)
+    centre = np.append(top.corners_world[:, :2].mean(axis=0), top.height)
+    sphere = ViewSphere.around(centre, config.active)
+    reached = robot.candidates(sphere)
+    first = sphere.direction_of(robot.T_world_camera)
+    azimuths = np.arctan2(first[1], first[0]) + GOLDEN_ANGLE * np.arange(1, count)
+    wanted = np.stack([first, *(direction(a, ELEVATION) for a in azimuths)])
+    poses = reached.T_world_camera[np.argmax(reached.directions @ wanted.T, axis=0)]
+    poses[0] = robot.T_world_camera
+    return poses
+
+
+def table_of(count: int) -> SimulatedScene:
+    """A table with so many boxes, cylinders and balls in rows, every third one on top of another."""
+    rng = np.random.default_rng([count, 0])
+    stacked = count // 3
+    side = int(np.ceil(np.sqrt(count - stacked)))
+    places = (np.argwhere(np.ones((side, side))) - (side - 1) / 2.0) * PITCH
+    places = places[np.argsort(np.hypot(*places.T), kind="stable")][: count - stacked]
+    below = [_standing(xy, 0.0, rng, flat=k < stacked) for k, xy in enumerate(places)]
+    above = [_standing(b.T_world_object[:2, 3], b.extents[2], rng) for b in below[:stacked]]
+    name = f"table-of-{count}"
+    return scene_from_spec(build_spec([Solid(s) for s in (*below, *above)], name, (1.2, 1.2)), name, name)
+
+
+def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False) -> Shape:
+    """A shape that stands over the table at a height [m]; with `flat` one that others can stand on."""
+    turn = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    kind = rng.choice(["box", "cylinder"] if flat else ["box", "cylinder", "sphere"])
+    size = rng.uniform(0.04, 0.07, 3)
+    tall = size[0] if kind == "sphere" else size[2]
+    T = transforms.rigid(turn, (*xy, TABLE_HEIGHT + height + tall / 2.0 + 1e-4))
+    if kind == "box":
+        return Box(T, size)
+    return Cylinder(T, size[0] / 2.0, size[2]) if kind == "cylinder" else Sphere(T, size[0] / 2.0)
+
+
+def fresh(view: View, *, labels: bool = True) -> View:
+    """The view as its camera's images make it: nothing is worked out of it yet."""
+    return replace(view, labels=view.labels if labels else None)
+
+
+class Episode:
+    """A scene model that is shown a recording's views one by one, each as its images."""
+
+    def __init__(self, recording: Recording, segmentation: SegmentationMethod) -> None:
+        self.scene = Scene(recording.config, segmentation=segmentation)
+        self._robot, self._labels = copy.copy(recording.robot), segmentation == "labels"
+        self._visited: list[Array] = []
+
+    def look(self, T_world_camera: Array, view: View) -> dict[str, float]:
+        """Take in a view and choose the next one; what `turn`, `perceive`, `plan` and each stage took [s]."""
+        time.sleep(PAUSE)
+        self._robot.move_to(T_world_camera)
+        started = time.perf_counter()
+        self.scene.update(fresh(view, labels=self._labels))
+        known = time.perf_counter()
+        assert self.scene.sphere is not None
+        self._visited.append(self.scene.sphere.direction_of(T_world_camera))
+        next_best_view(self.scene, self._robot, np.array(self._visited))
+        ended = time.perf_counter()
+        whole = {"turn": ended - started, "perceive": known - started, "plan": ended - known}
+        return dict(self.scene.timings) | whole
+
+
+def measure_turns(effort: Effort) -> list[Row]:
+    """Rows of the turn, of perceiving and of the stages: ours and Open3D's chain take turns view by view.
+
+    After a warm-up all views are gone through, and then the first one alone, for its median.
+    """
+    recording = record(load_scene(HEAP))
+    chains, missing = [], ""
+    try:
+        chains = [open3d_chain(view, recording.config.cloud.max_depth) for view in recording.views]
+    except (ImportError, OSError) as error:
+        missing = told(error)
+    first: dict[str, list[dict[str, float]]] = defaultdict(list)
+    later: dict[str, list[dict[str, float]]] = defaultdict(list)
+    for repeat in range(effort.runs + 1):
+        episodes = {name: Episode(recording, name) for name in SEGMENTATIONS}
+        for k in range(len(recording.views) if repeat <= min(3, effort.runs) else 1):
+            found = first if k == 0 else later
+            took = {"chain": {"chain": timed(chains[k], warm=False)[0]}} if chains else {}
+            took |= {n: e.look(recording.poses[k], recording.views[k]) for n, e in episodes.items()}
+            for name, laps in took.items():
+                found[name] += [laps] * (repeat > 0)
+    view = recording.views[0]
+    images = view.depth.nbytes + (0 if view.rgb is None else view.rgb.nbytes)
+    rows = [
+        timed_row(
+            f"{kind}.{name}{which}",
+            f"{what}, {SEGMENTS[name]}{', first view alone' if which else ''}",
+            [laps[kind] for laps in found[name]],
+            peer="Open3D's chain",
+            theirs=[laps["chain"] for laps in found["chain"]],
+            limit=(images, 0.0),
+            target=None if which else TARGETS.get(f"{kind}.{name}"),
+            note=missing,
+        )
+        for kind, what in (("turn", "view in → next view"), ("perceive", "view in → graph"))
+        for name in SEGMENTATIONS
+        for which, found in (("", later), (".first", first))
+    ]
+    return rows + _stages(recording, later, effort)
+
+
+def _stages(recording: Recording, later: dict[str, list[dict[str, float]]], effort: Effort) -> list[Row]:
+    """Rows of the stages: those that can be called by themselves, on the first view, and the turns' own."""
+    config, view = recording.config, recording.views[0]
+    points, normals, pixels = oriented_points(view, config.cloud)
+    assert view.labels is not None
+    loose = np.flatnonzero(view.labels.ravel()[pixels] == 0)
+    loose = loose[:: max(1, len(loose) // MAX_POINTS)]
+
+    def surface() -> object:
+        return find_support_surface(
+            points[loose], normals[loose], UP, config.surface, np.random.default_rng(0)
+        )
+
+    found = find_support_surface(points[loose], normals[loose], UP, config.surface, np.random.default_rng(0))
+
+    def segments() -> object:
+        rng = np.random.default_rng(0)
+        return segment(fresh(view, labels=False), found, config.segmentation, config.cloud, config.fit, rng)
+
+    # Depth in; place, normal and pixel of each point out; six running sums and three unknowns a pixel.
+    size = view.depth.size
+    of_points = (4.0 * size + 56.0 * len(points), 64.0 * size)
+    alone: dict[str, tuple[str, Callable[[], object], Limit]] = {
+        "points": (
+            "oriented points of a view", lambda: oriented_points(fresh(view), config.cloud), of_points,
+        ),
+        "surface": ("support surface among them", surface, (48.0 * len(loose), 0.0)),
+        "parts": ("automatic segments of a view", segments, (8.0 * size, 0.0)),
+    }  # fmt: skip
+    rows = [
+        timed_row(f"stage.{name}", what, in_turns({name: call}, 3 * effort.runs)[name], limit=limit)
+        for name, (what, call, limit) in alone.items()
+    ]
+    valid, objects = float(view.valid.sum()), len(np.unique(view.labels)) - 1
+    voxels = float(np.prod(np.ceil(np.array(config.voxels.extent) / config.voxels.size)))
+    limits: dict[str, Limit] = {
+        "segment": (4.0 * size + 56.0 * valid, 64.0 * size),
+        "register": (48.0 * valid, 0.0),
+        "map": (4.0 * size + 4.0 * voxels, 0.0),
+        "fit": fit_limit(int(np.count_nonzero(view.labels[view.valid]))),
+        "infer": (8.0 * SHAPE_NUMBERS * objects, 6.0 * objects * (objects - 1)),
+        "fuse": (8.0 * SHAPE_NUMBERS * objects, 0.0),
+        "plan": plan_limit(voxels, config.active.sphere_points, config),
+    }
+    for name in SEGMENTATIONS:
+        for stage in [s for s in later[name][0] if s not in ("turn", "perceive")]:
+            what = f"{stage}, in the turn with {SEGMENTS[name]}"
+            took = [laps[stage] for laps in later[name]]
+            rows.append(timed_row(f"stage.{name}.{stage}", what, took, limit=limits.get(stage)))
+    return rows
+
+
+def fit_limit(points: int) -> Limit:
+    """Of a fit: three shapes judged once (20 operations a point), one least-squares step of nine numbers."""
+    return 48.0 * points, points * (20.0 * 3 + 20.0 + 2.0 * 9 + 9 * 10.0)
+
+
+def plan_limit(voxels: float, candidates: int, config: Config) -> Limit:
+    """Of a decision: states of the map and poses once; each sample turned to each look, 20 operations."""
+    return voxels + 152.0 * candidates, 20.0 * SURFACE_SAMPLES * config.active.look_directions
+
+
+def measure_decision(effort: Effort) -> list[Row]:
+    """Rows of one decision over the view sphere: the default planner against the field's volumetric one."""
+    recording = record(table_of(OBJECTS), 2)
+    scene, robot, config = Scene(recording.config, segmentation="labels"), recording.robot, recording.config
+    for view in recording.views:
+        scene.update(fresh(view))
+    sphere, voxels = scene.sphere, scene.voxels
+    assert sphere is not None
+    assert voxels is not None
+    robot.move_to(recording.poses[-1])
+    visited = sphere.direction_of(recording.poses)
+    graph = _with_points(scene.graph, sphere, visited, config)
+    unasked = copy.copy(robot)
+    state = PlanningState(graph, sphere, voxels, visited, robot.candidates(sphere), config.active)
+    every = replace(state, config=replace(config.active, look_directions=1_000_000))
+
+    def plan(name: str, state: PlanningState) -> Callable[[], object]:
+        planner = make_planner(name)
+        return one_blas_thread(lambda: planner.plan(state, np.random.default_rng(0)))
+
+    found = in_turns(
+        {
+            "ours": plan("support", state),
+            "theirs": plan("occlusion-aware", state),
+            "every": plan("occlusion-aware", every),
+            "reach": lambda: copy.copy(unasked).candidates(sphere),
+        },
+        effort.runs,
+    )
+    what, limit = (
+        f"one decision, {POINTS} points of interest",
+        plan_limit(voxels.hits.size, len(state.candidates), config),
+    )
+    note = (
+        f"{len(sphere.directions):,} views, {len(state.candidates):,} within reach; the planner beside it "
+        f"looks from one in {config.active.look_directions:,} directions all around"
+    )
+    return [
+        timed_row(
+            "decision", what, found["ours"], peer="the planner occlusion-aware", theirs=found["theirs"],
+            limit=limit, target=0.05, note=note,
+        ),
+        timed_row(
+            "decision.every", what, found["ours"], peer="occlusion-aware, from every view",
+            theirs=found["every"], limit=limit, note="both score every view in reach",
+        ),
+        timed_row(
+            "decision.reach", "which views the robot reaches, before it", found["reach"],
+            limit=(152.0 * len(sphere.directions), 0.0),
+        ),
+    ]  # fmt: skip
+
+
+def _with_points(graph: SupportGraph, sphere: ViewSphere, visited: Array, config: Config) -> SupportGraph:
+    """The part of a graph that has exactly `POINTS` points of interest of Algorithm 1.
+
+    An object has as many as it has supporters, and at least one. Objects are left out from the last one on,
+    supports of what is left where that is too much.
+    """
+    objects, supports = list(graph.objects), list(graph.supports)
+
+    def part(count: int) -> SupportGraph:
+        ids = {o.id for o in objects[:count]}
+        return SupportGraph(tuple(objects[:count]), tuple(s for s in supports if {*s.pair} <= ids))
+
+    def points(count: int) -> int:
+        return len(points_of_interest(part(count), sphere, visited, len(visited), config.active))
+
+    while points(len(objects) - 1) >= POINTS:
+        objects.pop()
+    while (count := points(len(objects))) > POINTS:
+        ends = [s.supported for s in part(len(objects)).supports]
+        again = next(e for e in reversed(ends) if ends.count(e) > 1)
+        supports.remove(next(s for s in reversed(supports) if s.supported == again))
+    if count < POINTS:
+        raise ValueError(f"the graph has {count} points of interest, fewer than {POINTS}")
+    return part(len(objects))
+
+
+def measure_map(effort: Effort) -> list[Row]:
+    """Rows of the map's update with a VGA view against a pass that only unprojects and hashes its points."""
+    recording = record(load_scene(HEAP), 3)
+    config, view = recording.config, recording.views[-1]
+    centre_world = recording.poses[0][:3, 3] + config.active.sphere_radius * recording.poses[0][:3, 2]
+    known = VoxelMap.around(centre_world, config.voxels)
+    for earlier in recording.views[:-1]:
+        known = known.integrate(earlier, config.cloud.max_depth)
+    size = config.voxels.size
+
+    def hash_in_numpy() -> object:
+        bare = fresh(view)
+        points_world = transforms.transform(bare.pose, bare.points_camera[bare.valid])
+        return np.unique(np.floor(points_world / size).astype(np.int64) @ (1 << 40, 1 << 20, 1))
+
+    found = in_turns(
+        {
+            "map": lambda: known.integrate(view, config.cloud.max_depth),
+            "pass": lambda: hash_voxels(view, size),
+            "numpy": one_blas_thread(hash_in_numpy),
+        },
+        3 * effort.runs,
+    )
+    what, peer = f"update of the voxel map, {size * 100.0:g} cm", "unprojecting and hashing alone"
+    count = len(hash_voxels(view, size))
+    note = (
+        f"{int(view.valid.sum()):,} points in {count:,} voxels; the map bounds its space, the pass does not"
+    )
+    limit = (4.0 * view.depth.size + 4.0 * known.hits.size, 0.0)
+    return [
+        timed_row(
+            "map", what, found["map"], peer=peer, theirs=found["pass"], limit=limit, target=3.0, note=note,
+        ),
+        timed_row("map.numpy", what, found["map"], peer=f"{peer}, in NumPy", theirs=found["numpy"]),
+    ]  # fmt: skip
+
+
+def measure_start(effort: Effort) -> list[Row]:
+    """Rows of start-up, each in a process of its own; the first run of each is the warm-up."""
+
+    def run(*arguments: str, **environment: str) -> str:
+        return subprocess.run(
+            [sys.executable, *arguments], env=os.environ | environment, capture_output=True, text=True,
+            check=True,
+        ).stdout  # fmt: skip
+
+    importing = [float(run("-c", IMPORT)) for _ in range(effort.runs + 1)][1:]
+    helping = [timed(lambda: run("-m", "caryatid", "--help"), warm=False)[0] for _ in range(effort.runs + 1)]
+    with tempfile.TemporaryDirectory() as cache:
+        runs = 1 + min(3, effort.runs)
+        cold, *warm = [float(run("-c", FIRST_VIEWS, NUMBA_CACHE_DIR=cache)) for _ in range(runs)]
+    views = "two views with automatic segments, two with labels"
+    return [
+        Row(f"start.{name}", what, median(took)[0], "s", median(took)[1], len(took), target=target)
+        for name, what, took, target in (
+            ("import", "import caryatid", importing, 0.5),
+            ("help", "caryatid --help", helping[1:], 0.4),
+            ("first", f"first use, nothing compiled: {views}", [cold], 20.0),
+            ("compile", "of it, compiling", [cold - median(warm)[0]], 20.0),
+            ("again", "the same in a new process, compiled", warm, None),
+        )
+    ]
+
+
+def measure_growth(axis: str, effort: Effort) -> list[Row]:
+    """Rows of the exponents the turn grows with along one of `AXES`, and of the memory many views take."""
+    if axis == "views":
+        return [row for name in SEGMENTATIONS for row in _over_views(name, effort.views)]
+    recordings, seen = [], effort.runs + 1
+    if axis == "points":
+        usual = SensorConfig()
+        for w in effort.widths:
+            height, focal = w * usual.height // usual.width, usual.focal * w / usual.width
+            sensor = replace(usual, width=w, height=height, focal=focal)
+            recordings.append((float(w * height), record(load_scene(HEAP), seen, sensor)))
+    elif axis == "objects":
+        recordings = [(float(n), record(table_of(n), seen)) for n in effort.objects]
+    else:
+        known = record(load_scene(HEAP), seen)
+        for edge in effort.voxels:
+            config = replace(known.config, voxels=replace(known.config.voxels, size=edge))
+            count = float(np.prod(np.ceil(np.array(config.voxels.extent) / edge)))
+            recordings.append((count, replace(known, config=config)))
+    rows = []
+    for name in SEGMENTATIONS:
+        turns = []
+        for _, recording in (recordings[0], *recordings):
+            episode = Episode(recording, name)
+            took = [episode.look(T, v)["turn"] for T, v in zip(recording.poses, recording.views, strict=True)]
+            turns.append(median(took[1:])[0])
+        rows.append(_exponent(axis, name, [size for size, _ in recordings], turns[1:]))
+    return rows
+
+
+def _exponent(axis: str, segmentation: str, sizes: Sequence[float], turns: Sequence[float]) -> Row:
+    """Exponent of the size the turn grows with: least squares on both logarithms."""
+    whole, upper = (
+        np.polyfit(np.log(sizes[k:]), np.log(turns[k:]), 1)[0] for k in (0, (len(sizes) - 1) // 2)
+    )
+    what = f"growth with {AXES[axis]}, {SEGMENTS[segmentation]}"
+    note = f"{sizes[0]:,.0f} to {sizes[-1]:,.0f}; over the upper half {upper:.2f}"
+    target = 1.1 if axis in ("objects", "views") else None
+    name = f"growth.{axis}.{segmentation}"
+    return Row(name, what, float(whole), "1", runs=len(sizes), target=target, note=note)
+
+
+def _over_views(segmentation: SegmentationMethod, views: int) -> Iterator[Row]:
+    """Rows of growth with the views seen, from the tenth on, and of peak memory, in a process of its own."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        turns, peak = pool.submit(_many_views, segmentation, views).result()
+    edges = np.unique(np.geomspace(min(10, len(turns) // 2), len(turns) + 1, 13).astype(int))
+    bins = [range(a, b) for a, b in pairwise(edges)]
+    sizes = [float(np.exp(np.mean(np.log(b)))) for b in bins]
+    row = _exponent("views", segmentation, sizes, [median([turns[v - 1] for v in b])[0] for b in bins])
+    what = f"peak memory of {views} views, {SEGMENTS[segmentation]}"
+    memory = Row(f"growth.memory.{segmentation}", what, peak, "MB", target=1024.0)
+    if len(turns) < views:
+        note = (
+            f"only {len(turns)} views were done in {PATIENCE:.0f} s: {row.value:.2f}, {peak:.0f} MB by then"
+        )
+        row, memory = replace(row, value=None, note=note), replace(memory, value=None, note=note)
+    yield from (row, memory)
+
+
+def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[float], float]:
+    """Whole turn of each of many views [s], and the peak memory of the process [MB]."""
+    scene = load_scene(HEAP)
+    episode, turns, started = Episode(record(scene, 1), segmentation), [], time.perf_counter()
+    simulation = make_simulation(scene, Config(), noise="carmine", seed=0)
+    for T_world_camera in _ring(scene, simulation.robot, Config(), views):
+        turns.append(episode.look(T_world_camera, simulation.camera.capture(T_world_camera))["turn"])
+        if time.perf_counter() - started > PATIENCE:
+            break
+    status = Path("/proc/self/status")
+    if status.is_file() and (peak := re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="ascii"))):
+        return turns, int(peak[1]) / 1024.0
+    return turns, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
