@@ -175,7 +175,7 @@ def test_a_mask_that_names_no_object(recording, refused):
 
 def test_an_object_number_that_is_none(recording, refused):
     edit(recording / "scene_gt.json", lambda d: d["0"][0].update(obj_id=0))
-    refused("explore", recording, names=recording / "scene_gt.json", says="obj_id is 0")
+    refused("explore", recording, names=recording / "scene_gt.json", says="'obj_id' is 0")
 
 
 @BOTH
