@@ -49,7 +49,7 @@ def test_the_wheel_holds_the_package_and_nothing_else(built):
     assert {name for name in names if name.startswith("caryatid/")} == {
         name.removeprefix("src/") for name in sources("src/caryatid")
     }
-    assert {"caryatid/py.typed", "caryatid/report/page.html.jinja"} <= names
+    assert {"caryatid/py.typed", "caryatid/viz/page.html.jinja"} <= names
     assert {name.split("/")[0] for name in names} == {
         "caryatid",
         f"caryatid-{caryatid.__version__}.dist-info",
