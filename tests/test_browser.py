@@ -15,6 +15,8 @@ from caryatid.viewer.controls import Controls
 from caryatid.viewer.loop import Loop
 from caryatid.viewer.page import Page
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("viser")
 pytest.importorskip("playwright")
 

@@ -255,6 +255,7 @@ def said_on(words, *, out, err, **environment):
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*[349]\d")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", ["explore nowhere --out run", "explore tower --out run --fusion k", "juggle"]
 )
@@ -266,6 +267,7 @@ def test_errors_are_coloured_for_a_person_who_has_not_said_no(words):
     assert ESCAPE not in said_on(words.split(), out=False, err=False)[1]
 
 
+@pytest.mark.slow
 def test_help_and_tables_are_plain_in_a_pipe(kept):
     for words in (["--help"], ["order", "--help"], ["order", kept / "run", *QUICK]):
         assert ESCAPE in "".join(said_on(words, out=True, err=True))
@@ -275,6 +277,7 @@ def test_help_and_tables_are_plain_in_a_pipe(kept):
         assert not COLOUR.search("".join(said_on(words, out=True, err=True, NO_COLOR="1")))
 
 
+@pytest.mark.slow
 def test_a_spinner_turns_on_a_terminal_only(kept):
     words = ["order", kept / "run", *QUICK]
     assert "rehearsing" in said_on(words, out=False, err=True)[1]

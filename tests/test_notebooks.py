@@ -9,6 +9,8 @@ from pathlib import Path
 import nbformat
 import pytest
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 MOSD = ROOT.parent / "shared/data/mosd"
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))

@@ -20,6 +20,8 @@ from conftest import SMALL, run_command
 import caryatid
 from caryatid import cli
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NOT_SOURCE = {"__pycache__", ".git", ".venv", "dist", "build", "_build"}

@@ -14,6 +14,8 @@ from caryatid.benchmark.suites import SUITES
 from caryatid.cli import benchmark
 from caryatid.planning.planners import BUILT_IN
 
+pytestmark = pytest.mark.slow
+
 BASH = """
 source "$1"; shift
 COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))

@@ -16,6 +16,7 @@ EASY = {"vertices": ["table", "a"], "edges": [{"supporter": "table", "supported"
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is absent: no ground truth to compare with")
+@pytest.mark.slow
 def test_agrees_with_the_given_ground_truth():
     given, found, common, same_kind = 0, 0, 0, 0
     for folder in sorted(SHARED.iterdir()):
