@@ -233,12 +233,12 @@ class Dismantle(ExploringCommand):
             source, steps = open_exploration(self, config, progress)
             run = _Run("dismantle", self.source, source.name, self, config, progress, writer)
             run.source, run.report = source, writer is not None
-            run.take(steps)
             scene, truth = self._simulated(source)
             order = Order((), "interrupted before an order was found")
             taken: list[Taken] = []
             strip: tuple[Figure, ...] = ()
             try:
+                run.take(steps)
                 if run.interrupted:
                     raise KeyboardInterrupt
                 graph = run.newest.graph
@@ -253,6 +253,8 @@ class Dismantle(ExploringCommand):
                     T_world_camera = run.newest.sphere.poses(run.newest.visited[:1])[0]
                     strip = draw_lifts(scene, taken, graph, T_world_camera, config)
             except KeyboardInterrupt:
+                if run.last is None:
+                    raise
                 run.interrupted = True
             names = {t.body for t in taken}
             left = [name for name in scene.object_bodies.values() if name not in names]
