@@ -8,15 +8,15 @@ import os
 import re
 import sys
 from dataclasses import fields
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from unittest.mock import patch
 
 from docutils import nodes
+from pydantic import AfterValidator
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from caryatid import cli, config
-from caryatid.config.ranges import kinds
 from caryatid.config.settings import field_docs
 
 WIDTH = 100
@@ -73,7 +73,7 @@ def table_of(stage: str) -> str:
     """Return the settings of a stage as Markdown, with what the code says of each."""
     kind = kind_of(stage)
     values = kind()
-    ranges = kinds(kind)
+    ranges = get_type_hints(kind, include_extras=True)
     reasons = field_docs(kind)
     lines = ["| setting | default | allowed | what, and why this value |", "|---|---|---|---|"]
     for field in fields(kind):
@@ -105,11 +105,22 @@ def _unit(reason: str) -> tuple[str, str]:
     return unit, reason[: match.start()] + reason[match.end() :]
 
 
+SIGNS = {"gt": ">", "ge": "≥", "lt": "<", "le": "≤"}
+
+
 def _allowed(kind: Any) -> str:
     """Say which values a type allows."""
     if get_origin(kind) is Annotated:
         plain, *rules = get_args(kind)
-        return "; ".join(filter(None, [_allowed(plain), *map(str, rules)]))
+        limits = [
+            f"{sign} {getattr(limit, name):g}"
+            for rule in rules
+            for limit in getattr(rule, "metadata", [])
+            for name, sign in SIGNS.items()
+            if hasattr(limit, name)
+        ]
+        rising = ["in rising order"] if any(isinstance(rule, AfterValidator) for rule in rules) else []
+        return "; ".join(filter(None, [_allowed(plain), ", ".join(limits), *rising]))
     if get_origin(kind) is Literal:
         return ", ".join(f"`{name}`" for name in get_args(kind))
     if get_origin(kind) is tuple:

@@ -15,7 +15,7 @@ import numpy as np
 from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 
-from caryatid.config.reporting import LiftConfig
+from caryatid.config import LiftConfig
 from caryatid.geometry.transforms import Array
 from caryatid.simulation.world import mujoco_warnings_ignored
 

@@ -1,0 +1,635 @@
+"""Every setting of caryatid: one frozen dataclass per stage, with unit and reason of each value.
+
+A value outside its range raises `pydantic.ValidationError`. Values are the paper's where it gives them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import field
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
+
+from caryatid.config.choices import FusionMethod, ShapeKind
+
+CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+def _rising(values: tuple[float, float]) -> tuple[float, float]:
+    if values[0] > values[1]:
+        raise ValueError("values should be in rising order")
+    return values
+
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Likelihood = Annotated[float, Field(gt=0, lt=1)]
+"""A probability that is neither impossible nor certain: its odds are finite."""
+Factor = Annotated[float, Field(ge=1)]
+Angle = Annotated[float, Field(ge=0, le=180)]
+Acute = Annotated[float, Field(ge=0, lt=90)]
+"""An angle whose cosine is divided by."""
+Elevation = Annotated[float, Field(ge=-90, le=90)]
+Azimuth = Annotated[float, Field(ge=-360, le=360)]
+Count = Annotated[int, Field(ge=1)]
+WholeNumber = Annotated[int, Field(ge=0)]
+Lengths = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
+"""Smallest and largest length."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class CloudConfig:
+    """From depth image to oriented points."""
+
+    max_depth: Positive = 3.0
+    """Readings beyond this are dropped [m]; the paper's working range."""
+    min_depth: NotNegative = 0.35
+    """Readings nearer than the sensor's near limit are dropped [m]."""
+    normal_window: Count = 7
+    """Largest side of the square window of the local planes [px]; 7 × 7 reduce the noise to a quarter."""
+    normal_size: Positive = 0.02
+    """The same on the surface at the median distance [m]: 7 px at 1.5 m with f = 525 px; fewer in coarse
+    images, where 7 px would span an object."""
+    edge_jump: NotNegative = 0.01
+    """A larger depth step between neighbours separates two surfaces [m]; at 1 m, growing with z²."""
+    max_slope: NotNegative = 0.004
+    """Change of inverse depth within one surface beyond edge_jump [1/m per px]; a tilt of 80° at 2.7 m."""
+    voxel: Positive = 0.005
+    """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
+    depth: Count = 5
+    """Points kept in a voxel once more than twice as many views have shown it [1]; their mean errs by less
+    than half the noise of one."""
+    neighbours: Count = 16
+    """Neighbours from which a normal of an unorganised cloud is estimated [1]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class SurfaceConfig:
+    """The support surface (table top)."""
+
+    tolerance: Positive = 0.01
+    """Distance within which a point belongs to the plane [m]; 3σ of the sensor at 1.8 m."""
+    max_tilt: Angle = 10.0
+    """How far the normal may lean from the vertical where the view has a pose [deg]."""
+    max_deviation: Angle = 25.0
+    """How far a point's normal may lean from its plane's [deg]; 3σ of normals from depth."""
+    gap: NotNegative = 0.3
+    """Parts of one plane further apart than this are two surfaces [m]; shadows of objects are narrower."""
+    min_area: NotNegative = 0.05
+    """Seen area a table has at least [m²]; more than most objects' tops."""
+    storey: NotNegative = 0.3
+    """A plane that has a table this far above it is the floor [m]."""
+    min_points: Count = 200
+    """Minimum number of inliers of a table [points]; a tenth of `min_area` at 5 mm."""
+    search: Positive = 0.05
+    """A known table is searched for within this height of where it was [m]; 5σ of registration and tilt."""
+    spacing: Positive = 0.02
+    """Spacing of its points that are kept for later views [m]; its outline needs no finer."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class RegistrationConfig:
+    """Refining the reported poses of views against each other."""
+
+    enabled: bool = True
+    """Whether poses are refined."""
+    translation: Positive = 0.01
+    """Expected error of a reported position, per axis [m]; the worst that is usual, twice the usual."""
+    rotation: Positive = 0.5
+    """Expected error of a reported orientation, per axis, about the camera [deg]."""
+    noise: Positive = 0.001
+    """Expected distance of a patch to the plane of its match, beyond the spread of their readings [m]."""
+    spacing: Positive = 0.01
+    """Size of the patches of objects that readings are averaged over [m]; a dozen pixels at 1.5 m."""
+    spacing_far: Positive = 0.03
+    """Size of the patches of the support surface [m]."""
+    sample: Count = 600
+    """Patches of a view that are matched with another view [1]."""
+    reaches: tuple[Positive, ...] = (0.1, 0.05, 0.025)
+    """Maximum distance of a match [m], coarse to fine."""
+    min_points: Count = 100
+    """Minimum number of matches that determine a pose [1]."""
+    kept: Count = 12
+    """Views that later ones are laid onto and that move with them [1]; 30° apart on a full turn."""
+    max_translation: NotNegative = 0.1
+    """A longer move is refused [m]."""
+    max_rotation: Angle = 5.0
+    """A larger turn is refused [deg]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class SegmentationConfig:
+    """Automatic segmentation by local convexity."""
+
+    stride: Count = 2
+    """Pixels between samples of the organised image; 2 keeps 6 mm at 1.5 m."""
+    margin: NotNegative = 0.05
+    """Points further than this outside the support surface's outline belong to no object on it [m]."""
+    edge_jump: Positive = 0.006
+    """A sample further than this from its neighbour's plane is another surface's [m], at 1 m and times z²."""
+    surfel: Positive = 0.015
+    """Size of the patches whose edges are judged convex or concave [m]; four times the noise at 1.5 m."""
+    crease: NotNegative = 4.0
+    """What a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at edges."""
+    step: NotNegative = 0.0035
+    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]; 2σ evened out."""
+    reach: Positive = 0.012
+    """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
+    concavity: Angle = 15.0
+    """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's 10 and noise."""
+    rise: NotNegative = 0.01
+    """Height over the tangent plane of another place of a segment from which the pair is concave [m]."""
+    min_size: Count = 40
+    """Minimum number of samples of a segment [points]."""
+    min_width: NotNegative = 0.02
+    """A segment narrower than this beside a larger one belongs to it [m]; creases are rounded so far."""
+    merge_gap: NotNegative = 0.25
+    """Segments are merged across something nearer that hides up to this much between them [m]."""
+    clearance: NotNegative = 0.008
+    """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
+    max_height: Positive = 0.6
+    """Points higher above the table belong to no object on it [m]; table-top sizes."""
+    overlap: Share = 0.3
+    """Share of a segment's points that must lie on an object for the two to be associated [1]."""
+    overlap_reach: NotNegative = 0.02
+    """Distance within which a point lies on an object [m]; 2σ of registration error of both views."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class MaskConfig:
+    """Masks of a learned segmenter."""
+
+    min_pixels: WholeNumber = 200
+    """Masks with fewer pixels, before or after smaller ones are laid over them, are left out [px]."""
+    max_share: Share = 0.4
+    """A mask of more than this share of the image is the table or what is behind it [1]."""
+    min_score: float = 0.0
+    """Masks with a lower score are left out [the segmenter's unit]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class FitConfig:
+    """Primitive fitting."""
+
+    shapes: tuple[ShapeKind, ...] = ("box", "cylinder", "sphere")
+    """Shapes that are tried; the paper's three."""
+    hypotheses: Count = 100
+    """Maximum number of RANSAC hypotheses per shape [1]."""
+    max_points: Count = 800
+    """Points by which a shape is scored [1]; 1.5 cm apart on the largest objects."""
+    search_points: Count = 250
+    """Points that the search uses, or nearly twice as many [1]; the best hypotheses are refined on all."""
+    min_points: Count = 12
+    """Minimum number of points of an object [1]; a box has nine parameters."""
+    threshold: Positive = 0.01
+    """MSAC truncation of the distance to the surface [m]; 2σ of registration error."""
+    polish: Count = 3
+    """Best hypotheses of each shape that least squares refines [1]."""
+    steps: WholeNumber = 25
+    """Maximum number of least-squares steps [1]."""
+    max_extent: Positive = 0.5
+    """Longest extent of an object on a table [m]."""
+    min_extent: Positive = 0.008
+    """Shortest extent [m]; below the sensor's resolution."""
+    max_radius: Positive = 0.15
+    """Largest radius of cylinder and sphere [m]."""
+    normal_weight: NotNegative = 0.004
+    """Cost of a normal turned by 90° in model choice [m]: half the registration error."""
+    correlated: Positive = 4.0
+    """Neighbouring points that share one error [1]; depth is smoothed over 2 × 2 pixels."""
+    registration: NotNegative = 0.002
+    """Standard deviation of registration [m], which no number of points averages out."""
+    rim: NotNegative = 0.003
+    """Standard deviation of the points' border beside a depth edge [m]: one pixel at 1.5 m."""
+    max_residual: Positive = 0.008
+    """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class SplitConfig:
+    """Model split: one automatic segment may be several objects."""
+
+    cuts: WholeNumber = 5
+    """Cuts tried along each direction [1]; a sixth of the points apart."""
+    rounds: WholeNumber = 3
+    """Iterations of assigning points to the better shape and refitting both [1]."""
+    min_points: Count = 20
+    """Thinned points a side needs [1]; 1.5 times what a shape needs."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class ExplanationConfig:
+    """Description length of points explained by shapes: the least decides between one object and two."""
+
+    parameter_cost: NotNegative = 4.5
+    """Cost of each parameter of a shape [nats]; each is known to a ninetieth of its range."""
+    outlier: NotNegative = 4.0
+    """Cost of a point that no shape explains [nats]; as likely as one 2.8σ off."""
+    irregular: NotNegative = 1.4
+    """Cost of a point on an object that is none of the shapes [nats]."""
+    normal_weight: NotNegative = 4.0
+    """Cost of a normal turned by 90° [nats]; normals, blurred over edges, are good to 30°."""
+    reading: Positive = 0.0002
+    """Surface whose points err alike [m²]; half of the 2 cm square a registration error shows in."""
+    border: NotNegative = 4.0
+    """Cost of a point with only the other object around it, on a surface without crease [nats]."""
+    free_cost: NotNegative = 0.5
+    """Cost of a voxel inside a shape that was seen free [nats]; four points off at 5 mm spacing."""
+    usual: NotNegative = 0.9
+    """Mean cost of the points around a point that is still well explained [nats]; 9 in 10 true shapes."""
+    spacing: Positive = 0.008
+    """Spacing the points are thinned to [m]; a third of the patch that errs alike."""
+    reach: Positive = 0.03
+    """Objects further apart are never merged [m]; the width of an occluder's shadow."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class CompletionConfig:
+    """How far shapes reach into unseen space below them."""
+
+    max_tilt: Angle = 30.0
+    """An unseen side that faces down within this angle may be extended [deg]; what rests on a face does."""
+    step: Positive = 0.01
+    """Step of the extension [m]; a voxel."""
+    overlap: NotNegative = 0.004
+    """Maximum penetration of the moving side into another shape [m]; the fits' uncertainty."""
+    max_free: Share = 0.15
+    """The extension ends where more of its rim lies in voxels seen free [1]; half of one side of four."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class PlausibilityConfig:
+    """Shapes that neither overlap nor float."""
+
+    rounds: WholeNumber = 3
+    """Maximum number of corrections [1]; 0 leaves shapes as they were fitted."""
+    touch: NotNegative = 0.001
+    """Largest gap or overlap of two shapes in contact [m]; round edges, soft surfaces."""
+    sigmas: NotNegative = 3.0
+    """Standard deviations of a gap beyond which the fits' uncertainty does not explain it [1]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class SupportConfig:
+    """Support relations, section III-A."""
+
+    contact_margin: NotNegative = 0.005
+    """Gap up to which two shapes are in contact, however certain both are [m]."""
+    margin_sigma: NotNegative = 2.0
+    """The same in standard deviations of the gap, if larger [1]; misses one contact in forty."""
+    max_margin: NotNegative = 0.01
+    """Shapes further apart are not in contact, however uncertain they are [m]."""
+    reach: NotNegative = 0.012
+    """Gap up to which a contact is assumed where an object would tip without it [m]; 2.5σ of the gap."""
+    gentle_tilt: Angle = 25.0
+    """Planes steeper than this, where nothing overlaps, carry only what would tip without them [deg]."""
+    max_tilt: Angle = 75.0
+    """Separating planes steeper than this carry nothing [deg]: the normal is too near the horizontal."""
+    patch_depth: NotNegative = 0.003
+    """Surface this near to the first contact counts as touching [m]; the noise of one reading at 1.5 m."""
+    min_area_ratio: Share = 0.1
+    """r_s,min of eq. 1 [1]."""
+    overhang: NotNegative = 0.003
+    """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
+    top_down: Literal["paper", "balance"] = "balance"
+    """All that rests on an unstable object holds it (`paper`), or only what weighs against its tipping."""
+    max_drop: NotNegative = 0.04
+    """How far below an unsupported object its supporter may lie, hidden gap between them [m]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class FusionConfig:
+    """Fusing graphs over views, section III-B."""
+
+    method: FusionMethod = "pc+sg"
+    """What is fused: points (`pc`), graphs (`sg`) or both (Table I)."""
+    max_distance: NotNegative = 0.05
+    """Centres further apart are two objects [m], beside half the smaller object's size."""
+    max_angle: Angle = 20.0
+    """Axes further apart are two orientations [deg], up to the shape's symmetry."""
+    max_ratio: Factor = 1.6
+    """Sorted extents that differ by more than this factor [1] are two objects."""
+    settled: NotNegative = 0.005
+    """A shape that moves, grows or turns by less than this is unchanged [m]; σ of registration error."""
+    keep_share: Share = 0.5
+    """A support is kept while occurrences / opportunities is at least this [1]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class VoxelConfig:
+    """The voxel map for the occlusion test."""
+
+    size: Positive = 0.01
+    """Edge of a voxel [m]; the paper's leaf size."""
+    extent: tuple[Positive, Positive, Positive] = (1.6, 1.6, 1.0)
+    """Size of the map around the view sphere's centre [m]: a table with its margin."""
+    below: NotNegative = 0.1
+    """How far the map reaches below the sphere's centre [m]."""
+    stride: Count = 2
+    """Pixels between the rays that are followed; 2 is 6 mm at 1.5 m, below the voxel's size."""
+    margin: NotNegative = 0.01
+    """Length before a reading that a ray does not clear [m]; depth noise within it carves no surface."""
+    hit: Likelihood = 0.7
+    """Occupancy one view with a reading in a voxel speaks for [1]; the usual sensor model."""
+    miss: Likelihood = 0.4
+    """Occupancy one view that looks through a voxel speaks for [1]; the usual sensor model."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class ActiveVisionConfig:
+    """Points of interest, view sphere and the choice of the next view, section IV."""
+
+    sphere_points: Count = 40_000
+    """Points the view sphere is discretised to; the paper's."""
+    sphere_radius: Positive = 1.5
+    """Radius of the view sphere [m]; the paper's."""
+    saliency_weight: Share = 0.75
+    """λ_s of eq. 2 [1]; the paper's."""
+    saliency: Literal["paper", "decreasing"] = "decreasing"
+    """Eq. 2 with 2π as printed, or with π so that relations seen often matter less."""
+    edge_point: Literal["midpoint", "contact"] = "contact"
+    """Where a relation's point of interest lies: the middle of the centres, or the contact patch."""
+    occlusion: Literal["invert", "ignore"] = "invert"
+    """Saliency of a point is negated where it is hidden, as in the paper; or hidden points count as seen."""
+    propagation: bool = True
+    """Saliency spreads to neighbouring views, as in the paper; or a point's nearest view alone gets it."""
+    spread: Positive = 20.0
+    """Angle on the sphere at which saliency has fallen to exp(−½) [deg]."""
+    inhibition: NotNegative = 1.0
+    """Depth of the negative bump at every visited view [1]; 0 is no inhibition of return."""
+    path_cost: Literal["angle", "path", "none"] = "path"
+    """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path halves it."""
+    max_views: Count = 10
+    """Maximum number of views, including the first; the paper's."""
+    look_directions: Count = 1200
+    """Maximum number of directions on the whole sphere that planners try [1]; about 6° apart."""
+    effort: NotNegative = 0.05
+    """Share of all unseen surface worth a path of one sphere diameter to planner `support` [1]."""
+    view_cone: Acute = 30.0
+    """Angle from the optical axis within which a point is in the image [deg]; 57° × 43° sensor."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class RobotConfig:
+    """The simulated humanoid: holonomic platform, torso lift, head with yaw and pitch."""
+
+    footprint: Positive = 0.35
+    """Radius of the platform's disc [m]."""
+    camera_height: Lengths = (1.30, 1.90)
+    """Lowest and highest camera centre over the floor [m], by the torso lift."""
+    pitch: Annotated[tuple[Elevation, Elevation], AfterValidator(_rising)] = (-60.0, 20.0)
+    """Head pitch, down to up [deg]."""
+    yaw: Annotated[tuple[Azimuth, Azimuth], AfterValidator(_rising)] = (-80.0, 80.0)
+    """Head yaw against the platform [deg]."""
+    camera_forward: NotNegative = 0.1
+    """Distance of the camera in front of the platform's centre [m]."""
+    cell: Positive = 0.05
+    """Edge of a cell of the floor grid [m]."""
+    floor: Positive = 3.0
+    """Half the side of the square of floor the robot may use, around the table [m]."""
+    head_yaws: Count = 9
+    """Head yaws tried within the limits, straight ahead first, to stand clear of an obstacle."""
+    home: tuple[Azimuth, Elevation] = (180.0, 35.0)
+    """Azimuth and elevation on the view sphere of the first view [deg]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class ArmConfig:
+    """An arm with a camera in its hand."""
+
+    base: tuple[float, float, float] = (-0.5, 0.0, 0.0)
+    """Position of a simulated arm from the middle of the table top [m]; 0.2 m beside a built-in table."""
+    base_yaw: Azimuth = 0.0
+    """Where the x axis of its base points, from the world's x towards y [deg]; 0 is over the table."""
+    radius: Lengths = (0.4, 1.0)
+    """Smallest and largest view sphere tried [m]: nearer, the camera meets what is on the table, and the hand
+    of a common arm gets no farther. Equal ends fix the radius."""
+    radius_views: Count = 400
+    """Views tried on each sphere to choose among the spheres [1]; about 10° apart."""
+    sphere_points: Count = 4000
+    """Points of the view sphere [1]; about 3° apart, a tenth of the humanoid's since reachability is slow."""
+    rolls: Count = 8
+    """Rolls of the camera about its optical axis that are tried, level first [1]; 45° apart, 1 = level."""
+    clearance: NotNegative = 0.15
+    """Minimum height of the camera over the sphere's centre [m]; lower, the hand meets the table."""
+    cell: Positive = 0.08
+    """Edge of a cell of a sampled map [m]; finer ones need more samples, by the third power."""
+    view_directions: Count = 150
+    """Viewing directions a sampled map tells apart [1]; about 16° apart."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class SensorConfig:
+    """The simulated depth camera: a Carmine 1.09's image."""
+
+    width: Count = 640
+    """Image width [px]."""
+    height: Count = 480
+    """Image height [px]."""
+    focal: Positive = 525.0
+    """Focal length [px]; the driver's nominal value."""
+    far: Positive = 10.0
+    """Surfaces deeper than this are not seen at all [m]; noise cuts readings to the sensor's own range."""
+    light: tuple[float, float, float] = (-0.4, 0.3, 0.87)
+    """Direction towards the lamp in the world; off the vertical, so that faces of a box differ."""
+    ambient: Share = 0.45
+    """Share of a surface's colour that shows without the lamp [1]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class NoiseConfig:
+    """Carmine 1.09 depth noise and registration error, method notes section 2."""
+
+    axial: tuple[NotNegative, NotNegative, NotNegative] = (0.0012, 0.0019, 0.4)
+    """(a, b, z0) of σ(z) = a + b·(z − z0)² [m]."""
+    disparity_step: Positive = 0.00285
+    """Depth is quantised in equal steps of 1/z [1/m]: 1/8 px of disparity, f = 580 px, baseline 75 mm."""
+    grazing: Angle = 80.0
+    """No return where the surface is turned away by more than this [deg]."""
+    range: Lengths = (0.35, 3.0)
+    """Nearest and farthest reading [m]."""
+    edge_jump: NotNegative = 0.03
+    """No return at pixels beside a depth step larger than this [m]."""
+    translation: NotNegative = 0.005
+    """σ of the registration error's translation, each view [m]."""
+    rotation: Angle = 0.3
+    """σ of the registration error's rotation, each view [deg]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class PhysicsConfig:
+    """Settling a simulated scene and deriving ground-truth support from physics, method notes section 4."""
+
+    rest_window: Positive = 0.25
+    """Time over which an object must stay where it is to be at rest [s]."""
+    rest_distance: Positive = 0.001
+    """Movement within the window that still is rest [m]; soft contacts creep up to 3 mm/s."""
+    rest_angle: Angle = 1.0
+    """Rotation within the window that still is rest [deg]."""
+    settle_time: NotNegative = 6.0
+    """Maximum time to settle [s]; then a scene is used as it is, at rest or not."""
+    force_share: NotNegative = 0.03
+    """Least upward part of a contact force on an object that supports it, as a share of its weight [1]."""
+    removal_time: Positive = 1.0
+    """How long the others are observed after an object is removed [s]."""
+    moved: NotNegative = 0.01
+    """An object displaced by more than this has moved [m]."""
+    turned: Angle = 8.0
+    """An object turned by more than this has moved [deg]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class EvaluationConfig:
+    """Scores against a ground truth, method notes section 5."""
+
+    min_iou: Share = 0.5
+    """Volumes or masks that overlap by at least this are the same object [1]."""
+    table_tolerance: NotNegative = 0.02
+    """The table is found when its top is within this of the true height [m]."""
+    samples: Count = 10_000
+    """Points that measure the overlap of two volumes [1]; σ is at most 0.01, 0.005 for most pairs."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class OracleConfig:
+    """The planner that knows the ground truth, method notes section 6."""
+
+    candidates: Count = 32
+    """Maximum number of views tried beside the default planner's [1]; about 20° apart, 0.7 s each."""
+    stride: Count = 2
+    """Pixels between the rays that look for true surface [1]; 6 mm at 1.5 m, below the cell's size."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class ReportConfig:
+    """The pictures of the report; nothing here changes a result."""
+
+    image_width: Count = 640
+    """Width to which camera images are reduced [px]; a report of ten views stays below 8 MB."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class StatisticsConfig:
+    """Statistics of a benchmark's episodes; nothing here changes an episode."""
+
+    resamples: Count = 2000
+    """Bootstrap resamples of the scenes [1]; the ends of an interval then move by 3 % of its half width."""
+    confidence: Likelihood = 0.95
+    """Probability with which an interval covers the true mean [1]."""
+    thresholds: tuple[Share, ...] = (0.94, 0.90)
+    """F1 for which views and path length are reported [1]; the paper's, and one nearly all methods reach."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class RecordingConfig:
+    """Which frames of a recording become views."""
+
+    max_views: Count = 30
+    """Maximum number of views [1]; those farthest apart are kept. A table is known after 5 to 10."""
+    min_distance: Positive = 0.10
+    """A view is another one when its camera has moved by this from all others [m] …"""
+    min_angle: Annotated[float, Field(gt=0, le=180)] = 10.0
+    """… or has turned by this [deg]; from 10 cm or 10° on, sides of objects come into sight."""
+    sharp_window: NotNegative = 0.5
+    """A frame's sharpness is compared with that of frames within this [s]; they show nearly the same."""
+    sharp_share: Share = 0.7
+    """Least sharpness, as a share of the sharpest within the window [1]; a camera at rest varies by 10 %."""
+    colour_gap: NotNegative = 0.02
+    """Colour belongs to a depth image when it was taken within this [s]; just over half of 1/30 s."""
+    pose_gap: Positive = 0.2
+    """Maximum time between two poses that are interpolated [s]; robots send 10 a second."""
+    min_readings: Likelihood = 0.1
+    """Least share of pixels with a depth reading [1]; a camera held too near, or at the sky, has fewer."""
+    far: Annotated[float, Field(gt=0, le=65)] = 10.0
+    """Readings farther away than this are left out [m]; beyond what RGB-D cameras measure."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class ExportConfig:
+    """What other programs need and a scene model does not hold."""
+
+    density: Positive = 600.0
+    """Density of objects [kg/m³]; that of the simulated scenes, wood or a filled carton."""
+    friction: NotNegative = 0.8
+    """Sliding friction of objects [1]; that of the simulated scenes."""
+    corners: Annotated[int, Field(ge=8)] = 48
+    """Corners of a cylinder's ends in meshes [1]; its radius is then right to 0.2 %."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class SessionConfig:
+    """Limits on views handed to a session."""
+
+    max_pixels: Count = 16_000_000
+    """Maximum number of pixels of an image [1]; several times what depth cameras have; bounds memory."""
+    max_bytes: Count = 100_000_000
+    """Maximum size of a file [bytes]; larger than any camera's image."""
+    max_coordinate: Positive = 1e4
+    """Maximum coordinate of a camera [m]; beyond it, units are wrong."""
+    common: Share = 0.25
+    """Share of what a view shows around the table that must lie where earlier views saw something [1], within
+    what registration puts right; of right poses nearly all does, even from the other side, of wrong ones a
+    fifth."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class LiftConfig:
+    """One object lifted straight up, and what counts as harm to the others."""
+
+    speed: Positive = 0.1
+    """Speed of the lift [m/s]; a careful arm's."""
+    watch: NotNegative = 2.0
+    """How long the others are observed after the lift [s]; long enough for slow tipping."""
+    moved: NotNegative = 0.02
+    """An object displaced by more than this has been disturbed [m]: it slid or fell, and did not settle."""
+    turned: Angle = 15.0
+    """An object turned by more than this has been disturbed [deg]."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class RehearsalConfig:
+    """Lifts simulated on the extracted shapes before they are done."""
+
+    draws: Count = 8
+    """Scenes that a lift is rehearsed in [1]: the shapes as extracted, and others as likely by their
+    uncertainty; a risk of a third shows in one of eight with 96 %."""
+    friction: Lengths = (0.4, 1.0)
+    """Sliding friction is drawn from this range [1]: wood on cardboard to rubber on glass."""
+    density: Lengths = (300.0, 1200.0)
+    """Density of each object is drawn from this range [kg/m³]: half-empty packets to full bottles."""
+    settling: NotNegative = 0.5
+    """Time the extracted shapes get to settle [s]; gaps of a millimetre close at once."""
+
+
+@dataclass(frozen=True, slots=True, config=CHECKED)
+class Config:
+    """All stages."""
+
+    cloud: CloudConfig = field(default_factory=CloudConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
+    explanation: ExplanationConfig = field(default_factory=ExplanationConfig)
+    completion: CompletionConfig = field(default_factory=CompletionConfig)
+    plausibility: PlausibilityConfig = field(default_factory=PlausibilityConfig)
+    support: SupportConfig = field(default_factory=SupportConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    voxels: VoxelConfig = field(default_factory=VoxelConfig)
+    active: ActiveVisionConfig = field(default_factory=ActiveVisionConfig)
+    robot: RobotConfig = field(default_factory=RobotConfig)
+    arm: ArmConfig = field(default_factory=ArmConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    sensor: SensorConfig = field(default_factory=SensorConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    rehearsal: RehearsalConfig = field(default_factory=RehearsalConfig)
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
+    export: ExportConfig = field(default_factory=ExportConfig)
+    report: ReportConfig = field(default_factory=ReportConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    oracle: OracleConfig = field(default_factory=OracleConfig)
+    session: SessionConfig = field(default_factory=SessionConfig)
