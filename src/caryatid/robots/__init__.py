@@ -1,4 +1,4 @@
-"""Robots that carry the camera: the protocol, and `find_robot` for those of a simulated scene by name."""
+"""Robots that carry the camera: `find_robot` finds what makes one by its name."""
 
 from __future__ import annotations
 
@@ -7,16 +7,28 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from caryatid.errors import InputError, PlanningError
+from caryatid.robots.protocol import (
+    OwnViews,
+    Posture,
+    Robot,
+    Unreachable,
+    refusal_of,
+    view_sphere_of,
+)
 
 if TYPE_CHECKING:
     from caryatid.config import Config, RobotConfig
     from caryatid.geometry.transforms import Array
-    from caryatid.planning.candidates import Candidates
     from caryatid.robots.floor import FloorGrid
     from caryatid.sensing.view_sphere import ViewSphere
+
+__all__ = [
+    "OwnViews", "Posture", "Robot", "RobotMaker", "Surroundings", "Unreachable", "find_robot", "home_view",
+    "located", "offered", "refusal_of", "view_sphere_of",
+]  # fmt: skip
 
 HUMANOID = "humanoid"
 """The robot of the paper, and the default."""
@@ -26,84 +38,6 @@ ARM = "arm:"
 
 ENTRY_POINTS = "caryatid.robots"
 """Group under which other packages offer robots: callables that make one for `Surroundings`."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Posture:
-    """How the robot holds its camera at a pose.
-
-    Attributes:
-        platform_world: Platform (3,): x, y, yaw [m, m, rad].
-        camera_height: Height of the camera centre over the floor [m], set by the torso lift.
-        head_yaw: Against the platform, to the left [rad].
-        head_pitch: Upwards [rad].
-    """
-
-    platform_world: Array
-    camera_height: float
-    head_yaw: float
-    head_pitch: float
-
-
-@dataclass(frozen=True, slots=True)
-class Unreachable:
-    """No posture.
-
-    Attributes:
-        reason: Why, for a person to read.
-    """
-
-    reason: str
-
-
-class Robot(Protocol):
-    """What carries the camera; one with views of its own is an `OwnViews` too."""
-
-    @property
-    def T_world_camera(self) -> Array:
-        """Where the camera is now (4, 4)."""
-        ...
-
-    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot."""
-        ...
-
-    def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Return the views of the sphere that can be reached."""
-        ...
-
-    def move_to(self, T_world_camera: Array) -> float:
-        """Go to a pose (4, 4) of the camera and return the length of the way [m].
-
-        Raises:
-            PlanningError: The pose cannot be reached.
-        """
-        ...
-
-
-class OwnViews:
-    """What a robot may say beyond `Robot`: one that inherits this is asked, another is not."""
-
-    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
-        """Say on which sphere this robot's views lie: radius, centre and points.
-
-        What is asked twice, also about its own answer, is answered with the same sphere.
-
-        Args:
-            proposed: The sphere of the settings around the middle of the table top.
-
-        Returns:
-            The proposed one, unless a robot says otherwise.
-        """
-        return proposed
-
-    def confirm(self, T_world_camera: Array) -> Unreachable | None:
-        """Say why a candidate (4, 4) that was chosen cannot be taken after all; then another one is chosen.
-
-        Returns:
-            None, go ahead, unless a robot says otherwise.
-        """
-        return None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -178,16 +112,6 @@ def find_robot(name: str) -> RobotMaker:
 def located(name: str) -> str:
     """Return a robot's name with the file in it as an absolute path, for use from other folders."""
     return f"{ARM}{Path(name.removeprefix(ARM)).resolve()}" if name.startswith(ARM) else name
-
-
-def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
-    """Return the sphere a robot's views lie on: its own where it inherits `OwnViews`, else the proposed."""
-    return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
-
-
-def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
-    """Why a robot that inherits `OwnViews` does not take a candidate (4, 4) on a closer look, or None."""
-    return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
 
 
 def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:

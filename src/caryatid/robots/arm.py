@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import ArmConfig
-from caryatid.errors import InputError, PlanningError
+from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
-from caryatid.robots import OwnViews, Posture, Unreachable
 from caryatid.robots.floor import FloorGrid
+from caryatid.robots.protocol import OwnViews, Posture, SimulatedRobot, Unreachable, count_reasons, posture_at
 from caryatid.sensing.view_sphere import ViewSphere
 
 Reachable = Callable[[Array], NDArray[np.bool_]]
@@ -38,15 +38,17 @@ RADIUS_SHARE = 0.65
 away a view shows more of the table, and the nearest spheres show too little of it."""
 
 
-class ArmRobot(OwnViews):
+class ArmRobot(SimulatedRobot, OwnViews):
     """An arm that stands still, in simulation or as the plan for a real one.
 
     The views of its sphere look at the centre. Each is tried level first and then rolled about the optical
     axis, nearest to level first, since a picture shows the same however it is turned and a wrist seldom holds
     a camera level everywhere; the candidate is the pose with the first roll that the hand reaches.
 
-    The way to a view is the straight line between the camera's positions [m]. Between two views of one sphere
+    The path to a view is the straight line between the camera's positions. Between two views of one sphere
     that is its diameter times sin(α/2), α the angle at the centre: the cost of eq. 3 of the paper.
+
+    For a real arm: inherit, have the arm go there in `move_to`, and then call that of this class.
 
     Args:
         reachable: Which poses the hand can bring the camera to, in the frame of the arm's base: inverse
@@ -59,11 +61,14 @@ class ArmRobot(OwnViews):
         centre_world: Centre (3,) of its view sphere [m], or None for the middle of the table top.
         furniture: Knows the walls no view may look through, or None.
         T_world_camera: Where its camera is (4, 4), or None while it has not been put anywhere; then any view
-            is reached by a way of length 0.
+            is reached by a path of length 0.
 
     Raises:
         InputError: A pose is no rigid transform.
     """
+
+    nowhere = "the camera is nowhere yet; move the arm to a first view"
+    carrier = "camera"
 
     def __init__(
         self,
@@ -82,22 +87,10 @@ class ArmRobot(OwnViews):
         self._centre = None if centre_world is None else np.array(centre_world, dtype=np.float64)
         self._confirm = confirm
         self._furniture = furniture
-        self._T_world_camera: Array | None = None
         self._sphere: ViewSphere | None = None
         self._offer: tuple[ViewSphere, Candidates] | None = None
         if T_world_camera is not None:
             self._T_world_camera = transforms.as_rigid(T_world_camera, "T_world_camera").copy()
-
-    @property
-    def T_world_camera(self) -> Array:
-        """Where the camera is now (4, 4).
-
-        Raises:
-            PlanningError: The arm has not been put anywhere.
-        """
-        if self._T_world_camera is None:
-            raise PlanningError("the camera is nowhere yet; move the arm to a first view")
-        return self._T_world_camera
 
     def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
         """Choose the largest radius at which about as many views are within reach as at any other.
@@ -136,22 +129,18 @@ class ArmRobot(OwnViews):
         is_there = here is not None and np.array_equal(T, here)
         if not is_there and (refused := self.confirm(T)) is not None:
             return refused
-        x_base, forward = self.T_world_base[:3, 0], T[:3, 2]
-        base_yaw = float(np.arctan2(x_base[1], x_base[0]))
-        turn = float(np.arctan2(forward[1], forward[0])) - base_yaw
-        pitch = float(np.arcsin(np.clip(forward[2], -1.0, 1.0)))
-        base = np.array([*self.T_world_base[:2, 3], base_yaw])
-        return Posture(base, float(T[2, 3]), float(np.arctan2(np.sin(turn), np.cos(turn))), pitch)
+        base_yaw = float(np.arctan2(*self.T_world_base[[1, 0], 0]))
+        return posture_at(T, np.array([*self.T_world_base[:2, 3], base_yaw]))
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the views of the sphere within reach, clear of the table, that see its centre past walls.
 
-        They are found once for a sphere; then only the ways are.
+        They are found once for a sphere; then only the path lengths are.
         """
         if self._offer is None or self._offer[0] is not sphere:
             self._offer = sphere, self._offered(sphere)
         views = self._offer[1]
-        return views.from_elsewhere(self._way(views.T_world_camera))
+        return views.from_elsewhere(self._distances(views.T_world_camera))
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
         """Look closer whether the arm can go to a candidate (4, 4); None = it can."""
@@ -159,20 +148,9 @@ class ArmRobot(OwnViews):
             return None
         return Unreachable(UNCONFIRMED)
 
-    def move_to(self, T_world_camera: Array) -> float:
-        """Go there and return the straight distance from where the camera was [m].
-
-        For a real arm: inherit, have the arm go there, and then call this.
-
-        Raises:
-            PlanningError: The hand does not reach the pose.
-        """
-        posture = self.solve(T_world_camera)
-        if isinstance(posture, Unreachable):
-            raise PlanningError(f"the camera cannot go to this view: {posture.reason}")
-        length = float(self._way(T_world_camera[None])[0])
-        self._T_world_camera = np.array(T_world_camera, dtype=np.float64)
-        return length
+    def _go(self, posture: Posture, T_world_camera: Array) -> float:
+        """The straight distance from where the camera was [m]."""
+        return float(self._distances(T_world_camera[None])[0])
 
     def _radius_around(self, centre_world: Array) -> float:
         config = self._config
@@ -186,8 +164,8 @@ class ArmRobot(OwnViews):
     def _sphere_around(self, centre_world: Array, radius: float, count: int) -> ViewSphere:
         return ViewSphere(centre_world, radius, transforms.rotate(self.T_world_base, fibonacci_sphere(count)))
 
-    def _way(self, T_world_camera: Array) -> Array:
-        """Length (N,) [m] of the way to poses (N, 4, 4)."""
+    def _distances(self, T_world_camera: Array) -> Array:
+        """Straight distance (N,) [m] from the camera to poses (N, 4, 4)."""
         if self._T_world_camera is None:
             return np.zeros(len(T_world_camera))
         return np.linalg.norm(T_world_camera[:, :3, 3] - self._T_world_camera[:3, 3], axis=1)
@@ -198,9 +176,7 @@ class ArmRobot(OwnViews):
         left = np.flatnonzero(code < 0)
         held, reached = self._in_some_roll(poses[left])
         code[left[~reached]] = 2
-        counts = np.bincount(code + 1, minlength=len(REASONS) + 1)[1:]
-        rejected = {reason: int(n) for reason, n in zip(REASONS, counts, strict=True) if n}
-        good = left[reached]
+        rejected, good = count_reasons(code, REASONS), left[reached]
         return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
 
     def _refused(self, T_world_camera: Array, target_world: Array | None) -> NDArray[np.intp]:

@@ -114,12 +114,12 @@ class FloorGrid:
         return np.where(inside, row * width + column, 0), inside
 
     def path_lengths(self, start_world: ArrayLike) -> Array:
-        """Length [m] of the shortest way over the floor from a point (x, y) to each cell, by one Dijkstra.
+        """Length [m] of the shortest path over the floor from a point (x, y) to each cell, by one Dijkstra.
 
         A platform that stands beside the free cells (because the grid is coarse) starts at the nearest one.
 
         Returns:
-            (H, W), inf where no way leads.
+            (H, W), inf where no path leads.
         """
         lengths = np.full(self.free.shape, np.inf)
         if not self.free.any():

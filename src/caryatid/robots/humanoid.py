@@ -1,4 +1,4 @@
-"""Which camera poses a robot can reach, how it would stand there, and how far the way is."""
+"""Which camera poses a robot can reach, how it would stand there, and how long the path is."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import RobotConfig
-from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
-from caryatid.robots import Posture, Unreachable
 from caryatid.robots.floor import FloorGrid
+from caryatid.robots.protocol import Posture, SimulatedRobot, Unreachable, count_reasons
 from caryatid.sensing.view_sphere import ViewSphere
 
 REASONS = (
@@ -32,14 +31,14 @@ MAX_ROLL = 0.5
 """Camera roll beyond this cannot be reached, the head has no third joint [deg]."""
 
 
-class HumanoidRobot:
+class HumanoidRobot(SimulatedRobot):
     """A humanoid of ARMAR-6's kind in simulation: holonomic platform, torso lift, head with yaw and pitch.
 
     Args:
         floor: Where it may drive, and the furniture it knows of.
         config: Its limits.
         T_world_camera: Where its camera is (4, 4), or None while it has not been put anywhere; then any
-            place is reached by a way of length 0.
+            place is reached by a path of length 0.
 
     Raises:
         PlanningError: It cannot stand at that pose.
@@ -48,22 +47,10 @@ class HumanoidRobot:
     def __init__(self, floor: FloorGrid, config: RobotConfig, T_world_camera: Array | None = None) -> None:
         self._floor = floor
         self._config = config
-        self._T_world_camera: Array | None = None
         self._path_lengths = np.where(floor.free, 0.0, np.inf)
         self._offer: _Offer | None = None
         if T_world_camera is not None:
             self.move_to(T_world_camera)
-
-    @property
-    def T_world_camera(self) -> Array:
-        """Where the camera is now (4, 4).
-
-        Raises:
-            PlanningError: The robot has not been put anywhere.
-        """
-        if self._T_world_camera is None:
-            raise PlanningError("the robot stands nowhere yet; move it to a first view")
-        return self._T_world_camera
 
     def solve(self, T_world_camera: Array, target_world: Array | None = None) -> Posture | Unreachable:
         """Say how the robot would stand with its camera at a pose, or why it cannot.
@@ -83,44 +70,36 @@ class HumanoidRobot:
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the views of the sphere that can be reached and see its centre past the furniture.
 
-        They are found anew for another sphere, or where ways lead to other places; else only the ways are.
+        They are found anew for another sphere, or where other cells can be reached; else only their paths.
         """
         lengths = self._path_lengths.ravel()
-        led_to = np.isfinite(lengths)
+        reached = np.isfinite(lengths)
         offer = self._offer
-        if offer is None or offer.sphere is not sphere or not np.array_equal(offer.led_to, led_to):
-            offer = self._offer = self._offered(sphere, led_to)
+        if offer is None or offer.sphere is not sphere or not np.array_equal(offer.reached, reached):
+            offer = self._offer = self._offered(sphere, reached)
         return offer.candidates.from_elsewhere(lengths[offer.cells])
 
-    def _offered(self, sphere: ViewSphere, led_to: NDArray[np.bool_]) -> _Offer:
+    def _offered(self, sphere: ViewSphere, reached: NDArray[np.bool_]) -> _Offer:
         height = sphere.positions_world[:, 2]
         low, high = self._config.camera_height
         indices = np.flatnonzero((height >= low) & (height <= high))
         poses = sphere.poses(sphere.directions[indices])
         reach = self._reach(poses, sphere.centre_world)
-        counts = np.bincount(reach.code + 1, minlength=len(REASONS) + 1)[1:]
-        counts[:2] += (height < low).sum(), (height > high).sum()
-        rejected = {reason: int(n) for reason, n in zip(REASONS, counts, strict=True) if n}
+        code = np.where(height < low, 0, 1)
+        code[indices] = reach.code
         good = reach.code < 0
         cells = reach.cell[good]
         lengths = self._path_lengths.ravel()[cells]
         directions = sphere.directions[indices[good]]
+        rejected = count_reasons(code, REASONS)
         candidates = Candidates(poses[good], directions, lengths, rejected, indices[good])
-        return _Offer(sphere, led_to, candidates, cells)
+        return _Offer(sphere, reached, candidates, cells)
 
-    def move_to(self, T_world_camera: Array) -> float:
-        """Go there and return the length of the way over the floor [m].
-
-        Raises:
-            PlanningError: The pose cannot be reached.
-        """
-        posture = self.solve(T_world_camera)
-        if isinstance(posture, Unreachable):
-            raise PlanningError(f"the robot cannot go to this view: {posture.reason}")
+    def _go(self, posture: Posture, T_world_camera: Array) -> float:
+        """Path length over the floor [m]; from there on path lengths begin there."""
         cell, _ = self._floor.cells(posture.platform_world[None])
         length = float(self._path_lengths.ravel()[cell[0]])
         self._path_lengths = self._floor.path_lengths(posture.platform_world)
-        self._T_world_camera = np.array(T_world_camera, dtype=np.float64)
         return length
 
     def _reach(self, T_world_camera: Array, target_world: Array | None) -> _Reach:
@@ -207,9 +186,9 @@ class _Reach:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Offer:
-    """What can be reached of a sphere while ways lead to the same cells, and the cell of each view (N,)."""
+    """What can be reached of a sphere while paths lead to the same cells, and the cell of each view (N,)."""
 
     sphere: ViewSphere
-    led_to: NDArray[np.bool_]
+    reached: NDArray[np.bool_]
     candidates: Candidates
     cells: NDArray[np.intp]

@@ -219,15 +219,19 @@ def _checked_map(held: dict[str, Any], file: Path) -> ReachabilityMap:
         raise InputError(file, f"holds no {missing[0]}", REMEDY)
     if held["version"].shape != () or held["version"] != VERSION:
         raise InputError(file, f"has version {held['version']}, not {VERSION}", REMEDY)
-    reached, origin = held["reached"], held["origin_base"]
+    reached = held["reached"]
     if reached.ndim != 4 or reached.dtype != np.uint8 or reached.size == 0:
-        raise InputError(
-            file, f"its map is {reached.dtype} of shape {reached.shape}, not uint8 (X, Y, Z, D)", REMEDY
-        )
-    numbers = [("origin_base", origin, (3,)), ("cell", held["cell"], ()), ("fresh", held["fresh"], ())]
-    for name, value, shape in numbers:
+        found = f"{reached.dtype} of shape {reached.shape}"
+        raise InputError(file, f"its map is {found}, not uint8 (X, Y, Z, D)", REMEDY)
+    for name, shape in (("origin_base", (3,)), ("cell", ()), ("fresh", ())):
+        value = held[name]
         if value.shape != shape or value.dtype.kind != "f" or not np.isfinite(value).all():
             raise InputError(file, f"its {name} is not a finite number of shape {shape}", REMEDY)
     if held["cell"] <= 0.0:
         raise InputError(file, f"its cells are {held['cell']:g} m wide", REMEDY)
-    return ReachabilityMap(reached, origin.astype(np.float64), float(held["cell"]), float(held["fresh"]))
+    origin_base, cell, fresh = (
+        held["origin_base"].astype(np.float64),
+        float(held["cell"]),
+        float(held["fresh"]),
+    )
+    return ReachabilityMap(reached, origin_base, cell, fresh)

@@ -6,20 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from caryatid.errors import InputError, PlanningError
+from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.datasets import Dataset
 from caryatid.planning.candidates import Candidates
-from caryatid.robots import Posture, Unreachable
+from caryatid.robots.protocol import Posture, SimulatedRobot, Unreachable, posture_at
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
 
-SAME_POSITION, SAME_ANGLE = 1e-3, 2e-3
-"""Poses nearer than this [m], [rad] are the same recorded view."""
 
-
-class RecordingRobot:
+class RecordingRobot(SimulatedRobot):
     """Reaches each view of a recording once.
 
     Args:
@@ -43,11 +40,11 @@ class RecordingRobot:
         return self._recorded[self._used[-1]]
 
     def index_of(self, T_world_camera: Array) -> int | None:
-        """Which recorded view has this pose (4, 4); of several the first that has not been used."""
+        """Which recorded view has this pose (4, 4) to 1 mm and 2 mrad; of several the first not used yet."""
         distance = np.linalg.norm(self._recorded[:, :3, 3] - T_world_camera[:3, 3], axis=-1)
         cosine = (np.einsum("nij,ij->n", self._recorded[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
         angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-        same = np.flatnonzero((distance <= SAME_POSITION) & (angle <= SAME_ANGLE))
+        same = np.flatnonzero((distance <= 1e-3) & (angle <= 2e-3))
         unused = [int(i) for i in same if i not in self._used]
         return unused[0] if unused else (int(same[0]) if len(same) else None)
 
@@ -64,33 +61,23 @@ class RecordingRobot:
         if index in self._used:
             return Unreachable(f"view {index} of the recording has already been used")
         forward = T[:3, 2]
-        yaw = float(np.arctan2(forward[1], forward[0]))
-        pitch = float(np.arcsin(np.clip(forward[2], -1.0, 1.0)))
-        return Posture(np.array([T[0, 3], T[1, 3], yaw]), float(T[2, 3]), 0.0, pitch)
+        return posture_at(T, np.array([T[0, 3], T[1, 3], np.arctan2(forward[1], forward[0])]))
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Return the recorded views that have not been used; the way is the straight line between cameras."""
+        """Return the recorded views that have not been used; paths are straight lines between cameras."""
         left = np.setdiff1d(np.arange(len(self._recorded)), self._used)
         poses = self._recorded[left]
-        way = np.linalg.norm(poses[:, :3, 3] - self.T_world_camera[:3, 3], axis=-1)
+        path_length = np.linalg.norm(poses[:, :3, 3] - self.T_world_camera[:3, 3], axis=-1)
         nowhere = len(sphere.directions)
         rejected = {"already used": len(self._used), "the recording has no view from there": nowhere}
-        return Candidates(poses, sphere.direction_of(poses), way, rejected)
+        return Candidates(poses, sphere.direction_of(poses), path_length, rejected)
 
-    def move_to(self, T_world_camera: Array) -> float:
-        """Go on to a recorded view and return the straight distance [m].
-
-        Raises:
-            PlanningError: The recording has no such view, or it has been used.
-        """
-        posture = self.solve(T_world_camera)
-        if isinstance(posture, Unreachable):
-            raise PlanningError(f"the camera cannot go to this view: {posture.reason}")
-        index = self.index_of(T_world_camera)
+    def _go(self, posture: Posture, T_world_camera: Array) -> float:
+        """The straight distance to a recorded view [m], which is then used."""
+        before, index = self.T_world_camera, self.index_of(T_world_camera)
         assert index is not None
-        length = float(np.linalg.norm(self._recorded[index, :3, 3] - self.T_world_camera[:3, 3]))
         self._used.append(index)
-        return length
+        return float(np.linalg.norm(self.T_world_camera[:3, 3] - before[:3, 3]))
 
 
 class RecordingCamera:

@@ -1,0 +1,157 @@
+"""What carries the camera: the `Robot` protocol, its answers, and what robots in simulation share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+from caryatid.errors import PlanningError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from caryatid.geometry.transforms import Array
+    from caryatid.planning.candidates import Candidates
+    from caryatid.sensing.view_sphere import ViewSphere
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Posture:
+    """How the robot holds its camera at a pose.
+
+    Attributes:
+        platform_world: Platform (3,): x, y, yaw [m, m, rad].
+        camera_height: Height of the camera centre over the floor [m], set by the torso lift.
+        head_yaw: Against the platform, to the left [rad].
+        head_pitch: Upwards [rad].
+    """
+
+    platform_world: Array
+    camera_height: float
+    head_yaw: float
+    head_pitch: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unreachable:
+    """No posture.
+
+    Attributes:
+        reason: Why, for a person to read.
+    """
+
+    reason: str
+
+
+class Robot(Protocol):
+    """What carries the camera; one with views of its own is an `OwnViews` too."""
+
+    @property
+    def T_world_camera(self) -> Array:
+        """Where the camera is now (4, 4)."""
+        ...
+
+    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
+        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot."""
+        ...
+
+    def candidates(self, sphere: ViewSphere) -> Candidates:
+        """Return the views of the sphere that can be reached."""
+        ...
+
+    def move_to(self, T_world_camera: Array) -> float:
+        """Go to a pose (4, 4) of the camera and return the path length [m].
+
+        Raises:
+            PlanningError: The pose cannot be reached.
+        """
+        ...
+
+
+class OwnViews:
+    """What a robot may say beyond `Robot`: one that inherits this is asked, another is not."""
+
+    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
+        """Say on which sphere this robot's views lie: radius, centre and points.
+
+        What is asked twice, also about its own answer, is answered with the same sphere.
+
+        Args:
+            proposed: The sphere of the settings around the middle of the table top.
+
+        Returns:
+            The proposed one, unless a robot says otherwise.
+        """
+        return proposed
+
+    def confirm(self, T_world_camera: Array) -> Unreachable | None:
+        """Say why a candidate (4, 4) that was chosen cannot be taken after all; then another one is chosen.
+
+        Returns:
+            None, go ahead, unless a robot says otherwise.
+        """
+        return None
+
+
+class SimulatedRobot(Robot):
+    """What robots in simulation share: where the camera is, and going on from there."""
+
+    carrier = "robot"
+    nowhere = "the robot stands nowhere yet; move it to a first view"
+    _T_world_camera: Array | None = None
+
+    @property
+    def T_world_camera(self) -> Array:
+        """Where the camera is now (4, 4).
+
+        Raises:
+            PlanningError: It has not been put anywhere.
+        """
+        if self._T_world_camera is None:
+            raise PlanningError(self.nowhere)
+        return self._T_world_camera
+
+    def _go(self, posture: Posture, T_world_camera: Array) -> float:
+        """Take a posture that `solve` gave; return the path length [m] from where the robot was."""
+        raise NotImplementedError
+
+    def move_to(self, T_world_camera: Array) -> float:
+        """Go there and return the path length [m].
+
+        Raises:
+            PlanningError: The pose cannot be reached.
+        """
+        posture = self.solve(T_world_camera)
+        if isinstance(posture, Unreachable):
+            raise PlanningError(f"the {self.carrier} cannot go to this view: {posture.reason}")
+        length = self._go(posture, T_world_camera)
+        self._T_world_camera = T_world_camera.copy()
+        return length
+
+
+def posture_at(T_world_camera: Array, platform_world: Array) -> Posture:
+    """Posture of a level camera at a pose (4, 4) above a platform (3,): its gaze as yaw and pitch."""
+    x, y, z = T_world_camera[:3, 2].tolist()
+    turn = math.atan2(y, x) - float(platform_world[2])
+    head_yaw = math.atan2(math.sin(turn), math.cos(turn))
+    pitch = math.asin(min(max(z, -1.0), 1.0))
+    return Posture(platform_world, float(T_world_camera[2, 3]), head_yaw, pitch)
+
+
+def count_reasons(code: NDArray[np.intp], reasons: Sequence[str]) -> dict[str, int]:
+    """How many of N views were refused for each reason, by its index (N,) for each view; −1 = not refused."""
+    counts = {reason: int((code == index).sum()) for index, reason in enumerate(reasons)}
+    return {reason: count for reason, count in counts.items() if count}
+
+
+def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
+    """Return the sphere a robot's views lie on: its own where it inherits `OwnViews`, else the proposed."""
+    return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
+
+
+def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
+    """Why a robot that inherits `OwnViews` does not take a candidate (4, 4) on a closer look, or None."""
+    return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
