@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from caryatid.geometry import transforms
 from caryatid.geometry.rays import Grid, room, traverse
@@ -17,48 +14,8 @@ from caryatid.sensing.views import View
 
 SHARES = 64
 """Parts the work is dealt out to in turn, so that every thread has as much to do [1]."""
-EYES = 128
-"""Cameras of one piece of work, all with one point [1]."""
-SPACING = 0.01
-"""Spacing of the points on a shape that are looked for in the view [m]."""
 BEHIND = 0.02
-"""A reading this far behind such a point contradicts it [m]; 2σ of registration and depth together."""
-CONTRADICTING = 0.5
-"""Share of the points that must be contradicted for the view to speak against the object [1]."""
-
-
-class Sights(NamedTuple):
-    """Points in a scene and the cameras that may see them.
-
-    Attributes:
-        solid: What blocks lines of sight (X, Y, Z), not 0 = solid.
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        size: Edge of a voxel [m].
-        points: (P, 3) [m].
-        normals: Outward unit normals (P, 3); zero where a point looks the same from all sides.
-        before: How well each has been shown (P,), from 0 to 1.
-        weights: Worth (P,) of showing each fully.
-        eyes: Camera centres (3, C) [m].
-        axes: Optical axes (3, C), unit.
-        clearance: Length of a line of sight's beginning at the point that does not count [m].
-        good: Cosine of the angle to the normal up to which a point is shown fully.
-        cone: Least cosine of the angle to the optical axis within the image.
-        worth: Of what each camera shows of each point anew (P, C); written to.
-    """
-
-    solid: Grid
-    origin: Array
-    size: float
-    points: Array
-    normals: Array
-    before: Array
-    weights: Array
-    eyes: Array
-    axes: Array
-    clearance: float
-    good: float
-    cone: float
-    worth: Array
+"""A reading this far behind a point contradicts it [m]; 2σ of registration and depth together."""
 
 
 def shown(
@@ -78,40 +35,51 @@ def shown(
     """Worth of what each camera shows of each point anew.
 
     A camera shows a point as well as the cosine of the angle to its normal over `good`, fully beyond that;
-    not at all where the point lies outside its image or the line of sight is blocked. The arguments are as
-    in `Sights`.
+    not at all where the point lies outside its image or the line of sight is blocked.
+
+    Args:
+        solid: What blocks lines of sight (X, Y, Z), not 0 = solid.
+        origin: Corner (3,) [m] of voxel [0, 0, 0].
+        size: Edge of a voxel [m].
+        points: (P, 3) [m].
+        normals: Outward unit normals (P, 3); zero where a point looks the same from all sides.
+        before: How well each has been shown (P,), from 0 to 1.
+        weights: Worth (P,) of showing each fully.
+        eyes: Camera centres (3, C) [m].
+        axes: Optical axes (3, C), unit.
+        clearance: Length of a line of sight's beginning at the point that does not count [m].
+        good: Cosine of the angle to the normal up to which a point is shown fully.
+        cone: Least cosine of the angle to the optical axis within the image.
 
     Returns:
         (P, C): weight · (how well it is shown − how well before), 0 where that is less.
     """
     worth = np.empty((len(points), eyes.shape[1]))
-    sights = Sights(
-        solid, origin, size, points, normals, before, weights, eyes, axes, clearance, good, cone, worth
-    )
-    for_each(show, SHARES, sights)
+    samples, cameras = (points, normals, before, weights), (eyes, axes, clearance, good, cone)
+    for_each(_show, SHARES, (solid, origin, 1.0 / size, *samples, *cameras, worth))
     return worth
 
 
 @njit(cache=True, error_model="numpy")
-def show(share: int, sights: Sights) -> None:
-    """Write the worth of every so manieth piece of work: one point and some of the cameras."""
-    found = room(sights.solid.shape)
-    cameras = sights.eyes.shape[1]
-    across = (cameras + EYES - 1) // EYES
-    for piece in range(share, len(sights.points) * across, SHARES):
-        p, first = piece // across, piece % across * EYES
-        end = min(first + EYES, cameras)
-        _face(sights, p, first, end)
-        _hide(sights, found, p, first, end)
+def _show(share, data):  # type: ignore[no-untyped-def]
+    """Write the worth of every so manieth piece of work: one point and 128 of the cameras."""
+    solid, worth = data[0], data[-1]
+    found, count = room(solid.shape), worth.shape[1]
+    across = (count + 127) // 128
+    for piece in range(share, len(worth) * across, SHARES):
+        p, first = piece // across, piece % across * 128
+        end = min(first + 128, count)
+        _face(data, p, first, end)
+        _hide(data, found, p, first, end)
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _face(sights: Sights, p: int, first: int, end: int) -> None:
+def _face(data, p, first, end):  # type: ignore[no-untyped-def]
     """Write what each camera shows of one point anew where nothing is in between."""
-    x, y, z = sights.points[p, 0], sights.points[p, 1], sights.points[p, 2]
-    a, b, c = sights.normals[p, 0], sights.normals[p, 1], sights.normals[p, 2]
-    before, weight, good, cone = sights.before[p], sights.weights[p], sights.good, sights.cone
-    eyes, axes, worth = sights.eyes, sights.axes, sights.worth[p]
+    _, _, _, points, normals, befores, weights, eyes, axes, _, good, cone, worths = data
+    x, y, z = points[p, 0], points[p, 1], points[p, 2]
+    a, b, c = normals[p, 0], normals[p, 1], normals[p, 2]
+    before, weight, worth = befores[p], weights[p], worths[p]
     around = a == 0.0 and b == 0.0 and c == 0.0
     for n in range(first, end):
         dx, dy, dz = eyes[0, n] - x, eyes[1, n] - y, eyes[2, n] - z
@@ -123,22 +91,21 @@ def _face(sights: Sights, p: int, first: int, end: int) -> None:
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _hide(sights: Sights, found: NDArray[np.int32], p: int, first: int, end: int) -> None:
+def _hide(data, found, p, first, end):  # type: ignore[no-untyped-def]
     """Set to nought what cameras would show of one point but for what is in between."""
-    shape, flat, worth, eyes = sights.solid.shape, sights.solid.reshape(-1), sights.worth[p], sights.eyes
-    per_metre = 1.0 / sights.size
-    x, y, z = sights.points[p, 0], sights.points[p, 1], sights.points[p, 2]
-    origin = sights.origin
+    solid, origin, per_metre, points, _, _, _, eyes, _, clearance, _, _, worths = data
+    shape, flat, worth = solid.shape, solid.reshape(-1), worths[p]
+    x, y, z = points[p, 0], points[p, 1], points[p, 2]
     start = ((x - origin[0]) * per_metre, (y - origin[1]) * per_metre, (z - origin[2]) * per_metre)
     for n in range(first, end):
         if worth[n] == 0.0:
             continue
         dx, dy, dz = eyes[0, n] - x, eyes[1, n] - y, eyes[2, n] - z
         length = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if length <= sights.clearance:
+        if length <= clearance:
             continue
         ray = (dx * per_metre, dy * per_metre, dz * per_metre)
-        slabs = traverse(found, shape, start, ray, sights.clearance / length, 1.0)
+        slabs = traverse(found, shape, start, ray, clearance / length, 1.0)
         blocked = np.uint8(0)
         for m in range(slabs):
             blocked |= flat[np.uint32(found[0, m])]
@@ -155,9 +122,8 @@ def seen_through(shape: Shape, view: View) -> bool:
         shape: In the world frame.
         view: A view with a pose.
     """
-    points_world, normals_world = shape.surface(SPACING)
-    eye_world = view.pose[:3, 3]
-    facing = np.sum((eye_world - points_world) * normals_world, axis=1) > 0.0
+    points_world, normals_world = shape.surface(0.01)
+    facing = np.sum((view.pose[:3, 3] - points_world) * normals_world, axis=1) > 0.0
     p = transforms.transform(transforms.invert(view.pose), points_world[facing])
     p = p[p[:, 2] > 1e-3]
     u = np.rint(p[:, 0] / p[:, 2] * view.K[0, 0] + view.K[0, 2]).astype(np.intp)
@@ -166,6 +132,4 @@ def seen_through(shape: Shape, view: View) -> bool:
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
     depth = view.depth[v[inside], u[inside]]
     read = depth > 0.0
-    if not read.any():
-        return False
-    return bool((depth[read] > p[inside, 2][read] + BEHIND).mean() > CONTRADICTING)
+    return bool(read.any()) and bool((depth[read] > p[inside, 2][read] + BEHIND).mean() > 0.5)

@@ -13,324 +13,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import VoxelConfig
-from caryatid.geometry.rays import Grid, Triple, Voxel, room, traverse
+from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import signed_distance
+from caryatid.geometry.signed_distance import local, signed_distance
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import for_each
 from caryatid.sensing.views import View
-from caryatid.sensing.visibility import shown
-
-MOST = np.uint8(255)
-"""Counts go no further."""
-TILE = 8
-"""Rays along each side of the tiles an image is cut into: neighbours meet the same voxels [1]."""
-SHARES = 64
-"""Parts the tiles are dealt out to in turn, so that every thread has as much to do [1]."""
-
-
-class Entry(NamedTuple):
-    """A view that is entered into a voxel map.
-
-    Attributes:
-        depth: Depth image (H, W) [m], 0 = no reading.
-        K: Pinhole matrix (3, 3) [px].
-        T_world_camera: Its pose (4, 4).
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        size: Edge of a voxel [m].
-        stride: Pixels between the rays that are followed.
-        margin: Length before a reading that its ray does not clear [m].
-        max_depth: Readings beyond this count as free space up to this depth [m].
-        hits: Views (X, Y, Z) that had a reading in each voxel.
-        passes: Views (X, Y, Z) that looked through it.
-        new_hits: 0 at first (X, Y, Z), 1 where a reading ends, then `hits` with this view; written to.
-        new_passes: 0 at first (X, Y, Z), 1 where a ray passes, then `passes` with this view; written to.
-    """
-
-    depth: NDArray[np.float32]
-    K: Array
-    T_world_camera: Array
-    origin: Array
-    size: float
-    stride: int
-    margin: float
-    max_depth: float
-    hits: Grid
-    passes: Grid
-    new_hits: Grid
-    new_passes: Grid
-
-
-def enter_view(
-    hits: Grid,
-    passes: Grid,
-    depth: NDArray[np.float32],
-    K: Array,
-    T_world_camera: Array,
-    origin: Array,
-    size: float,
-    stride: int,
-    margin: float,
-    max_depth: float,
-) -> tuple[Grid, Grid]:
-    """Count one more view in the voxels its rays traverse and those its readings end in; of both the latter.
-
-    The arguments are as in `Entry`.
-
-    Returns:
-        The new counts of hits and of passes; they stay at 255.
-    """
-    entry = Entry(
-        np.ascontiguousarray(depth, dtype=np.float32),
-        np.ascontiguousarray(K, dtype=np.float64),
-        np.ascontiguousarray(T_world_camera, dtype=np.float64),
-        origin,
-        float(size),
-        int(stride),
-        float(margin),
-        float(max_depth),
-        hits,
-        passes,
-        np.zeros_like(hits),
-        np.zeros_like(passes),
-    )
-    for_each(look_through, SHARES, entry)
-    for_each(end_in, -(-len(depth) // stride), entry)
-    for_each(count, len(hits), entry)
-    return entry.new_hits, entry.new_passes
-
-
-@njit(cache=True, error_model="numpy")
-def look_through(share: int, entry: Entry) -> None:
-    """Mark what the rays of every so manieth tile of the image traverse."""
-    height, width = entry.depth.shape
-    rows, columns = (height + entry.stride - 1) // entry.stride, (width + entry.stride - 1) // entry.stride
-    across = (columns + TILE - 1) // TILE
-    T, shape, size = entry.T_world_camera, entry.hits.shape, entry.size
-    passed = entry.new_passes.reshape(-1)
-    start = (
-        (T[0, 3] - entry.origin[0]) / size,
-        (T[1, 3] - entry.origin[1]) / size,
-        (T[2, 3] - entry.origin[2]) / size,
-    )
-    found = room(shape)
-    for tile in range(share, (rows + TILE - 1) // TILE * across, SHARES):
-        top, left = tile // across * TILE, tile % across * TILE
-        for row in range(top, min(top + TILE, rows)):
-            for column in range(left, min(left + TILE, columns)):
-                (x, y, z), length, depth = _ray(entry, column * entry.stride, row * entry.stride)
-                if depth <= 0.0:
-                    continue
-                far = depth > entry.max_depth
-                t_to = entry.max_depth / depth if far else 1.0 - entry.margin / length
-                slabs = traverse(found, shape, start, (x / size, y / size, z / size), 0.0, t_to)
-                for n in range(slabs):
-                    passed[np.uint32(found[0, n])] = 1
-                    passed[np.uint32(found[1, n])] = 1
-                    passed[np.uint32(found[2, n])] = 1
-
-
-@njit(cache=True, error_model="numpy")
-def end_in(row: int, entry: Entry) -> None:
-    """Mark the voxels in which the rays of one row of the image end."""
-    T, shape, size = entry.T_world_camera, entry.hits.shape, entry.size
-    for u in range(0, entry.depth.shape[1], entry.stride):
-        (x, y, z), _, depth = _ray(entry, u, row * entry.stride)
-        i = int(np.floor((T[0, 3] + x - entry.origin[0]) / size))
-        j = int(np.floor((T[1, 3] + y - entry.origin[1]) / size))
-        k = int(np.floor((T[2, 3] + z - entry.origin[2]) / size))
-        inside = 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]
-        if inside and 0.0 < depth <= entry.max_depth:
-            entry.new_hits[i, j, k] = 1
-
-
-@njit(cache=True)
-def count(layer: int, entry: Entry) -> None:
-    """Turn the marks in one layer of the map into counts, 255 at the most; no ray passes where one ends."""
-    hits, passes = entry.hits[layer].reshape(-1), entry.passes[layer].reshape(-1)
-    new_hits, new_passes = entry.new_hits[layer].reshape(-1), entry.new_passes[layer].reshape(-1)
-    for n in range(len(hits)):
-        hit, passed = new_hits[n], new_passes[n]
-        new_hits[n] = hits[n] + np.uint8((hit > 0) & (hits[n] < MOST))
-        new_passes[n] = passes[n] + np.uint8((passed > hit) & (passes[n] < MOST))
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _ray(entry: Entry, u: int, v: int) -> tuple[Triple, float, float]:
-    """Way [m] along the world's axes from the camera to a pixel's reading, its length and its depth."""
-    z = float(entry.depth[v, u])
-    K, R = entry.K, entry.T_world_camera
-    x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
-    ray = (
-        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
-        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
-        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
-    )
-    return ray, np.sqrt(x * x + y * y + z * z), z
-
-
-class Known(NamedTuple):
-    """What a voxel map comes to know.
-
-    Attributes:
-        hits: Views (X, Y, Z) that had a reading in each voxel.
-        passes: Views (X, Y, Z) that looked through it.
-        table: State (256, 256) by how many views looked through and how many hit; without a hit the same
-            however many looked through.
-        states: State (X, Y, Z) of each voxel; written to.
-        sought: The state whose voxels are counted; one that takes a hit.
-        counts: Voxels of that state in each layer (X,); written to.
-    """
-
-    hits: Grid
-    passes: Grid
-    table: NDArray[np.int8]
-    states: NDArray[np.int8]
-    sought: int
-    counts: NDArray[np.intp]
-
-
-class Found(NamedTuple):
-    """Where the voxels of one state are.
-
-    Attributes:
-        states: State (X, Y, Z) of each voxel.
-        sought: The state.
-        ends: How many voxels of that state there are up to the end of each layer (X,).
-        places: Their indices (3, N), in order; written to.
-    """
-
-    states: NDArray[np.int8]
-    sought: int
-    ends: NDArray[np.intp]
-    places: NDArray[np.intp]
-
-
-def states_of(
-    hits: Grid, passes: Grid, table: NDArray[np.int8], sought: int
-) -> tuple[NDArray[np.int8], NDArray[np.intp]]:
-    """State of each voxel, and where one of the states is.
-
-    The arguments are as in `Known`.
-
-    Returns:
-        States (X, Y, Z), and the indices (3, N) of the voxels whose state is sought.
-    """
-    hits, passes = np.ascontiguousarray(hits), np.ascontiguousarray(passes)
-    counts = np.zeros(len(hits), dtype=np.intp)
-    known = Known(hits, passes, table, np.empty(hits.shape, dtype=np.int8), sought, counts)
-    for_each(look_up, len(hits), known)
-    ends = np.cumsum(counts)
-    index = np.empty((3, int(counts.sum())), dtype=np.intp)
-    for_each(find, len(hits), Found(known.states, sought, ends, index))
-    return known.states, index
-
-
-@njit(cache=True)
-def look_up(layer: int, known: Known) -> None:
-    """Look up the states of one layer of the map."""
-    hits, passes = known.hits[layer].reshape(-1), known.passes[layer].reshape(-1)
-    states, table = known.states[layer].reshape(-1), known.table
-    unknown, free = table[0, 0], table[1, 0]
-    for n in range(len(hits)):
-        states[n] = free if passes[n] > 0 else unknown
-    # Nearly all voxels have no hit: all others without a look into the table take a quarter of the time.
-    sought = 0
-    for n in range(len(hits)):
-        if hits[n] > 0:
-            states[n] = table[passes[n], hits[n]]
-            sought += states[n] == known.sought
-    known.counts[layer] = sought
-
-
-@njit(cache=True)
-def find(layer: int, found: Found) -> None:
-    """Write down where in one layer of the map the state is."""
-    states = found.states[layer]
-    n = found.ends[layer - 1] if layer > 0 else 0
-    if n == found.ends[layer]:
-        return
-    for j in range(states.shape[0]):
-        for k in range(states.shape[1]):
-            if states[j, k] == found.sought:
-                found.places[0, n], found.places[1, n], found.places[2, n] = layer, j, k
-                n += 1
-
-
-@njit(cache=True, error_model="numpy")
-def voxels_at(points: Array, origin: Array, size: float, shape: Voxel) -> NDArray[np.intp]:
-    """Flat index (N,) of the voxel of a grid that holds each point (N, 3) [m]; −1 outside.
-
-    Args:
-        points: (N, 3) [m].
-        origin: Corner of the grid (3,) [m].
-        size: Edge of a voxel [m].
-        shape: Voxels along each axis.
-    """
-    index = np.empty(len(points), dtype=np.intp)
-    for n in range(len(points)):
-        i = int(np.floor((points[n, 0] - origin[0]) / size))
-        j = int(np.floor((points[n, 1] - origin[1]) / size))
-        k = int(np.floor((points[n, 2] - origin[2]) / size))
-        inside = 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]
-        index[n] = (i * shape[1] + j) * shape[2] + k if inside else -1
-    return index
-
-
-class Filling(NamedTuple):
-    """A grid to be filled with shapes.
-
-    Attributes:
-        grid: What is solid (X, Y, Z), not 0 = solid; written to.
-        origin: Corner (3,) [m] of its voxel [0, 0, 0].
-        size: Edge of a voxel [m].
-        kinds: Codes (S,) of the shapes.
-        R: Their axes (S, 3, 3), columns = x, y, z of the object.
-        centres: (S, 3) [m].
-        half: Half extents (S, 3) [m] along the axes.
-        low: First voxel (S, 3) of the box around each shape, within the grid.
-        high: The voxel (S, 3) after its last.
-    """
-
-    grid: Grid
-    origin: Array
-    size: float
-    kinds: NDArray[np.int64]
-    R: Array
-    centres: Array
-    half: Array
-    low: NDArray[np.int64]
-    high: NDArray[np.int64]
-
-
-@njit(cache=True, error_model="numpy")
-def fill_layer(x: int, filling: Filling) -> None:
-    """Mark the voxels of one layer of the grid whose centres are inside a shape."""
-    R, half, size = filling.R, filling.half, filling.size
-    for s in range(len(filling.kinds)):
-        if not filling.low[s, 0] <= x < filling.high[s, 0]:
-            continue
-        u = filling.origin[0] + (x + 0.5) * size - filling.centres[s, 0]
-        for y in range(filling.low[s, 1], filling.high[s, 1]):
-            v = filling.origin[1] + (y + 0.5) * size - filling.centres[s, 1]
-            for z in range(filling.low[s, 2], filling.high[s, 2]):
-                w = filling.origin[2] + (z + 0.5) * size - filling.centres[s, 2]
-                a = R[s, 0, 0] * u + R[s, 1, 0] * v + R[s, 2, 0] * w
-                b = R[s, 0, 1] * u + R[s, 1, 1] * v + R[s, 2, 1] * w
-                c = R[s, 0, 2] * u + R[s, 1, 2] * v + R[s, 2, 2] * w
-                if signed_distance(filling.kinds[s], a, b, c, half[s, 0], half[s, 1], half[s, 2]) < 0.0:
-                    filling.grid[x, y, z] = 1
-
-
-Number = TypeVar("Number", np.int8, np.float32)
-"""What a lookup table holds."""
+from caryatid.sensing.visibility import SHARES, shown
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
@@ -342,8 +37,8 @@ class VoxelMap:
 
     Attributes:
         origin_world: Corner (3,) [m] of voxel [0, 0, 0]; the grid's axes are the world's.
-        hits: Views (X, Y, Z) that had a reading in the voxel.
-        passes: Views (X, Y, Z) that looked through it.
+        hits: Views (X, Y, Z) that had a reading in the voxel; 255 are the most it counts.
+        passes: Views (X, Y, Z) that looked through it; 255 are the most it counts.
         config: Size and evidence.
     """
 
@@ -378,8 +73,13 @@ class VoxelMap:
 
     @cached_property
     def _known(self) -> tuple[NDArray[np.int8], NDArray[np.intp]]:
-        """States of the voxels, and where they are occupied."""
-        return states_of(self.hits, self.passes, _states(self.config), OCCUPIED)
+        """States of the voxels, and where they are occupied; few voxels have hits to be weighed."""
+        states = (self.passes.ravel() > 0).view(np.int8)
+        hit = np.flatnonzero(self.hits.ravel() != 0)
+        log_odds = _log_odds(self.config)[self.passes.ravel()[hit], self.hits.ravel()[hit]]
+        states[hit] = np.where(log_odds > 0.0, OCCUPIED, FREE)
+        occupied = np.unravel_index(hit[log_odds > 0.0], self.hits.shape)
+        return states.reshape(self.hits.shape), np.stack(occupied)
 
     @property
     def occupancy(self) -> NDArray[np.float32]:
@@ -390,7 +90,7 @@ class VoxelMap:
         """
         low, high = (np.log(p / (1.0 - p)) for p in (0.12, 0.97))
         log_odds = np.clip(5.0 * _log_odds(self.config), low, high)
-        return self._looked_up((1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32))
+        return (1.0 / (1.0 + np.exp(-log_odds))).astype(np.float32)[self.passes, self.hits]
 
     @property
     def end_world(self) -> Array:
@@ -404,19 +104,13 @@ class VoxelMap:
             view: A view with a pose. Pixels without a reading say nothing.
             max_depth: Readings beyond this count as free space up to this depth [m].
         """
-        hits, passes = enter_view(
-            self.hits,
-            self.passes,
-            view.depth,
-            view.K,
-            np.ascontiguousarray(view.pose),
-            self.origin_world,
-            self.config.size,
-            self.config.stride,
-            self.config.margin,
-            float(max_depth),
-        )
-        return VoxelMap(self.origin_world, hits, passes, self.config)
+        config, T_world_camera = self.config, np.ascontiguousarray(view.pose)
+        hits, passes = np.zeros_like(self.hits), np.zeros_like(self.passes)
+        depth, K = np.ascontiguousarray(view.depth), np.ascontiguousarray(view.K)
+        camera = (depth, K, T_world_camera, config.stride, config.margin, float(max_depth))
+        for_each(_mark_rays, SHARES, (*camera, self.origin_world, config.size, hits, passes))
+        for_each(_count_marks, len(hits), (self.hits, self.passes, hits, passes))
+        return VoxelMap(self.origin_world, hits, passes, config)
 
     def solid(self, shapes: Sequence[Shape] = ()) -> Solid:
         """What blocks lines of sight: the voxels seen occupied, and everything inside the shapes.
@@ -437,9 +131,7 @@ class VoxelMap:
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
         grid[tuple(self.occupied - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
-        for_each(
-            fill_layer, len(grid), Filling(grid, origin_world, size, *arrays, low - lowest, high - lowest)
-        )
+        for_each(_fill_layer, len(grid), (*arrays, low - lowest, high - lowest, grid, origin_world, size))
         return Solid(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
@@ -463,17 +155,7 @@ class VoxelMap:
 
     def state_at(self, points_world: Array) -> NDArray[np.int8]:
         """State (N,) of the voxels that hold points (N, 3) [m]; 0 outside the map."""
-        points = np.ascontiguousarray(points_world)
-        index = voxels_at(points, self.origin_world, self.config.size, self.hits.shape)
-        inside = index >= 0
-        held = index[inside]
-        states = np.full(len(index), UNKNOWN, dtype=np.int8)
-        states[inside] = self.states.reshape(-1)[held]
-        return states
-
-    def _looked_up(self, table: NDArray[Number]) -> NDArray[Number]:
-        """Value of each voxel (X, Y, Z) in a table (256, 256) as `_log_odds`."""
-        return np.take(table.ravel(), self.passes.astype(np.uint16) * np.uint16(256) + self.hits)
+        return values_at(self.states, points_world, self.origin_world, self.config.size)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -492,11 +174,8 @@ class Solid:
 
     def holds(self, points_world: Array) -> NDArray[np.bool_]:
         """Whether points (N, 3) [m] lie in solid voxels (N,)."""
-        points = np.ascontiguousarray(points_world)
-        index = voxels_at(points, self.origin_world, self.voxels.config.size, self.grid.shape)
-        inside = index >= 0
-        inside[inside] = self.grid.ravel()[index[inside]] > 0
-        return inside
+        solid = self.grid.view(np.int8)
+        return values_at(solid, points_world, self.origin_world, self.voxels.config.size) > 0
 
     def blocked(self, points_world: Array, targets_world: Array, clearance: float) -> NDArray[np.bool_]:
         """Test lines of sight.
@@ -519,6 +198,22 @@ class Solid:
         return free == 0.0
 
 
+def values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
+    """What the voxels of a grid (X, Y, Z) hold at points (N, 3) [m]; 0 outside.
+
+    Args:
+        grid: Its values.
+        points: Where to look.
+        origin: Corner (3,) [m] of voxel [0, 0, 0].
+        size: Edge of a voxel [m].
+    """
+    index = np.floor((points - origin) / size).astype(np.intp)
+    inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
+    values = np.zeros(len(index), dtype=np.int8)
+    values[inside] = grid[tuple(index[inside].T)]
+    return values
+
+
 @cache
 def _log_odds(config: VoxelConfig) -> Array:
     """Log-odds of being occupied (256, 256) by how many views looked through and how many hit."""
@@ -527,10 +222,76 @@ def _log_odds(config: VoxelConfig) -> Array:
     return np.arange(256) * hit + np.arange(256)[:, None] * miss
 
 
-@cache
-def _states(config: VoxelConfig) -> NDArray[np.int8]:
-    """State (256, 256) by how many views looked through and how many hit; without a hit none is occupied."""
-    states = np.where(_log_odds(config) <= 0.0, FREE, OCCUPIED).astype(np.int8)
-    states[:, 0] = FREE
-    states[0, 0] = UNKNOWN
-    return states
+@njit(cache=True, error_model="numpy")
+def _mark_rays(share, data):  # type: ignore[no-untyped-def]
+    """Mark the voxels that the rays of every so manieth tile of the image pass, and those in which they end.
+
+    A tile is 8 × 8 rays: neighbours meet the same voxels.
+    """
+    depth_image, K, T, stride, margin, max_depth, origin, size, hits, passes = data
+    rows, columns = (len(depth_image) + stride - 1) // stride, (depth_image.shape[1] + stride - 1) // stride
+    across = (columns + 7) // 8
+    shape, passed = hits.shape, passes.reshape(-1)
+    start = ((T[0, 3] - origin[0]) / size, (T[1, 3] - origin[1]) / size, (T[2, 3] - origin[2]) / size)
+    found = room(shape)
+    for tile in range(share, (rows + 7) // 8 * across, SHARES):
+        top, left = tile // across * 8, tile % across * 8
+        for row in range(top, min(top + 8, rows)):
+            for column in range(left, min(left + 8, columns)):
+                (x, y, z), length, depth = _ray(depth_image, K, T, column * stride, row * stride)
+                if depth <= 0.0:
+                    continue
+                t_to = max_depth / depth if depth > max_depth else 1.0 - margin / length
+                slabs = traverse(found, shape, start, (x / size, y / size, z / size), 0.0, t_to)
+                for n in range(slabs):
+                    passed[np.uint32(found[0, n])] = 1
+                    passed[np.uint32(found[1, n])] = 1
+                    passed[np.uint32(found[2, n])] = 1
+                i = int(np.floor((T[0, 3] + x - origin[0]) / size))
+                j = int(np.floor((T[1, 3] + y - origin[1]) / size))
+                k = int(np.floor((T[2, 3] + z - origin[2]) / size))
+                inside = 0 <= i < shape[0] and 0 <= j < shape[1] and 0 <= k < shape[2]
+                if inside and depth <= max_depth:
+                    hits[i, j, k] = 1
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _ray(depth_image, K, R, u, v):  # type: ignore[no-untyped-def]
+    """Vector (3) [m] in the world from the camera to a pixel's reading, its length and its depth."""
+    z = float(depth_image[v, u])
+    x, y = (u - K[0, 2]) / K[0, 0] * z, (v - K[1, 2]) / K[1, 1] * z
+    ray = (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+    return ray, np.sqrt(x * x + y * y + z * z), z
+
+
+@njit(cache=True)
+def _count_marks(layer, data):  # type: ignore[no-untyped-def]
+    """Turn the marks in one layer of the map into counts, 255 at the most; no ray passes where one ends."""
+    hits, passes = data[0][layer].reshape(-1), data[1][layer].reshape(-1)
+    new_hits, new_passes = data[2][layer].reshape(-1), data[3][layer].reshape(-1)
+    for n in range(len(hits)):
+        hit, passed = new_hits[n], new_passes[n]
+        new_hits[n] = hits[n] + np.uint8((hit > 0) & (hits[n] < 255))
+        new_passes[n] = passes[n] + np.uint8((passed > hit) & (passes[n] < 255))
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_layer(i, data):  # type: ignore[no-untyped-def]
+    """Mark the voxels of one layer of a grid whose centres are inside a shape, within low ≤ index < high."""
+    kinds, R, centres, half, low, high, grid, origin, size = data
+    centre = np.empty((1, 3))
+    for s in range(len(kinds)):
+        if not low[s, 0] <= i < high[s, 0]:
+            continue
+        centre[0, 0] = origin[0] + (i + 0.5) * size
+        for j in range(low[s, 1], high[s, 1]):
+            centre[0, 1] = origin[1] + (j + 0.5) * size
+            for k in range(low[s, 2], high[s, 2]):
+                centre[0, 2] = origin[2] + (k + 0.5) * size
+                x, y, z = local(R[s], centres[s], centre, 0)
+                if signed_distance(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2]) < 0.0:
+                    grid[i, j, k] = 1
