@@ -332,9 +332,9 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     [
         ("[fit\n", "is not TOML"),
         ("[fit]\nhypothesis = 3\n", "there is no setting 'fit.hypothesis'"),
-        ("[fit]\nhypotheses = 'many'\n", "give a whole number"),
-        ("[fit]\nthreshold = nan\n", "give a finite number"),
-        ("[fusion]\nmethod = 'all'\n", "one of pc, sg, pc+sg"),
+        ("[fit]\nhypotheses = 'many'\n", "should be a valid integer"),
+        ("[fit]\nthreshold = nan\n", "should be a finite number"),
+        ("[fusion]\nmethod = 'all'\n", "should be 'pc', 'sg' or 'pc+sg'"),
     ],
 )
 def test_settings_that_are_not_valid(tmp_path, scene_file, refused, content, says):

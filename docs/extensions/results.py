@@ -38,7 +38,7 @@ def _kept(kind: str, function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def forget(configuration: Any, program: str) -> None:
-    """Begin anew with another program."""
+    """Forget what the program before made."""
     _seen.clear()
 
 

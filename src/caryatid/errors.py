@@ -1,4 +1,4 @@
-"""What can go wrong, said so that a user can mend it."""
+"""Errors that a user can remedy, each in one sentence."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class InputError(CaryatidError):
         super().__init__(f"{self.source}: {reason}" + (f"; {remedy}" if remedy else ""))
 
     def __reduce__(self) -> tuple[type[InputError], tuple[str, str, str]]:
-        """What it is made of anew where a process hands it to another."""
+        """Arguments from which another process rebuilds it."""
         return type(self), (self.source, self.reason, self.remedy)
 
 
