@@ -18,7 +18,7 @@ from bag_files import write_bag
 from conftest import SMALL, run_command
 
 import caryatid
-from caryatid import cli
+from caryatid.cli.commands import COMMANDS
 
 pytestmark = pytest.mark.slow
 
@@ -158,7 +158,7 @@ WORDS = {
 }
 
 
-@pytest.mark.parametrize("extra", [e for e, words in WORDS.items() if words.split()[0] in cli.commands()])
+@pytest.mark.parametrize("extra", [e for e, words in WORDS.items() if words.split()[0] in COMMANDS])
 def test_where_an_extra_is_missing_its_name_is_told(tmp_path, scene_file, views, extra):
     write_bag(tmp_path / "pour.bag", views)
     run = tmp_path / "run"

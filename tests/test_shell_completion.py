@@ -9,9 +9,9 @@ import subprocess
 import pytest
 from conftest import run_command
 
-from caryatid import cli
 from caryatid.benchmark.suites import SUITES
 from caryatid.cli import benchmark
+from caryatid.cli.commands import COMMANDS
 from caryatid.planning.planners import BUILT_IN
 
 pytestmark = pytest.mark.slow
@@ -43,7 +43,7 @@ def offered(tmp_path, capsys):
 
 
 def test_commands_options_values_and_files_are_completed(offered):
-    assert offered("") >= set(cli.commands())
+    assert offered("") >= set(COMMANDS)
     assert offered("ex") == {"explore", "extract", "export"}
     assert offered("session", "") >= {"new", "add", "next", "graph", "undo"}
     assert offered("explore", "tower", "--no") == {"--noise", "--no-early-stop", "--no-report"}
@@ -58,7 +58,7 @@ def test_commands_options_values_and_files_are_completed(offered):
 def test_every_shell_gets_a_script_it_can_read(shell, tmp_path, capsys):
     assert run_command("completion", shell) == 0
     text = capsys.readouterr().out
-    assert all(name in text for name in cli.commands())
+    assert all(name in text for name in COMMANDS)
     assert run_command("completion", shell, "--json") == 0
     assert json.loads(capsys.readouterr().out) == {"shell": shell, "script": text}
     if shutil.which(shell):

@@ -233,7 +233,7 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(moment, opening, 
 
 def _waiting(monkeypatch, meanwhile):
     """Have the command, where it would wait for Ctrl-C, do something else."""
-    monkeypatch.setattr("caryatid.cli.watching.wait_for_interrupt", meanwhile)
+    monkeypatch.setattr("caryatid.cli.view.wait_for_interrupt", meanwhile)
 
 
 def test_view_serves_a_run_to_this_machine_until_it_is_stopped(run_folder, monkeypatch, capsys):
@@ -277,25 +277,23 @@ def test_explore_shows_its_views_while_it_works(scene_file, tmp_path, monkeypatc
 
 @pytest.mark.slow
 def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_file, tmp_path, monkeypatch):
-    from caryatid.cli.watching import Watcher
-
     shown, waited = [], []
     monkeypatch.setattr("webbrowser.open", lambda url: None)
     _waiting(monkeypatch, lambda: waited.append(True))
-    whole = Watcher.show
+    whole = PageProcess.add
 
-    def interrupted(self, step, score):
-        whole(self, step, score)
-        shown.append(step.index)
-        if step.index == 1:
+    def interrupted(page, moment):
+        whole(page, moment)
+        shown.append(moment.step.index)
+        if moment.step.index == 1:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(Watcher, "show", interrupted)
+    monkeypatch.setattr(PageProcess, "add", interrupted)
     options = ("--no-early-stop", "--view", "--no-report", "--quiet", *SMALL)
     assert run_command("explore", scene_file, "--out", tmp_path / "run", *options) == 130
     assert shown == [0, 1]
     assert not waited
-    assert len(read_run(tmp_path / "run").views) == 1
+    assert len(read_run(tmp_path / "run").views) == 2
 
 
 @pytest.mark.slow

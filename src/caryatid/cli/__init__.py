@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from collections.abc import Sequence
+from typing import NoReturn
 
 from caryatid import __version__
 from caryatid.errors import in_one_line
@@ -36,9 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if arguments == ["--version"]:
             sys.stdout.write(f"caryatid {__version__}\n")
             return 0
-        from caryatid.cli.options import read_command
+        from caryatid.cli.commands import read_command
 
-        command = read_command(commands(), arguments)
+        command = read_command(arguments)
         debug = command.general.debug
         command()
         sys.stdout.flush()
@@ -64,36 +64,3 @@ def run_from_shell() -> NoReturn:
         sys.stderr.flush()
         os._exit(status)
     sys.exit(status)
-
-
-def commands() -> dict[str, Callable[..., Any]]:
-    """All commands by name, in the order of the help."""
-    from caryatid.cli.benchmark import Benchmark
-    from caryatid.cli.importing import Import
-    from caryatid.cli.options import Completion, ShowConfig
-    from caryatid.cli.results import Evaluate, Export, OrderCommand, ReportCommand
-    from caryatid.cli.run import Demo, Dismantle, Explore, Extract
-    from caryatid.cli.sessions import Serve, SessionCommand
-    from caryatid.cli.view import View
-
-    return {
-        "demo": Demo,
-        "explore": Explore,
-        "extract": Extract,
-        "view": View,
-        "evaluate": Evaluate,
-        "order": OrderCommand,
-        "dismantle": Dismantle,
-        "import": Import,
-        "report": ReportCommand,
-        "export": Export,
-        "benchmark": Benchmark,
-        "session": SessionCommand,
-        "serve": Serve,
-        "config": ShowConfig,
-        "completion": Completion,
-    }
-
-
-if __name__ == "__main__":
-    run_from_shell()

@@ -12,31 +12,36 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from caryatid.cli.options import SAID, Command, PlannerName, defaults_to, one_of, whole_number
+from caryatid.cli.options import (
+    SAID,
+    Command,
+    Flag,
+    OptionalCount,
+    OptionalPath,
+    OptionalText,
+    defaults_to,
+    one_of,
+    planner_name,
+    shown_as,
+)
 from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from caryatid.benchmark.episodes import Episode
-    from caryatid.benchmark.running import Outcomes
     from caryatid.benchmark.store import ResultStore
     from caryatid.benchmark.suites import Suite
+    from caryatid.cli.output import Output
 
-Count = Annotated[int | None, whole_number(1)]
 CORES = os.cpu_count() or 1
 """Default number of processes."""
-SUMMARY = "summary.json.gz"
-"""What figures are made of, without the episodes; the documentation is built from such files."""
-MINUTE = 60.0
-"""Without a terminal, print a line at most this often [s]."""
 
 SUITES = (
     "smoke", "fig5", "planners", "path", "ablation", "ablation-attention", "poses", "noise", "dismantle",
     "full",
 )  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
+
+Words = tyro.conf.UseAppendAction[tuple[str, ...]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,11 +62,9 @@ class Benchmark(Command):
     """Folder of the results; earlier ones count."""
     suite: Annotated[str | None, one_of(SUITES), SAID] = None
     """What to compare."""
-    scenes: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="SCENE", help_behavior_hint="")
-    ] = ()
+    scenes: Annotated[Words, shown_as("SCENE")] = ()
     """Scenes instead of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
-    planner: Annotated[tyro.conf.UseAppendAction[tuple[PlannerName, ...]], SAID] = ()
+    planner: Annotated[tyro.conf.UseAppendAction[tuple[Annotated[str, planner_name()], ...]], SAID] = ()
     """Planner instead of the suite's methods; may be repeated. The others are compared with the first."""
     fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], SAID] = ()
     """Fusion instead of the suite's; may be repeated."""
@@ -69,35 +72,30 @@ class Benchmark(Command):
     """Segmentation instead of the suite's conditions; may be repeated. Default: labels."""
     noise: Annotated[tyro.conf.UseAppendAction[tuple[NoiseModel, ...]], SAID] = ()
     """Noise of the camera, instead of the suite's conditions; may be repeated. Default: carmine."""
-    set: Annotated[
-        tyro.conf.UseAppendAction[tuple[str, ...]],
-        tyro.conf.arg(metavar="STAGE.NAME=VALUE", help_behavior_hint=""),
-    ] = ()
+    set: Annotated[Words, shown_as("STAGE.NAME=VALUE")] = ()
     """One setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
-    seeds: Annotated[Count, defaults_to("the suite's")] = None
+    seeds: Annotated[OptionalCount, defaults_to("the suite's")] = None
     """Seeds 0…N−1 of every episode."""
-    views: Annotated[Count, defaults_to("the suite's")] = None
+    views: Annotated[OptionalCount, defaults_to("the suite's")] = None
     """Views of every episode, including the first."""
-    jobs: Annotated[Count, defaults_to(f"the cores of this machine, {CORES}")] = None
+    jobs: Annotated[OptionalCount, defaults_to(f"the cores of this machine, {CORES}")] = None
     """Number of processes."""
-    scheduler: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="ADDRESS"), SAID] = None
+    scheduler: Annotated[OptionalText, shown_as("ADDRESS")] = None
     """Run on the workers of this dask.distributed scheduler instead, such as tcp://10.0.0.5:8786."""
-    retry: Annotated[bool, SAID] = False
+    retry: Flag = False
     """Run failed episodes again."""
-    reference: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="METHOD"), SAID] = None
+    reference: Annotated[OptionalText, shown_as("METHOD")] = None
     """Method the others are compared with in the figures, instead of the suite's."""
-    docs: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="FILE.md"), SAID] = None
+    docs: Annotated[OptionalPath, shown_as("FILE.md")] = None
     """Write the figures as a Markdown document too."""
 
     def __call__(self) -> None:
-        """Run the episodes that are missing and write the figures; what is done is kept."""
         from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
-        from caryatid.cli.output import progress_console
+        from caryatid.cli.output import Output
         from caryatid.runtime.fingerprint import fingerprint
 
-        console = progress_console(self.general.silent)
         import_pandas()
-        path = self.out / RESULTS
+        out, path = Output(self.general), self.out / RESULTS
         suite = None if self.suite is None else self._suite(self.suite)
         if self.scheduler is not None and self.jobs is not None:
             raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
@@ -107,8 +105,8 @@ class Benchmark(Command):
         with ResultStore(path, code, collect_provenance()) as store:
             try:
                 if suite is not None:
-                    self._run(suite, store, console)
-                self._report(store, console)
+                    self._run(suite, store, out)
+                self._report(store, out)
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("what is done is kept, start again to continue") from None
 
@@ -145,62 +143,60 @@ class Benchmark(Command):
             connect(self.scheduler).close()
         check_reference(self.reference, methods)
 
-    def _run(self, suite: Suite, store: ResultStore, console: Console) -> None:
+    def _run(self, suite: Suite, store: ResultStore, out: Output) -> None:
         """Run the missing episodes with a progress bar; where there is no terminal, print a line a minute."""
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         from caryatid.benchmark.episodes import short_name
+        from caryatid.benchmark.running import run_locally, run_on_cluster
         from caryatid.runtime.compiling import compile_kernels
 
         missing = store.plan(suite.name, suite.members(), retry=self.retry)
         total = len({member.episode for member in store.suites[suite.name]})
-        if missing and self.scheduler is None:
-            compile_kernels(console.print)
+        if self.scheduler is not None and missing:
+            episodes = run_on_cluster(missing, self.scheduler, out.say)
+        elif missing:
+            compile_kernels(out.say)
+            episodes = run_locally(missing, self.jobs or CORES)
+        else:
+            return
         columns = (
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
         )  # fmt: skip
+        console = out.progress
         hidden = console.quiet or not console.is_interactive
         bar = Progress(*columns, console=console, disable=hidden, speed_estimate_period=600.0)
         task = bar.add_task(suite.name, total=total, completed=total - len(missing))
         printed = time.monotonic()
-        with bar, closing(self._outcomes(missing, console)) as outcomes:
+        with bar, closing(episodes) as outcomes:
             for done, (episode, outcome) in enumerate(outcomes, start=total - len(missing) + 1):
                 store.add(episode, outcome)
                 bar.advance(task)
                 if outcome.error is not None:
                     name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
-                    console.print(f"failed: {name}: {outcome.error}", markup=False)
-                if hidden and time.monotonic() - printed >= MINUTE:
+                    out.say(f"failed: {name}: {outcome.error}")
+                if hidden and time.monotonic() - printed >= 60.0:
                     printed = time.monotonic()
-                    console.print(f"{suite.name}: {done} of {total} episodes", markup=False)
+                    out.say(f"{suite.name}: {done} of {total} episodes")
 
-    def _outcomes(self, missing: list[Episode], console: Console) -> Outcomes:
-        from caryatid.benchmark.running import run_locally, run_on_cluster
-
-        if missing and self.scheduler is not None:
-            yield from run_on_cluster(missing, self.scheduler, lambda text: console.print(text, markup=False))
-        elif missing:
-            yield from run_locally(missing, self.jobs or CORES)
-
-    def _report(self, store: ResultStore, console: Console) -> None:
+    def _report(self, store: ResultStore, out: Output) -> None:
         """Write tables, figures and pages, and print what there is."""
         from caryatid.benchmark import report
-        from caryatid.cli.output import write_json
 
         results = report.summarise_store(store, self.reference)
         for result in results:
             failed = f", {len(result.failures)} failed" if result.failures else ""
             line = f"{result.name}: {result.episodes} of {result.planned} episodes{failed}"
-            console.print(line, markup=False)
+            out.say(line)
         for line in report.write_tables(store, self.out):
-            console.print(line, markup=False)
+            out.say(line)
         if results:
             command = f"caryatid benchmark --out {self.out.name}"
             if self.reference is not None:
                 command += f" --reference {shlex.quote(self.reference)}"
-            report.write_results(results, store.about, self.out / SUMMARY)
+            report.write_results(results, store.about, self.out / "summary.json.gz")
             page = report.write_page(results, store.about, self.out, command)
-            console.print(f"figures: {page}", markup=False)
+            out.say(f"figures: {page}")
             if self.docs is not None:
                 report.write_document(results, store.about, self.docs, f"{command} --docs {self.docs.name}")
         if self.general.json:
@@ -213,4 +209,4 @@ class Benchmark(Command):
                 }
                 for result in results
             }
-            write_json({"results": str(self.out), "suites": suites})
+            out.result({"results": str(self.out), "suites": suites})

@@ -3,74 +3,81 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from caryatid.evaluation.scores import Score
-from caryatid.exploration import Step
-from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph
-from caryatid.io.json_files import json_text
-from caryatid.runtime.stopwatch import StageTime, by_stage
+from caryatid.runtime.stopwatch import by_stage
+
+if TYPE_CHECKING:
+    from caryatid.cli.options import General
+    from caryatid.evaluation.scores import Score
+    from caryatid.exploration import Step
+    from caryatid.graph import SceneObject, SupportGraph
 
 WAITING = ("capture",)
 """Stages that wait for the camera and are not part of a turn."""
 
 
-def result_console() -> Console:
-    """Stdout, for results."""
-    return Console(highlight=False)
+class Output:
+    """What a command prints.
 
-
-def progress_console(silent: bool) -> Console:
-    """Stderr, for progress; nothing moves there unless it is a terminal, not even with FORCE_COLOR.
+    Nothing moves on stderr unless it is a terminal, not even with FORCE_COLOR.
 
     Args:
-        silent: Print nothing.
-    """
-    moving = None if sys.stderr.isatty() else False
-    return Console(
-        stderr=True, quiet=silent, highlight=False, emoji=False, soft_wrap=True, force_interactive=moving
-    )
-
-
-def write_json(document: Mapping[str, Any]) -> None:
-    """Print the result as one JSON document."""
-    sys.stdout.write(json_text(document))
-
-
-class Progress:
-    """Prints what goes on.
-
-    Args:
-        silent: Print nothing.
+        general: Whether progress is printed, and results as JSON.
     """
 
-    def __init__(self, silent: bool) -> None:
-        self._console = progress_console(silent)
-
-    @contextmanager
-    def working(self, what: str) -> Iterator[None]:
-        """Show a spinner on a terminal."""
-        with self._console.status(what) if self._console.is_interactive else nullcontext():
-            yield
+    def __init__(self, general: General) -> None:
+        self._json = general.json
+        self.progress = Console(
+            stderr=True,
+            quiet=general.quiet or general.json,
+            highlight=False,
+            emoji=False,
+            soft_wrap=True,
+            force_interactive=None if sys.stderr.isatty() else False,
+        )
 
     def say(self, text: str) -> None:
-        """Print a line."""
-        self._console.print(text, markup=False)
+        """Print a line of progress."""
+        self.progress.print(text, markup=False)
+
+    def working(self, what: str) -> AbstractContextManager[Any]:
+        """Show a spinner on a terminal."""
+        return self.progress.status(what) if self.progress.is_interactive else nullcontext()
+
+    def result(self, document: Mapping[str, Any], *shown: RenderableType) -> None:
+        """Print the result: as one JSON document, or else text as it is and tables."""
+        if self._json:
+            from caryatid.io.json_files import json_text
+
+            shown = (json_text(document),)
+        for item in shown:
+            if isinstance(item, str):
+                sys.stdout.write(item)
+            else:
+                Console(highlight=False).print(item)
+        sys.stdout.flush()
+
+    def compile(self) -> None:
+        """Compile the kernels that are not compiled yet."""
+        from caryatid.runtime.compiling import compile_kernels
+
+        with self.working("compiling"):
+            compile_kernels(self.say)
 
     def step(self, step: Step, before: SupportGraph | None, score: Score | None) -> None:
         """Print what a view changed, its score where the ground truth is known, and what comes next."""
-        seconds = sum(v for k, v in step.timings.items() if k not in WAITING)
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
-        self.say(f"view {step.index:02d}: {summary(step.graph)}{f1} ({seconds:.1f} s)")
-        for line in changes(before or SupportGraph(), step.graph):
+        self.say(f"view {step.index:02d}: {summary(step.graph)}{f1} ({_turn(step.timings):.1f} s)")
+        for line in changes(before, step.graph):
             self.say(f"  {line}")
         if step.decision is not None:
             self.say(f"  next view: {step.decision.why}")
@@ -91,32 +98,26 @@ def summary(graph: SupportGraph) -> str:
     return f"{counted(objects, 'object')}, {counted(len(graph.supports), 'support')}{doubt}"
 
 
-def changes(before: SupportGraph, after: SupportGraph) -> list[str]:
+def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
     """What a view changed: a line each for objects found, supported differently, and gone."""
-    known = {o.id for o in before.objects}
-    present = {o.id for o in after.objects}
+    known = {} if before is None else {o.id: _held(o, before) for o in before.objects}
+    held = {o.id: _held(o, after) for o in after.objects}
     objects = [o for o in after.objects if o.role == "object"]
-    found = [f"{o.id} ({o.shape.kind}) {_held(o, after)}" for o in objects if o.id not in known]
-    moved = [
-        f"{o.id} {_held(o, after)}"
-        for o in objects
-        if o.id in known and _supporters(o, before) != _supporters(o, after)
-    ]
-    gone = [o.id for o in before.objects if o.id not in present]
-    lines = (("found", found), ("now", moved), ("gone", gone))
-    return [f"{kind}: {', '.join(items)}" for kind, items in lines if items]
-
-
-def _supporters(o: SceneObject, graph: SupportGraph) -> list[str]:
-    return sorted(s.supporter for s in graph.supports if s.supported == o.id)
+    lines = {
+        "found": [f"{o.id} ({o.shape.kind}) {held[o.id]}" for o in objects if o.id not in known],
+        "now": [f"{o.id} {held[o.id]}" for o in objects if known.get(o.id, held[o.id]) != held[o.id]],
+        "gone": [i for i in known if i not in held],
+    }
+    return [f"{kind}: {', '.join(items)}" for kind, items in lines.items() if items]
 
 
 def _held(o: SceneObject, graph: SupportGraph) -> str:
-    names = ["the table" if i == SUPPORT_SURFACE_ID else i for i in _supporters(o, graph)]
+    supporters = sorted(s.supporter for s in graph.supports if s.supported == o.id)
+    names = [i if graph[i].role == "object" else "the table" for i in supporters]
     return f"held by {' and '.join(names)}" if names else "held by nothing seen yet"
 
 
-def left_table(title: str, *columns: str) -> Table:
+def numbered_table(title: str, *columns: str) -> Table:
     """A table of numbered rows."""
     table = Table(title=Text(title), title_justify="left")
     table.add_column("", justify="right")
@@ -125,55 +126,41 @@ def left_table(title: str, *columns: str) -> Table:
     return table
 
 
-def profile_record(steps: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What `--profile` adds to the JSON document: times in seconds and shares of a turn.
-
-    Args:
-        steps: Number and timings [s] of each view, as in run.json.
-    """
-    stages, turn = _profile(steps)
-    views = [{"view": step["view"]} | step["timings"] for step in steps]
-    return {"profile": {"stages": [asdict(s) for s in stages], "turn": asdict(turn), "views": views}}
-
-
-def print_profile(steps: Sequence[Mapping[str, Any]]) -> None:
-    """Print two tables: time by stage over the views, and by view [ms].
-
-    Args:
-        steps: Number and timings [s] of each view, as in run.json.
-    """
-    stages, turn = _profile(steps)
-    table = _figures("time by stage [ms]", ["stage", "median", "highest", "share"])
-    table.columns[0].justify = "left"
-    for s in stages:
-        share = "" if s.share is None else f"{100.0 * s.share:.0f} %"
-        table.add_row(s.stage, _milliseconds(s.median), _milliseconds(s.highest), share)
-    table.add_section()
-    table.add_row(turn.stage, _milliseconds(turn.median), _milliseconds(turn.highest))
-    views = _figures("time by view [ms]", ["view", *(s.stage for s in stages), turn.stage])
-    for step in steps:
-        times = [step["timings"].get(s.stage) for s in stages]
-        views.add_row(f"{step['view']:02d}", *map(_milliseconds, [*times, _turn(step["timings"])]))
-    console = result_console()
-    console.print(table)
-    console.print(views)
-
-
-def _profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[StageTime], StageTime]:
-    """Stages in their order, and the whole turn."""
-    laps = [step["timings"] for step in steps]
-    return by_stage(laps, beside=WAITING), by_stage([{"turn": _turn(lap)} for lap in laps])[0]
-
-
-def _turn(laps: Mapping[str, float]) -> float:
-    return sum(seconds for stage, seconds in laps.items() if stage not in WAITING)
-
-
-def _figures(title: str, columns: Sequence[str]) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
+def figures_table(title: str, *columns: str) -> Table:
+    """A table of figures, aligned to the right."""
+    table = Table(title=Text(title), title_justify="left")
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
     return table
+
+
+def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[Table]]:
+    """What `--profile` adds to the JSON document, in seconds, and two tables, by stage and by view [ms].
+
+    Args:
+        steps: Number and timings [s] of each view, as in run.json.
+    """
+    stages = by_stage([step["timings"] for step in steps], beside=WAITING)
+    (turn,) = by_stage([{"turn": _turn(step["timings"])} for step in steps])
+    views = [{"view": step["view"]} | step["timings"] for step in steps]
+    record = {"stages": [asdict(s) for s in stages], "turn": asdict(turn), "views": views}
+    by_name = figures_table("time by stage [ms]", "stage", "median", "highest", "share")
+    by_name.columns[0].justify = "left"
+    for s in (*stages, turn):
+        share = "" if s is turn or s.share is None else f"{100.0 * s.share:.0f} %"
+        by_name.add_row(s.stage, _milliseconds(s.median), _milliseconds(s.highest), share)
+    by_view = figures_table("time by view [ms]", "view", *(s.stage for s in stages), turn.stage)
+    for step in steps:
+        times = [*(step["timings"].get(s.stage) for s in stages), _turn(step["timings"])]
+        by_view.add_row(f"{step['view']:02d}", *map(_milliseconds, times))
+    for table in (by_name, by_view):
+        table.box, table.padding, table.pad_edge = box.SIMPLE_HEAD, (0, 0, 0, 0), False
+    return {"profile": record}, [by_name, by_view]
+
+
+def _turn(laps: Mapping[str, float]) -> float:
+    """Time of a turn [s]."""
+    return sum(seconds for stage, seconds in laps.items() if stage not in WAITING)
 
 
 def _milliseconds(seconds: float | None) -> str:

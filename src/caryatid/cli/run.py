@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import platform
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,36 +13,31 @@ import tyro
 
 from caryatid.cli.options import (
     DEFAULTS,
-    SAID,
+    Count,
     ExploringCommand,
+    Flag,
     ModellingCommand,
+    OptionalCount,
+    OptionalPath,
     OutPath,
     Segmentation,
     SourceName,
-    Views,
     defaults_to,
-    whole_number,
-    with_views,
+    shown_as,
 )
 from caryatid.config import Config
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
-    from caryatid.cli.output import Progress
-    from caryatid.cli.watching import Watcher
-    from caryatid.evaluation.scores import Score, TrueScene
+    from caryatid.cli.output import Output
     from caryatid.exploration import Step
     from caryatid.io.runs import RunWriter
-    from caryatid.manipulation.dismantling import Taken
-    from caryatid.manipulation.order import Order
+    from caryatid.runs import RunRecorder
     from caryatid.sources import Source
-    from caryatid.viz import Figure, ViewPage
+    from caryatid.viewer.process import PageProcess
 
-PACKAGES = ("mujoco", "numpy", "scipy", "numba", "shapely")
-"""Packages whose versions run.json records."""
-
-NoReport = Annotated[bool, SAID]
-Profile = Annotated[bool, SAID]
+DEMO_VIEWS = 5
+"""Views of the demo [1]: half as many as usual, enough for its scene."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,33 +60,31 @@ class Explore(ExploringCommand):
     """Scene or recording."""
     out: OutPath
     """Run folder to write; replaces an earlier run."""
-    no_early_stop: Annotated[bool, SAID] = False
+    no_early_stop: Flag = False
     """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
-    no_report: NoReport = False
+    no_report: Flag = False
     """Leave out report.html."""
-    view: Annotated[bool, SAID] = False
+    view: Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
-    profile: Profile = False
+    profile: Flag = False
     """Print the time of each stage at the end; with --json as part of the document."""
 
     def __call__(self) -> None:
-        """Run the command."""
         self.run(self.settings())
 
     def run(self, config: Config) -> None:
         """Explore with these settings."""
-        from caryatid.cli.output import Progress
+        from caryatid.cli.output import Output
+        from caryatid.cli.view import watched
         from caryatid.io.runs import RunWriter
 
-        progress = Progress(self.general.silent)
-        with _watched(self.source, config, progress) if self.view else nullcontext() as watcher:
+        out = Output(self.general)
+        with watched(self.source, config, out) if self.view else nullcontext() as page:
             with RunWriter(self.out) as writer:
-                source, steps = open_exploration(self, config, progress)
-                run = _Run("explore", self.source, source.name, self, config, progress, writer)
-                run.source, run.watcher, run.report = source, watcher, not self.no_report
-                run.take(steps)
-                run.finish(exploring_options(self))
-            run.tell(self.profile)
+                source, recorder = _open(self, config, out, writer)
+                _take(recorder, _explored(self, source, config), out, page)
+                recorder.finish()
+            _tell(self, recorder, source.name, out)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,16 +99,16 @@ class Demo(ModellingCommand):
     """Run folder to write; replaces an earlier run."""
     scene: Annotated[str, tyro.conf.arg(metavar="NAME")] = "clutter"
     """A built-in scene, such as tower, bridge or dense-12-0."""
-    views: Annotated[Views, defaults_to(5)] = None
+    views: Annotated[OptionalCount, defaults_to(DEMO_VIEWS)] = None
     """Maximum number of views, including the first."""
-    view: Annotated[bool, SAID] = False
+    view: Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
-    profile: Profile = False
+    profile: Flag = False
     """Print the time of each stage at the end; with --json as part of the document."""
 
     def __call__(self) -> None:
-        """Run the command."""
-        config = with_views(self.modelling.settings(with_views(DEFAULTS, 5)), self.views)
+        fewer = replace(DEFAULTS, active=replace(DEFAULTS.active, max_views=DEMO_VIEWS))
+        config = self.modelling.read({"active.max_views": self.views}, fewer)
         shared = {name: getattr(self, name) for name in ("out", "view", "profile", "modelling", "general")}
         Explore(source=self.scene, noise="carmine", **shared).run(config)
 
@@ -134,43 +126,49 @@ class Extract(ModellingCommand):
     """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
     out: OutPath
     """Run folder to write; replaces an earlier run."""
-    segmentation: Segmentation = None
+    segmentation: Annotated[Segmentation, defaults_to("labels where the source has them")] = None
     """Use the masks or labels that are given, or segment automatically."""
-    label_divisor: Annotated[int, whole_number(1)] = 1
+    label_divisor: Count = 1
     """For clouds whose labels number parts of objects: object = label // N."""
-    no_report: NoReport = False
+    no_report: Flag = False
     """Leave out report.html."""
-    profile: Profile = False
+    profile: Flag = False
     """Print the time of each stage at the end; with --json as part of the document."""
 
     def __call__(self) -> None:
-        """Run the command."""
-        config = self.modelling.settings()
-        from caryatid.cli.output import Progress
+        from caryatid.cli.output import Output
         from caryatid.io.runs import RunWriter
+        from caryatid.runs import RunRecorder
         from caryatid.sources import CLOUD_SUFFIXES
 
-        progress = Progress(self.general.silent)
+        config, out = self.modelling.read(), Output(self.general)
         is_cloud = Path(self.source).suffix.lower() in CLOUD_SUFFIXES
+        options = {"segmentation": self.segmentation, "label_divisor": self.label_divisor}
         with RunWriter(self.out) as writer:
-            steps = (self._of_cloud if is_cloud else self._of_recording)(config, progress)
-            run = _Run("extract", self.source, Path(self.source).name, self, config, progress, writer)
-            run.report = not self.no_report
-            run.take(steps)
-            run.finish({"segmentation": self.segmentation, "label_divisor": self.label_divisor})
-        run.tell(self.profile)
+            steps = (self._of_cloud if is_cloud else self._of_recording)(config, out)
+            recorder = RunRecorder(
+                command="extract",
+                source=self.source,
+                seed=self.modelling.seed,
+                options=options,
+                config=config,
+                writer=writer,
+            )
+            _take(recorder, steps, out)
+            recorder.finish()
+        _tell(self, recorder, Path(self.source).name, out)
 
-    def _of_recording(self, config: Config, progress: Progress) -> Iterator[Step]:
+    def _of_recording(self, config: Config, out: Output) -> Iterator[Step]:
         from caryatid.exploration import Explorer
         from caryatid.sources import open_recording
 
-        with progress.working("reading the recording"):
+        with out.working("reading the recording"):
             recording = open_recording(self.source, config, self.segmentation)
-        _compile(progress)
+        out.compile()
         explorer = Explorer(config=config, segmentation=self.segmentation, seed=self.modelling.seed)
         return (explorer.look(frame.load()) for frame in recording.frames)
 
-    def _of_cloud(self, config: Config, progress: Progress) -> Iterator[Step]:
+    def _of_cloud(self, config: Config, out: Output) -> Iterator[Step]:
         import numpy as np
 
         from caryatid.exploration import Explorer
@@ -178,15 +176,15 @@ class Extract(ModellingCommand):
         from caryatid.segmentation.observation import level_cloud
         from caryatid.sources import check_segments
 
-        with progress.working("reading the cloud"):
+        with out.working("reading the cloud"):
             stored = read_stored_cloud(self.source, self.label_divisor)
             if self.segmentation == "labels" and stored.labels is None:
                 raise InputError(self.source, "has no field label", "use --segmentation auto")
             if self.segmentation != "auto" and stored.labels is not None:
                 check_segments(self.source, Counter(stored.labels[stored.kept].tolist()), config)
-        _compile(progress)
+        out.compile()
         explorer = Explorer(config=config, segmentation=self.segmentation, seed=self.modelling.seed)
-        with progress.working("extracting"):
+        with out.working("extracting"):
             rng = np.random.default_rng(self.modelling.seed)
             cloud = stored.to_cloud(config.cloud)
             cloud = level_cloud(cloud, config, segmentation=self.segmentation, rng=rng)
@@ -208,279 +206,155 @@ class Dismantle(ExploringCommand):
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """An MJCF scene, or the name of a built-in one."""
-    out: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="RUN"), SAID] = None
+    out: Annotated[OptionalPath, shown_as("RUN")] = None
     """Run folder to write, its report with pictures of every lift; without it nothing is written."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
-    no_early_stop: Annotated[bool, SAID] = False
+    no_early_stop: Flag = False
     """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
 
     def __call__(self) -> None:
-        """Run the command."""
-        config = self.settings()
-        from caryatid.cli.output import Progress, write_json
+        from rich.text import Text
+
+        from caryatid.cli.output import Output, numbered_table
         from caryatid.io.runs import RunWriter
-        from caryatid.manipulation.dismantling import bodies_of, dismantle, dismantling_record
+        from caryatid.manipulation.dismantling import bodies_of, dismantle, dismantling_record, succeeded
         from caryatid.manipulation.order import Order, plan_order
         from caryatid.runtime.threads import cores
-        from caryatid.sources import is_recording
-        from caryatid.viz.strip import draw_lifts
+        from caryatid.simulation.camera import SimulatedCamera
+        from caryatid.viz.strip import draw_lifts, stored_figures
 
-        if is_recording(self.source):
-            raise self._not_simulated()
-        progress = Progress(self.general.silent)
+        config, out = self.settings(), Output(self.general)
         with RunWriter(self.out) if self.out is not None else nullcontext() as writer:
-            source, steps = open_exploration(self, config, progress)
-            run = _Run("dismantle", self.source, source.name, self, config, progress, writer)
-            run.source, run.report = source, writer is not None
-            scene, truth = self._simulated(source)
-            order = Order((), "interrupted before an order was found")
-            taken: list[Taken] = []
-            strip: tuple[Figure, ...] = ()
+            source, recorder = _open(self, config, out, writer)
+            if source.truth is None or not isinstance(source.camera, SimulatedCamera):
+                remedy = "give an MJCF scene; for a run, use `caryatid order`"
+                raise InputError(self.source, "cannot be simulated", remedy)
+            scene = source.camera.scene
+            order, taken, files = Order((), "interrupted before an order was found"), [], {}
             try:
-                run.take(steps)
-                if run.interrupted:
+                last = _take(recorder, _explored(self, source, config), out)
+                if last is None:
                     raise KeyboardInterrupt
-                graph = run.newest.graph
-                with progress.working("rehearsing"):
+                with out.working("rehearsing"):
                     seed = self.modelling.seed
-                    order = plan_order(graph, config, hands=self.hands, seed=seed, threads=cores())
-                for t in dismantle(scene, order.steps, bodies_of(graph, truth), config):
+                    order = plan_order(last.graph, config, hands=self.hands, seed=seed, threads=cores())
+                for t in dismantle(scene, order.steps, bodies_of(last.graph, source.truth), config):
                     taken.append(t)
                     disturbed = ", ".join(t.disturbed)
-                    progress.say(f"{t.step.object_id}: " + (f"{disturbed} disturbed" if disturbed else "ok"))
+                    out.say(f"{t.step.object_id}: " + (f"{disturbed} disturbed" if disturbed else "ok"))
                 if writer is not None:
-                    T_world_camera = run.newest.sphere.poses(run.newest.visited[:1])[0]
-                    strip = draw_lifts(scene, taken, graph, T_world_camera, config)
+                    T_world_camera = last.sphere.poses(last.visited[:1])[0]
+                    files = stored_figures(draw_lifts(scene, taken, last.graph, T_world_camera, config))
             except KeyboardInterrupt:
-                if run.last is None:
+                recorder.interrupted = True
+                if recorder.views == 0:
                     raise
-                run.interrupted = True
-            names = {t.body for t in taken}
-            left = [name for name in scene.object_bodies.values() if name not in names]
+            bodies = {t.body for t in taken}
+            left = [name for name in scene.object_bodies.values() if name not in bodies]
             record = dismantling_record(order, taken, left)
-            options = exploring_options(self)
-            run.finish(options, {"dismantling": record}, strip)
-        if self.general.json:
-            write_json(record)
-        else:
-            _print_dismantling(order, taken, left, source.name)
-
-    def _simulated(self, source: Source) -> tuple[Any, TrueScene]:
-        """The scene in physics and its ground truth."""
-        from caryatid.simulation.camera import SimulatedCamera
-
-        if source.truth is None or not isinstance(source.camera, SimulatedCamera):
-            raise self._not_simulated()
-        return source.camera.scene, source.truth
-
-    def _not_simulated(self) -> InputError:
-        return InputError(
-            self.source, "cannot be simulated", "give an MJCF scene; for a run, use `caryatid order`"
-        )
+            recorder.finish({"dismantling": record}, files)
+        if self.out is not None:
+            _draw_report(self.out, out)
+        outcome = "all taken, nothing disturbed" if succeeded(taken, left) else "not without harm"
+        if left and all(t.ok for t in taken):
+            outcome = f"nothing disturbed, but {', '.join(left)} left"
+        table = numbered_table(f"{source.name}: {outcome}", "take", "body", "hold", "disturbed", "why")
+        for number, t in enumerate(taken, start=1):
+            disturbed = ", ".join(t.disturbed) or "–"
+            cells = (t.step.object_id, t.body or "nothing there", ", ".join(t.held), disturbed)
+            table.add_row(str(number), *cells, Text(t.step.why))
+        out.result(record, table, *([Text(order.refusal)] if order.refusal else []))
 
 
-def open_exploration(
-    options: Explore | Dismantle, config: Config, progress: Progress
-) -> tuple[Source, Iterator[Step]]:
-    """Open what is to be explored, and return it with the steps of its exploration."""
-    from caryatid.evaluation.oracle import planner_for
-    from caryatid.exploration import explore
+def _open(
+    command: Explore | Dismantle, config: Config, out: Output, writer: RunWriter | None
+) -> tuple[Source, RunRecorder]:
+    """Open what is to be explored, and the record of its exploration."""
+    from caryatid.runs import RunRecorder
     from caryatid.sources import open_source
 
-    seed, segmentation = options.modelling.seed, options.segmentation
-    with progress.working("opening"):
+    with out.working("opening"):
         source = open_source(
-            options.source,
+            command.source,
             config,
-            noise=options.noise,
-            segmentation=segmentation,
-            seed=seed,
-            robot=options.robot,
+            noise=command.noise,
+            segmentation=command.segmentation,
+            seed=command.modelling.seed,
+            robot=command.robot,
         )
-    _compile(progress)
-    planner, camera = planner_for(
-        options.planner, source.camera, source.truth, config, segmentation=segmentation, seed=seed
-    )
-    return source, explore(
-        camera,
-        source.robot,
-        planner=planner,
-        config=config,
-        segmentation=segmentation,
-        seed=seed,
-        early_stop=not options.no_early_stop,
-    )
-
-
-def exploring_options(options: Explore | Dismantle) -> dict[str, Any]:
-    """What run.json records of the options of an exploration."""
+    out.compile()
     names = ("planner", "robot", "segmentation", "noise")
-    return {name: getattr(options, name) for name in names} | {"early_stop": not options.no_early_stop}
+    recorder = RunRecorder(
+        command=type(command).__name__.lower(),
+        source=command.source,
+        seed=command.modelling.seed,
+        options={name: getattr(command, name) for name in names} | {"early_stop": not command.no_early_stop},
+        config=config,
+        writer=writer,
+        truth=source.truth,
+    )
+    return source, recorder
 
 
-def _compile(progress: Progress) -> None:
-    from caryatid.runtime.compiling import compile_kernels
+def _explored(command: Explore | Dismantle, source: Source, config: Config) -> Iterator[Step]:
+    """The steps of an exploration."""
+    from caryatid.evaluation.oracle import planner_for
+    from caryatid.exploration import explore
 
-    with progress.working("compiling"):
-        compile_kernels(progress.say)
-
-
-def _watched(source: str, config: Config, progress: Progress) -> AbstractContextManager[Watcher]:
-    from caryatid.cli.watching import wait_for_interrupt, watched
-
-    return watched(source, config, progress, wait_for_interrupt)
+    known: dict[str, Any] = {"segmentation": command.segmentation, "seed": command.modelling.seed}
+    planner, camera = planner_for(command.planner, source.camera, source.truth, config, **known)
+    stop = not command.no_early_stop
+    return explore(camera, source.robot, planner=planner, config=config, early_stop=stop, **known)
 
 
-def _print_dismantling(order: Order, taken: Sequence[Taken], left: Sequence[str], name: str) -> None:
-    from rich.text import Text
+def _take(
+    recorder: RunRecorder, steps: Iterable[Step], out: Output, page: PageProcess | None = None
+) -> Step | None:
+    """Keep, print and show every step; Ctrl-C ends the run after the views so far.
 
-    from caryatid.cli.output import left_table, result_console
-    from caryatid.manipulation.dismantling import succeeded
+    Returns:
+        The last step, or None after Ctrl-C.
+    """
+    from caryatid.viewer.drawing import Moment
 
-    outcome = "all taken, nothing disturbed" if succeeded(taken, left) else "not without harm"
-    if left and all(t.ok for t in taken):
-        outcome = f"nothing disturbed, but {', '.join(left)} left"
-    table = left_table(f"{name}: {outcome}", "take", "body", "hold", "disturbed", "why")
-    for number, t in enumerate(taken, start=1):
-        disturbed = ", ".join(t.disturbed) or "–"
-        cells = (t.step.object_id, t.body or "nothing there", ", ".join(t.held), disturbed)
-        table.add_row(str(number), *cells, Text(t.step.why))
-    console = result_console()
-    console.print(table)
-    if order.refusal:
-        console.print(Text(order.refusal))
+    last = None
+    try:
+        for step in steps:
+            score = recorder.keep(step)
+            out.step(step, None if last is None else last.graph, score)
+            if page is not None:
+                page.add(Moment(step, None if score is None else score.f1))
+            last = step
+    except KeyboardInterrupt:
+        recorder.interrupted = True
+        if recorder.views == 0:
+            raise
+    return None if recorder.interrupted else last
 
 
-@dataclass(slots=True)
-class _Run:
-    """A run in the making: its folder, its report and what is printed of it."""
+def _tell(command: Explore | Extract, recorder: RunRecorder, name: str, out: Output) -> None:
+    """Write the report and print what came of the run."""
+    from caryatid.cli.output import counted, profile, summary
+    from caryatid.io.graph_json import graph_to_json
 
-    command: str
-    given: str
-    name: str
-    options: ModellingCommand
-    config: Config
-    progress: Progress
-    writer: RunWriter | None
-    source: Source | None = None
-    watcher: Watcher | None = None
-    report: bool = True
-    last: Step | None = None
-    pages: list[ViewPage] = field(default_factory=list)
-    steps: list[dict[str, Any]] = field(default_factory=list)
-    scores: list[Score] = field(default_factory=list)
-    interrupted: bool = False
+    if not command.no_report:
+        _draw_report(command.out, out)
+    graph = recorder.graphs[-1]
+    record, tables = profile(recorder.steps) if command.profile else ({}, [])
+    out.say(f"{name}: {summary(graph)} after {counted(recorder.views, 'view')}")
+    out.say(f"run: {command.out}" + ("" if command.no_report else ", open its report.html"))
+    if tables or command.general.json:
+        out.result({"run": str(command.out), "graph": graph_to_json(graph)} | record, *tables)
 
-    @property
-    def newest(self) -> Step:
-        """The newest step."""
-        if self.last is None:
-            raise RuntimeError("a run has at least one view")
-        return self.last
 
-    def take(self, steps: Iterable[Step]) -> None:
-        """Keep every step as it comes; Ctrl-C ends the run after the views so far."""
-        try:
-            for step in steps:
-                self._keep(step)
-        except KeyboardInterrupt:
-            if self.last is None:
-                raise
-            self.interrupted = True
+def _draw_report(folder: Path, out: Output) -> None:
+    """Draw the report of a run that is in its place already."""
+    from caryatid.runs import write_report
 
-    def _keep(self, step: Step) -> None:
-        import numpy as np
-
-        from caryatid.evaluation.scores import score
-        from caryatid.steps import write_step
-        from caryatid.viz import draw_view
-
-        before, newest = self.last, None
-        if self.source is not None and self.source.truth is not None:
-            newest = score(step.graph, self.source.truth, np.random.default_rng(0))
-        if self.watcher is not None and self.source is not None:
-            self.watcher.show(step, None if newest is None else newest.f1)
-        page = [draw_view(step, self.config.report)] if self.report else []
-        if self.writer is not None:
-            write_step(self.writer, step)
-        self.last = step
-        self.pages += page
-        self.scores += [] if newest is None else [newest]
-        names = ("timings", "angle_travelled", "path_travelled", "stop")
-        self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
-        self.progress.step(step, None if before is None else before.graph, newest)
-
-    def finish(
-        self,
-        options: Mapping[str, Any],
-        more: Mapping[str, Any] | None = None,
-        strip: tuple[Figure, ...] = (),
-    ) -> None:
-        """Write what a run folder holds beside its views, and put it in its place.
-
-        Args:
-            options: What run.json records of the options.
-            more: What else run.json is to hold.
-            strip: Pictures for the end of the report.
-
-        Raises:
-            KeyboardInterrupt: The run was interrupted; says what was kept.
-        """
-        if self.writer is not None:
-            html = self._html(options, strip) if self.report and not self.interrupted else None
-            from caryatid.viz.strip import stored_figures
-
-            record = self._record(options, self.writer.views) | dict(more or {})
-            self.writer.finish(self.newest.graph, record, html, stored_figures(strip))
-        if self.interrupted and self.writer is not None:
-            kept = "1 view is" if self.writer.views == 1 else f"{self.writer.views} views are"
-            out = self.writer.folder
-            raise KeyboardInterrupt(f"{kept} kept in {out}; `caryatid report {out}` makes the report")
-        if self.interrupted:
-            raise KeyboardInterrupt
-
-    def _html(self, options: Mapping[str, Any], strip: tuple[Figure, ...]) -> str:
-        from caryatid.viz import Report, render_html
-
-        settings = {"source": self.given, "seed": self.options.modelling.seed} | dict(options)
-        settings |= {"fusion": self.config.fusion.method, "views": self.config.active.max_views}
-        scores = [asdict(score) for score in self.scores]
-        return render_html(Report(f"caryatid: {Path(self.given).name}", self.pages, settings, scores, strip))
-
-    def _record(self, options: Mapping[str, Any], views: int) -> dict[str, Any]:
-        """What run.json holds."""
-        from importlib.metadata import version
-
-        from caryatid import __version__
-
-        versions = {"caryatid": __version__, "python": platform.python_version()}
-        record: dict[str, Any] = {
-            "command": self.command,
-            "source": self.given,
-            "seed": self.options.modelling.seed,
-            "options": dict(options),
-            "settings": asdict(self.config),
-            "versions": versions | {name: version(name) for name in PACKAGES},
-            "angle_travelled": self.newest.angle_travelled,
-            "path_travelled": self.newest.path_travelled,
-            "steps": self.steps[:views],
-        }
-        if self.scores:
-            record["scores"] = [asdict(score) for score in self.scores[:views]]
-        return record | ({"interrupted": True} if self.interrupted else {})
-
-    def tell(self, profile: bool) -> None:
-        """Print what came of the run."""
-        from caryatid.cli.output import counted, print_profile, profile_record, summary, write_json
-        from caryatid.io.graph_json import graph_to_json
-
-        graph, general = self.newest.graph, self.options.general
-        out = "" if self.writer is None else str(self.writer.folder)
-        if general.json:
-            document = {"run": out, "graph": graph_to_json(graph)}
-            write_json(document | (profile_record(self.steps) if profile else {}))
-        self.progress.say(f"{self.name}: {summary(graph)} after {counted(len(self.steps), 'view')}")
-        self.progress.say(f"run: {out}" + (", open its report.html" if self.report else ""))
-        if profile and not general.json:
-            print_profile(self.steps)
+    try:
+        with out.working("drawing the report"):
+            write_report(folder)
+    except KeyboardInterrupt:
+        reason = f"the run is kept in {folder}; `caryatid report {folder}` makes the report"
+        raise KeyboardInterrupt(reason) from None

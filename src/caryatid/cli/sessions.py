@@ -3,43 +3,40 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
 from caryatid.cli.options import (
-    SAID,
-    Assignments,
     Command,
-    ConfigPath,
+    Count,
     General,
-    Modelling,
+    ModellingCommand,
     OptionalPath,
-    PlannerName,
-    RobotName,
+    OptionalText,
+    Port,
+    Segmentation,
+    SettingsCommand,
     defaults_to,
-    one_of,
-    whole_number,
+    planner_name,
+    robot_name,
+    shown_as,
 )
-from caryatid.config import SegmentationMethod
-from caryatid.config.settings import read_settings
 from caryatid.errors import InputError
 
-NEEDED = ("fastapi", "starlette", "pydantic", "uvicorn")
+NEEDED = ("fastapi", "starlette", "uvicorn")
 """Packages of the extra `serve`."""
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-Count = Annotated[int, whole_number(1)]
-Port = Annotated[int, whole_number(0)]
+ImagePath = Annotated[OptionalPath, shown_as("FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class New(Command):
+class New(ModellingCommand):
     """Begin a session in a new folder.
 
     To try:
@@ -50,21 +47,15 @@ class New(Command):
 
     folder: Folder
     """Folder of the session; new or empty."""
-    segmentation: Annotated[
-        SegmentationMethod | None,
-        one_of(SegmentationMethod),
-        defaults_to("labels where the first view has them"),
-    ] = None
+    segmentation: Annotated[Segmentation, defaults_to("labels where the first view has them")] = None
     """Use the label images that are given, or segment automatically."""
-    planner: PlannerName = "support"
+    planner: Annotated[str, planner_name()] = "support"
     """Planner of the next view."""
-    robot: RobotName = "humanoid"
+    robot: Annotated[str, robot_name()] = "humanoid"
     """Robot: arm:FILE.npz is an arm with a reachability map, module:callable one of your own."""
-    modelling: tyro.conf.OmitArgPrefixes[Modelling] = field(default_factory=Modelling)
 
     def __call__(self) -> None:
-        """Run the command."""
-        config = self.modelling.settings()
+        config = self.modelling.read()
         from caryatid.robots import located
         from caryatid.sessions import Session
 
@@ -77,8 +68,7 @@ class New(Command):
             robot=located(self.robot),
         )
         with session:
-            document = {"session": str(self.folder), "views": 0}
-            _print(self.general, document, f"session: {self.folder}")
+            _print(self.general, {"session": self.folder, "views": 0}, f"session: {self.folder}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,15 +88,14 @@ class Add(Command):
     """Depth image: 16-bit PNG, or .npy in metres; 0 or NaN = no reading."""
     camera: Annotated[Path, tyro.conf.arg(metavar="C.json")]
     """Camera of the view: pinhole matrix, pose, scale of the depth image."""
-    rgb: OptionalPath = None
+    rgb: ImagePath = None
     """Colour image: PNG, JPEG or .npy."""
-    labels: OptionalPath = None
+    labels: ImagePath = None
     """Object number of each pixel: grey PNG or .npy; 0 = nothing, an object keeps its number."""
-    number: Annotated[int | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="N"), SAID] = None
+    number: Annotated[int | None, shown_as("N")] = None
     """Expected number of the view, from 0: a view that is already there is not added again."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from caryatid.cli.output import summary
         from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Capture, Session
@@ -133,21 +122,17 @@ class Next(Command):
 
     folder: Folder
     """Folder of the session."""
-    candidates: Annotated[Path | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="C.json"), SAID] = None
+    candidates: Annotated[OptionalPath, shown_as("C.json")] = None
     """Poses to choose from, instead of those the session's robot reaches."""
 
     def __call__(self) -> None:
-        """Run the command."""
-        from caryatid.cli.output import write_json
-        from caryatid.io.json_files import read_json
+        from caryatid.cli.output import Output
         from caryatid.sessions import Session
-        from caryatid.sessions.next_view import candidates_from
+        from caryatid.sessions.next_view import read_candidates
 
         with Session.open(self.folder, read_only=True) as session:
-            poses, lengths = None, None
-            if self.candidates is not None:
-                poses, lengths = candidates_from(read_json(self.candidates), str(self.candidates))
-            write_json(session.next(poses, lengths).to_json())
+            reach = (None, None) if self.candidates is None else read_candidates(self.candidates)
+            Output(General(json=True)).result(session.next(*reach).to_json())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,12 +147,12 @@ class Graph(Command):
     """Folder of the session."""
 
     def __call__(self) -> None:
-        """Run the command."""
-        from caryatid.io.graph_json import graph_text
+        from caryatid.cli.output import Output
+        from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Session
 
         with Session.open(self.folder, read_only=True) as session:
-            sys.stdout.write(graph_text(session.graph))
+            Output(General(json=True)).result(graph_to_json(session.graph))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +167,6 @@ class Undo(Command):
     """Folder of the session."""
 
     def __call__(self) -> None:
-        """Run the command."""
         from caryatid.cli.output import counted, summary
         from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Session
@@ -200,15 +184,7 @@ class SessionCommand:
     A view that was added stays, whatever happens to the process. One command writes at a time.
     """
 
-    step: tyro.conf.OmitArgPrefixes[
-        tyro.conf.OmitSubcommandPrefixes[
-            Annotated[New, tyro.conf.subcommand("new")]
-            | Annotated[Add, tyro.conf.subcommand("add")]
-            | Annotated[Next, tyro.conf.subcommand("next")]
-            | Annotated[Graph, tyro.conf.subcommand("graph")]
-            | Annotated[Undo, tyro.conf.subcommand("undo")]
-        ]
-    ]
+    step: New | Add | Next | Graph | Undo
 
     @property
     def general(self) -> General:
@@ -216,12 +192,11 @@ class SessionCommand:
         return self.step.general
 
     def __call__(self) -> None:
-        """Run the command."""
         self.step()
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve(Command):
+class Serve(SettingsCommand):
     """Serve sessions over HTTP to robot software in any language; /docs shows the OpenAPI page.
 
     At 127.0.0.1 only programs of this machine can connect, and need no token. Any other --host demands one,
@@ -238,7 +213,7 @@ class Serve(Command):
     """Address to listen at."""
     port: Port = 8765
     """Port to listen at; 0 = any that is free."""
-    token: Annotated[str | None, tyro.conf.DisallowNone, tyro.conf.arg(metavar="TOKEN"), SAID] = None
+    token: Annotated[OptionalText, shown_as("TOKEN")] = None
     """Token that requests need; better given as CARYATID_TOKEN, where no process list shows it."""
     open_sessions: Count = 4
     """Sessions kept open; others are opened from disk on request, in a tenth of a second."""
@@ -246,20 +221,23 @@ class Serve(Command):
     """Maximum number of waiting requests; more are asked to try again."""
     max_request: Count = 16
     """Maximum size of a request [MB]."""
-    config: ConfigPath = None
-    """Settings of new sessions, instead of the defaults."""
-    set: Assignments = ()
-    """One setting of new sessions; overrides the file."""
 
     def __call__(self) -> None:
-        """Run the command."""
-        config = read_settings(self.config, self.set)
+        config = self.settings.read()
         try:
             from caryatid.service.serving import run_service
         except ModuleNotFoundError as error:
             if error.name not in NEEDED:
                 raise
             raise InputError("serve", f"needs {error.name}", 'pip install "caryatid[serve]"') from None
+        from caryatid.cli.output import Output
+
+        out = Output(self.general)
+
+        def listening(address: str) -> None:
+            text = f"serving {self.folder} at {address}, its pages at {address}/docs; Ctrl-C stops"
+            _print(self.general, {"address": address, "folder": self.folder}, text)
+
         run_service(
             self.folder,
             config,
@@ -269,8 +247,8 @@ class Serve(Command):
             open_sessions=self.open_sessions,
             waiting=self.waiting,
             max_request=self.max_request * 1_000_000,
-            quiet=self.general.quiet,
-            json=self.general.json,
+            compiling=out.say,
+            listening=listening,
         )
 
 
@@ -283,9 +261,7 @@ def _views_kept() -> Iterator[None]:
 
 
 def _print(general: General, document: Mapping[str, Any], line: str) -> None:
-    from caryatid.cli.output import write_json
+    """Print one JSON document, or a line unless --quiet."""
+    from caryatid.cli.output import Output
 
-    if general.json:
-        write_json(document)
-    elif not general.quiet:
-        sys.stdout.write(f"{line}\n")
+    Output(general).result(document, *(() if general.quiet else (f"{line}\n",)))

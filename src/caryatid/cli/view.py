@@ -1,25 +1,27 @@
-"""`caryatid view`: a run, a scene or a recording in the browser."""
+"""`caryatid view`: a run, a scene or a recording in the browser; and the page of `--view`."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from threading import Event
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from caryatid.cli.options import SAID, ExploringCommand, SourceName, whole_number
+from caryatid.cli.options import ExploringCommand, Flag, Port, SourceName
 
 if TYPE_CHECKING:
     from contextlib import ExitStack
 
-    from caryatid.cli.output import Progress
+    from caryatid.cli.output import Output
     from caryatid.config import Config
     from caryatid.viewer.page import Page
+    from caryatid.viewer.process import PageProcess
 
-SWITCH_INTERVAL = 0.0005
-"""Interval at which Python turns to a thread that waits [s]; a tenth of the default."""
-
-Port = Annotated[int, whole_number(0)]
+PORT = 8770
+"""Where the page is, or at the next port that is free."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,35 +45,27 @@ class View(ExploringCommand):
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen at; at any other than this one others can come, and nobody asks them who they are."""
-    port: Port = 8770
+    port: Port = PORT
     """Port to listen at, or the next one that is free; 0 = any that is free."""
-    no_browser: Annotated[bool, SAID] = False
+    no_browser: Flag = False
     """Say where the page is, and leave it to you to open it."""
 
     def __call__(self) -> None:
-        """Show a run, a scene or a recording until Ctrl-C."""
         import sys
         from contextlib import ExitStack
         from pathlib import Path
 
-        from caryatid.cli.output import Progress
-        from caryatid.cli.watching import wait_for_interrupt
-        from caryatid.io.json_files import json_text
+        from caryatid.cli.output import Output
         from caryatid.io.runs import is_run
 
-        config = self.settings()
-        # The page shares the interpreter with the loop and gives way to it at once.
-        sys.setswitchinterval(SWITCH_INTERVAL)
-        progress = Progress(self.general.silent)
+        config, out = self.settings(), Output(self.general)
+        # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
+        sys.setswitchinterval(0.0005)
         with ExitStack() as stack:
-            if is_run(Path(self.source)):
-                page = self._open_run(stack)
-            else:
-                page = self._open_loop(config, progress, stack)
+            page = self._open_run(stack) if is_run(Path(self.source)) else self._open_loop(config, out, stack)
             if self.general.json:
-                sys.stdout.write(json_text({"address": page.url, "source": self.source}))
-                sys.stdout.flush()
-            progress.say(f"{self.source} at {page.url}; Ctrl-C ends")
+                out.result({"address": page.url, "source": self.source})
+            out.say(f"{self.source} at {page.url}; Ctrl-C ends")
             if not self.no_browser:
                 page.open_browser()
             wait_for_interrupt()
@@ -92,32 +86,52 @@ class View(ExploringCommand):
             page.add(Moment(step, scores[step.index] if scores else None))
         return page
 
-    def _open_loop(self, config: Config, progress: Progress, stack: ExitStack) -> Page:
+    def _open_loop(self, config: Config, out: Output, stack: ExitStack) -> Page:
         from functools import partial
 
-        from caryatid.runtime.compiling import compile_kernels
         from caryatid.sources import open_source
         from caryatid.viewer.controls import Controls
         from caryatid.viewer.loop import Loop
         from caryatid.viewer.page import Page
 
-        seed = self.modelling.seed
-        opening = partial(
-            open_source,
-            self.source,
-            noise=self.noise,
-            segmentation=self.segmentation,
-            seed=seed,
-            robot=self.robot,
-        )
-        with progress.working("opening"):
-            loop = Loop(opening, config, planner=self.planner, segmentation=self.segmentation, seed=seed)
-        with progress.working("compiling"):
-            compile_kernels(progress.say)
-        title = f"caryatid: {loop.source.name}"
-        page = Page(title, config.support, host=self.host, port=self.port)
+        shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.modelling.seed}
+        opening = partial(open_source, self.source, noise=self.noise, robot=self.robot, **shared)
+        with out.working("opening"):
+            loop = Loop(opening, config, planner=self.planner, **shared)
+        out.compile()
+        page = Page(f"caryatid: {loop.source.name}", config.support, host=self.host, port=self.port)
         stack.callback(page.close)
-        controls = Controls(page, loop, seed=seed)
+        controls = Controls(page, loop, seed=self.modelling.seed)
         stack.callback(controls.close)
         controls.start()
         return page
+
+
+def wait_for_interrupt() -> None:
+    """Return at Ctrl-C."""
+    try:
+        Event().wait()
+    except KeyboardInterrupt:
+        return
+
+
+@contextmanager
+def watched(name: str, config: Config, out: Output) -> Iterator[PageProcess]:
+    """Open a page for an exploration; where that comes to its end by itself, keep it open until Ctrl-C.
+
+    Args:
+        name: What is explored.
+        config: All settings.
+        out: Says where the page is.
+    """
+    from caryatid.viewer.process import PageProcess
+
+    page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
+    out.say(f"{name} at {page.url}")
+    page.open_browser()
+    try:
+        yield page
+        out.say(f"the page stays at {page.url}; Ctrl-C ends")
+        wait_for_interrupt()
+    finally:
+        page.close()

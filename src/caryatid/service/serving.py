@@ -5,14 +5,13 @@ from __future__ import annotations
 import ipaddress
 import signal
 import socket
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import uvicorn
 
 from caryatid.config import Config
 from caryatid.errors import InputError
-from caryatid.io.json_files import json_text
 from caryatid.io.staging import write_errors
 from caryatid.runtime.compiling import compile_kernels
 from caryatid.service.app import make_app
@@ -56,9 +55,9 @@ def run_service(
     open_sessions: int,
     waiting: int,
     max_request: int,
-    quiet: bool,
-    json: bool,
-) -> int:
+    compiling: Callable[[str], None],
+    listening: Callable[[str], None],
+) -> None:
     """Serve the sessions of a folder until Ctrl-C or SIGTERM; what has been asked by then is answered.
 
     Args:
@@ -70,8 +69,8 @@ def run_service(
         open_sessions: How many are kept in memory at once.
         waiting: How many requests may wait.
         max_request: Largest request [bytes].
-        quiet: Say nothing.
-        json: Say where it listens as JSON.
+        compiling: Called with one line if there are kernels to compile.
+        listening: Called with the address once requests are answered.
 
     Raises:
         InputError: A token is missing, the address is taken, or the folder cannot be written.
@@ -80,7 +79,7 @@ def run_service(
     with write_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     listener = _listen(host, port)
-    compile_kernels(lambda line: None if quiet or json else _say(line))
+    compile_kernels(compiling)
     app = make_app(
         SessionPool(folder, config, open_sessions, waiting), token=token, max_request=max_request, host=host
     )
@@ -104,16 +103,11 @@ def run_service(
     # The server hears signals itself as soon as it runs, and hands them on once it has stopped.
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        if json:
-            sys.stdout.write(json_text({"address": address, "folder": str(folder)}))
-            sys.stdout.flush()
-        elif not quiet:
-            _say(f"serving {folder} at {address}, its pages at {address}/docs; Ctrl-C stops")
+        listening(address)
         server.run(sockets=[listener])
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    return 0
 
 
 def _listen(host: str, port: int) -> socket.socket:
@@ -125,8 +119,3 @@ def _listen(host: str, port: int) -> socket.socket:
         raise InputError(
             f"{host}:{port}", f"cannot be listened at ({reason.lower()})", "choose another --port or --host"
         ) from None
-
-
-def _say(line: str) -> None:
-    sys.stdout.write(f"{line}\n")
-    sys.stdout.flush()

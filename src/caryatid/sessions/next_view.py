@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import next_best_view
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.json_files import Numbers, parse_json
+from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.robots import (
@@ -110,17 +111,13 @@ class _Reachable:
     path_length: Annotated[Array, Numbers(-1)] | None = None
 
 
-def candidates_from(document: Mapping[str, Any], source: str) -> tuple[Array, Array | None]:
+def read_candidates(path: Path) -> tuple[Array, Array | None]:
     """Read poses (N, 4, 4) a robot reaches and the path length (N,) [m] to each, None where it is missing.
-
-    Args:
-        document: The parsed JSON object.
-        source: What to call it in errors.
 
     Raises:
         InputError: A key is missing, or not a list of poses, or of lengths.
     """
-    given = parse_json(_Reachable, document, source)
+    given = parse_json(_Reachable, read_json(path), path)
     return given.T_world_camera, given.path_length
 
 

@@ -1,0 +1,133 @@
+"""All commands by name, and the one that the command line asks for; the two that only print text."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import os
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stdout, suppress
+from dataclasses import asdict, dataclass
+from pkgutil import resolve_name
+from typing import Annotated, Any, Literal, Union
+
+import tyro
+
+from caryatid.cli.options import Command, ModellingCommand
+
+DESCRIPTION = """Explore a cluttered table until it is known which object supports which.
+
+To begin:
+  caryatid demo                                     a built-in table, explored in simulation
+  caryatid view clutter                             the same in the browser, view by view
+  caryatid explore tower --noise carmine --out run  another, or a scene or recording of your own
+  caryatid extract table.pcd --out run              one cloud, or all views of a recording
+  caryatid order run                                a safe order to take away what was found
+  caryatid COMMAND --help                           what a command does, its options, and examples
+  caryatid --version                                the version of caryatid
+"""
+"""Beginning of the help."""
+
+COMMANDS = {
+    "demo": "run:Demo",
+    "explore": "run:Explore",
+    "extract": "run:Extract",
+    "view": "view:View",
+    "evaluate": "results:Evaluate",
+    "order": "results:OrderCommand",
+    "dismantle": "run:Dismantle",
+    "import": "results:Import",
+    "report": "results:ReportCommand",
+    "export": "results:Export",
+    "benchmark": "benchmark:Benchmark",
+    "session": "sessions:SessionCommand",
+    "serve": "sessions:Serve",
+    "config": "commands:ShowConfig",
+    "completion": "commands:Completion",
+}
+"""Modules and classes of the commands, in the order of the help; imported when they are asked for."""
+
+MARKERS = (
+    tyro.conf.DisallowNone,
+    tyro.conf.FlagCreatePairsOff,
+    tyro.conf.HelptextFromCommentsOff,
+    tyro.conf.OmitArgPrefixes,
+    tyro.conf.OmitSubcommandPrefixes,
+)
+"""How options look."""
+
+
+def find_command(name: str) -> type:
+    """Return the dataclass of a command."""
+    command: type = resolve_name(f"caryatid.cli.{COMMANDS[name]}")
+    return command
+
+
+def read_command(arguments: Sequence[str]) -> Any:
+    """Return the command that the arguments ask for, ready to be called.
+
+    Raises:
+        SystemExit: After --help, with 0; on wrong options, with 2.
+    """
+    shown = sys.stdout.isatty() and sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+    tyro._experimental_options["ansi_codes"] = shown
+    if arguments and arguments[0] in COMMANDS:
+        name, *options = arguments
+        return tyro.cli(find_command(name), prog=f"caryatid {name}", args=options, config=MARKERS)
+    return tyro.cli(
+        _any_command(), prog="caryatid", description=DESCRIPTION, args=list(arguments), config=MARKERS
+    )
+
+
+def _any_command() -> Any:
+    """The type of all commands, each with the first line of its help."""
+    subcommands = []
+    for name in COMMANDS:
+        command = find_command(name)
+        summary = (inspect.getdoc(command) or "").partition("\n")[0]
+        spec = tyro.conf.subcommand(name, constructor=command, description=summary)
+        subcommands.append(Annotated[Any, spec])
+    # Where there is no help text, tyro looks for one in the sources of `typing`, which takes long.
+    return Annotated[Union[tuple(subcommands)], tyro.conf.arg(help="")]  # noqa: UP007
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShowConfig(ModellingCommand):
+    """Print all settings as TOML, to edit and pass back with --config.
+
+    To try:
+      caryatid config > settings.toml
+    """
+
+    def __call__(self) -> None:
+        from caryatid.cli.output import Output
+        from caryatid.config.settings import write_settings
+
+        config = self.modelling.read()
+        Output(self.general).result(asdict(config), write_settings(config))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Completion(Command):
+    """Print a script that lets the shell complete commands and options.
+
+    To try:
+      source <(caryatid completion bash)
+      caryatid completion bash > ~/.local/share/bash-completion/completions/caryatid
+      caryatid completion zsh > "${fpath[1]}/_caryatid"
+      caryatid completion fish > ~/.config/fish/completions/caryatid.fish
+      caryatid completion tcsh > ~/.caryatid.tcsh && echo source ~/.caryatid.tcsh >> ~/.tcshrc
+    """
+
+    shell: Annotated[Literal["bash", "zsh", "fish", "tcsh"], tyro.conf.Positional]
+    """The shell."""
+
+    def __call__(self) -> None:
+        from caryatid.cli.output import Output
+
+        script = io.StringIO()
+        words = ["--tyro-write-completion", self.shell, "-"]
+        with redirect_stdout(script), suppress(SystemExit):
+            tyro.cli(_any_command(), prog="caryatid", args=words, config=MARKERS)
+        Output(self.general).result({"shell": self.shell, "script": script.getvalue()}, script.getvalue())

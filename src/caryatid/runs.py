@@ -1,0 +1,144 @@
+"""A run from its first step to its report: each step is kept and scored, the report drawn from the folder."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from caryatid.config import Config
+from caryatid.evaluation.scores import Score, TrueScene, score
+from caryatid.exploration import Step
+from caryatid.graph import SupportGraph
+from caryatid.io.runs import RunWriter, read_run
+from caryatid.io.staging import write_file
+from caryatid.steps import read_config, read_steps, write_step
+from caryatid.viz import Report, draw_view, render_html, render_pdf
+from caryatid.viz.strip import read_figures
+
+PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
+"""Packages whose versions run.json records."""
+
+
+@dataclass(slots=True, kw_only=True)
+class RunRecorder:
+    """Keeps and scores the steps of a run, and writes run.json.
+
+    Attributes:
+        command: Name of the command.
+        source: What is explored, as the user gave it.
+        seed: Seed of every random choice.
+        options: What run.json records of the options.
+        config: All settings.
+        writer: Writes the run folder; None where none is wanted.
+        truth: What is really there, where known.
+        steps: What run.json records of each view: its number, its timings [s], angle and path so far.
+        graphs: The fused graph after each view.
+        scores: The score of each view, where the truth is known.
+        interrupted: Whether Ctrl-C ended the run.
+    """
+
+    command: str
+    source: str
+    seed: int
+    options: Mapping[str, object]
+    config: Config
+    writer: RunWriter | None
+    truth: TrueScene | None = None
+    steps: list[dict[str, Any]] = field(default_factory=list)
+    graphs: list[SupportGraph] = field(default_factory=list)
+    scores: list[Score] = field(default_factory=list)
+    interrupted: bool = False
+
+    @property
+    def views(self) -> int:
+        """Number of views that are kept; an interrupt may come before the newest one is written."""
+        return len(self.graphs) if self.writer is None else self.writer.views
+
+    def keep(self, step: Step) -> Score | None:
+        """Score a step and write it to the run folder; returns the score.
+
+        Raises:
+            InputError: The disk is full or refuses; nothing is left behind.
+        """
+        if self.truth is not None:
+            self.scores.append(score(step.graph, self.truth, np.random.default_rng(0)))
+        names = ("timings", "angle_travelled", "path_travelled", "stop")
+        self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
+        self.graphs.append(step.graph)
+        if self.writer is not None:
+            write_step(self.writer, step)
+        return self.scores[-1] if self.scores else None
+
+    def finish(
+        self, more: Mapping[str, object] | None = None, files: Mapping[str, bytes] | None = None
+    ) -> None:
+        """Put the run folder in its place.
+
+        Args:
+            more: What else run.json is to hold.
+            files: Further files by their paths in the folder.
+
+        Raises:
+            KeyboardInterrupt: The run was interrupted; says what was kept.
+        """
+        if self.writer is not None:
+            record = self._record() | dict(more or {})
+            self.writer.finish(self.graphs[self.views - 1], record, files=files)
+        if self.interrupted and self.writer is not None:
+            kept = "1 view is" if self.views == 1 else f"{self.views} views are"
+            folder = self.writer.folder
+            raise KeyboardInterrupt(f"{kept} kept in {folder}; `caryatid report {folder}` makes the report")
+        if self.interrupted:
+            raise KeyboardInterrupt
+
+    def _record(self) -> dict[str, Any]:
+        """What run.json holds."""
+        last = self.steps[self.views - 1]
+        record: dict[str, Any] = {
+            "command": self.command,
+            "source": self.source,
+            "seed": self.seed,
+            "options": dict(self.options),
+            "settings": asdict(self.config),
+            "versions": {"python": platform.python_version()} | {name: version(name) for name in PACKAGES},
+            "angle_travelled": last["angle_travelled"],
+            "path_travelled": last["path_travelled"],
+            "steps": self.steps[: self.views],
+        }
+        if self.truth is not None:
+            record["scores"] = [asdict(score) for score in self.scores[: self.views]]
+        return record | ({"interrupted": True} if self.interrupted else {})
+
+
+def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
+    """Draw the report of a run folder and write its report.html.
+
+    Args:
+        folder: The run.
+        pdf: Where to write it as a PDF too.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        InputError: It is no run, a file in it is broken, or a file cannot be written; an older report.html
+            is left as it was.
+    """
+    run = read_run(folder)
+    config, record = read_config(run), run.record
+    settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
+    settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
+    pages = [draw_view(step, config.report) for step in read_steps(run)]
+    title = f"caryatid: {Path(record['source']).name}"
+    report = Report(title, pages, settings, record.get("scores", ()), read_figures(folder))
+    files = {} if pdf is None else {pdf: render_pdf(report)}
+    files[folder / "report.html"] = render_html(report).encode()
+    for path, content in files.items():
+        write_file(path, content)
+    return list(files)
