@@ -9,8 +9,6 @@ from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile, solve_positive
 from caryatid.geometry.signed_distance import gradient, local, write_distances
 
-ROBUST_WIDTH = 2.5
-"""Residuals beyond this many robust standard deviations lose most of their weight (Geman–McClure)."""
 RIDGE = 1e-3 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
 """Added to the diagonal, times the damping, so that what no point determines stays where it is."""
 NOISE_FLOOR = 0.001
@@ -20,8 +18,6 @@ CONVERGED = 1e-4
 """Least squares end with a step that lowers the cost by less than this share; the rest is far below noise."""
 ROUGHLY = 1e-3
 """The same where another refinement follows."""
-SHRINK = 2e-5
-"""Pull on every extent in the search [m]: keeps sides that hold no points near; the last fit has none."""
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
@@ -54,7 +50,8 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
     write_distances(kind, R, centre, half, points, distance)
     for _ in range(steps):
         absolute[:] = np.abs(distance)
-        scale = ROBUST_WIDTH * max(1.4826 * quantile(absolute, 0.5), NOISE_FLOOR)
+        # What is further off than 2.5 robust standard deviations loses most of its weight.
+        scale = 2.5 * max(1.4826 * quantile(absolute, 0.5), NOISE_FLOOR)
         normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
         cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
         improved = False

@@ -10,19 +10,26 @@ from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
 from caryatid.geometry.signed_distance import gradient, local
 
-BARE_SPACING = 0.008
-"""Spacing of the samples that look for points near a side [m]; a point within twice that is near one."""
 FACING = 0.7
 """A point bears out the side whose outward normal its own gradient follows with this cosine [1]; 45°."""
-AGREE = 0.5
-"""Least cosine between a point's normal and the shape's there [1]."""
+BARE_SPACING = 0.008
+"""Spacing of the samples that look for points near a side [m]; a point within twice that is near one."""
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def draw_in(  # type: ignore[no-untyped-def]
+def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
+    """Coordinates (N, 3) of points (N, 3) in a frame with axes R (3, 3) at an origin (3,)."""
+    own = np.empty((len(points), 3))
+    for i in range(len(points)):
+        own[i, 0], own[i, 1], own[i, 2] = local(R, origin, points, i)
+    return own
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def judge(  # type: ignore[no-untyped-def]
     kind, R, centre, half, points, normals, threshold, least, min_extent, seen
 ):
-    """Find the sides that points bear out, and move the others inwards to where the points end.
+    """Find the sides that points bear out, draw the others in to where the points end, and score the shape.
 
     Args:
         kind: Code of the shape.
@@ -35,87 +42,51 @@ def draw_in(  # type: ignore[no-untyped-def]
         least: Points that bear out a side at the least.
         min_extent: Least extent [m].
         seen: Whether the sides -x, +x, -y, +y, -z, +z are (6,); written to.
-    """
-    hx, hy, hz = half[0], half[1], half[2]
-    counts = np.zeros(6, np.intp)
-    near_points = np.empty((3, len(points)))
-    near = 0
-    for i in range(len(points)):
-        x, y, z = local(R, centre, points, i)
-        d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
-        if not abs(d) < threshold:
-            continue
-        near_points[0, near], near_points[1, near], near_points[2, near] = x, y, z
-        near += 1
-        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-        wx = R[0, 0] * gx + R[0, 1] * gy + R[0, 2] * gz
-        wy = R[1, 0] * gx + R[1, 1] * gy + R[1, 2] * gz
-        wz = R[2, 0] * gx + R[2, 1] * gy + R[2, 2] * gz
-        if nx * wx + ny * wy + nz * wz > AGREE:
-            counts[0] += gx < -FACING
-            counts[1] += gx > FACING
-            counts[2] += gy < -FACING
-            counts[3] += gy > FACING
-            counts[4] += gz < -FACING
-            counts[5] += gz > FACING
-    for side in range(6):
-        seen[side] = counts[side] >= least
-    if kind == SPHERE:
-        return
-    if near == 0:
-        near = len(points)
-        for i in range(near):
-            for a in range(3):
-                near_points[a, i] = 0.0
-                for b in range(3):
-                    near_points[a, i] += R[b, a] * (points[i, b] - centre[b])
-    shift = np.zeros(3)
-    for axis in range(3):
-        if (kind == CYLINDER and axis < 2) or (seen[2 * axis] and seen[2 * axis + 1]):
-            continue
-        reach = near_points[axis, :near]
-        low, high = -half[axis], half[axis]
-        if not seen[2 * axis]:
-            low = min(max(low, quantile(reach, TRIM)), high - min_extent)
-        if not seen[2 * axis + 1]:
-            high = max(min(high, quantile(reach, 1.0 - TRIM)), low + min_extent)
-        half[axis], shift[axis] = (high - low) / 2.0, (high + low) / 2.0
-    for a in range(3):
-        centre[a] += R[a, 0] * shift[0] + R[a, 1] * shift[1] + R[a, 2] * shift[2]
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def misfit(kind, R, centre, half, points, normals, threshold):  # type: ignore[no-untyped-def]
-    """How badly a shape explains oriented points.
-
-    Args:
-        kind: Code of the shape.
-        R: Its axes (3, 3).
-        centre: Its centre (3,) [m].
-        half: Its half extents (3,) [m].
-        points: (N, 3) [m].
-        normals: Unit normals (N, 3).
-        threshold: Distance beyond which points are none of its [m].
 
     Returns:
         Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, 1 at the most;
         share of the points within the threshold.
     """
+    own, facing, count = in_frame(R, centre, points), in_frame(R, np.zeros(3), normals), len(points)
+    counts, near = np.zeros(6, np.intp), np.zeros(count, np.bool_)
     hx, hy, hz = half[0], half[1], half[2]
+    for i in range(count):
+        d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
+        near[i] = abs(d) < threshold
+        if near[i] and gx * facing[i, 0] + gy * facing[i, 1] + gz * facing[i, 2] > 0.5:
+            for axis, g in enumerate((gx, gy, gz)):
+                counts[2 * axis] += g < -FACING
+                counts[2 * axis + 1] += g > FACING
+    seen[:] = counts >= least
+    if kind != SPHERE:
+        _draw_in(kind, R, centre, half, own, own[near] if near.any() else own, min_extent, seen)
     away = turned = 0.0
     inliers = 0
-    for i in range(len(points)):
-        x, y, z = local(R, centre, points, i)
-        d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
-        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
-        mx = R[0, 0] * nx + R[1, 0] * ny + R[2, 0] * nz
-        my = R[0, 1] * nx + R[1, 1] * ny + R[2, 1] * nz
-        mz = R[0, 2] * nx + R[1, 2] * ny + R[2, 2] * nz
+    hx, hy, hz = half[0], half[1], half[2]
+    for i in range(count):
+        d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
         away += min(abs(d), threshold)
-        turned += min(max(1.0 - (gx * mx + gy * my + gz * mz), 0.0), 1.0)
+        cosine = gx * facing[i, 0] + gy * facing[i, 1] + gz * facing[i, 2]
+        turned += min(max(1.0 - cosine, 0.0), 1.0)
         inliers += abs(d) < threshold
-    count = len(points)
     return away / count, turned / count, inliers / count
+
+
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _draw_in(kind, R, centre, half, own, near, min_extent, seen):  # type: ignore[no-untyped-def]
+    """Move sides that are not seen inwards to where the near points end; all points move with the centre."""
+    shift = np.zeros(3)
+    for axis in range(2 if kind == CYLINDER else 0, 3):
+        low, high = -half[axis], half[axis]
+        if not seen[2 * axis]:
+            low = min(max(low, quantile(near[:, axis].copy(), TRIM)), high - min_extent)
+        if not seen[2 * axis + 1]:
+            high = max(min(high, quantile(near[:, axis].copy(), 1.0 - TRIM)), low + min_extent)
+        half[axis], shift[axis] = (high - low) / 2.0, (high + low) / 2.0
+    for a in range(3):
+        centre[a] += R[a, 0] * shift[0] + R[a, 1] * shift[1] + R[a, 2] * shift[2]
+        for i in range(len(own)):
+            own[i, a] -= shift[a]
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
@@ -130,19 +101,12 @@ def bare_share(kind, R, centre, half, seen, points):  # type: ignore[no-untyped-
         seen: Which sides (6,) are seen.
         points: (N, 3) [m].
     """
-    own = np.empty((len(points), 3))
-    for i in range(len(points)):
-        for a in range(3):
-            own[i, a] = 0.0
-            for b in range(3):
-                own[i, a] += R[b, a] * (points[i, b] - centre[b])
-    squared = 4.0 * BARE_SPACING * BARE_SPACING
+    own = in_frame(R, centre, points)
     samples = bare = last = 0
     for side in range(6):
         if not seen[side]:
             continue
-        axis, sign = side // 2, 2 * (side % 2) - 1
-        places = _samples(kind, half, axis, sign, BARE_SPACING)
+        places = _samples(kind, half, side // 2, 2 * (side % 2) - 1)
         samples += len(places)
         for k in range(len(places)):
             u, v, w = places[k, 0], places[k, 1], places[k, 2]
@@ -150,59 +114,43 @@ def bare_share(kind, R, centre, half, seen, points):  # type: ignore[no-untyped-
             for n in range(-1, len(own)):
                 i = last if n < 0 else n
                 x, y, z = own[i, 0] - u, own[i, 1] - v, own[i, 2] - w
-                if x * x + y * y + z * z <= squared:
-                    found = True
-                    last = i
+                if x * x + y * y + z * z <= 4.0 * BARE_SPACING * BARE_SPACING:
+                    found, last = True, i
                     break
             bare += not found
     return bare / samples if samples > 0 else 1.0
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _samples(kind, half, axis, sign, spacing):  # type: ignore[no-untyped-def]
-    """Points (M, 3) [m] about `spacing` apart on one side, in the object's frame.
+def _samples(kind, half, axis, sign):  # type: ignore[no-untyped-def]
+    """Points (M, 3) [m] about `BARE_SPACING` apart on one side, in the object's frame.
 
     A round side is the part of the surface whose outward normal is nearest to the side's direction.
     """
-    if kind == BOX or (kind == CYLINDER and axis == 2):
-        return _flat_side(kind, half, axis, sign, spacing)
-    quarter = half[0] * np.pi / 2.0
-    around = max(2, int(np.ceil(quarter / spacing)))
-    along = around if kind == SPHERE else max(2, int(np.ceil(2.0 * half[2] / spacing)))
-    found = np.empty((around * along, 3))
     u, v = (axis + 1) % 3, (axis + 2) % 3
-    if kind == CYLINDER:
+    flat = kind == BOX or (kind == CYLINDER and axis == 2)
+    if kind == CYLINDER and not flat:
         u, v = 1 - axis, 2
-    for i in range(around):
-        angle = (np.pi / 2.0) * ((i + 0.5) / around - 0.5)
-        for j in range(along):
-            k = i * along + j
-            if kind == CYLINDER:
-                found[k, axis] = sign * half[0] * np.cos(angle)
-                found[k, u] = half[0] * np.sin(angle)
-                found[k, v] = half[2] * (2.0 * (j + 0.5) / along - 1.0)
+    quarter = half[0] * np.pi / 4.0
+    rows = max(2, int(np.ceil(2.0 * (half[u] if flat else quarter) / BARE_SPACING)))
+    columns = max(2, int(np.ceil(2.0 * (quarter if kind == SPHERE else half[v]) / BARE_SPACING)))
+    found = np.empty((rows * columns, 3))
+    count = 0
+    for i in range(rows):
+        for j in range(columns):
+            a, b = 2.0 * (i + 0.5) / rows - 1.0, 2.0 * (j + 0.5) / columns - 1.0
+            if flat:
+                x, y, z = half[axis], half[u] * a, half[v] * b
+                if kind == CYLINDER and y * y + z * z > half[0] * half[0]:
+                    continue
+            elif kind == CYLINDER:
+                angle = np.pi / 4.0 * a
+                x, y, z = half[0] * np.cos(angle), half[0] * np.sin(angle), half[2] * b
             else:
                 # Equal angles both ways: the cube's side blown up to the sphere.
-                b = np.tan((np.pi / 2.0) * ((j + 0.5) / along - 0.5))
-                a = np.tan(angle)
-                length = half[0] / np.sqrt(1.0 + a * a + b * b)
-                found[k, axis], found[k, u], found[k, v] = sign * length, a * length, b * length
-    return found
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _flat_side(kind, half, axis, sign, spacing):  # type: ignore[no-untyped-def]
-    u, v = (axis + 1) % 3, (axis + 2) % 3
-    columns = max(2, int(np.ceil(2.0 * half[u] / spacing)))
-    rows = max(2, int(np.ceil(2.0 * half[v] / spacing)))
-    found = np.empty((columns * rows, 3))
-    count = 0
-    for i in range(columns):
-        for j in range(rows):
-            a = half[u] * (2.0 * (i + 0.5) / columns - 1.0)
-            b = half[v] * (2.0 * (j + 0.5) / rows - 1.0)
-            if kind == CYLINDER and a * a + b * b > half[0] * half[0]:
-                continue
-            found[count, axis], found[count, u], found[count, v] = sign * half[axis], a, b
+                a, b = np.tan(np.pi / 4.0 * a), np.tan(np.pi / 4.0 * b)
+                x = half[0] / np.sqrt(1.0 + a * a + b * b)
+                y, z = a * x, b * x
+            found[count, axis], found[count, u], found[count, v] = sign * x, y, z
             count += 1
     return found[:count]

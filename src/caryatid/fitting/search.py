@@ -12,10 +12,6 @@ from caryatid.geometry import BOX, CYLINDER
 from caryatid.geometry.points import quantile
 from caryatid.geometry.signed_distance import local, signed_distance
 
-CONFIDENCE = 0.99
-"""The search stops when a better sample is less likely than 1 − this [1]."""
-BATCH = 25
-"""Hypotheses drawn between two looks at the stopping rule."""
 TRIM = 0.005
 """Share of the points beyond each end of an extent that count as noise [1]."""
 LEAST_EXTENT, LEAST_RADIUS = 1e-4, 1e-3
@@ -24,13 +20,11 @@ LEAST_SINE = (0.1, 0.3, 0.5)
 """Least sine of the angle between two normals that determine a sphere, a cylinder and a box [1]."""
 AGREEING = float(np.cos(np.radians(25.0)))
 """Least cosine between normals of one face [1]."""
-TURN = 3.0
-"""Step between the directions tried for the sides of a flat box [deg]; least squares do the rest."""
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def search(  # type: ignore[no-untyped-def]
-    kind, points, normals, samples, threshold, max_radius, max_extent, R, centre, half, cost
+    kind, points, normals, samples, threshold, max_radius, max_extent, R, centre, half
 ):
     """Score hypotheses until a better one has become unlikely; keep the best, the best first (MSAC).
 
@@ -45,14 +39,12 @@ def search(  # type: ignore[no-untyped-def]
         R: Axes (K + 1, 3, 3) of the K best, columns = x, y, z; written to, the last one is for trials.
         centre: (K + 1, 3) [m]; written to.
         half: Half extents (K + 1, 3) [m]; written to.
-        cost: Mean truncated squared distances (K + 1,) in units of the threshold; written to.
 
     Returns:
         How many there are, at most K.
     """
     count, keep = len(points), len(R) - 1
-    for k in range(keep + 1):
-        cost[k] = np.inf
+    cost = np.full(keep + 1, np.inf)
     most_inliers = found = 0
     for b in range(len(samples)):
         i, j = samples[b]
@@ -71,9 +63,10 @@ def search(  # type: ignore[no-untyped-def]
                 found = min(found + 1, keep)
                 if place == 0:
                     most_inliers = inliers
-        if (b + 1) % BATCH == 0 and found > 0:
+        # Every 25 hypotheses: stop when a better one is less likely than a hundredth.
+        if b % 25 == 24 and found > 0:
             hit = min(max((most_inliers / count) ** 2, 1e-9), 1.0 - 1e-9)
-            if b + 1 >= keep * np.log(1.0 - CONFIDENCE) / np.log(1.0 - hit):
+            if b + 1 >= keep * np.log(0.01) / np.log(1.0 - hit):
                 break
     return found
 
@@ -105,8 +98,8 @@ def of_one_face(  # type: ignore[no-untyped-def]
     _set_axes(R, ux, uy, uz, x, y, z, 0)
     if kind == BOX:
         best, least = 0.0, np.inf
-        for step in range(int(90.0 / TURN)):
-            angle = np.radians(step * TURN)
+        for step in range(30):
+            angle = np.radians(3.0 * step)  # Least squares do the rest.
             area = 1.0
             for quarter in range(2):
                 c, s = np.cos(angle + quarter * np.pi / 2.0), np.sin(angle + quarter * np.pi / 2.0)

@@ -11,11 +11,6 @@ from caryatid.config import FitConfig
 from caryatid.geometry import BOX, SPHERE
 from caryatid.geometry.transforms import Array
 
-_SIZE_COLUMNS = np.array([(6, 6, 6), (6, 6, 8), (6, 7, 8)])
-"""Column of the normal equations that holds the half extent along x, y, z, by the code of the kind."""
-_TURN = 1.0
-"""Standard deviation of a rotation that nothing determines [rad]."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Uncertainty:
@@ -46,46 +41,45 @@ class Uncertainty:
 
 
 def estimate(
-    kinds: NDArray[np.intp],
+    kind: int,
     seen: NDArray[np.bool_],
     unseen: Array,
-    normal_matrices: Array,
-    sigma: Array,
+    information: Array,
+    sigma: float,
     config: FitConfig,
-) -> list[Uncertainty]:
-    """Standard deviations of several shapes from the normal equations of their last fits.
+) -> Uncertainty:
+    """Standard deviations of a shape from the normal equations of its last fit.
 
     Args:
-        kinds: Code (P,) of each shape's kind.
-        seen: Which sides (P, 6) points bear out.
-        unseen: Standard deviation (P, 6) [m] of the sides that no point bears out.
-        normal_matrices: Sum over the points of the products of their derivatives (P, 9, 9), unseen sides out
-            of the way; rows and columns as of `least_squares.normal_equations`.
-        sigma: Robust standard deviation (P,) [m] of the points' distances to the shape.
+        kind: Code of the shape.
+        seen: Which sides (6,) points bear out.
+        unseen: Standard deviation (6,) [m] of the sides that no point bears out.
+        information: Sum over the points of the products of their derivatives (9, 9), unseen sides out of the
+            way; rows and columns as of `least_squares.normal_equations`.
+        sigma: Robust standard deviation [m] of the points' distances to the shape.
         config: How many points share an error, and the error of registration.
     """
-    information = normal_matrices / (config.correlated * sigma[:, None, None] ** 2)
-    prior = np.array([config.max_extent] * 3 + [_TURN] * 3 + [config.max_extent] * 3)
+    # A radian for a rotation that nothing determines.
+    prior = np.array([config.max_extent] * 3 + [1.0] * 3 + [config.max_extent] * 3)
+    information = information / (config.correlated * sigma**2)
     covariance = np.linalg.inv(information + np.diag(prior**-2.0))
     # Rounding may leave a variance a little below zero.
-    variance = np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0)
-    rows, axes, columns = np.arange(len(kinds))[:, None], np.arange(3), _SIZE_COLUMNS[kinds]
-    centre, half, both = variance[:, :3], variance[rows, columns], covariance[rows, axes, columns]
-    borne_out = _borne_out(kinds, seen)
-    low = np.where(borne_out[:, 0::2], np.maximum(centre + half - 2.0 * both, 0.0), unseen[:, 0::2] ** 2)
-    high = np.where(borne_out[:, 1::2], np.maximum(centre + half + 2.0 * both, 0.0), unseen[:, 1::2] ** 2)
-    determined = borne_out[:, 0::2] & borne_out[:, 1::2]
-    floor = config.registration**2
-    position = np.sqrt(np.where(determined, centre, (low + high) / 4.0) + floor)
-    sizes = np.sqrt(np.where(determined, 4.0 * half, low + high) + floor)
-    sides = np.sqrt(np.stack([low, high], axis=2).reshape(-1, 6) + floor)
-    rotation = np.sqrt(variance[:, 3:6])
-    return [Uncertainty(*found) for found in zip(position, rotation, sizes, sides, strict=True)]
-
-
-def _borne_out(kinds: NDArray[np.intp], seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Sides (P, 6) that points tell of: any part of a round surface tells where all of it is."""
+    variance = np.maximum(np.diagonal(covariance), 0.0)
+    # The half extents along x, y, z have these columns: round ones share one.
+    columns = {BOX: (6, 7, 8), SPHERE: (6, 6, 6)}.get(kind, (6, 6, 8))
+    centre, half, both = variance[:3], variance[list(columns)], covariance[range(3), columns]
     borne_out = seen.copy()
-    borne_out[:, :4] |= (kinds != BOX)[:, None] & seen[:, :4].any(axis=1, keepdims=True)
-    borne_out[kinds == SPHERE] = True
-    return borne_out
+    if kind != BOX:
+        # Any part of a round surface tells where all of it is.
+        borne_out[:4] |= seen[:4].any()
+    borne_out |= kind == SPHERE
+    low = np.where(borne_out[0::2], np.maximum(centre + half - 2.0 * both, 0.0), unseen[0::2] ** 2)
+    high = np.where(borne_out[1::2], np.maximum(centre + half + 2.0 * both, 0.0), unseen[1::2] ** 2)
+    determined = borne_out[0::2] & borne_out[1::2]
+    floor = config.registration**2
+    return Uncertainty(
+        position=np.sqrt(np.where(determined, centre, (low + high) / 4.0) + floor),
+        rotation=np.sqrt(variance[3:6]),
+        sizes=np.sqrt(np.where(determined, 4.0 * half, low + high) + floor),
+        sides=np.sqrt(np.stack([low, high], axis=1).ravel() + floor),
+    )

@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import ExplanationConfig, FitConfig
-from caryatid.fitting import explaining as kernels
-from caryatid.fitting.explaining import free_inside
-from caryatid.fitting.primitives import Oriented, candidates
+from caryatid.fitting.primitives import Oriented, candidates, free_inside
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.voxel_map import VoxelMap
@@ -77,9 +75,10 @@ def point_costs(shape: Shape | None, evidence: Evidence, config: ExplanationConf
     """Cost (N,) [nats] of each point on a shape, or on an irregular object, before its weight."""
     if shape is None:
         return np.full(len(evidence), config.irregular)
-    row = Primitives.of([shape]).row(0)
-    prices = evidence.noise, config.normal_weight, config.outlier
-    return np.asarray(kernels.point_costs(*row, evidence.points, evidence.normals, *prices))
+    distance, outward = Primitives.of([shape]).gradient(0, evidence.points)
+    turned = 1.0 - np.einsum("ij,ij->i", outward, evidence.normals)
+    cost = distance**2 / (2.0 * evidence.noise**2) + config.normal_weight * turned
+    return np.minimum(cost, config.outlier)
 
 
 def shape_cost(shape: Shape | None, evidence: Evidence, config: ExplanationConfig) -> float:

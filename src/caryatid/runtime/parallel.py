@@ -7,13 +7,16 @@ each piece of work is compiled once, and the loop needs no compiling.
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
 from numba import types
+
+Result = TypeVar("Result")
 
 
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
@@ -28,17 +31,29 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
         data: Arrays and numbers, best a `NamedTuple`; results are written to arrays among them.
     """
     compiled = _compiled(work, data)
+    on_threads(lambda index: compiled(index, data), count)
+
+
+def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
+    """Results of a task for each index from 0 to count − 1, found on as many threads as numba uses.
+
+    Args:
+        task: Calls kernels compiled with `nogil=True`; it must not call `on_threads` itself.
+        count: Number of indices.
+    """
+    results: list[Any] = [None] * count
     indices = iter(range(count))
 
     def take_share() -> None:
         for index in indices:
-            compiled(index, data)
+            results[index] = task(index)
 
     helpers = min(numba.get_num_threads(), count) - 1
     shares = [_threads(os.getpid()).submit(take_share) for _ in range(helpers)]
     take_share()
     for share in shares:
         share.result()
+    return results
 
 
 _kept: dict[tuple[Any, ...], Any] = {}
