@@ -107,7 +107,7 @@ def normal(name):
 
 MODULES = {
     "view": ["viser"],
-    "serve": ["fastapi", "starlette", "pydantic", "uvicorn"],
+    "serve": ["fastapi", "starlette", "uvicorn"],
     "ros": ["rosbags"],
     "benchmark": ["pyarrow"],
     "cluster": ["distributed", "dask"],
