@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from caryatid.geometry import transforms
-from caryatid.io.transform_tree import SECOND, MissingTransform, TransformTree, is_pose
+from caryatid.io.video import SECOND, MissingTransform, TransformTree, is_pose
 
 NOW = 1_700_000_000 * SECOND
 """Large enough that a float would lose the nanoseconds."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import io
 import json
 import zipfile
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Iterator
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +29,8 @@ from caryatid.sensing.views import Cloud, View
 COMPRESSION = 1
 """Level of zlib: higher ones take longer and save little."""
 
-ARRAYS = {
-    "view": ("depth", "K", "T_world_camera", "rgb", "labels", "normals_camera"),
-    "candidates": ("T_world_camera", "directions", "path_length", "indices"),
-    "decision": ("T_world_camera", "candidate_saliency", "sphere_saliency"),
-}
-"""The arrays of each part of a step, by the names of the fields."""
+PARTS = {"cloud": Cloud, "sphere": ViewSphere, "view": View, "candidates": Candidates, "decision": Decision}
+"""The parts of a step that hold arrays."""
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -135,108 +131,74 @@ def _summary(step: Step) -> dict[str, Any]:
 
 
 def _encoded(step: Step) -> bytes:
-    arrays: dict[str, Any] = {
-        "labels": step.labels,
-        "visited": step.visited,
-        "cloud.points": step.cloud.points_world.astype(np.float32),
-        "cloud.normals": step.cloud.normals_world.astype(np.float32),
-        "cloud.labels": step.cloud.labels,
-        "cloud.rgb": step.cloud.rgb,
-        "cloud.viewpoint": step.cloud.viewpoint_world,
-        "sphere.centre": step.sphere.centre_world,
-        "sphere.directions": step.sphere.directions,
-    }
-    document: dict[str, Any] = {
-        "index": step.index,
-        "name": step.name,
-        "timings": step.timings,
-        "angle_travelled": step.angle_travelled,
-        "path_travelled": step.path_travelled,
-        "stop": step.stop,
-        "cloud.name": step.cloud.name,
-        "sphere.radius": step.sphere.radius,
-    }
-    if step.view is not None:
-        arrays |= _fields("view", step.view)
+    """Arrays are members named `part.field`; all else is in the member `document`."""
+    arrays: Arrays = {"labels": step.labels, "visited": step.visited}
+    for part in PARTS:
+        holder = getattr(step, part)
+        held = {} if holder is None else {name: getattr(holder, name) for name in _names(part).values()}
+        arrays |= {
+            key: held[name]
+            for key, name in _names(part).items()
+            if name in held and isinstance(held[name], np.ndarray)
+        }
+    for name in ("cloud.points", "cloud.normals"):
+        arrays[name] = arrays[name].astype(np.float32)
+    names = ("index", "name", "timings", "angle_travelled", "path_travelled", "stop")
+    document: dict[str, Any] = {name: getattr(step, name) for name in names}
+    document |= {"cloud.name": step.cloud.name, "sphere.radius": step.sphere.radius}
     if step.candidates is not None:
-        arrays |= _fields("candidates", step.candidates)
         document["candidates.rejected"] = step.candidates.rejected
     if step.decision is not None:
-        d = step.decision
-        arrays |= _fields("decision", d)
-        document["decision"] = {key: getattr(d, key) for key in ("index", "saliency", "cost", "score", "why")}
-        document["decision"]["points_of_interest"] = [_lists(asdict(p)) for p in d.points_of_interest]
+        names = ("index", "saliency", "cost", "score", "why", "points_of_interest")
+        document["decision"] = {name: getattr(step.decision, name) for name in names}
     if step.robot is not None:
-        document["robot"] = _lists(asdict(step.robot) | {"posture": _lists(asdict(step.robot.posture))})
-    arrays |= {"document": np.frombuffer(_json(document), dtype=np.uint8)}
+        document["robot"] = step.robot
+    arrays["document"] = np.frombuffer(json.dumps(document, default=_plain).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION) as archive:
         for name, array in arrays.items():
-            if array is not None:
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
     return buffer.getvalue()
 
 
 def _decoded(document: dict[str, Any], arrays: Arrays, folder: Path) -> Step:
-    cloud = Cloud(
-        arrays["cloud.points"].astype(np.float64),
-        arrays["cloud.normals"].astype(np.float64),
-        arrays.get("cloud.labels"),
-        arrays.get("cloud.rgb"),
-        arrays.get("cloud.viewpoint"),
-        document["cloud.name"],
-    )
-    view = candidates = decision = robot = None
-    if "view.depth" in arrays:
-        view = View(**_group(arrays, "view"), name=document["name"])
-    if "candidates.directions" in arrays:
-        rejected = document["candidates.rejected"]
-        candidates = Candidates(**_group(arrays, "candidates"), rejected=rejected)
+    held: dict[str, dict[str, Any]] = {
+        part: {name: arrays.pop(key) for key, name in _names(part).items() if key in arrays} for part in PARTS
+    }
+    for name in ("points_world", "normals_world"):
+        held["cloud"][name] = held["cloud"][name].astype(np.float64)
+    step = {name: value for name, value in (document | arrays).items() if "." not in name}
+    step["graph"] = read_graph(folder / "graph.json")
+    step["cloud"] = Cloud(**held["cloud"], name=document["cloud.name"])
+    step["sphere"] = ViewSphere(**held["sphere"], radius=document["sphere.radius"])
+    step |= {"view": None, "candidates": None, "decision": None}
+    if held["view"]:
+        step["view"] = View(**held["view"], name=document["name"])
+    if held["candidates"]:
+        step["candidates"] = Candidates(**held["candidates"], rejected=document["candidates.rejected"])
     if "decision" in document:
-        points = tuple(_point_of_interest(p) for p in document["decision"].pop("points_of_interest"))
-        decision = Decision(**document["decision"], **_group(arrays, "decision"), points_of_interest=points)
+        points = (
+            _arrays(p) | {"subject": tuple(p["subject"])} for p in document["decision"]["points_of_interest"]
+        )
+        given = document["decision"] | {"points_of_interest": tuple(PointOfInterest(**p) for p in points)}
+        step["decision"] = Decision(**held["decision"], **given)
     if "robot" in document:
-        given = document["robot"]
-        posture = given["posture"] | {"platform_world": np.array(given["posture"]["platform_world"])}
-        T_world_camera = np.array(given["T_world_camera"])
-        robot = RobotPose(**given | {"posture": Posture(**posture), "T_world_camera": T_world_camera})
-    return Step(
-        document["index"],
-        document["name"],
-        view,
-        arrays["labels"],
-        read_graph(folder / "graph.json"),
-        cloud,
-        ViewSphere(arrays["sphere.centre"], document["sphere.radius"], arrays["sphere.directions"]),
-        arrays["visited"],
-        candidates,
-        decision,
-        document["timings"],
-        document["angle_travelled"],
-        document["path_travelled"],
-        document["stop"],
-        robot,
-    )
+        posture = Posture(**_arrays(document["robot"]["posture"]))
+        step["robot"] = RobotPose(**_arrays(document["robot"]) | {"posture": posture})
+    return Step(**step)
 
 
-def _fields(name: str, holder: object) -> dict[str, Any]:
-    return {f"{name}.{field}": getattr(holder, field) for field in ARRAYS[name]}
+def _names(part: str) -> dict[str, str]:
+    """Members that hold the arrays of a part, and the fields they come from."""
+    names = (field.name for field in fields(PARTS[part]) if field.init)
+    return {f"{part}.{name.removesuffix('_world')}": name for name in names}
 
 
-def _group(arrays: Arrays, name: str) -> dict[str, Any]:
-    """Arrays called `name.…`, by the rest of their names."""
-    return {key.partition(".")[2]: value for key, value in arrays.items() if key.startswith(f"{name}.")}
+def _plain(value: Any) -> Any:
+    """What JSON does not know: arrays, NumPy's scalars and dataclasses."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else asdict(value)
 
 
-def _json(document: Mapping[str, Any]) -> bytes:
-    return json.dumps(document, default=lambda number: number.item()).encode()
-
-
-def _lists(fields: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in fields.items()}
-
-
-def _point_of_interest(given: dict[str, Any]) -> PointOfInterest:
-    arrays = {key: np.array(given[key]) for key in ("position_world", "direction")}
-    return PointOfInterest(**given | arrays | {"subject": tuple(given["subject"])})
+def _arrays(given: dict[str, Any]) -> dict[str, Any]:
+    return {key: np.array(value) if isinstance(value, list) else value for key, value in given.items()}

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from caryatid.io.importing import FrameFilter, Imported, choose_views, import_recording
     from caryatid.io.point_clouds import StoredCloud, read_cloud, read_stored_cloud
     from caryatid.io.runs import Run, RunView, RunWriter, read_run
-    from caryatid.io.transform_tree import TransformTree
+    from caryatid.io.video import TransformTree
 
 _HOMES = {
     "bop": ["RecordedFrame", "Recording", "read_recording", "write_recording"],
@@ -22,7 +22,7 @@ _HOMES = {
     "importing": ["FrameFilter", "Imported", "choose_views", "import_recording"],
     "point_clouds": ["StoredCloud", "read_cloud", "read_stored_cloud"],
     "runs": ["Run", "RunView", "RunWriter", "read_run"],
-    "transform_tree": ["TransformTree"],
+    "video": ["TransformTree"],
 }
 
 __all__ = [

@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import io
 import struct
 import weakref
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from caryatid.config import RecordingConfig
 from caryatid.errors import CaryatidError, InputError
 from caryatid.geometry.transforms import Array
-from caryatid.io.datasets import NO_COLOUR, NO_POSE, BrokenFrameError, Dataset, OpenOptions, Topics, within
-from caryatid.io.images import UNREADABLE
-from caryatid.io.transform_tree import SECOND, MissingTransform, TransformTree, is_pose, nearest
-from caryatid.sensing.views import View, check_intrinsics
+from caryatid.io import images
+from caryatid.io.datasets import Dataset, OpenOptions
+from caryatid.io.images import BrokenImageError
+from caryatid.io.video import SECOND, Decoded, TransformTree, is_pose, make_video, nearest
+from caryatid.sensing.views import check_intrinsics
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
 """Endings of files that are bags; a folder with a metadata.yaml is one too."""
@@ -51,11 +51,14 @@ _CONFIG_HEADER: Final = struct.Struct("<iff")
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
-    """Where an image is in a bag, when it was taken [ns], and the frame of its camera."""
+class _Image:
+    """Where an image is in a bag, when it was taken [ns], and the frame of its camera.
 
+    Of several received at the same time `twin` counts those before it.
+    """
+
+    name: str
     topic: str
-    number: int
     received: int
     twin: int
     time: int
@@ -69,53 +72,6 @@ class _Camera:
     K: Array
     size: tuple[int, int]
     distorts: bool
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Frame:
-    bag: _Bag
-    depth: _Place
-    colour: _Place | None
-    camera: _Camera
-    T_world_camera: Array | None
-    far: float
-    info_topic: str
-    has_labels: bool = False
-
-    @property
-    def name(self) -> str:
-        return f"{self.bag.path.name}: depth image {self.number}"
-
-    @property
-    def number(self) -> int:
-        return self.depth.number
-
-    @property
-    def time(self) -> int:
-        return self.depth.time
-
-    def load(self) -> View:
-        bag, camera = self.bag, self.camera
-        depth = within(_depth(bag.message(self.depth), bag.source(self.depth.topic)), self.far)
-        size, frame = depth.shape[::-1], self.depth.frame
-        source = bag.source(self.info_topic)
-        remedy = "give the info topic of the depth images"
-        if camera.size != size:
-            reason = f"is the camera of {_size(camera.size)} pixel images, the depth has {_size(size)}"
-            raise InputError(source, reason, remedy)
-        if camera.frame != frame:
-            raise InputError(source, f"is the camera '{camera.frame}', the depth is of '{frame}'", remedy)
-        rgb = None
-        if self.colour is not None:
-            rgb = _colour(bag.message(self.colour), bag.source(self.colour.topic))
-            if rgb.shape[:2] != depth.shape or self.colour.frame != frame:
-                raise InputError(
-                    bag.path,
-                    f"depth ({_size(size)}, frame '{frame}') is not registered to colour "
-                    f"({_size(rgb.shape[1::-1])}, frame '{self.colour.frame}')",
-                    "give the topic of depth aligned to colour, or leave --rgb out",
-                )
-        return View(depth=depth, K=camera.K, T_world_camera=self.T_world_camera, rgb=rgb, name=self.name)
 
 
 def recognises(path: Path) -> bool:
@@ -142,40 +98,46 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     info_topic = bag.require("--info", topics.info)
     rgb_topic = None if topics.rgb is None else bag.require("--rgb", topics.rgb)
     cameras = _read_cameras(bag, info_topic)
-    tree = _read_transforms(bag, topics, config)
-    depths, millimetres = bag.places(depth_topic)
-    colours = None if rgb_topic is None else sorted(bag.places(rgb_topic)[0], key=lambda place: place.time)
-    if tree is not None:
-        for frame in dict.fromkeys([topics.world, *(depth.frame for depth in depths)]):
+    depths, millimetres = bag.images(depth_topic)
+    colours = None if rgb_topic is None else bag.images(rgb_topic)[0]
+    pose_at, notes = None, []
+    if topics.world is None:
+        notes.append("no --tf FRAME: poses are not known, a single frame is taken")
+    else:
+        tree, world = _read_transforms(bag, config.pose_gap), topics.world
+        for frame in dict.fromkeys([world, *(depth.frame for depth in depths)]):
             if frame not in tree.frames:
                 known = f"there are {', '.join(tree.frames)}"
                 raise InputError(path, f"there is no frame '{frame}' in its transforms", known)
-    camera_times, colour_times = [c.time for c in cameras], [c.time for c in colours or ()]
-    frames, skipped = [], Counter[str]()
-    for depth in depths:
-        colour, T_world_camera = None, None
-        if colours is not None:
-            index = nearest(colour_times, depth.time)
-            if index is None or abs(colour_times[index] - depth.time) > config.colour_gap * SECOND:
-                skipped[NO_COLOUR] += 1
-                continue
-            colour = colours[index]
-        if tree is not None and topics.world is not None:
-            try:
-                T_world_camera = tree.between(topics.world, depth.frame, depth.time)
-            except MissingTransform:
-                skipped[NO_POSE] += 1
-                continue
-        camera = cameras[nearest(camera_times, depth.time) or 0]
-        frames.append(_Frame(bag, depth, colour, camera, T_world_camera, config.far, info_topic))
-    notes = []
-    if topics.world is None:
-        notes.append("no --tf FRAME: poses are not known, a single frame is taken")
+        pose_at = lambda depth: tree.between(world, depth.frame, depth.time)  # noqa: E731
     if any(camera.distorts for camera in cameras):
         notes.append("the lens distorts, and a pinhole is assumed: give rectified topics, unless these are")
-    frames.sort(key=lambda frame: (frame.time, frame.number))
-    scale = 1.0 if millimetres else None
-    return Dataset(path, frames, skipped, tuple(notes), is_video=True, depth_scale=scale)
+    decode = partial(_decode, bag, cameras, bag.source(info_topic))
+    video = make_video(path, depths, colours, pose_at, decode, config)
+    return replace(video, notes=tuple(notes), depth_scale=1.0 if millimetres else None)
+
+
+def _decode(bag: _Bag, cameras: list[_Camera], info: str, at: _Image, colour_at: _Image | None) -> Decoded:
+    """Decode a depth image and its colour; both must fit each other and the camera, `info` in errors."""
+    camera = cameras[nearest([c.time for c in cameras], at.time) or 0]
+    depth = _depth(bag.message(at), bag.source(at.topic))
+    size, remedy = depth.shape[::-1], "give the info topic of the depth images"
+    if camera.size != size:
+        reason = f"is the camera of {_size(camera.size)} pixel images, the depth has {_size(size)}"
+        raise InputError(info, reason, remedy)
+    if camera.frame != at.frame:
+        raise InputError(info, f"is the camera '{camera.frame}', the depth is of '{at.frame}'", remedy)
+    if colour_at is None:
+        return depth, None, camera.K
+    rgb = _colour(bag.message(colour_at), bag.source(colour_at.topic))
+    if rgb.shape[:2] != depth.shape or colour_at.frame != at.frame:
+        raise InputError(
+            bag.path,
+            f"depth ({_size(size)}, frame '{at.frame}') is not registered to colour "
+            f"({_size(rgb.shape[1::-1])}, frame '{colour_at.frame}')",
+            "give the topic of depth aligned to colour, or leave --rgb out",
+        )
+    return depth, rgb, camera.K
 
 
 class _Bag:
@@ -239,23 +201,23 @@ class _Bag:
                 message = self._reader.deserialize(data, connection.msgtype)
             yield connection.topic, int(received), message
 
-    def places(self, topic: str) -> tuple[list[_Place], bool]:
+    def images(self, topic: str) -> tuple[list[_Image], bool]:
         """All images of a topic, and whether they hold whole millimetres if they are of depth."""
-        places: list[_Place] = []
+        found: list[_Image] = []
         twins, millimetres = Counter[int](), True
         for number, (_, received, message) in enumerate(self.messages([topic])):
-            time, frame = _stamp(message.header, received), message.header.frame_id.removeprefix("/")
-            places.append(_Place(topic, number, received, twins[received], time, frame))
+            name = f"{self.path.name}: depth image {number}"
+            time, frame = _stamp(message.header, received), _frame(message.header.frame_id)
+            found.append(_Image(name, topic, received, twins[received], time, frame))
             twins[received] += 1
             compressed = message.__msgtype__ == COMPRESSED
-            encoding = message.format[:5] if compressed else message.encoding
-            millimetres = millimetres and encoding != "32FC1"
-        return places, millimetres
+            millimetres = millimetres and (message.format[:5] if compressed else message.encoding) != "32FC1"
+        return found, millimetres
 
-    def message(self, place: _Place) -> Any:
+    def message(self, image: _Image) -> Any:
         """The message of an image."""
-        found = self.messages([place.topic], place.received, place.received + 1)
-        for _, _, message in islice(found, place.twin, None):
+        found = self.messages([image.topic], image.received, image.received + 1)
+        for _, _, message in islice(found, image.twin, None):
             return message
         raise InputError(self.path, "has been changed while it was read", "import it again")
 
@@ -274,7 +236,7 @@ def _read_cameras(bag: _Bag, topic: str) -> list[_Camera]:
         if not K.any():
             reason = "says the camera is not calibrated: K is 0"
             raise InputError(source, reason, "calibrate it, and record again")
-        frame, size = message.header.frame_id.removeprefix("/"), (int(message.width), int(message.height))
+        frame, size = _frame(message.header.frame_id), (int(message.width), int(message.height))
         time = _stamp(message.header, received)
         cameras.append(_Camera(time, frame, check_intrinsics(K, source), size, bool(np.any(D))))
     if not cameras:
@@ -282,23 +244,23 @@ def _read_cameras(bag: _Bag, topic: str) -> list[_Camera]:
     return sorted(cameras, key=lambda camera: camera.time)
 
 
-def _read_transforms(bag: _Bag, topics: Topics, config: RecordingConfig) -> TransformTree | None:
-    if topics.world is None:
-        return None
-    tree = TransformTree(config.pose_gap)
+def _read_transforms(bag: _Bag, max_gap: float) -> TransformTree:
+    tree = TransformTree(max_gap)
     for topic, received, message in bag.messages(bag.topics(TRANSFORMS)):
         for item in message.transforms:
             t, q = item.transform.translation, item.transform.rotation
-            pose = (t.x, t.y, t.z, q.x, q.y, q.z, q.w)
+            pose, time = (t.x, t.y, t.z, q.x, q.y, q.z, q.w), _stamp(item.header, received)
             if is_pose(pose):
-                parent, child = (
-                    name.removeprefix("/") for name in (item.header.frame_id, item.child_frame_id)
-                )
-                time = _stamp(item.header, received)
+                parent, child = _frame(item.header.frame_id), _frame(item.child_frame_id)
                 tree.add(parent, child, time, pose, fixed=topic.endswith("tf_static"))
     if not tree.frames:
         raise InputError(bag.path, "holds no transforms", "record /tf and /tf_static, or leave --tf out")
     return tree
+
+
+def _frame(name: str) -> str:
+    """Name of a frame as ROS 2 writes it, without a slash."""
+    return name.removeprefix("/")
 
 
 def _stamp(header: Any, received: int) -> int:
@@ -319,7 +281,7 @@ def _depth(message: Any, source: str) -> NDArray[np.float32]:
 def _colour(message: Any, source: str) -> NDArray[np.uint8]:
     """Colour (H, W, 3) of an image message, compressed or not; grey images have three equal channels."""
     if message.__msgtype__ == COMPRESSED:
-        return _decoded(message.data.tobytes(), "RGB", source)
+        return images.read_colour(message.data.tobytes(), source)
     if message.encoding not in COLOUR_ENCODINGS:
         raise _unknown(source, message.encoding, COLOUR_ENCODINGS, "colour")
     count, channels = COLOUR_ENCODINGS[message.encoding]
@@ -333,7 +295,7 @@ def _pixels(message: Any, kind: str, channels: int, source: str) -> NDArray[Any]
     row = width * channels * dtype.itemsize
     data = np.asarray(message.data, dtype=np.uint8)
     if not height or not width or step < row or data.size < height * step:
-        raise BrokenFrameError(source, "an image has less data than its size says", "record it again")
+        raise BrokenImageError(source, "an image has less data than its size says", "record it again")
     rows = np.ascontiguousarray(data[: height * step].reshape(height, step)[:, :row])
     return rows.view(dtype).reshape(height, width, channels).astype(dtype.newbyteorder("="))
 
@@ -345,29 +307,15 @@ def _compressed_depth(message: Any, source: str) -> NDArray[np.float32]:
         reason = f"its depth is compressed as '{message.format}'"
         raise InputError(source, reason, "record it raw, or compressed as PNG")
     if "compressedDepth" not in codec:
-        return _cleaned(_decoded(data, "I;16", source) * _MILLIMETRES)
+        return _cleaned(images.read_units(data, source) * _MILLIMETRES)
     if len(data) < _CONFIG_HEADER.size:
-        raise BrokenFrameError(source, "an image is cut off", "record it again")
-    units = _decoded(data[_CONFIG_HEADER.size :], "I;16", source)
+        raise BrokenImageError(source, "an image is cut off", "record it again")
+    units = images.read_units(data[_CONFIG_HEADER.size :], source)
     if encoding != "32FC1":
         return _cleaned(units * _MILLIMETRES)
     _, scale, offset = _CONFIG_HEADER.unpack_from(data)
     with np.errstate(divide="ignore", invalid="ignore"):
         return _cleaned(np.where(units > 0, scale / (units - np.float64(offset)), 0.0))
-
-
-def _decoded(data: bytes, mode: str, source: str) -> NDArray[Any]:
-    """Pixels of a PNG or JPEG as colour (`RGB`), or as 16-bit numbers (`I;16`)."""
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-            if mode == "RGB":
-                return np.array(image.convert("RGB"))
-            if image.mode.startswith("I"):
-                return np.array(image).astype(np.uint16)
-            reason = f"has pixels of mode {image.mode}"
-    except (*UNREADABLE, Image.DecompressionBombError) as error:
-        reason = f"is broken ({error})"
-    raise BrokenFrameError(source, f"an image {reason}", "record it again")
 
 
 def _cleaned(depth: NDArray[Any]) -> NDArray[np.float32]:

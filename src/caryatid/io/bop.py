@@ -6,8 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final
 
 import numpy as np
 from annotated_types import Ge, Gt, Lt
@@ -87,14 +86,13 @@ class RecordedFrame:
         Raises:
             InputError: A file has gone or is broken, the depth image is empty, or masks overlap.
         """
-        return View(
-            depth=images.read_depth(self.depth_path, self.depth_scale),
-            K=self.K,
-            T_world_camera=self.T_world_camera,
-            rgb=None if self.rgb_path is None else images.read_colour(self.rgb_path),
-            labels=None if self.masks is None else self.load_labels(),
-            name=self.name,
-        )
+        depth = images.read_depth(self.depth_path, self.depth_scale)
+        if not depth.any():
+            reason = "the frame is empty: no pixel has a depth reading"
+            raise InputError(self.depth_path, reason, "leave this frame out")
+        rgb = None if self.rgb_path is None else images.read_colour(self.rgb_path)
+        labels = None if self.masks is None else self.load_labels()
+        return View(depth, self.K, self.T_world_camera, rgb, labels, name=self.name)
 
     def load_labels(self) -> NDArray[np.int32]:
         """Decode the masks alone: object number of each pixel (H, W), 0 = nothing.
@@ -197,7 +195,7 @@ def read_recording(folder: str | Path) -> Recording:
     return Recording(folder, frames)
 
 
-class RecordingWriter:
+class RecordingWriter(StagedFolder):
     """Writes a BOP scene folder view by view; it appears whole, at `finish`, or not at all.
 
     Args:
@@ -208,17 +206,9 @@ class RecordingWriter:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        self._staged = StagedFolder(Path(folder))
+        super().__init__(folder)
         self._cameras: dict[str, Any] = {}
         self._objects: dict[str, Any] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._staged.discard()
 
     def add_view(self, view: View, depth_scale: float = 0.1) -> None:
         """Write the next view.
@@ -237,15 +227,15 @@ class RecordingWriter:
             camera["cam_R_w2c"] = T_camera_world[:3, :3].ravel()
             camera["cam_t_w2c"] = T_camera_world[:3, 3] * 1000.0
         self._cameras[str(index)] = camera
-        self._staged.write(f"depth/{index:06d}.png", images.png(_depth_units(view, depth_scale)))
+        self.write(f"depth/{index:06d}.png", images.png(_depth_units(view, depth_scale)))
         if view.rgb is not None:
-            self._staged.write(f"rgb/{index:06d}.png", images.png(view.rgb))
+            self.write(f"rgb/{index:06d}.png", images.png(view.rgb))
         if view.labels is not None:
             present = [int(k) for k in np.unique(view.labels) if k > 0]
             self._objects[str(index)] = [{"obj_id": k} for k in present]
             for order, label in enumerate(present):
                 mask = np.where(view.labels == label, np.uint8(255), np.uint8(0))
-                self._staged.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
+                self.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
 
     def finish(self) -> None:
         """Put the folder in its place.
@@ -253,10 +243,10 @@ class RecordingWriter:
         Raises:
             InputError: The place has been taken meanwhile, or the disk is full or refuses.
         """
-        self._staged.write("scene_camera.json", json_text(self._cameras).encode())
+        self.write("scene_camera.json", json_text(self._cameras).encode())
         if self._objects:
-            self._staged.write("scene_gt.json", json_text(self._objects).encode())
-        self._staged.publish()
+            self.write("scene_gt.json", json_text(self._objects).encode())
+        self.publish()
 
 
 def write_recording(folder: str | Path, views: Sequence[View], depth_scale: float = 0.1) -> None:

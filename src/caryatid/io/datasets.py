@@ -14,9 +14,6 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from caryatid.config import RecordingConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
@@ -36,10 +33,6 @@ BLURRED: Final = "blurred"
 ALIKE: Final = "seen from where another view is"
 SPARE: Final = "more than are wanted"
 """Why a frame does not become a view."""
-
-
-class BrokenFrameError(InputError):
-    """One frame cannot be decoded; others of its dataset may be whole."""
 
 
 class Frame(Protocol):
@@ -74,7 +67,7 @@ class Frame(Protocol):
         """Decode the frame.
 
         Raises:
-            BrokenFrameError: It cannot be decoded, but other frames may.
+            caryatid.io.images.BrokenImageError: It cannot be decoded, but other frames may.
             InputError: It does not fit the dataset.
         """
         ...
@@ -210,8 +203,3 @@ def open_dataset(
             "RGB-D folder with depth.txt",
         )
     return known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
-
-
-def within(depth: NDArray[np.float32], far: float) -> NDArray[np.float32]:
-    """Depth (H, W) [m] without readings farther away than `far` [m]."""
-    return np.where(depth <= far, depth, np.float32(0.0))

@@ -22,11 +22,10 @@ FORMAT: Final = "caryatid/graph"
 VERSION: Final = 1
 """What graph.json says it is."""
 
-
 Count = Annotated[int, Ge(0)]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Uncertainty:
     position: Annotated[Array, Numbers(3)]
     rotation: Annotated[Array, Numbers(3)]
@@ -34,8 +33,10 @@ class _Uncertainty:
     sides: Annotated[Array, Numbers(6)]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Object:
+    """An entry of `objects`; keys are written in this order."""
+
     id: str
     role: Role
     label: Annotated[int, Ge(0), Le(SUPPORT_LABEL)]
@@ -51,29 +52,22 @@ class _Object:
     doubt: str = ""
     uncertainty: _Uncertainty | None = None
 
-    def made(self, source: str) -> SceneObject:
-        u, source = self.uncertainty, f"{source} ('{self.id}')"
+    def decoded(self, source: str) -> SceneObject:
+        source = f"{source} ('{self.id}')"
         lengths = self.size.values() if isinstance(self.size, dict) else self.size
         if not all(length > 0.0 for length in lengths):
             raise InputError(source, f"size {self.size} is not positive", "give sizes in metres")
-        return SceneObject(
-            id=self.id,
-            label=self.label,
-            shape=from_size(self.shape, self.T_world_object, self.size, source),
-            role=self.role,
-            occurrences=self.occurrences,
-            opportunities=self.opportunities,
-            residual=self.residual,
-            poor_fit=self.poor_fit,
-            seen=self.seen,
-            why=self.why,
-            doubt=self.doubt,
-            uncertainty=None if u is None else Uncertainty(u.position, u.rotation, u.sizes, u.sides),
-        )
+        given = dict(vars(self))
+        given["shape"] = from_size(self.shape, given.pop("T_world_object"), given.pop("size"), source)
+        if self.uncertainty is not None:
+            given["uncertainty"] = Uncertainty(**vars(self.uncertainty))
+        return SceneObject(**given)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Support:
+    """An entry of `supports`: the fields of a `Support` in their order."""
+
     supporter: str
     supported: str
     kind: Kind
@@ -84,26 +78,19 @@ class _Support:
     normal: Annotated[Array, Numbers(3)] | None = None
     why: str = ""
 
-    def made(self) -> Support:
-        return Support(*(getattr(self, f.name) for f in fields(self)))
 
-
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True)
 class _Stability:
+    """An entry of `stability`; JSON has no infinity, so an overhang without end is null."""
+
     ratio: float
+    overhang: float | None
     small_area: bool
     tips: bool
-    overhang: float | None
-
-    def made(self) -> Stability:
-        overhang = inf if self.overhang is None else self.overhang
-        return Stability(ratio=self.ratio, overhang=overhang, small_area=self.small_area, tips=self.tips)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class _Graph:
-    """What is read of graph.json."""
-
     version: int
     objects: list[_Object]
     supports: list[_Support]
@@ -123,16 +110,14 @@ def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
         "version": VERSION,
         "frame": "world, z up, metres",
         "objects": [_object_to_json(o) for o in graph.objects],
-        "supports": [_support_to_json(s) for s in graph.supports],
+        "supports": [
+            {key.removesuffix("_world"): value for key, value in asdict(s).items() if value is not None}
+            for s in graph.supports
+        ],
     }
     if graph.stability:
         document["stability"] = {
-            id_: {
-                "ratio": verdict.ratio,
-                "overhang": verdict.overhang if isfinite(verdict.overhang) else None,
-                "small_area": verdict.small_area,
-                "tips": verdict.tips,
-            }
+            id_: asdict(verdict) | ({} if isfinite(verdict.overhang) else {"overhang": None})
             for id_, verdict in sorted(graph.stability.items())
         }
     result: dict[str, Any] = plain(document)
@@ -188,9 +173,12 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
                 name, f"no object is called '{known}'", f"the objects are {', '.join(ids) or 'none'}"
             )
     return SupportGraph(
-        tuple(o.made(name) for o in given.objects),
-        tuple(s.made() for s in given.supports),
-        {id_: item.made() for id_, item in given.stability.items()},
+        tuple(o.decoded(name) for o in given.objects),
+        tuple(Support(*vars(s).values()) for s in given.supports),
+        {
+            id_: Stability(s.ratio, inf if s.overhang is None else s.overhang, s.small_area, s.tips)
+            for id_, s in given.stability.items()
+        },
     )
 
 
@@ -207,38 +195,6 @@ def read_graph(path: str | Path) -> SupportGraph:
 
 
 def _object_to_json(o: SceneObject) -> dict[str, Any]:
-    item = {
-        "id": o.id,
-        "role": o.role,
-        "label": o.label,
-        "shape": o.shape.kind,
-        "T_world_object": o.shape.T_world_object,
-        "size": o.shape.size,
-        "occurrences": o.occurrences,
-        "opportunities": o.opportunities,
-        "residual": o.residual,
-        "poor_fit": o.poor_fit,
-        "seen": o.seen,
-        "why": o.why,
-        "doubt": o.doubt,
-    }
-    if o.uncertainty is not None:
-        item["uncertainty"] = asdict(o.uncertainty)
-    return item
-
-
-def _support_to_json(s: Support) -> dict[str, Any]:
-    item: dict[str, Any] = {
-        "supporter": s.supporter,
-        "supported": s.supported,
-        "kind": s.kind,
-        "certain": s.certain,
-        "occurrences": s.occurrences,
-        "opportunities": s.opportunities,
-    }
-    if s.contact_world is not None:
-        item["contact"] = s.contact_world
-    if s.normal_world is not None:
-        item["normal"] = s.normal_world
-    item["why"] = s.why
-    return item
+    item = {key.name: getattr(o, key.name, None) for key in fields(_Object)}
+    item |= {"shape": o.shape.kind, "T_world_object": o.shape.T_world_object, "size": o.shape.size}
+    return {key: value for key, value in item.items() if value is not None}

@@ -20,8 +20,10 @@ from caryatid.errors import InputError
 DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
-UNREADABLE: Final = (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error)
-"""What Pillow raises on a damaged image."""
+
+
+class BrokenImageError(InputError):
+    """An image that cannot be decoded; others of its recording may be whole."""
 
 
 def check_image(path: Path, modes: tuple[str, ...] | None = None, what: str = "") -> tuple[int, int]:
@@ -38,13 +40,12 @@ def check_image(path: Path, modes: tuple[str, ...] | None = None, what: str = ""
     Raises:
         InputError: The file is missing, truncated, no image, or of another mode.
     """
-    with _errors(path), Image.open(path) as image:
-        size, mode = image.size, image.mode
+    with _opened(path, modes=modes, what=what) as image:
+        size = image.size
         if image.format == "PNG":
             image.verify()
         else:
             image.load()
-    _check_mode(mode, modes, what, path)
     return size
 
 
@@ -59,22 +60,19 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
         Depth (H, W) [m], 0 = no reading.
 
     Raises:
-        InputError: Missing, truncated, not 16 bit, or without a single reading.
+        InputError: Missing, truncated, or not 16 bit.
     """
-    raw = read_units(path)
-    if not raw.any():
-        raise InputError(path, "the frame is empty: no pixel has a depth reading", "leave this frame out")
-    return (raw.astype(np.float64) * (depth_scale / 1000.0)).astype(np.float32)
+    return (read_units(path).astype(np.float64) * (depth_scale / 1000.0)).astype(np.float32)
 
 
-def read_colour(path: Path) -> NDArray[np.uint8]:
-    """Read a colour image (H, W, 3); grey ones become three equal channels.
+def read_colour(image: Path | bytes, name: str = "") -> NDArray[np.uint8]:
+    """Read a colour image (H, W, 3), a file or its content; grey ones become three equal channels.
 
     Raises:
         InputError: Missing, truncated or no image.
     """
-    with _errors(path), Image.open(path) as image:
-        return np.array(image.convert("RGB"))
+    with _opened(image, name) as opened:
+        return np.array(opened.convert("RGB"))
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -83,23 +81,18 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises:
         InputError: Missing, truncated, or not of one channel.
     """
-    return _read(path, MASK_MODES, "a grey PNG") > 0
+    with _opened(path, modes=MASK_MODES, what="a grey PNG") as opened:
+        return np.asarray(opened) > 0
 
 
-def read_units(path: Path) -> NDArray[np.int32]:
-    """Read a 16-bit grey PNG (H, W) as it is: depth in units of its own, or labels.
+def read_units(image: Path | bytes, name: str = "") -> NDArray[np.int32]:
+    """Read a 16-bit grey PNG (H, W), a file or its content, as it is: depth in units of its own, or labels.
 
     Raises:
         InputError: Missing, truncated or not 16 bit.
     """
-    return _read(path, DEPTH_MODES, "a 16-bit grey PNG").astype(np.int32)
-
-
-def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
-    """Encode an image, (H, W, 3) uint8 or (H, W) uint8 or uint16, as PNG."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="PNG")
-    return buffer.getvalue()
+    with _opened(image, name, DEPTH_MODES, "a 16-bit grey PNG") as opened:
+        return np.asarray(opened).astype(np.int32)
 
 
 def decode_image(content: bytes, name: str, modes: tuple[str, ...], what: str, most: int) -> NDArray[Any]:
@@ -115,40 +108,44 @@ def decode_image(content: bytes, name: str, modes: tuple[str, ...], what: str, m
     Raises:
         InputError: It is broken, larger, or no such image.
     """
-    with _errors(name), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
-        (width, height), mode = image.size, image.mode
-        if width * height <= most and mode in modes:
-            return np.array(image)
-    _check_mode(mode, modes, what, name)
-    raise InputError(name, f"has {width}×{height} pixels, {most} are allowed", "give a smaller image")
+    with _opened(content, name, modes, what) as image:
+        width, height = image.size
+        if width * height > most:
+            reason = f"has {width}×{height} pixels, {most} are allowed"
+            raise InputError(name, reason, "give a smaller image")
+        return np.array(image)
 
 
-def _read(path: Path, modes: tuple[str, ...], what: str) -> NDArray[Any]:
-    check_image(path, modes, what)
-    with _errors(path), Image.open(path) as image:
-        return np.asarray(image)
-
-
-def _check_mode(mode: str, modes: tuple[str, ...] | None, what: str, source: str | Path) -> None:
-    if modes is not None and mode not in modes:
-        raise InputError(source, f"has pixels of mode {mode}, not {what}", f"save it as {what}")
+def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
+    """Encode an image, (H, W, 3) uint8 or (H, W) uint8 or uint16, as PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, format="PNG")
+    return buffer.getvalue()
 
 
 @contextmanager
-def _errors(path: str | Path) -> Iterator[None]:
-    """Turn what Pillow raises on a bad file into one sentence."""
+def _opened(
+    image: Path | bytes, name: str = "", modes: tuple[str, ...] | None = None, what: str = ""
+) -> Iterator[Image.Image]:
+    """Open a PNG or JPEG; whatever Pillow raises on a bad one becomes one sentence."""
+    source = image if isinstance(image, Path) else name
     remedy = "copy or record the file again"
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            yield
+            file = image if isinstance(image, Path) else io.BytesIO(image)
+            with Image.open(file, formats=("PNG", "JPEG")) as opened:
+                if modes is not None and opened.mode not in modes:
+                    reason = f"has pixels of mode {opened.mode}, not {what}"
+                    raise BrokenImageError(source, reason, f"save it as {what}")
+                yield opened
     except FileNotFoundError:
-        raise InputError(path, "the file is missing", remedy) from None
+        raise BrokenImageError(source, "the file is missing", remedy) from None
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise InputError(path, "says it is larger than any camera's image", remedy) from error
+        raise BrokenImageError(source, "says it is larger than any camera's image", remedy) from error
     except UnidentifiedImageError as error:
-        raise InputError(path, "is no image", remedy) from error
+        raise BrokenImageError(source, "is no image", remedy) from error
     except (PermissionError, IsADirectoryError) as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
-    except UNREADABLE as error:
-        raise InputError(path, f"the image is truncated or broken ({error})", remedy) from error
+        raise BrokenImageError(source, f"cannot be read ({error.strerror})", remedy) from error
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as error:
+        raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error

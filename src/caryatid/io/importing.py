@@ -18,7 +18,8 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io import datasets
 from caryatid.io.bop import RecordingWriter
-from caryatid.io.datasets import BrokenFrameError, Dataset, Frame, OpenOptions, Topics, open_dataset
+from caryatid.io.datasets import Dataset, Frame, OpenOptions, Topics, open_dataset
+from caryatid.io.images import BrokenImageError
 from caryatid.segmentation.observation import levelled
 from caryatid.sensing.views import View
 
@@ -77,7 +78,7 @@ class FrameFilter:
         for frame in dataset.frames:
             try:
                 view = frame.load()
-            except BrokenFrameError:
+            except BrokenImageError:
                 skipped[datasets.BROKEN] += 1
                 continue
             readings = sharpness_of_depth(view.depth)

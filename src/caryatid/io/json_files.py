@@ -47,17 +47,18 @@ class Numbers:
         Raises:
             ValueError: They have another shape, hold something else than finite numbers, or are not rigid.
         """
-        expected = "×".join("N" if n < 0 else str(n) for n in self.shape) + " finite numbers"
         try:
             array = np.array(value, dtype=np.float64) if _all_numbers(value) else np.array(np.nan)
         except (ValueError, OverflowError):
             array = np.array(np.nan)
         if array.size == 0 and self.shape[0] < 0:
             array = array.reshape(0, *self.shape[1:])
-        fits = len(array.shape) == len(self.shape)
+        fits = array.ndim == len(self.shape)
         fits = fits and all(wanted in (-1, n) for wanted, n in zip(self.shape, array.shape, strict=True))
         if not fits or not np.isfinite(array).all():
-            raise ValueError(f"must be {expected}")
+            raise ValueError(
+                f"must be {'×'.join('N' if n < 0 else str(n) for n in self.shape)} finite numbers"
+            )
         try:
             return transforms.as_rigid(array, "") if self.rigid else array
         except InputError as error:
@@ -121,7 +122,7 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
 def json_text(document: Mapping[str, Any]) -> str:
     """Write a document as JSON text: keys in the order given, floats rounded to `DECIMALS`, no negative zero.
 
-    NumPy scalars and arrays become numbers and lists.
+    NumPy scalars and arrays become numbers and lists, dataclasses objects.
 
     Raises:
         ValueError: A number is NaN or infinite.
@@ -130,12 +131,14 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Turn NumPy values, tuples and paths into what JSON knows, floats rounded to `DECIMALS`."""
+    """Turn NumPy values, tuples, paths and dataclasses into what JSON knows, floats rounded to `DECIMALS`."""
     match value:
         case Mapping():
             return {str(key): plain(item) for key, item in value.items()}
         case np.ndarray() | np.generic():
             return plain(value.tolist())
+        case object(__dataclass_fields__=names):
+            return {name: plain(getattr(value, name)) for name in names}
         case list() | tuple():
             return [plain(item) for item in value]
         case float():

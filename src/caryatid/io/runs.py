@@ -6,8 +6,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,37 +23,36 @@ from caryatid.sensing.views import SUPPORT_LABEL
 FORMAT: Final = "caryatid/run"
 VERSION: Final = 2
 """What run.json says it is. Version 1, of caryatid 0.1.0, has no step.npz."""
+AGAIN: Final = "run caryatid again"
+"""What to do where a file of a run is broken."""
 
 
-class RunWriter:
+class RunWriter(StagedFolder):
     """Writes a run folder as views come in.
 
-    Until `finish` everything lies in a hidden sibling folder `.NAME.partial-…`, so nothing half-written
-    looks whole; leaving the `with` block without `finish`, by an error or otherwise, removes it. After an
+    Leaving the `with` block without `finish`, by an error or otherwise, leaves nothing behind. After an
     interrupt call `finish`, inside the block, to keep the views done so far. A run folder already there is
     replaced, at `finish` and not before; a folder that is no run is never touched.
 
     Args:
         folder: RUN.
 
+    Attributes:
+        views: Number of views written.
+
     Raises:
         InputError: RUN holds something else, or cannot be written.
     """
 
+    remedy = "give another --out; only a folder written by caryatid is replaced"
+
     def __init__(self, folder: str | Path) -> None:
-        self.folder = Path(folder)
+        super().__init__(folder)
         self.views = 0
-        self._staged = StagedFolder(
-            self.folder, is_run, "give another --out; only a folder written by caryatid is replaced"
-        )
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._staged.discard()
+    def replaces(self, folder: Path) -> bool:
+        """Whether a folder is a run."""
+        return is_run(folder)
 
     def add_view(
         self,
@@ -84,17 +82,17 @@ class RunWriter:
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
             raise InputError(name, f"labels leave 0…{SUPPORT_LABEL}", "number objects from 1, 0 = nothing")
         folder = _view_folder(self.views)
-        self._staged.write(f"{folder}/graph.json", graph_text(graph).encode())
+        self.write(f"{folder}/graph.json", graph_text(graph).encode())
         if labels.ndim == 2:
-            self._staged.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
+            self.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
         else:
             buffer = io.BytesIO()
             np.save(buffer, labels.astype(np.int32))
-            self._staged.write(f"{folder}/labels.npy", buffer.getvalue())
+            self.write(f"{folder}/labels.npy", buffer.getvalue())
         document = {"view": self.views, "name": name, "T_world_camera": T_world_camera, "K": K}
-        self._staged.write(f"{folder}/view.json", json_text(document | dict(record or {})).encode())
+        self.write(f"{folder}/view.json", json_text(document | dict(record or {})).encode())
         if step is not None:
-            self._staged.write(f"{folder}/step.npz", step)
+            self.write(f"{folder}/step.npz", step)
         self.views += 1
 
     def finish(
@@ -117,17 +115,16 @@ class RunWriter:
             InputError: The disk is full or refuses; nothing is left behind.
         """
         if self.views == 0:
-            self._staged.discard()
             raise CaryatidError(f"{self.folder}: no view was finished, so there is no run to keep")
-        self._staged.remove(_view_folder(self.views))
-        self._staged.write("graph.json", graph_text(graph).encode())
+        self.remove(_view_folder(self.views))
+        self.write("graph.json", graph_text(graph).encode())
         if report is not None:
-            self._staged.write("report.html", report.encode())
+            self.write("report.html", report.encode())
         for path, content in (files or {}).items():
-            self._staged.write(path, content)
+            self.write(path, content)
         document = {"format": FORMAT, "version": VERSION, "views": self.views} | dict(record)
-        self._staged.write("run.json", json_text(document).encode())
-        self._staged.publish()
+        self.write("run.json", json_text(document).encode())
+        self.publish()
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -141,7 +138,6 @@ class RunView:
         T_world_camera: Camera pose (4, 4), or None.
         K: Pinhole matrix (3, 3) [px], or None.
         record: All of view.json.
-        labels_path: labels.png or labels.npy.
         folder: Its folder, `views/NN`.
     """
 
@@ -151,8 +147,13 @@ class RunView:
     T_world_camera: Array | None
     K: Array | None
     record: dict[str, Any]
-    labels_path: Path
     folder: Path
+
+    @property
+    def labels_path(self) -> Path:
+        """labels.png, or labels.npy of a cloud."""
+        image = self.folder / "labels.png"
+        return image if image.exists() else self.folder / "labels.npy"
 
     def load_labels(self) -> NDArray[np.int32]:
         """Read the label image (H, W), or the labels (N,) of a cloud's points.
@@ -160,17 +161,17 @@ class RunView:
         Raises:
             InputError: The file is missing, broken or of another kind.
         """
-        if self.labels_path.suffix == ".png":
-            return images.read_units(self.labels_path)
-        remedy = "run caryatid again"
+        path = self.labels_path
+        if path.suffix == ".png":
+            return images.read_units(path)
         try:
-            labels = np.load(self.labels_path, allow_pickle=False)
+            labels = np.load(path, allow_pickle=False)
         except FileNotFoundError:
-            raise InputError(self.labels_path, "the file is missing", remedy) from None
+            raise InputError(path, "the file is missing", AGAIN) from None
         except (OSError, ValueError, EOFError) as error:
-            raise InputError(self.labels_path, f"is no label array ({error})", remedy) from error
+            raise InputError(path, f"is no label array ({error})", AGAIN) from error
         if not isinstance(labels, np.ndarray) or labels.ndim != 1 or labels.dtype.kind not in "iu":
-            raise InputError(self.labels_path, "is no array of whole numbers (N,)", remedy)
+            raise InputError(path, "is no array of whole numbers (N,)", AGAIN)
         return labels.astype(np.int32)
 
 
@@ -197,8 +198,8 @@ class _RunFile:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _View:
+@dataclass(frozen=True, eq=False)
+class _ViewFile:
     name: str
     T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
     K: Annotated[Array, Numbers(3, 3)] | None = None
@@ -210,14 +211,14 @@ def read_run(folder: str | Path) -> Run:
     Raises:
         InputError: It is no run folder, or a file in it is missing or broken.
     """
-    folder = Path(folder)
+    folder, remedy = Path(folder), "give the folder a run was written to with --out"
     if not folder.is_dir():
-        raise InputError(folder, "is no folder", "give the folder a run was written to with --out")
+        raise InputError(folder, "is no folder", remedy)
     path = folder / "run.json"
-    record = read_json(path, "give the folder a run was written to with --out")
+    record = read_json(path, remedy)
     if record.get("format") != FORMAT or record.get("version") not in (1, VERSION):
-        raise InputError(path, f"is not of format '{FORMAT}', version 1 or {VERSION}", "run caryatid again")
-    count = parse_json(_RunFile, record, path, "run caryatid again").views
+        raise InputError(path, f"is not of format '{FORMAT}', version 1 or {VERSION}", AGAIN)
+    count = parse_json(_RunFile, record, path, AGAIN).views
     return Run(
         folder,
         record,
@@ -240,16 +241,6 @@ def _view_folder(index: int) -> str:
 
 def _read_view(folder: Path, index: int) -> RunView:
     path = folder / "view.json"
-    record = read_json(path, "run caryatid again")
-    given = parse_json(_View, record, path, "run caryatid again")
-    image = folder / "labels.png"
-    return RunView(
-        index=index,
-        name=given.name,
-        graph=read_graph(folder / "graph.json"),
-        T_world_camera=given.T_world_camera,
-        K=given.K,
-        record=record,
-        labels_path=image if image.exists() else folder / "labels.npy",
-        folder=folder,
-    )
+    record = read_json(path, AGAIN)
+    given = vars(parse_json(_ViewFile, record, path, AGAIN))
+    return RunView(index, graph=read_graph(folder / "graph.json"), record=record, folder=folder, **given)

@@ -6,9 +6,10 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Self
 
 from caryatid.errors import InputError
 
@@ -20,58 +21,56 @@ class StagedFolder:
     """A folder in the making.
 
     Everything is written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place and
-    `discard` removes, together with parent folders made for it.
+    `discard`, or leaving the `with` block, removes, together with parent folders made for it.
 
     Args:
         folder: Where the folder shall be.
-        replaceable: Whether a folder that is there already may be replaced.
-        remedy: What to do where it may not.
         durable: Wait until every file, and the folder itself, is on the disk.
+
+    Attributes:
+        folder: Where the folder shall be.
 
     Raises:
         InputError: The place is taken by something that may not be replaced, or cannot be written.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        replaceable: Callable[[Path], bool] = lambda _: False,
-        remedy: str = "give a new folder",
-        *,
-        durable: bool = False,
-    ) -> None:
-        self.folder = folder.resolve()
-        self._replaceable = replaceable
-        self._remedy = remedy
+    remedy = "give a new folder"
+    """What to do where the place is taken."""
+
+    def __init__(self, folder: str | Path, *, durable: bool = False) -> None:
+        self.folder = Path(folder)
+        self._place = self.folder.resolve()
         self._durable = durable
-        self._made: list[Path] = []
-        self._open = True
         self._check_place()
-        self.partial = _partial(self.folder)
-        self._old = self.partial.with_name(f"{self.partial.name}-replaced")
+        self._partial = _partial(self._place)
+        self._old = self._partial.with_name(f"{self._partial.name}-replaced")
+        self._made = [parent for parent in self._place.parents if not parent.exists()]
         try:
             with write_errors(self.folder):
-                for parent in reversed(self.folder.parents):
-                    if not parent.exists():
-                        parent.mkdir()
-                        self._made.append(parent)
-                self.partial.mkdir()
+                self._partial.mkdir(parents=True)
         except BaseException:
             self.discard()
             raise
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.discard()
+
+    def replaces(self, folder: Path) -> bool:
+        """Whether a folder that is not empty may be replaced."""
+        return False
+
     def write(self, name: str, content: bytes) -> None:
         """Write one file, `name` relative to the folder.
 
-        An interrupt leaves the folder open, with this file perhaps half written.
+        An interrupt leaves the folder as it is, with this file perhaps half written.
 
         Raises:
             InputError: The disk is full or refuses; the whole folder is discarded then.
-            ValueError: The folder has been published or discarded.
         """
-        if not self._open:
-            raise ValueError(f"{self.folder} has been published or discarded")
-        path = self.partial / name
+        path = self._partial / name
         try:
             with write_errors(self.folder):
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -82,7 +81,7 @@ class StagedFolder:
 
     def remove(self, name: str) -> None:
         """Remove a subfolder, `name` relative to the folder, if it is there."""
-        shutil.rmtree(self.partial / name, ignore_errors=True)
+        shutil.rmtree(self._partial / name, ignore_errors=True)
 
     def publish(self) -> None:
         """Put the folder in its place, replacing an older one where that is allowed.
@@ -94,42 +93,40 @@ class StagedFolder:
             self._check_place()
             with write_errors(self.folder):
                 if self._durable:
-                    sync(self.partial)
-                if self.folder.exists():
-                    self.folder.rename(self._old)
-                self.partial.rename(self.folder)
+                    sync(self._partial)
+                if self._place.exists():
+                    self._place.rename(self._old)
+                self._partial.rename(self._place)
                 if self._durable:
                     try:
-                        sync(self.folder.parent)
+                        sync(self._place.parent)
                     except OSError:
-                        self.folder.rename(self.partial)
+                        self._place.rename(self._partial)
                         raise
         except BaseException:
             self.discard()
             raise
-        self._open = False
         shutil.rmtree(self._old, ignore_errors=True)
 
     def discard(self) -> None:
         """Remove what has been written and leave the place as it was; does nothing after `publish`."""
-        self._open = False
         with suppress(OSError):
-            if self._old.exists() and not self.folder.exists():
-                self._old.rename(self.folder)
-        shutil.rmtree(self.partial, ignore_errors=True)
-        for parent in reversed(self._made):
+            if self._old.exists() and not self._place.exists():
+                self._old.rename(self._place)
+        shutil.rmtree(self._partial, ignore_errors=True)
+        for parent in self._made:
             with suppress(OSError):
                 parent.rmdir()
 
     def _check_place(self) -> None:
-        if not os.path.lexists(self.folder):
+        if not os.path.lexists(self._place):
             return
-        if not self.folder.is_dir():
-            raise InputError(self.folder, "already exists and is not a folder", self._remedy)
+        if not self._place.is_dir():
+            raise InputError(self.folder, "already exists and is not a folder", self.remedy)
         with write_errors(self.folder):
-            empty = not any(self.folder.iterdir())
-        if not empty and not self._replaceable(self.folder):
-            raise InputError(self.folder, "already exists and holds other files", self._remedy)
+            empty = not any(self._place.iterdir())
+        if not empty and not self.replaces(self._place):
+            raise InputError(self.folder, "already exists and holds other files", self.remedy)
 
 
 def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
@@ -194,16 +191,6 @@ def write_errors(path: Path) -> Iterator[None]:
         raise InputError(path, reason, remedy) from error
 
 
-def _partial(path: Path) -> Path:
-    return path.with_name(f"{PARTIAL}{path.name}-{secrets.token_hex(4)}")
-
-
-def _write(path: Path, content: bytes, durable: bool) -> None:
-    path.write_bytes(content)
-    if durable:
-        sync(path)
-
-
 def sync(path: Path) -> None:
     """Wait until a file, or the names in a folder, are on the disk, where the system can."""
     if os.name == "nt":
@@ -213,3 +200,13 @@ def sync(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def _partial(path: Path) -> Path:
+    return path.with_name(f"{PARTIAL}{path.name}-{secrets.token_hex(4)}")
+
+
+def _write(path: Path, content: bytes, durable: bool) -> None:
+    path.write_bytes(content)
+    if durable:
+        sync(path)

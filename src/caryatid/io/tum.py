@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Annotated, Final
@@ -16,10 +15,10 @@ from caryatid.config import RecordingConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.io import images
-from caryatid.io.datasets import NO_COLOUR, NO_POSE, BrokenFrameError, Dataset, OpenOptions, Topics, within
+from caryatid.io.datasets import Dataset, OpenOptions, Topics
 from caryatid.io.json_files import parse_json, read_json
-from caryatid.io.transform_tree import SECOND, MissingTransform, TransformTree, is_pose, nearest
-from caryatid.sensing.views import View, check_intrinsics
+from caryatid.io.video import SECOND, Decoded, TransformTree, is_pose, make_video
+from caryatid.sensing.views import check_intrinsics
 
 DEPTH_SCALE: Final = 0.2
 """Millimetres of one unit of depth in the data set: 5000 units are a metre."""
@@ -50,45 +49,27 @@ class _Camera:
     size: tuple[int, int] | None
     note: str
 
+    def decode(self, depth: _Image, colour: _Image | None) -> Decoded:
+        metres = images.read_depth(depth.path, self.depth_scale)
+        rgb = None if colour is None else images.read_colour(colour.path)
+        if rgb is not None and rgb.shape[:2] != metres.shape:
+            reason = "its colour image is of another size"
+            raise InputError(depth.path, reason, "register the images to one size")
+        if self.size not in (None, metres.shape[::-1]):
+            height, width = metres.shape
+            reason = f"is {width}×{height} pixels, the published camera has 640×480"
+            raise InputError(depth.path, reason, "give --camera FILE.json")
+        return metres, rgb, self.K
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Frame:
-    number: int
+
+@dataclass(frozen=True, slots=True)
+class _Image:
     time: int
-    T_world_camera: Array | None
-    depth: Path
-    colour: Path | None
-    camera: _Camera
-    far: float
-    has_labels: bool = False
+    path: Path
 
     @property
     def name(self) -> str:
-        return str(self.depth)
-
-    def load(self) -> View:
-        try:
-            units = images.read_units(self.depth)
-            rgb = None if self.colour is None else images.read_colour(self.colour)
-        except InputError as error:
-            raise BrokenFrameError(error.source, error.reason, error.remedy) from None
-        if rgb is not None and rgb.shape[:2] != units.shape:
-            reason = "its colour image is of another size"
-            raise InputError(self.depth, reason, "register the images to one size")
-        if self.camera.size not in (None, units.shape[::-1]):
-            raise InputError(
-                self.depth,
-                f"is {units.shape[1]}×{units.shape[0]} pixels, the published camera has 640×480",
-                "give --camera FILE.json",
-            )
-        depth = (units.astype(np.float64) * (self.camera.depth_scale / 1000.0)).astype(np.float32)
-        return View(
-            depth=within(depth, self.far),
-            K=self.camera.K,
-            T_world_camera=self.T_world_camera,
-            rgb=rgb,
-            name=self.name,
-        )
+        return str(self.path)
 
 
 def recognises(path: Path) -> bool:
@@ -111,31 +92,16 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
         remedy = f"{path} is a TUM RGB-D folder; leave them out"
         raise InputError("--depth, --info, --rgb, --tf", "are for bags", remedy)
     camera = _read_camera(path, options.camera_file)
-    depths = _read_list(path, "depth.txt")
-    colours = sorted(_read_list(path, "rgb.txt")) if (path / "rgb.txt").is_file() else None
-    colour_times = [time for time, _ in colours or ()]
-    tree = _read_poses(path, config)
-    frames, skipped = [], Counter[str]()
-    for number, (time, depth) in enumerate(depths):
-        T_world_camera, colour = None, None
-        if tree is not None:
-            try:
-                T_world_camera = tree.between(_WORLD, _CAMERA, time)
-            except MissingTransform:
-                skipped[NO_POSE] += 1
-                continue
-        if colours is not None:
-            index = nearest(colour_times, time)
-            if index is None or abs(colour_times[index] - time) > config.colour_gap * SECOND:
-                skipped[NO_COLOUR] += 1
-                continue
-            colour = colours[index][1]
-        frames.append(_Frame(number, time, T_world_camera, depth, colour, camera, config.far))
-    notes = [camera.note]
-    if tree is None:
+    depths = _read_list(path / "depth.txt")
+    colours = _read_list(path / "rgb.txt") if (path / "rgb.txt").is_file() else None
+    pose_at, notes = None, [camera.note]
+    if (path / "groundtruth.txt").is_file():
+        tree = _read_poses(path / "groundtruth.txt", config.pose_gap)
+        pose_at = lambda depth: tree.between(_WORLD, _CAMERA, depth.time)  # noqa: E731
+    else:
         notes.append("no groundtruth.txt: poses are not known, a single frame is taken")
-    frames.sort(key=lambda frame: (frame.time, frame.number))
-    return Dataset(path, frames, skipped, tuple(notes), is_video=True, depth_scale=camera.depth_scale)
+    video = make_video(path, depths, colours, pose_at, camera.decode, config)
+    return replace(video, notes=tuple(notes), depth_scale=camera.depth_scale)
 
 
 def _read_camera(folder: Path, camera_file: Path | None) -> _Camera:
@@ -156,11 +122,8 @@ def _read_camera(folder: Path, camera_file: Path | None) -> _Camera:
     )
 
 
-def _read_poses(folder: Path, config: RecordingConfig) -> TransformTree | None:
-    path = folder / "groundtruth.txt"
-    if not path.is_file():
-        return None
-    tree = TransformTree(config.pose_gap)
+def _read_poses(path: Path, max_gap: float) -> TransformTree:
+    tree = TransformTree(max_gap)
     for time, words in _read_rows(path, 8):
         try:
             pose = [float(word) for word in words]
@@ -172,9 +135,8 @@ def _read_poses(folder: Path, config: RecordingConfig) -> TransformTree | None:
     return tree
 
 
-def _read_list(folder: Path, name: str) -> list[tuple[int, Path]]:
-    """Times [ns] and files that a list names."""
-    return [(time, folder / file) for time, (file,) in _read_rows(folder / name, 2)]
+def _read_list(path: Path) -> list[_Image]:
+    return [_Image(time, path.parent / file) for time, (file,) in _read_rows(path, 2)]
 
 
 def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:

@@ -1,0 +1,242 @@
+"""Depth images that follow each other in time, each with the colour and the camera pose of its moment."""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from math import hypot, isfinite
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation, Slerp
+
+from caryatid.config import RecordingConfig
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset
+from caryatid.sensing.views import View
+
+SECOND = 1_000_000_000
+"""Nanoseconds of a second: times are whole nanoseconds, which floats cannot hold since 1970."""
+
+Decoded = tuple[NDArray[np.float32], NDArray[np.uint8] | None, Array]
+"""Depth (H, W) [m], colour (H, W, 3) or None, and pinhole matrix (3, 3) [px]."""
+
+
+class TimedImage(Protocol):
+    """An image that is not decoded yet."""
+
+    @property
+    def name(self) -> str:
+        """What to call it."""
+        ...
+
+    @property
+    def time(self) -> int:
+        """When it was taken [ns]."""
+        ...
+
+
+Image = TypeVar("Image", bound=TimedImage)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class VideoFrame:
+    """A depth image with the colour and the camera pose of its moment; a `Frame`.
+
+    Attributes:
+        name: Name of the view it becomes.
+        number: Its number among the depth images.
+        time: When it was taken [ns].
+        T_world_camera: Camera pose (4, 4), or None where it is not known.
+        decode: Decodes depth and colour.
+        far: Readings farther away are left out [m].
+        has_labels: False: masks are no part of what robots record.
+    """
+
+    name: str
+    number: int
+    time: int
+    T_world_camera: Array | None
+    decode: Callable[[], Decoded]
+    far: float
+    has_labels: bool = False
+
+    def load(self) -> View:
+        """Decode the frame."""
+        depth, rgb, K = self.decode()
+        depth = np.where(depth <= self.far, depth, np.float32(0.0))
+        return View(depth, K, self.T_world_camera, rgb, name=self.name)
+
+
+def make_video(
+    path: Path,
+    depths: Sequence[Image],
+    colours: Sequence[Image] | None,
+    pose_at: Callable[[Image], Array] | None,
+    decode: Callable[[Image, Image | None], Decoded],
+    config: RecordingConfig,
+) -> Dataset:
+    """Find the colour and the camera pose of each depth image.
+
+    Args:
+        path: File or folder.
+        depths: Depth images; they are numbered in this order.
+        colours: Colour images, or None to leave colour out.
+        pose_at: Camera pose (4, 4) of a depth image; raises `MissingTransform`. None leaves poses out.
+        decode: Decodes a depth image and its colour image.
+        config: How far apart in time depth and colour may be, and what is too far away.
+
+    Returns:
+        The frames that have all that is wanted in the order of time, and how many have not.
+    """
+    frames: list[VideoFrame] = []
+    skipped = Counter[str]()
+    ordered = sorted(colours or (), key=lambda colour: colour.time)
+    times = [colour.time for colour in ordered]
+    for number, depth in enumerate(depths):
+        colour, T_world_camera = None, None
+        if colours is not None:
+            index = nearest(times, depth.time)
+            if index is None or abs(times[index] - depth.time) > config.colour_gap * SECOND:
+                skipped[NO_COLOUR] += 1
+                continue
+            colour = ordered[index]
+        if pose_at is not None:
+            try:
+                T_world_camera = pose_at(depth)
+            except MissingTransform:
+                skipped[NO_POSE] += 1
+                continue
+        decoded = partial(decode, depth, colour)
+        frames.append(VideoFrame(depth.name, number, depth.time, T_world_camera, decoded, config.far))
+    frames.sort(key=lambda frame: (frame.time, frame.number))
+    return Dataset(path, frames, skipped, is_video=True)
+
+
+def nearest(times: Sequence[int], time: int) -> int | None:
+    """Index of the time nearest to another, of two as near the earlier one; None where there is none."""
+    after = bisect_left(times, time)
+    around = range(max(after - 1, 0), min(after + 1, len(times)))
+    return min(around, key=lambda index: abs(times[index] - time), default=None)
+
+
+class MissingTransform(Exception):  # noqa: N818
+    """There is no transform between two frames at a time."""
+
+
+@dataclass(slots=True)
+class _Link:
+    """Where one frame was over time: times [ns], parents, and poses as translation and quaternion, w last.
+
+    As compact as robots that send for hours need it.
+    """
+
+    times: array[int] = field(default_factory=lambda: array("q"))
+    parents: list[str] = field(default_factory=list)
+    numbers: array[float] = field(default_factory=lambda: array("d"))
+
+    def in_order(self) -> tuple[NDArray[np.int64], list[str], Array]:
+        """Times that rise, with parents and poses (N, 7); of those at the same time the last one counts."""
+        times, last = np.unique(np.array(self.times)[::-1], return_index=True)
+        order = len(self.times) - 1 - last
+        return times, [self.parents[i] for i in order], np.array(self.numbers).reshape(-1, 7)[order]
+
+
+class TransformTree:
+    """Poses of frames in their parent frames, asked for between any two frames at any time.
+
+    Args:
+        max_gap: Poses further apart in time than this are not interpolated across [s].
+    """
+
+    def __init__(self, max_gap: float) -> None:
+        self._max_gap = round(max_gap * SECOND)
+        self._fixed: dict[str, tuple[str, Array]] = {}
+        self._links: dict[str, _Link] = {}
+        self._ordered: dict[str, tuple[NDArray[np.int64], list[str], Array]] = {}
+
+    @property
+    def frames(self) -> list[str]:
+        """Names of all frames."""
+        parents = {parent for link in self._links.values() for parent in link.parents}
+        parents |= {parent for parent, _ in self._fixed.values()}
+        return sorted({*self._links, *self._fixed} | parents)
+
+    def add(self, parent: str, child: str, time: int, pose: Sequence[float], *, fixed: bool = False) -> None:
+        """Take in one pose; of two at the same time the later one counts.
+
+        Args:
+            parent: Frame the pose is given in.
+            child: Frame whose pose it is.
+            time: When [ns].
+            pose: Translation [m] and quaternion, w last, of any length but 0: seven numbers for which
+                `is_pose` holds.
+            fixed: It holds for all times, unless there are poses of single times.
+        """
+        if fixed:
+            rotation = Rotation.from_quat(pose[3:]).as_matrix()
+            self._fixed[child] = parent, transforms.rigid(rotation, pose[:3])
+            return
+        link = self._links.setdefault(child, _Link())
+        link.times.append(time)
+        link.parents.append(parent)
+        link.numbers.extend(pose)
+        self._ordered.pop(child, None)
+
+    def between(self, target: str, source: str, time: int) -> Array:
+        """`T_target_source` (4, 4): the pose of one frame in another at a time [ns].
+
+        Between two poses the rotation is interpolated along the shortest arc and the translation linearly.
+
+        Raises:
+            MissingTransform: The frames are not connected, or a link has no pose around that time.
+        """
+        T_up_source = dict(self._upwards(source, time))
+        for frame, T_frame_target in self._upwards(target, time):
+            if frame in T_up_source:
+                return transforms.invert(T_frame_target) @ T_up_source[frame]
+        raise MissingTransform(f"'{source}' has no pose in '{target}' at {time / SECOND:.3f} s")
+
+    def _upwards(self, frame: str, time: int) -> Iterator[tuple[str, Array]]:
+        """The frame and those above it, each with the pose of `frame` in it, as far as is known."""
+        T_up_frame = np.eye(4)
+        met: set[str] = set()
+        while frame not in met:
+            yield frame, T_up_frame
+            met.add(frame)
+            step = self._step(frame, time)
+            if step is None:
+                return
+            frame, T_parent_child = step
+            T_up_frame = T_parent_child @ T_up_frame
+
+    def _step(self, child: str, time: int) -> tuple[str, Array] | None:
+        """Parent of a frame and its pose in it at a time, or None where that is not known."""
+        if child not in self._links:
+            return self._fixed.get(child)
+        if child not in self._ordered:
+            self._ordered[child] = self._links[child].in_order()
+        times, parents, poses = self._ordered[child]
+        stop = int(np.searchsorted(times, time))
+        if stop == len(times):
+            return None
+        start = stop if times[stop] == time else stop - 1
+        gap = int(times[stop] - times[start])
+        if start < 0 or parents[start] != parents[stop] or gap > self._max_gap:
+            return None
+        share = (time - int(times[start])) / max(gap, 1)
+        turn = Slerp((0.0, 1.0), Rotation.from_quat(poses[[start, stop], 3:]))
+        position = (1.0 - share) * poses[start, :3] + share * poses[stop, :3]
+        return parents[stop], transforms.rigid(turn(share).as_matrix(), position)
+
+
+def is_pose(numbers: Sequence[float]) -> bool:
+    """Whether numbers are a translation and a quaternion: seven, finite, the quaternion not of length 0."""
+    return len(numbers) == 7 and all(map(isfinite, numbers)) and hypot(*numbers[3:]) > 1e-6
