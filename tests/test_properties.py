@@ -30,7 +30,7 @@ from synthetic import (
 )
 
 from caryatid.config import FitConfig, SupportConfig
-from caryatid.evaluation.scores import as_scene, score, score_scenes
+from caryatid.evaluation.scores import as_scene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.fitting.primitives import Fit, Oriented, fit, fit_many
 from caryatid.geometry import transforms
@@ -255,7 +255,7 @@ def test_with_sg_the_order_of_views_changes_no_vertex_and_no_edge(name):
 def test_the_truth_against_itself_scores_one(name):
     scene = simulated_scene(name)
     truth = true_scene_from_simulation(scene, ground_truth(scene))
-    result = score_scenes(truth, truth, np.random.default_rng(0))
+    result = score(truth, truth, np.random.default_rng(0))
     assert (
         result.f1 == result.precision == result.recall == result.edge_precision == result.edge_recall == 1.0
     )

@@ -17,7 +17,6 @@ from caryatid.evaluation import (
     read_true_scene,
     score,
     score_masks,
-    score_scenes,
 )
 from caryatid.evaluation.scores import (
     mask_ious,
@@ -261,11 +260,9 @@ def test_a_run_is_scored_against_the_frames_it_was_made_from(tmp_path):
 def test_a_view_is_scored_by_the_pixels_seen_up_to_it(tmp_path):
     record(tmp_path / "rec", 2)
     mine = np.where(TRUE_LABELS == 5, 1, np.where(TRUE_LABELS == 7, 2, 0))
-    nothing = np.zeros_like(mine)
-    write_run(tmp_path / "RUN", [mask_graph()] * 2, [mine, nothing], ["rec/000000", "rec/000001"])
-    first, second = evaluate_run(tmp_path / "RUN", tmp_path / "rec")
-    assert first.score.mean_iou == 1.0
-    assert second.score.mean_iou == 0.5
+    names = ["rec/000000", "rec/000001"]
+    write_run(tmp_path / "RUN", [mask_graph()] * 2, [mine, np.zeros_like(mine)], names)
+    assert [v.score.mean_iou for v in evaluate_run(tmp_path / "RUN", tmp_path / "rec")] == [1.0, 0.5]
 
 
 @pytest.mark.parametrize(
@@ -290,16 +287,12 @@ def test_a_bad_truth_is_refused(tmp_path, scene_folder, name, content, said):
     assert "\n" not in str(caught.value)
 
 
-def test_missing_folders_and_truths_are_refused(tmp_path, scene_folder):
+def test_missing_folders_are_refused(tmp_path, scene_folder):
     with pytest.raises(InputError, match="is no folder"):
         evaluate_run(tmp_path / "nowhere", scene_folder)
     write_run(tmp_path / "RUN", [scene_graph(2)])
     with pytest.raises(InputError, match="is no folder"):
         evaluate_run(tmp_path / "RUN", tmp_path / "nowhere")
-    record(tmp_path / "rec", 1)
-    (tmp_path / "rec/gt.json").unlink()
-    with pytest.raises(InputError, match=r"gt\.json.*missing"):
-        evaluate_run(tmp_path / "RUN", tmp_path / "rec")
 
 
 @pytest.mark.slow
@@ -308,7 +301,7 @@ def test_missing_folders_and_truths_are_refused(tmp_path, scene_folder):
 def test_a_true_scene_against_itself_is_one(name):
     truth = read_true_scene(SHARED / "scenes" / name)
     gt = json.loads((SHARED / "scenes" / name / "gt.json").read_text())
-    result = score_scenes(truth, truth, np.random.default_rng(0))
+    result = score(truth, truth, np.random.default_rng(0))
     assert (result.precision, result.recall, result.f1, result.mean_iou) == (1.0,) * 4
     assert len(result.matches) == len(gt["vertices"])
     assert len(truth.edges) == len(gt["edges"])

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.simulation import GroundTruth, ground_truth, load_scene, read_truth, write_truth
 from caryatid.simulation.truth import mean_contact_forces
@@ -35,7 +34,7 @@ def test_agrees_with_the_given_ground_truth():
 
 def test_forces_carry_the_weight():
     scene = load_scene("bridge")
-    forces = mean_contact_forces(scene, PhysicsConfig())
+    forces = mean_contact_forces(scene)
     for label in scene.object_bodies:
         held = sum(force[2] for (_, b), force in forces.items() if b == label)
         weight = scene.model.body_mass[scene.body_id(label)] * 9.81
@@ -86,12 +85,15 @@ def test_kind_and_removal_may_be_missing(tmp_path: Path):
         (json.dumps({**EASY, "vertices": "table"}), "'vertices'"),
         (json.dumps({**EASY, "vertices": ["table", "a", "a"]}), "twice"),
         (json.dumps({"vertices": ["table"]}), "'edges'"),
-        (json.dumps({**EASY, "edges": [3]}), "edge 0"),
-        (json.dumps({**EASY, "edges": [{"supporter": "table", "supported": "b"}]}), "supported 'b'"),
-        (json.dumps({**EASY, "edges": [{"supported": "a"}]}), "supporter None"),
-        (json.dumps({**EASY, "edges": [{**EASY["edges"][0], "kind": "glue"}]}), "'glue'"),
-        (json.dumps({**EASY, "removal": {"a": ["ghost"]}}), "'removal'"),
-        (json.dumps({**EASY, "removal": {"a": [{}]}}), "'removal'"),
+        (json.dumps({**EASY, "edges": [3]}), "edges: '0' is 3"),
+        (
+            json.dumps({**EASY, "edges": [{"supporter": "table", "supported": "b"}]}),
+            "'b', which is no vertex",
+        ),
+        (json.dumps({**EASY, "edges": [{"supported": "a"}]}), "edges.0: the key 'supporter' is missing"),
+        (json.dumps({**EASY, "edges": [{**EASY["edges"][0], "kind": "glue"}]}), "glue.*bottom-up"),
+        (json.dumps({**EASY, "removal": {"a": ["ghost"]}}), "'ghost', which is no vertex"),
+        (json.dumps({**EASY, "removal": {"a": [{}]}}), "removal"),
     ],
 )
 def test_broken_files_are_refused_by_name(tmp_path: Path, text: str, reason: str):

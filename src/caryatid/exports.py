@@ -113,13 +113,9 @@ def to_mjcf(graph: SupportGraph, config: ExportConfig) -> str:
     """
     import mujoco
 
-    from caryatid.simulation.world import Solid, add_solid
+    from caryatid.simulation.world import Solid, add_solid, empty_spec
 
-    spec = mujoco.MjSpec()
-    spec.modelname = "caryatid"
-    spec.option.impratio = 10.0
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec = empty_spec("caryatid")
     try:
         for item in graph.objects:
             if item.role == "support_surface":

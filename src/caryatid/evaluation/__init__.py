@@ -1,16 +1,8 @@
-"""Scores against a truth, benchmark and plots."""
+"""Scores of support graphs against a ground truth."""
 
 from __future__ import annotations
 
-from caryatid.evaluation.scores import (
-    Score,
-    TrueObject,
-    TrueScene,
-    as_scene,
-    score,
-    score_masks,
-    score_scenes,
-)
+from caryatid.evaluation.scores import Score, TrueObject, TrueScene, as_scene, score, score_masks
 from caryatid.evaluation.truths import ViewScore, evaluate_run, read_true_scene, true_scene_from_simulation
 
 __all__ = [
@@ -23,6 +15,5 @@ __all__ = [
     "read_true_scene",
     "score",
     "score_masks",
-    "score_scenes",
     "true_scene_from_simulation",
 ]

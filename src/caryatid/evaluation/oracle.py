@@ -31,9 +31,6 @@ EQUAL = 1e-9
 SURFACE_CELL = 0.01
 """Edge of the cells ground-truth surface is counted in [m]; that of a voxel of the map."""
 
-CELLS = 4096
-"""Cells of true surface along each axis around the world's origin [1]; 41 m of 1 cm."""
-
 
 class _WatchedCamera:
     """A camera that remembers pose (4, 4) and view of each capture that nobody has asked about yet."""
@@ -160,10 +157,13 @@ class OraclePlanner:
         on_object = labels > 0
         reach = image.depth.ravel()[on_object, None]
         points_world = T_world_camera[:3, 3] + reach * rays_world[on_object]
-        place = np.floor(points_world / SURFACE_CELL).astype(np.int64) + CELLS // 2
-        place = np.clip(place, 0, CELLS - 1)
-        numbers = np.concatenate([labels[on_object, None].astype(np.int64), place], axis=1)
-        return np.unique(numbers @ np.array([CELLS**3, CELLS**2, CELLS, 1], dtype=np.int64))
+        cells = 4096  # along each axis around the world's origin: 41 m
+        place = np.floor(points_world / SURFACE_CELL).astype(np.int64) + cells // 2
+        return np.unique(
+            np.ravel_multi_index(
+                (labels[on_object], *np.clip(place, 0, cells - 1).T), (int(labels.max()) + 1, *(cells,) * 3)
+            )
+        )
 
 
 def planner_for(

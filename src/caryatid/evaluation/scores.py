@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -85,38 +85,44 @@ class Score:
     matches: Mapping[str, str] = field(default_factory=dict)
     ious: Mapping[str, float] = field(default_factory=dict)
 
+    @property
+    def vertex_f1(self) -> float:
+        """F1 of vertices alone [1]."""
+        return _harmonic_mean(self.vertex_precision, self.vertex_recall)
+
+    @property
+    def edge_f1(self) -> float:
+        """F1 of edges alone [1]."""
+        return _harmonic_mean(self.edge_precision, self.edge_recall)
+
 
 def score(
-    graph: SupportGraph, truth: TrueScene, rng: np.random.Generator, config: EvaluationConfig | None = None
+    found: SupportGraph | TrueScene,
+    truth: TrueScene,
+    rng: np.random.Generator,
+    config: EvaluationConfig | None = None,
 ) -> Score:
-    """Score a graph of fitted shapes against true solids.
+    """Score a graph of fitted shapes, or a scene of solids, against true solids; the truth itself scores 1.
 
     Every edge of the graph counts, the uncertain ones too: a guess that is wrong costs precision. An edge is
     true when both its ends are matched and the directed pair is in the truth, whatever its kind.
 
     Args:
-        graph: The extracted graph, in the world frame of the truth.
+        found: The extracted graph, in the world frame of the truth.
         truth: The true scene.
         rng: Draws the points volumes are measured with.
         config: Least IoU, tolerance of the table's height, points a pair.
     """
-    return score_scenes(as_scene(graph), truth, rng, config)
-
-
-def score_scenes(
-    found: TrueScene, truth: TrueScene, rng: np.random.Generator, config: EvaluationConfig | None = None
-) -> Score:
-    """Score one scene of solids against another as `score` does; a scene against itself scores 1."""
     config = config or EvaluationConfig()
+    found = as_scene(found) if isinstance(found, SupportGraph) else found
     iou = volume_ious(found.objects, truth.objects, config.samples, rng)
-    pairs = assign(iou, config.min_iou)
-    ious = {found.objects[i].name: float(iou[i, j]) for i, j in pairs}
-    matches = {found.objects[i].name: truth.objects[j].name for i, j in pairs}
+    names, true_names = [o.name for o in found.objects], [o.name for o in truth.objects]
+    matches, ious = _matched(iou, names, true_names, config.min_iou)
     tops = [t.table_top for t in (found, truth) if t.table_top is not None]
     same = len(tops) == 2 and abs(tops[0] - tops[1]) <= config.table_tolerance
     if same and found.table is not None and truth.table is not None:
         matches[found.table] = truth.table
-    return score_matches(found.vertices, found.edges, truth.vertices, truth.edges, matches, ious)
+    return _score_matches(found.vertices, found.edges, truth.vertices, truth.edges, matches, ious)
 
 
 def score_masks(
@@ -148,42 +154,46 @@ def score_masks(
     names = [name for name in vertices if name != TABLE]
     numbers = [_object_number(name) for name in names]
     iou = mask_ious(labels, true_labels, [o.label for o in objects], numbers)
-    pairs = assign(iou, config.min_iou)
-    ious = {objects[i].id: float(iou[i, j]) for i, j in pairs}
-    matches = {objects[i].id: names[j] for i, j in pairs}
+    matches, ious = _matched(iou, [o.id for o in objects], names, config.min_iou)
     surface = graph.support_surface
     if surface is not None and TABLE in vertices:
         matches[surface.id] = TABLE
-    found_vertices = tuple(o.id for o in graph.objects)
-    found_edges = frozenset(s.pair for s in graph.supports)
-    return score_matches(found_vertices, found_edges, tuple(vertices), edges, matches, ious)
+    found = [o.id for o in graph.objects]
+    return _score_matches(found, {s.pair for s in graph.supports}, vertices, edges, matches, ious)
 
 
-def score_matches(
+def _matched(
+    iou: Array, found: Sequence[str], true: Sequence[str], min_iou: float
+) -> tuple[dict[str, str], dict[str, float]]:
+    """Which found name (F) is which true one (T) by IoUs (F, T), one-to-one; and the IoU of each."""
+    pairs = assign(iou, min_iou)
+    return {found[i]: true[j] for i, j in pairs}, {found[i]: float(iou[i, j]) for i, j in pairs}
+
+
+def _score_matches(
     found_vertices: Sequence[str],
-    found_edges: frozenset[tuple[str, str]],
+    found_edges: Set[tuple[str, str]],
     vertices: Sequence[str],
-    edges: frozenset[tuple[str, str]],
-    matches: Mapping[str, str],
-    ious: Mapping[str, float],
+    edges: Set[tuple[str, str]],
+    matches: dict[str, str],
+    ious: dict[str, float],
 ) -> Score:
     """Eqs. 4 and 5 once it is known which extracted vertex is which true one, one-to-one."""
     v, e = len(matches), sum((matches.get(a), matches.get(b)) in edges for a, b in found_edges)
-    claims, facts = (len(found_vertices), len(found_edges)), (len(vertices), len(edges))
-    precision, recall = _ratios(v + e, sum(claims), sum(facts))
-    vertex_precision, vertex_recall = _ratios(v, claims[0], facts[0])
-    edge_precision, edge_recall = _ratios(e, claims[1], facts[1])
+    precision, recall = _ratios(v + e, len(found_vertices) + len(found_edges), len(vertices) + len(edges))
+    vertex_precision, vertex_recall = _ratios(v, len(found_vertices), len(vertices))
+    edge_precision, edge_recall = _ratios(e, len(found_edges), len(edges))
     return Score(
         precision=precision,
         recall=recall,
-        f1=2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0,
+        f1=_harmonic_mean(precision, recall),
         vertex_precision=vertex_precision,
         vertex_recall=vertex_recall,
         edge_precision=edge_precision,
         edge_recall=edge_recall,
         mean_iou=float(np.mean(list(ious.values()))) if ious else 0.0,
-        matches=dict(matches),
-        ious=dict(ious),
+        matches=matches,
+        ious=ious,
     )
 
 
@@ -288,6 +298,10 @@ def _ratios(right: int, claimed: int, true: int) -> tuple[float, float]:
     """Precision and recall of some that are right, of those claimed and those that are true."""
     nothing = 1.0 if claimed == true == 0 else 0.0
     return right / claimed if claimed else nothing, right / true if true else nothing
+
+
+def _harmonic_mean(a: float, b: float) -> float:
+    return 2.0 * a * b / (a + b) if a + b > 0.0 else 0.0
 
 
 def _object_number(name: str) -> int:

@@ -48,19 +48,19 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth) -> Tru
         InputError: The truth names a body the scene does not have.
     """
     labels = {body: label for label, body in scene.object_bodies.items()}
-    unknown = [name for name in truth.vertices if name not in labels and name != scene.table]
-    if unknown:
-        raise InputError(
-            scene.source,
-            f"gt.json names '{unknown[0]}', which is no body of the scene",
-            f"the bodies are {', '.join((scene.table, *labels))}",
-        )
     objects = []
-    for name in [name for name in truth.vertices if name in labels]:
-        contains = partial(world.contains, scene, labels[name])
-        objects.append(TrueObject(name, contains, np.stack(world.bounds(scene, labels[name]))))
+    for name in truth.vertices:
+        if name in labels:
+            contains = partial(world.contains, scene, labels[name])
+            objects.append(TrueObject(name, contains, np.stack(world.bounds(scene, labels[name]))))
+        elif name != scene.table:
+            raise InputError(
+                scene.source,
+                f"gt.json names '{name}', which is no body of the scene",
+                f"the bodies are {', '.join((scene.table, *labels))}",
+            )
     table = scene.table if scene.table in truth.vertices else None
-    height = world.table_top(scene).height
+    height = float(world.table_centre(scene)[2])
     return TrueScene(truth.vertices, frozenset(truth.pairs), tuple(objects), table, height)
 
 

@@ -15,7 +15,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.order import Order, TakeStep
 from caryatid.simulation.lifting import Lifting
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, state_of
 
 LEAST_IOU = 0.01
 """An extracted object stands for the body it overlaps most; overlapping less than this, for none [1]."""
@@ -89,13 +89,8 @@ def dismantling_record(order: Order, taken: Sequence[Taken], left: Sequence[str]
         t.step.to_json() | {"body": t.body, "held": list(t.held), "ok": t.ok, "disturbed": list(t.disturbed)}
         for t in taken
     ]
-    return {
-        "success": succeeded(taken, left),
-        "steps": steps,
-        "left": list(left),
-        "safe": order.safe,
-        "refusal": order.refusal or None,
-    }
+    record = {"success": succeeded(taken, left), "steps": steps, "left": list(left)}
+    return record | {"safe": order.safe, "refusal": order.refusal or None}
 
 
 def succeeded(taken: Sequence[Taken], left: Sequence[str]) -> bool:
@@ -110,8 +105,7 @@ def poses_of(scene: SimulatedScene) -> Array:
 
 def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
     """Return a scene with its objects in another state (N, 7), as of `poses_of`, for pictures."""
-    data = mujoco.MjData(scene.model)
-    data.qpos[:] = scene.data.qpos
+    data = state_of(scene)
     data.qpos[_addresses(scene)] = state
     mujoco.mj_forward(scene.model, data)
     return replace(scene, data=data)

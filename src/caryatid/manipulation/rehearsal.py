@@ -22,17 +22,8 @@ from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
-from caryatid.simulation.world import TABLE, Solid, add_solid, quaternion
+from caryatid.simulation.world import TABLE, Solid, add_solid, empty_spec, quaternion
 from caryatid.support.plausibility import drawn, reconcile
-
-TIME_STEP = 0.004
-"""Of rehearsals [s]: twice MuJoCo's own, which its implicit integrator bears, for half the time."""
-
-TABLE_FRICTION = 0.1
-"""Of the table [1]. Contacts take the larger of two: it is not to hide how slippery objects are."""
-
-RIM = 0.1
-"""The table is taken to be this much larger on each side than what was seen of it [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -81,13 +72,11 @@ class Rehearsal:
         if not self.ids:
             raise InputError("graph", "has no objects", "there is nothing to take away")
         self._graph, self._config, self._threads = graph, config, threads
-        self._scenes: list[_Scene] = []
-        self._states: list[Array] = []
         self._trials: dict[tuple[str, ...], Trial] = {}
         draws = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
-        for scene, state in self._each(lambda k: _settled(draws[k], self.ids, config)):
-            self._scenes.append(scene)
-            self._states.append(state)
+        settled = self._each(lambda k: _settled(draws[k], self.ids, config))
+        self._scenes: list[_Scene] = [scene for scene, _ in settled]
+        self._states: list[Array] = [state for _, state in settled]
 
     @property
     def restless(self) -> dict[str, float]:
@@ -158,11 +147,9 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
     densities = rng.uniform(*settings.density, len(objects))
     if number == 0:
         frictions[:], densities[:] = np.mean(settings.friction), np.mean(settings.density)
-    spec = mujoco.MjSpec()
-    spec.option.timestep = TIME_STEP
-    spec.option.impratio = 10.0
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec = empty_spec("rehearsal")
+    # Twice MuJoCo's own time step, which the implicit integrator bears, for half the time.
+    spec.option.timestep = 0.004
     for o, friction, density in zip(objects, frictions, densities, strict=True):
         if o.role == "support_surface":
             _add_table(spec, o)
@@ -172,11 +159,15 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
 
 
 def _add_table(spec: Any, table: SceneObject) -> None:
+    """The table, 10 cm larger on each side than what was seen of it.
+
+    It is slippery: contacts take the larger friction of two, and it is not to hide how slippery objects are.
+    """
     T, extents = table.shape.T_world_object, table.shape.extents
     up = int(np.argmax(np.abs(T[2, :3])))
-    half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, RIM)
+    half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, 0.1)
     body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[TABLE_FRICTION, 0.005, 0.001])
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
 
 
 def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[_Scene, Array]:

@@ -3,10 +3,18 @@
 from __future__ import annotations
 
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.generation import generate_dense, generate_packed, generate_pile
+from caryatid.simulation.generation import generate
 from caryatid.simulation.scenes import is_builtin, list_scenes, load_scene, write_scene
 from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, read_truth, write_truth
-from caryatid.simulation.world import SimulatedScene, bounds, contains, static_boxes, table_top, true_shapes
+from caryatid.simulation.world import (
+    SimulatedScene,
+    bounds,
+    contains,
+    static_boxes,
+    table_centre,
+    table_top,
+    true_shapes,
+)
 
 __all__ = [
     "GroundTruth",
@@ -15,15 +23,14 @@ __all__ = [
     "TrueEdge",
     "bounds",
     "contains",
-    "generate_dense",
-    "generate_packed",
-    "generate_pile",
+    "generate",
     "ground_truth",
     "is_builtin",
     "list_scenes",
     "load_scene",
     "read_truth",
     "static_boxes",
+    "table_centre",
     "table_top",
     "true_shapes",
     "write_scene",

@@ -39,7 +39,7 @@ def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np
         Depth (H, W) [m], 0 = no reading.
     """
     near, far = config.range
-    seen = (depth > 0.0) & (incidence <= np.deg2rad(config.grazing)) & ~depth_edges(depth, config.edge_jump)
+    seen = (depth > 0.0) & (incidence <= np.deg2rad(config.grazing)) & ~_depth_edges(depth, config.edge_jump)
     noisy = depth + axial_sigma(depth, config) * rng.standard_normal(depth.shape)
     noisy = np.maximum(noisy, near / 2.0)
     steps = np.maximum(np.round(1.0 / (noisy * config.disparity_step)), 1.0)
@@ -47,15 +47,13 @@ def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np
     return np.where(seen & (quantised >= near) & (quantised <= far), quantised, 0.0)
 
 
-def depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
+def _depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
     """Pixels (H, W) on either side of a step of more than `jump` [m] to one of their four neighbours."""
     edges = np.zeros(depth.shape, dtype=bool)
-    rows = np.abs(np.diff(depth, axis=0)) > jump
-    columns = np.abs(np.diff(depth, axis=1)) > jump
-    edges[:-1] |= rows
-    edges[1:] |= rows
-    edges[:, :-1] |= columns
-    edges[:, 1:] |= columns
+    for pixels, values in ((edges, depth), (edges.T, depth.T)):
+        step = np.abs(np.diff(values, axis=0)) > jump
+        pixels[:-1] |= step
+        pixels[1:] |= step
     return edges
 
 
@@ -75,16 +73,6 @@ def misregister(T_world_camera: Array, config: NoiseConfig, rng: np.random.Gener
     shift = config.translation * rng.standard_normal(3)
     R_world_camera = transforms.rotation_from_vector(angle * axis) @ T_world_camera[:3, :3]
     return transforms.rigid(R_world_camera, T_world_camera[:3, 3] + shift)
-
-
-GEOM_GROUPS = 6
-"""Groups MuJoCo sorts geoms into."""
-
-UNSET_COLOUR = 0.5
-"""Red, green and blue of a geom that is given no colour: its material's counts then."""
-
-BACKGROUND = (0.55, 0.62, 0.70)
-"""Colour where a ray meets nothing."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -178,13 +166,8 @@ class SimulatedCamera:
 
 def intrinsics(sensor: SensorConfig) -> Array:
     """Pinhole matrix (3, 3) [px] with the principal point in the middle of the image."""
-    return np.array(
-        [
-            [sensor.focal, 0.0, (sensor.width - 1) / 2.0],
-            [0.0, sensor.focal, (sensor.height - 1) / 2.0],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    u, v = (sensor.width - 1) / 2.0, (sensor.height - 1) / 2.0
+    return np.array([[sensor.focal, 0.0, u], [0.0, sensor.focal, v], [0.0, 0.0, 1.0]])
 
 
 def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: SensorConfig) -> Rendering:
@@ -201,22 +184,12 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
     geoms = np.empty(lengths.size, dtype=np.int32)
     depth = np.empty(lengths.size)
     normals_world = np.empty((lengths.size, 3))
-    visible = np.ones(GEOM_GROUPS, dtype=np.uint8)
+    visible = np.ones(6, dtype=np.uint8)  # MuJoCo has six groups of geoms
     visible[INVISIBLE_GROUP] = 0
     mujoco.mj_multiRay(
-        scene.model,
-        scene.data,
-        T_world_camera[:3, 3],
-        rays_world.ravel(),
-        visible,
-        1,
-        -1,
-        geoms,
-        depth,
-        normals_world.reshape(-1),
-        lengths.size,
-        sensor.far * float(lengths.max()),
-    )
+        scene.model, scene.data, T_world_camera[:3, 3], rays_world.ravel(), visible, 1, -1, geoms, depth,
+        normals_world.reshape(-1), lengths.size, sensor.far * float(lengths.max()),
+    )  # fmt: skip
     missed = (geoms < 0) | (depth > sensor.far)
     geoms[missed], depth[missed], normals_world[missed] = -1, 0.0, 0.0
     cosine = -np.einsum("ij,ij->i", normals_world, rays_world) / lengths
@@ -258,9 +231,10 @@ def _shade(
     """Lambert's law with one lamp and ambient light: colours (N, 3)."""
     model = scene.model
     colours = model.geom_rgba[:, :3].astype(np.float32)
-    plain = (model.geom_matid >= 0) & (colours == UNSET_COLOUR).all(axis=1)
+    # A geom that is given no colour is grey: its material's counts then.
+    plain = (model.geom_matid >= 0) & (colours == 0.5).all(axis=1)
     colours[plain] = model.mat_rgba[model.geom_matid[plain], :3]
-    colours = np.concatenate([colours, np.array([BACKGROUND], dtype=np.float32)])
+    colours = np.concatenate([colours, np.array([(0.55, 0.62, 0.70)], dtype=np.float32)])
     lit = np.einsum("ij,j->i", normals_world, transforms.unit(sensor.light))
     brightness = sensor.ambient + (1.0 - sensor.ambient) * np.maximum(lit, 0.0)
     brightness[geoms < 0] = 1.0

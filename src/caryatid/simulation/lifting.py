@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import LiftConfig
 from caryatid.geometry.transforms import Array
-from caryatid.simulation.world import mujoco_warnings_ignored
+from caryatid.simulation.world import displacement, mujoco_warnings_ignored
 
 ASIDE = 50.0
 """How far up an object is put when it has been lifted [m]; nothing meets it there."""
@@ -27,9 +27,6 @@ CLEARANCE = 0.02
 
 SEGMENT = 0.25
 """Time simulated between two looks at the objects [s]; what falls is seen falling."""
-
-REST = 2e-4
-"""What moves by less than this in a `SEGMENT` stays where it is [m]: contacts creep as slowly."""
 
 HAND = "caryatid-hand-"
 """Names of the bodies that grasp begin so."""
@@ -93,8 +90,7 @@ class Lifting:
 
     def rest(self, state: Array, held: Collection[int], seconds: float) -> Array:
         """State (N, 7) after some time [s] in which nothing is lifted and some objects are held."""
-        data = self._data(state, held)
-        return self._after(data, 0.0, seconds)
+        return self._after(self._data(state, held), 0.0, seconds)
 
     def lift(
         self,
@@ -124,7 +120,7 @@ class Lifting:
             segments = max(1, int(np.ceil(seconds / SEGMENT)))
             for _ in range(segments):
                 now = self._after(data, speed, seconds / segments, index)
-                moved, turned = _apart(state[watched], now[watched])
+                moved, turned = displacement(state[watched], now[watched])
                 distance[watched] = np.maximum(distance[watched], moved)
                 angle[watched] = np.maximum(angle[watched], turned)
                 film.append(now)
@@ -138,7 +134,7 @@ class Lifting:
 
     def strayed(self, before: Array, after: Array, config: LiftConfig) -> NDArray[np.bool_]:
         """Which objects (N,) moved or turned beyond the limits between two states (N, 7)."""
-        return _beyond(*_apart(before, after), config)
+        return _beyond(*displacement(before, after), config)
 
     def _data(self, state: Array, grasped: Collection[int]) -> Any:
         """MuJoCo's data for a state; what is grasped, or aside, is held where it is."""
@@ -174,9 +170,6 @@ class Lifting:
             states, _ = rollout.rollout(model, mujoco.MjData(model), start[None], path, control_spec=_GRASPS)
         mujoco.mj_setState(model, data, states[0, -1], _STATE)
         data.mocap_pos[self._hand[index], 2] = path[0, -1, height]
-        return self._objects(data)
-
-    def _objects(self, data: Any) -> Array:
         return np.array(data.qpos[self._qpos])
 
     def _rise(self, data: Any, watched: NDArray[np.bool_], index: int) -> float:
@@ -214,17 +207,10 @@ def _with_hands(spec: Any, bodies: Sequence[str]) -> Any:
         return spec.compile()
 
 
-def _apart(before: Array, after: Array) -> tuple[Array, Array]:
-    """Distances (N,) [m] and angles (N,) [rad] between states (N, 7)."""
-    cosine = np.abs(np.einsum("ni,ni->n", before[:, 3:], after[:, 3:]))
-    angle = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
-    return np.linalg.norm(after[:, :3] - before[:, :3], axis=1), angle
-
-
 def _at_rest(film: Sequence[Array]) -> bool:
-    """Whether the last two of some states (N, 7) are the same to a fifth of a millimetre and of a degree."""
-    distance, angle = _apart(*film[-2:])
-    return bool((distance < REST).all() and (angle < np.deg2rad(1000.0 * REST)).all())
+    """Whether nothing lately moved by 0.2 mm or turned by 0.2°: contacts creep as slowly."""
+    distance, angle = displacement(*film[-2:])
+    return bool((distance < 2e-4).all() and (angle < np.deg2rad(0.2)).all())
 
 
 def _beyond(distance: Array, angle: Array, config: LiftConfig) -> NDArray[np.bool_]:

@@ -9,6 +9,7 @@ import numpy as np
 from caryatid.config import Config, SegmentationMethod, SensorConfig
 from caryatid.exploration import Step, explore, next_best_view
 from caryatid.fitting.primitives import fit
+from caryatid.geometry.shapes import Box
 from caryatid.planning.planners import BUILT_IN
 from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
@@ -31,12 +32,8 @@ def rehearse(number: int) -> None:
 
 
 def _fit() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.5, 0.5, (600, 3)) * (0.1, 0.2, 0.1)
-    axis = np.argmax(np.abs(points) / (0.1, 0.2, 0.1), axis=1)
-    normals = np.eye(3)[axis] * np.sign(points[np.arange(600), axis])[:, None]
-    points[np.arange(600), axis] = normals.sum(axis=1) * np.array([0.05, 0.1, 0.05])[axis]
-    fit(points, normals, config=Config().fit, rng=rng)
+    points, normals = Box(np.eye(4), np.array([0.1, 0.2, 0.1])).surface(0.01)
+    fit(points, normals, config=Config().fit, rng=np.random.default_rng(0))
 
 
 def _explore_by_colour_and_depth() -> None:

@@ -6,20 +6,13 @@ import re
 from os import PathLike, fspath
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import mujoco
 
 from caryatid.config import PhysicsConfig
-from caryatid.errors import InputError
-from caryatid.simulation.generation import (
-    DENSE_SIZES,
-    PACKED_SIZES,
-    PILE_SIZES,
-    generate_dense,
-    generate_packed,
-    generate_pile,
-)
+from caryatid.errors import InputError, in_one_line
+from caryatid.simulation.generation import SIZES, GeneratedKind, generate
 from caryatid.simulation.truth import ground_truth, write_truth
 from caryatid.simulation.world import (
     SimulatedScene,
@@ -29,7 +22,6 @@ from caryatid.simulation.world import (
     build_spec,
     cylinder,
     mujoco_warnings_ignored,
-    one_line,
     quaternion,
     scene_from_spec,
     sphere,
@@ -102,20 +94,6 @@ DESIGNED: Final = MappingProxyType[str, tuple[Solid, ...]](
 """Solids of each designed scene, by name; heights count from the table top."""
 
 
-SETTLING = 1.0
-"""Time the solids are given to find their contacts [s]."""
-
-
-def designed_scene(name: str, config: PhysicsConfig | None = None) -> SimulatedScene:
-    """Set up and settle one of the designed scenes.
-
-    Args:
-        name: A key of `DESIGNED`.
-        config: When it is at rest.
-    """
-    return scene_from_spec(build_spec(DESIGNED[name], name), name, name, config, least=SETTLING)
-
-
 SCENE_FILE = "scene.xml"
 """Name of the MJCF file in a scene folder."""
 
@@ -140,27 +118,21 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         InputError: No such file or scene, broken XML, no static body `table`, no objects, or it is unstable.
     """
     text = fspath(source)
-    if text in DESIGNED:
-        return designed_scene(text, config)
+    if text in DESIGNED:  # the solids are given a second to find their contacts
+        return scene_from_spec(build_spec(DESIGNED[text], text), text, text, config, least=1.0)
     if match := _GENERATED.fullmatch(text):
-        generate = {"pile": generate_pile, "dense": generate_dense, "packed": generate_packed}[match[1]]
-        return generate(int(match[2]), int(match[3]), physics=config)
+        return generate(cast(GeneratedKind, match[1]), int(match[2]), int(match[3]), config)
     return _load_file(text, config)
 
 
 def list_scenes() -> list[str]:
     """Names `load_scene` knows: the designed scenes, then the generators with their range of sizes."""
-    return [
-        *DESIGNED,
-        f"pile-SIZE-SEED (SIZE {PILE_SIZES[0]}…{PILE_SIZES[1]})",
-        f"dense-SIZE-SEED (SIZE {DENSE_SIZES[0]}…{DENSE_SIZES[1]})",
-        f"packed-SIZE-SEED (SIZE {PACKED_SIZES[0]}…{PACKED_SIZES[1]})",
-    ]
+    return [*DESIGNED, *(f"{kind}-SIZE-SEED (SIZE {a}…{b})" for kind, (a, b) in SIZES.items())]
 
 
 def is_builtin(source: str | PathLike[str]) -> bool:
     """Whether `load_scene` takes this for the name of a built-in scene."""
-    return fspath(source) in DESIGNED or _GENERATED.fullmatch(fspath(source)) is not None
+    return fspath(source) in DESIGNED or bool(_GENERATED.fullmatch(fspath(source)))
 
 
 def write_scene(scene: SimulatedScene, folder: str | PathLike[str]) -> Path:
@@ -198,17 +170,15 @@ def _load_file(source: str, config: PhysicsConfig | None) -> SimulatedScene:
     if path.is_dir():
         path = path / SCENE_FILE
     if not path.exists():
-        built_in = ", ".join(list_scenes())
-        raise InputError(
-            path, "no such scene", f"give an MJCF file or one of the built-in scenes: {built_in}"
-        )
+        remedy = f"give an MJCF file or one of the built-in scenes: {', '.join(list_scenes())}"
+        raise InputError(path, "no such scene", remedy)
     if not path.is_file():
         raise InputError(path, "is no file", "give an MJCF file")
     try:
         with mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise InputError(path, f"is no MJCF ({one_line(error)})", "mend the XML") from None
+        raise InputError(path, f"is no MJCF ({in_one_line(error)})", "mend the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     return scene_from_spec(spec, name or path.stem, str(path), config)
 
@@ -222,22 +192,10 @@ def _collect_assets(spec: Any, target: Path) -> None:
     assets: dict[str, bytes] = {}
     for asset, directory in files:
         if asset.file:
-            content = (origin / (directory or "") / asset.file).read_bytes()
-            asset.file = f"assets/{Path(asset.file).name}"
-            assets[asset.file] = content
+            name = f"assets/{Path(asset.file).name}"
+            assets[name], asset.file = (origin / (directory or "") / asset.file).read_bytes(), name
     for name, content in assets.items():
         (target / name).parent.mkdir(exist_ok=True)
         (target / name).write_bytes(content)
     spec.compiler.meshdir = spec.compiler.texturedir = ""
     spec.modelfiledir = str(target)
-
-
-__all__ = [
-    "SCENE_FILE",
-    "TRUTH_FILE",
-    "SimulatedScene",
-    "is_builtin",
-    "list_scenes",
-    "load_scene",
-    "write_scene",
-]

@@ -11,7 +11,7 @@ from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robo
 from caryatid.robots.floor import FloorGrid
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.world import SimulatedScene, static_boxes, table_top
+from caryatid.simulation.world import SimulatedScene, static_boxes, table_centre
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -51,8 +51,7 @@ def make_simulation(
         PlanningError: No view of the table can be reached.
     """
     boxes = static_boxes(scene)
-    top = table_top(scene)
-    centre = np.append(top.corners_world[:, :2].mean(axis=0), top.height)
+    centre = table_centre(scene)
     floor = FloorGrid.from_boxes(
         [b.T_world_object[:3, 3] for b in boxes],
         [b.extents / 2.0 for b in boxes],

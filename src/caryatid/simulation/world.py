@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from caryatid.config import PhysicsConfig
-from caryatid.errors import InputError
+from caryatid.errors import InputError, in_one_line
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
@@ -25,6 +25,9 @@ TABLE = "table"
 
 INVISIBLE_GROUP = 3
 """Geoms of this group collide and are not seen."""
+
+_WARNING = mujoco.mjtWarning
+_BLOWN_UP = (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -66,8 +69,7 @@ class SimulatedScene:
             raise InputError(
                 self.source, f"has no object with label {label}", f"labels are 1…{len(self.object_bodies)}"
             )
-        name = self.table if label == 0 else self.object_bodies[label]
-        return int(self.model.body(name).id)
+        return int(self.model.body(self.object_bodies.get(label, self.table)).id)
 
     def geoms(self, label: int) -> list[int]:
         """Geoms of the object with this label, or of the table with 0, bodies welded to it included.
@@ -75,11 +77,8 @@ class SimulatedScene:
         Raises:
             InputError: No object carries the label.
         """
-        body = self.body_id(label)
-        if label != 0:
-            return [int(g) for g in np.flatnonzero(self.geom_labels == label)]
-        below = _subtree(self.model, body)
-        return [g for g in range(self.model.ngeom) if int(self.model.geom_bodyid[g]) in below]
+        inside = np.isin(self.model.geom_bodyid, _subtree(self.model, self.body_id(label)))
+        return np.flatnonzero(inside if label == 0 else self.geom_labels == label).tolist()
 
 
 def scene_from_spec(
@@ -103,7 +102,7 @@ def scene_from_spec(
         with mujoco_warnings_ignored():
             model = spec.compile()
     except ValueError as error:
-        raise InputError(source, f"MuJoCo refuses it: {one_line(error)}", "mend the MJCF") from None
+        raise InputError(source, f"MuJoCo refuses it: {in_one_line(error)}", "mend the MJCF") from None
     if not np.isfinite(model.qpos0).all():
         raise InputError(source, "a body's pose holds NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
@@ -113,27 +112,25 @@ def scene_from_spec(
         raise InputError(
             source, f"body '{TABLE}' can move", "take its joints out: the support surface is static"
         )
-    if not any(int(model.geom_bodyid[g]) in _subtree(model, table) for g in range(model.ngeom)):
+    if not np.isin(model.geom_bodyid, _subtree(model, table)).any():
         raise InputError(source, f"body '{TABLE}' has no geom", "give the table a top")
-    free = [int(model.jnt_bodyid[j]) for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)]
+    free = sorted(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
     if not free:
         raise InputError(source, "has no objects", "every object is a body with a free joint")
     if len(free) >= SUPPORT_LABEL:
         raise InputError(source, f"has {len(free)} objects", f"fewer than {SUPPORT_LABEL} can be told apart")
-    label_of_root = {body: label for label, body in enumerate(sorted(free), start=1)}
-    geom_roots = model.body_rootid[model.geom_bodyid]
-    geom_labels = np.array([label_of_root.get(int(root), 0) for root in geom_roots], dtype=np.int32)
-    unseen = [body for body, label in label_of_root.items() if not (geom_labels == label).any()]
-    if unseen:
-        raise InputError(
-            source, f"body '{model.body(unseen[0]).name}' has no geom", "give every object a shape"
-        )
-    data = mujoco.MjData(model)
-    at_rest = settle(model, data, source, config or PhysicsConfig(), least=least)
-    names = {label: model.body(body).name for body, label in label_of_root.items()}
+    names = {label: str(model.body(body).name) for label, body in enumerate(free, start=1)}
     if "" in names.values():
         raise InputError(source, "an object has no name", "name every body with a free joint")
-    return SimulatedScene(model, data, spec, name, source, names, TABLE, geom_labels, at_rest)
+    geom_roots = model.body_rootid[model.geom_bodyid]
+    geom_labels = np.where(np.isin(geom_roots, free), np.searchsorted(free, geom_roots) + 1, 0)
+    if unseen := set(names) - set(geom_labels.tolist()):
+        raise InputError(source, f"body '{names[min(unseen)]}' has no geom", "give every object a shape")
+    data = mujoco.MjData(model)
+    at_rest = settle(model, data, source, config or PhysicsConfig(), least=least)
+    return SimulatedScene(
+        model, data, spec, name, source, names, TABLE, geom_labels.astype(np.int32), at_rest
+    )
 
 
 def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float = 0.0) -> bool:
@@ -152,8 +149,25 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
     Raises:
         InputError: The simulation blew up.
     """
+    window = max(1, round(config.rest_window / model.opt.timestep))
+    at_rest = False
     with mujoco_warnings_ignored():
-        at_rest = _run_to_rest(model, data, source, config, least)
+        mujoco.mj_forward(model, data)
+        mujoco.mj_step(model, data, nstep=round(least / model.opt.timestep))
+        mujoco.mj_forward(model, data)
+        for _ in range(max(1, round(config.settle_time / config.rest_window))):
+            before, poses = data.qpos.copy(), body_poses(data)
+            mujoco.mj_step(model, data, nstep=window)
+            mujoco.mj_forward(model, data)
+            if any(data.warning[int(kind)].number for kind in _BLOWN_UP):
+                raise InputError(
+                    source, "its simulation is unstable", "shorten the time step or mend overlapping bodies"
+                )
+            distance, angle = displacement(poses, body_poses(data))
+            if distance.max() <= config.rest_distance and angle.max() <= np.deg2rad(config.rest_angle):
+                data.qpos[:] = before
+                at_rest = True
+                break
     data.qvel[:] = 0.0
     data.qacc_warmstart[:] = 0.0
     data.time = 0.0
@@ -161,41 +175,16 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
     return at_rest
 
 
-def _run_to_rest(model: Any, data: Any, source: str, config: PhysicsConfig, least: float) -> bool:
-    mujoco.mj_forward(model, data)
-    mujoco.mj_step(model, data, nstep=round(least / model.opt.timestep))
-    mujoco.mj_forward(model, data)
-    steps = max(1, round(config.rest_window / model.opt.timestep))
-    for _ in range(max(1, round(config.settle_time / config.rest_window))):
-        before = data.qpos.copy()
-        positions, rotations = data.xpos.copy(), data.xmat.copy()
-        mujoco.mj_step(model, data, nstep=steps)
-        mujoco.mj_forward(model, data)
-        _check_stable(data, source)
-        distance, angle = displacement(positions, rotations, data.xpos, data.xmat)
-        if distance.max() <= config.rest_distance and angle.max() <= np.deg2rad(config.rest_angle):
-            data.qpos[:] = before
-            return True
-    return False
+def body_poses(data: Any) -> Array:
+    """Position [m] and quaternion, w first, of every body of a state (B, 7)."""
+    return np.hstack([data.xpos, data.xquat])
 
 
-def displacement(
-    positions_a: Array, rotations_a: Array, positions_b: Array, rotations_b: Array
-) -> tuple[Array, Array]:
-    """How far N bodies moved and turned between two states.
-
-    Args:
-        positions_a: Body positions (N, 3) [m] before.
-        rotations_a: Body rotations (N, 9), row by row.
-        positions_b: Body positions (N, 3) [m] after.
-        rotations_b: Body rotations (N, 9).
-
-    Returns:
-        Distances (N,) [m] and angles (N,) [rad].
-    """
-    trace = np.einsum("ni,ni->n", rotations_a, rotations_b)
-    angle = np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0))
-    return np.linalg.norm(positions_b - positions_a, axis=-1), angle
+def displacement(before: Array, after: Array) -> tuple[Array, Array]:
+    """Distances (N,) [m] and angles (N,) [rad] between poses (N, 7): positions and quaternions."""
+    cosine = np.abs(np.einsum("ni,ni->n", before[:, 3:], after[:, 3:]))
+    angle = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
+    return np.linalg.norm(after[:, :3] - before[:, :3], axis=1), angle
 
 
 def state_of(scene: SimulatedScene) -> Any:
@@ -217,16 +206,12 @@ def body_pose(scene: SimulatedScene, label: int) -> Array:
     return T_world_body
 
 
-def one_line(error: Exception) -> str:
-    """Return the text of an error on one line."""
-    return " ".join(str(error).split())
-
-
-def _subtree(model: Any, body: int) -> set[int]:
-    inside = {body}
+def _subtree(model: Any, body: int) -> list[int]:
+    """A body and all that hang from it; MuJoCo numbers bodies after the ones they hang from."""
+    inside = [body]
     for child in range(body + 1, model.nbody):
-        if int(model.body_parentid[child]) in inside:
-            inside.add(child)
+        if model.body_parentid[child] in inside:
+            inside.append(child)
     return inside
 
 
@@ -241,18 +226,6 @@ def mujoco_warnings_ignored() -> Iterator[None]:
         mujoco.set_mju_user_warning(handler)
 
 
-def _check_stable(data: Any, source: str) -> None:
-    bad = (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-    )
-    if any(data.warning[int(kind)].number for kind in bad):
-        raise InputError(
-            source, "its simulation is unstable", "shorten the time step or mend overlapping bodies"
-        )
-
-
 TABLE_HEIGHT = 0.75
 """Height of the table tops built here [m]."""
 
@@ -262,15 +235,7 @@ TABLE_SIZE = (0.6, 0.9)
 Side = Literal["+x", "+y", "-y"]
 """Where a wall may stand; the robot comes from -x."""
 
-_TOP_THICKNESS = 0.04
-_LEG = 0.04
-_WALL_THICKNESS = 0.06
-_WALL_LENGTH = 3.2
-_WALL_HEIGHT = 2.0
-_WALL_GAP = {"+x": 0.24, "+y": 0.32, "-y": 0.32}
-_WOOD, _DARK_WOOD, _PLASTER = (0.72, 0.58, 0.42, 1.0), (0.6, 0.48, 0.35, 1.0), (0.85, 0.85, 0.82, 1.0)
-_GOLDEN_RATIO = 0.618034
-_ROLLING = {"box": (4, 0.005, 0.001), "cylinder": (6, 0.005, 0.001), "sphere": (6, 0.01, 0.01)}
+Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -289,9 +254,9 @@ class Solid:
 
 
 def box(
-    size: tuple[float, float, float],
-    at: tuple[float, float, float],
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    size: Vector,
+    at: Vector,
+    turn: Vector = (0.0, 0.0, 0.0),
     density: float = 600.0,
     friction: float = 0.8,
 ) -> Solid:
@@ -307,28 +272,24 @@ def box(
     return Solid(Box(_placed(at, turn), np.array(size)), density, friction)
 
 
-def cylinder(
-    radius: float,
-    height: float,
-    at: tuple[float, float, float],
-    turn: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    density: float = 600.0,
-) -> Solid:
-    """A cylinder [m], upright unless turned; the other arguments are as in `box`.
-
-    Args:
-        radius: Of its ends [m].
-        height: Along its axis [m].
-        at: As in `box`.
-        turn: As in `box`.
-        density: As in `box`.
-    """
-    return Solid(Cylinder(_placed(at, turn), radius, height), density)
+def cylinder(radius: float, height: float, at: Vector, density: float = 600.0) -> Solid:
+    """An upright cylinder [m]; the other arguments are as in `box`."""
+    return Solid(Cylinder(_placed(at, (0.0, 0.0, 0.0)), radius, height), density)
 
 
-def sphere(radius: float, at: tuple[float, float, float], density: float = 600.0) -> Solid:
-    """A ball [m]; the other arguments are as in `box`."""
-    return Solid(Sphere(_placed(at, (0.0, 0.0, 0.0)), radius), density)
+def sphere(radius: float, at: Vector) -> Solid:
+    """A ball [m]; `at` is as in `box`."""
+    return Solid(Sphere(_placed(at, (0.0, 0.0, 0.0)), radius))
+
+
+def empty_spec(name: str) -> Any:
+    """A `mujoco.MjSpec` of nothing, with a solver under which stacks stand and slide little."""
+    spec = mujoco.MjSpec()
+    spec.modelname = name
+    spec.option.impratio = 10.0
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return spec
 
 
 def build_spec(
@@ -348,15 +309,10 @@ def build_spec(
     Returns:
         The `mujoco.MjSpec`.
     """
-    spec = mujoco.MjSpec()
-    spec.modelname = name
-    spec.option.impratio = 10.0
-    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec = empty_spec(name)
     spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
     for index, side in enumerate(walls):
-        centre, half = _wall(side, table_size)
-        _add_box(spec.worldbody, f"wall{index}", centre, half, _PLASTER)
+        _add_wall(spec.worldbody, f"wall{index}", side, table_size)
     _add_table(spec.worldbody.add_body(name=TABLE), table_size)
     for index, solid in enumerate(solids):
         add_solid(spec, f"object{index}", solid, palette(index))
@@ -365,7 +321,7 @@ def build_spec(
 
 def palette(index: int) -> tuple[float, float, float, float]:
     """Colour of the object with this number; neighbours in number differ widely in hue."""
-    hue = (0.02 + index * _GOLDEN_RATIO) % 1.0
+    hue = (0.02 + index * 0.618034) % 1.0  # turns by the golden ratio never come back near
     value = (0.88, 0.7, 0.55)[(index // 7) % 3]
     return (*colorsys.hsv_to_rgb(hue, 0.75, value), 1.0)
 
@@ -377,50 +333,38 @@ def quaternion(R: Array) -> Array:
     return wxyz
 
 
-def _placed(at: tuple[float, float, float], turn: tuple[float, float, float]) -> Array:
+def _placed(at: Vector, turn: Vector) -> Array:
     R = transforms.rotation_from_vector(np.deg2rad(turn))
     return transforms.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
 
 
 def _add_table(table: Any, size: tuple[float, float]) -> None:
-    x, y = size[0] / 2.0, size[1] / 2.0
-    under = TABLE_HEIGHT - _TOP_THICKNESS
-    _add_box(
-        table,
-        "table_top",
-        (0.0, 0.0, TABLE_HEIGHT - _TOP_THICKNESS / 2.0),
-        (x, y, _TOP_THICKNESS / 2.0),
-        _WOOD,
-    )
-    inset, half = 0.75 * _LEG, (_LEG / 2.0, _LEG / 2.0, under / 2.0)
+    """A top 4 cm thick on legs of 4 cm by 4 cm, a little inside its corners."""
+    x, y, thick, leg = size[0] / 2.0, size[1] / 2.0, 0.04, 0.04
+    under = TABLE_HEIGHT - thick
+    middle = (0.0, 0.0, TABLE_HEIGHT - thick / 2.0)
+    _add_box(table, "table_top", middle, (x, y, thick / 2.0), (0.72, 0.58, 0.42, 1.0))
     for index, (sign_x, sign_y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        centre = (sign_x * (x - inset), sign_y * (y - inset), under / 2.0)
-        _add_box(table, f"table_leg{index}", centre, half, _DARK_WOOD)
+        centre = (sign_x * (x - 0.75 * leg), sign_y * (y - 0.75 * leg), under / 2.0)
+        half = (leg / 2.0, leg / 2.0, under / 2.0)
+        _add_box(table, f"table_leg{index}", centre, half, (0.6, 0.48, 0.35, 1.0))
 
 
-def _wall(
-    side: Side, table_size: tuple[float, float]
-) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    """Centre and half sizes [m] of a wall on one side of the table."""
-    thick, long, high = _WALL_THICKNESS / 2.0, _WALL_LENGTH / 2.0, _WALL_HEIGHT / 2.0
-    sign = 1.0 if side[0] == "+" else -1.0
-    match side[1]:
-        case "x":
-            return (sign * (table_size[0] / 2.0 + _WALL_GAP[side] + thick), 0.0, high), (thick, long, high)
-        case _:
-            return (0.0, sign * (table_size[1] / 2.0 + _WALL_GAP[side] + thick), high), (long, thick, high)
+def _add_wall(world: Any, name: str, side: Side, table_size: tuple[float, float]) -> None:
+    """A wall 3.2 m long, 2 m high and 6 cm thick beside the table."""
+    half, gap = [0.03, 1.6, 1.0], {"+x": 0.24, "+y": 0.32, "-y": 0.32}[side]
+    away = table_size["xy".index(side[1])] / 2.0 + gap + half[0]
+    centre = [away if side[0] == "+" else -away, 0.0, half[2]]
+    if side[1] == "y":
+        centre[:2], half[:2] = centre[1::-1], half[1::-1]
+    _add_box(world, name, centre, half, (0.85, 0.85, 0.82, 1.0))
 
 
 def _add_box(
-    body: Any,
-    name: str,
-    centre: tuple[float, float, float],
-    half: tuple[float, float, float],
-    rgba: tuple[float, float, float, float],
+    body: Any, name: str, centre: Sequence[float], half: Sequence[float], rgba: Sequence[float]
 ) -> None:
-    body.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_BOX, pos=list(centre), size=list(half), rgba=list(rgba)
-    )
+    kind = mujoco.mjtGeom.mjGEOM_BOX
+    body.add_geom(name=name, type=kind, pos=list(centre), size=list(half), rgba=list(rgba))
 
 
 def add_solid(
@@ -438,17 +382,16 @@ def add_solid(
     T_world_body = shape.T_world_object
     body = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
     body.add_freejoint()
-    kind, size = mujoco.mjtGeom.mjGEOM_BOX, shape.extents / 2.0
-    match shape:
-        case Cylinder():
-            kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([shape.radius, shape.height / 2.0, 0.0])
-        case Sphere():
-            kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.array([shape.radius, 0.0, 0.0])
-    condim, torsional, rolling = _ROLLING.get(shape.kind, _ROLLING["box"])
+    kind, size, torsional, rolling = mujoco.mjtGeom.mjGEOM_BOX, shape.extents / 2.0, 0.005, 0.001
+    if isinstance(shape, Cylinder):
+        kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([shape.radius, shape.height / 2.0, 0.0])
+    elif isinstance(shape, Sphere):
+        kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.array([shape.radius, 0.0, 0.0])
+        torsional, rolling = 0.01, 0.01
     body.add_geom(
         type=kind,
         size=size,
-        condim=condim,
+        condim=4 if kind == mujoco.mjtGeom.mjGEOM_BOX else 6,
         friction=[solid.friction, torsional, rolling],
         density=solid.density,
         rgba=rgba,
@@ -456,22 +399,6 @@ def add_solid(
 
 
 _GEOM = mujoco.mjtGeom
-_FLAT = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class TableTop:
-    """Where things stand.
-
-    Attributes:
-        height: Of the top over the world's origin [m].
-        corners_world: The rectangle (4, 3) [m], anticlockwise from above.
-        shape: The geom as a box.
-    """
-
-    height: float
-    corners_world: Array
-    shape: Box
 
 
 def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[np.bool_]:
@@ -512,39 +439,34 @@ def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
 
 def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
     """Shape of every object, by label, that is a single box, cylinder or sphere; others are left out."""
-    shapes: dict[int, Shape] = {}
-    for label in scene.object_bodies:
-        geoms = solid_geoms(scene, label)
-        shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
-        if shape is not None:
-            shapes[label] = shape
-    return shapes
+    geoms = {label: solid_geoms(scene, label) for label in scene.object_bodies}
+    shapes = {label: _primitive(scene, own[0]) for label, own in geoms.items() if len(own) == 1}
+    return {label: shape for label, shape in shapes.items() if shape is not None}
 
 
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
     """Oriented boxes around the geoms that belong to no object, the table's first; planes are no obstacle."""
-    table = scene.geoms(0)
-    others = [g for g in np.flatnonzero(scene.geom_labels == 0).tolist() if g not in table]
-    solid = [g for g in (*table, *others) if int(scene.model.geom_type[g]) not in _FLAT]
-    return tuple(_geom_box(scene, g) for g in solid)
+    flat = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
+    geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels == 0).tolist()])
+    return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
 
 
-def table_top(scene: SimulatedScene) -> TableTop:
-    """The table geom with the largest area seen from above, as a level box."""
+def table_top(scene: SimulatedScene) -> Box:
+    """The table geom with the largest area seen from above, as a level box; things stand on it."""
     boxes = [_level(_geom_box(scene, g)) for g in scene.geoms(0)]
-    top = max(boxes, key=lambda box: box.extents[0] * box.extents[1])
-    height = top.T_world_object[2, 3] + top.extents[2] / 2.0
-    signs = np.array([[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [1.0, 1.0, 1.0], [-1.0, 1.0, 1.0]])
-    corners_world = transforms.transform(top.T_world_object, signs * top.extents / 2.0)
-    return TableTop(float(height), corners_world, top)
+    return max(boxes, key=lambda box: box.extents[0] * box.extents[1])
+
+
+def table_centre(scene: SimulatedScene) -> Array:
+    """Middle (3,) of the table's upper face [m], world frame."""
+    top = table_top(scene)
+    return top.T_world_object[:3, 3] + (0.0, 0.0, top.extents[2] / 2.0)
 
 
 def solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
     """Geoms that make up the solid of an object (0 = table): those that collide, or all if none does."""
-    geoms = scene.geoms(label)
-    model = scene.model
-    colliding = [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]]
-    return colliding or geoms
+    geoms, model = scene.geoms(label), scene.model
+    return [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]] or geoms
 
 
 def _geom_pose(scene: SimulatedScene, geom: int) -> Array:
@@ -578,8 +500,7 @@ def _level(box: Box) -> Box:
         half = np.abs(R) @ (box.extents / 2.0)
         return Box(transforms.rigid(np.eye(3), box.T_world_object[:3, 3]), 2.0 * half)
     first, second = (upright + 1) % 3, (upright + 2) % 3
-    x = R[:, first] * (1.0, 1.0, 0.0)
-    x = x / np.linalg.norm(x)
+    x = transforms.unit(R[:, first] * (1.0, 1.0, 0.0))
     R_level = np.stack([x, np.cross((0.0, 0.0, 1.0), x), (0.0, 0.0, 1.0)], axis=1)
     return Box(transforms.rigid(R_level, box.T_world_object[:3, 3]), box.extents[[first, second, upright]])
 
