@@ -26,16 +26,10 @@ from caryatid.benchmark.episodes import (
     settings_of,
 )
 from caryatid.benchmark.report import read_results, summarise_store, write_document, write_results
-from caryatid.benchmark.statistics import area_over_path, first_reach, summarise
+from caryatid.benchmark.statistics import area_over_path, bootstrap, first_reach, summarise
 from caryatid.benchmark.store import RESULTS, Member, ResultStore, collect_provenance
-from caryatid.benchmark.suites import (
-    SUITES,
-    find_suite,
-    with_conditions,
-    with_fusions,
-    with_planners,
-    with_settings,
-)
+from caryatid.benchmark.suites import SUITES, change_suite, find_suite
+from caryatid.config import StatisticsConfig
 from caryatid.errors import InputError
 from caryatid.simulation.scenes import is_builtin, load_scene, write_scene
 
@@ -54,7 +48,7 @@ def member(scene: str = "tower", method: str = "support", seed: int = 0, kind: s
     return Member(Episode(scene, planner=method, seed=seed, views=3), method, "labels, Carmine noise", kind)
 
 
-def fill(path, methods=("support", "random", "oracle"), scenes=6) -> None:
+def fill(path, methods=("support", "random", "oracle"), scenes=2) -> None:
     """A result file of episodes that never ran; the last one failed."""
     rng = np.random.default_rng(1)
     members = [
@@ -79,9 +73,13 @@ def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
     suite = find_suite(name)
     assert all(is_builtin(scene) for scene in suite.scenes)
     few = replace(suite, scenes=suite.scenes[:1], seeds=1)
-    changed = with_fusions(few, ["pc", "sg"])
-    changed = with_conditions(changed, ["auto", "labels"], ["none", "carmine"])
-    changed = with_settings(changed, ["noise.translation=0.02"])
+    changed = change_suite(
+        few,
+        fusions=["pc", "sg"],
+        segmentations=["auto", "labels"],
+        noises=["none", "carmine"],
+        settings=["noise.translation=0.02"],
+    )
     for one in (few, changed):
         members = one.members()
         assert len(members) == len(one.conditions) * len(one.methods)
@@ -96,7 +94,7 @@ def test_every_suite_is_made_of_valid_episodes_and_can_be_changed(name):
 
 
 def test_planners_can_take_the_place_of_the_methods():
-    suite = with_planners(find_suite("smoke"), ["random", "paper", "random"])
+    suite = change_suite(find_suite("smoke"), planners=["random", "paper", "random"])
     assert [(m.label, m.planner, m.fusion) for m in suite.methods] == [
         ("random", "random", "pc+sg"),
         ("paper", "paper", "pc+sg"),
@@ -106,7 +104,7 @@ def test_planners_can_take_the_place_of_the_methods():
 def test_what_cannot_be_changed_or_does_not_exist_is_refused():
     suite = find_suite("smoke")
     with pytest.raises(InputError, match=r"fusion\.method=pc: every episode has its own; use --fusion"):
-        with_settings(suite, ["fusion.method=pc"])
+        change_suite(suite, settings=["fusion.method=pc"])
     with pytest.raises(InputError, match="no suite 'fig6'; choose one of smoke, fig5, planners"):
         find_suite("fig6")
 
@@ -175,8 +173,8 @@ def test_what_is_added_comes_back_and_only_what_is_missing_is_asked_for(tmp_path
         assert store.table("smoke")["f1"].tolist() == [0.1 + 0.2, 0.5, 0.1 + 0.2]
 
 
-@pytest.mark.parametrize("torn", range(0, 400, 37))
-def test_a_torn_last_line_is_ignored(tmp_path, torn):
+@pytest.mark.parametrize("torn", [0, 1, 200])
+def test_a_torn_last_line_is_ignored_and_written_again(tmp_path, torn):
     path = tmp_path / RESULTS
     members = [member(seed=s) for s in range(2)]
     with ResultStore(path, "code") as store:
@@ -190,18 +188,11 @@ def test_a_torn_last_line_is_ignored(tmp_path, torn):
     with ResultStore(path, "code") as store:
         assert store.plan("a", members) == [members[1].episode]
         store.add(members[1].episode, Outcome((row(1, 0.7),)))
-        assert store.table("a")["f1"].tolist() == [0.5, 0.7]
     with ResultStore(path) as store:
         assert store.table("a")["f1"].tolist() == [0.5, 0.7]
-
-
-def test_a_file_torn_in_its_first_line_is_begun_again(tmp_path):
-    path = tmp_path / RESULTS
     path.write_bytes(b'{"about": {"ver')
     with ResultStore(path, "code") as store:
-        store.plan("a", [member()])
-    with ResultStore(path) as store:
-        assert store.suites == {"a": [member()]}
+        assert store.plan("a", members) == [m.episode for m in members]
 
 
 def test_one_writes_and_others_read(tmp_path):
@@ -301,17 +292,9 @@ def test_seeds_of_a_scene_count_as_one_and_failures_not_at_all(tmp_path):
 
 
 def test_an_interval_covers_the_mean_as_often_as_it_says():
-    rng, covered = np.random.default_rng(5), 0
-    for _ in range(40):
-        values = rng.normal(0.5, 0.1, 30)
-        one = figure(
-            summarise(table({"m": [(f"s{i}", [f]) for i, f in enumerate(values)]}), reference="m"),
-            "m",
-            "f1",
-            1,
-        )
-        covered += one.low < 0.5 < one.high
-    assert 33 <= covered <= 40
+    values = np.random.default_rng(5).normal(0.5, 0.1, (40, 30))
+    found = [bootstrap(v[:, None], lambda means: means, StatisticsConfig())[0] for v in values]
+    assert 33 <= sum(low < 0.5 < high for _, low, high in found) <= 40
 
 
 def test_thresholds_and_areas_over_the_path():
@@ -332,7 +315,7 @@ def test_the_command_writes_tables_figures_and_pages_of_what_there_is(tmp_path, 
     command = ("benchmark", "--out", out, "--docs", tmp_path / "page.md", "--reference", "support", "--json")
     assert run_command(*command) == 0
     said = json.loads(capsys.readouterr().out)["suites"]["planners"]
-    assert (said["planned"], said["done"], said["failed"]) == (36, 36, 1)
+    assert (said["planned"], said["done"], said["failed"]) == (12, 12, 1)
     page, document = (out / "index.html").read_text(), (tmp_path / "page.md").read_text()
     for text in (page, document):
         for part in ("planners", "random", "oracle", "Until F1 reaches a threshold", "dense scenes only"):
@@ -341,41 +324,35 @@ def test_the_command_writes_tables_figures_and_pages_of_what_there_is(tmp_path, 
     assert not [link for link in ("http://", "<script", "<link") if link in page]
     shown = {line.split("(")[1].rstrip(")") for line in document.splitlines() if line.startswith("![")}
     assert shown == {f"page/{file.name}" for file in (tmp_path / "page").iterdir()}
+    assert page.count('src="data:image/svg+xml;base64,') == len(shown)
     assert (out / "planners" / "f1-over-views.png").read_bytes().startswith(b"\x89PNG")
     f1 = said["f1"]["labels, Carmine noise"]["random"]
     assert f"| random | {f1[0]:.3f} [" in document
-    before = page
-    assert run_command(*command) == 0
-    assert (out / "index.html").read_text() == before
+    with ResultStore(out / RESULTS) as store:
+        known = [row["f1"] for outcome in store.outcomes.values() for row in outcome.rows]
+    with (out / "planners.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["f1"]) for line in lines if line["f1"]] == known
+    assert lines[-1]["error"].endswith("fell <over>")
+    parquet = pd.read_parquet(out / "planners.parquet")
+    assert list(parquet.columns) == list(lines[0])
+    assert parquet["f1"].dropna().tolist() == known
     assert run_command("benchmark", "--out", out, "--reference", "nobody") == 1
     assert "no such method; choose one of support, random, oracle" in capsys.readouterr().err
 
 
-def test_csv_and_parquet_hold_every_digit(tmp_path):
-    out = tmp_path / "bench"
-    fill(out / RESULTS)
-    assert run_command("benchmark", "--out", out, "--quiet") == 0
-    with ResultStore(out / RESULTS) as store:
-        known = [row for outcome in store.outcomes.values() for row in outcome.rows]
-    with (out / "planners.csv").open() as file:
-        lines = list(csv.DictReader(file))
-    assert [float(line["f1"]) for line in lines if line["f1"]] == [row["f1"] for row in known]
-    assert lines[-1]["error"].endswith("fell <over>")
-    parquet = pd.read_parquet(out / "planners.parquet")
-    assert list(parquet.columns) == list(lines[0])
-    assert parquet["f1"].dropna().tolist() == [row["f1"] for row in known]
-
-
 def test_a_document_can_be_made_again_of_the_summary(tmp_path):
-    fill(tmp_path / RESULTS, ("support", "random"), scenes=2)
+    fill(tmp_path / RESULTS, ("support", "random"), scenes=1)
     with ResultStore(tmp_path / RESULTS) as store:
         results, about = summarise_store(store), store.about
     write_results(results, about, tmp_path / "s.json.gz")
     for name, made in (("a", (results, about)), ("b", read_results(tmp_path / "s.json.gz"))):
         (tmp_path / name).mkdir()
         write_document(*made, tmp_path / name / "page.md", "command")
-    one, other = ((tmp_path / name / "page.md").read_text() for name in "ab")
-    assert one == other
+    one, other = (sorted((tmp_path / name).rglob("*.*")) for name in "ab")
+    assert [file.name for file in one] == [file.name for file in other]
+    assert one[-1].read_text() == other[-1].read_text() != ""
+    assert len(one) > 3
 
 
 def test_without_pandas_the_remedy_is_told(tmp_path, monkeypatch, capsys):

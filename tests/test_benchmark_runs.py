@@ -24,7 +24,7 @@ import caryatid
 from caryatid.benchmark.episodes import Episode, Outcome, content_of, run_episode
 from caryatid.benchmark.running import connect, run_locally, run_on_cluster, run_on_worker
 from caryatid.benchmark.store import RESULTS, ResultStore
-from caryatid.benchmark.suites import find_suite, with_planners
+from caryatid.benchmark.suites import change_suite, find_suite
 from caryatid.errors import CaryatidError, InputError
 from caryatid.runtime.fingerprint import fingerprint
 
@@ -133,6 +133,8 @@ def test_however_a_run_ends_the_next_one_goes_on(started, tmp_path):
     assert status == 0
     assert said.startswith(f"smoke: {SEEDS} of {SEEDS} episodes\n")
     assert known.items() < all_rows(out).items()
+    keys = [line["key"] for line in map(json.loads, (out / RESULTS).open()) if "key" in line]
+    assert len(keys) == len(set(keys)) == SEEDS
     with ResultStore(out / RESULTS) as store:
         assert len(store.outcomes) == len(store.suites["smoke"]) == SEEDS
         for member in store.suites["smoke"][::3]:
@@ -167,7 +169,7 @@ def test_a_second_run_on_a_folder_is_refused_and_reading_is_not(started, tmp_pat
 def test_rows_are_the_same_on_any_number_of_processes(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     before = dict(os.environ)
-    suite = with_planners(find_suite("smoke"), ["support", "random"])
+    suite = change_suite(find_suite("smoke"), planners=["support", "random"])
     suite = replace(suite, scenes=("tower", "dense-99-1"), seeds=1, views=2)
     episodes = [replace(m.episode, settings=QUICK) for m in suite.members()]
     found = [{e: without_times(o) for e, o in run_locally(episodes, jobs)} for jobs in (1, 2)]
@@ -259,7 +261,7 @@ def cluster(tmp_path):
 def test_a_run_that_loses_a_worker_is_complete_and_the_same(cluster, tmp_path, scene_file, monkeypatch):
     monkeypatch.chdir(scene_file.parents[1])
     folder = scene_file.parent.name
-    suite = with_planners(find_suite("smoke"), ["support", "random"])
+    suite = change_suite(find_suite("smoke"), planners=["support", "random"])
     suite = replace(suite, scenes=("tower", folder, "dense-99-1"), seeds=2, views=2)
     members = [replace(m, episode=replace(m.episode, settings=QUICK)) for m in suite.members()]
     cluster.add_worker(threads=2)

@@ -6,11 +6,11 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from caryatid.errors import InputError, in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, TrueScene, score
 from caryatid.evaluation.truths import SEED, true_scene_from_simulation
-from caryatid.exploration import Step, explore
+from caryatid.exploration import explore
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
 from caryatid.manipulation.order import TakeStep, plan_order
@@ -111,12 +111,8 @@ def settings_of(episode: Episode) -> Config:
     Raises:
         InputError: A setting does not exist or its value is not valid.
     """
-    config = read_settings(None, episode.settings)
-    return replace(
-        config,
-        fusion=replace(config.fusion, method=episode.fusion),
-        active=replace(config.active, max_views=episode.views),
-    )
+    own = f"fusion.method={episode.fusion}", f"active.max_views={episode.views}"
+    return read_settings(None, (*own, *episode.settings))
 
 
 def find_scenes(sources: Iterable[str]) -> list[str]:
@@ -183,86 +179,59 @@ def take_apart(
         1 where nothing was disturbed, else 0; and the share of the lifts that disturbed nothing.
     """
     bodies = bodies_of(graph, truth)
-    steps = [s for s in _removal_steps(order, graph, truth, config, seed) if s.object_id in bodies]
+    objects = [o for o in graph.objects if o.role == "object"]
+    ids = [o.id for o in sorted(objects, key=lambda o: (-o.centre_world[2], o.label))]
+    if order == "random":
+        ids = [objects[k].id for k in np.random.default_rng(seed).permutation(len(objects))]
+    elif order == "true graph":
+        ids = _by_graph(ids, truth.edges, bodies)
+    steps = [TakeStep(i, (), False, 1.0, "not rehearsed") for i in ids]
+    if objects and order in ("one hand", "two hands"):
+        steps = list(plan_order(graph, config, hands=1 if order == "one hand" else 2, seed=seed).steps)
+    steps = [step for step in steps if step.object_id in bodies]
     height = dict(zip(scene.object_bodies.values(), poses_of(scene)[:, 2], strict=True))
     missed = sorted(set(height) - {bodies[s.object_id] for s in steps}, key=lambda b: -height[b])
-    ok = [
-        taken.ok
-        for taken in dismantle(
-            scene, [*steps, *map(_unrehearsed, missed)], bodies | {b: b for b in missed}, config
-        )
-    ]
+    steps += [TakeStep(body, (), False, 1.0, "not extracted") for body in missed]
+    ok = [taken.ok for taken in dismantle(scene, steps, bodies | {b: b for b in missed}, config)]
     return float(all(ok)), float(np.mean(ok))
 
 
-def counts(true: int, graph: SupportGraph, found: Score) -> Row:
-    """Numbers of true objects, of extracted ones and of those that are both, the table left out."""
-    return {"objects": true, "returned": len(graph.objects) - 1, "matched": len(found.ious)}
+def figures_of(found: Score, graph: SupportGraph, true: int) -> Row:
+    """Scores of a graph, and numbers of true objects, of extracted ones and of those that are both."""
+    scores = {name: getattr(found, name) for name in SCORES}
+    return scores | {"objects": true, "returned": len(graph.objects) - 1, "matched": len(found.ious)}
 
 
 def _rows(episode: Episode) -> list[Row]:
     config = settings_of(episode)
     scene, truth = open_scene(episode.scene, episode.content)
     simulation = make_simulation(scene, config, noise=episode.noise, seed=episode.seed)
-    planner, camera = planner_for(
-        episode.planner,
-        simulation.camera,
-        truth,
-        config,
-        segmentation=episode.segmentation,
-        seed=episode.seed,
-    )
+    known: dict[str, Any] = {"segmentation": episode.segmentation, "seed": episode.seed}
+    planner, camera = planner_for(episode.planner, simulation.camera, truth, config, **known)
     rows: list[Row] = []
     planning, taken = 0.0, (0.0, 0.0)
-    for step in explore(
-        camera,
-        simulation.robot,
-        planner=planner,
-        config=config,
-        segmentation=episode.segmentation,
-        seed=episode.seed,
-        early_stop=False,
-    ):
+    for step in explore(camera, simulation.robot, planner=planner, config=config, early_stop=False, **known):
         found = score(step.graph, truth, np.random.default_rng(SEED))
-        row = _row(step, found, planning) | counts(len(truth.objects), step.graph, found)
-        if episode.order and row["view"] in REMOVAL_VIEWS:
+        view = step.index + 1
+        if episode.order and view in REMOVAL_VIEWS:
             taken = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
-        rows.append(row | {"unharmed": taken[0], "lifts": taken[1]})
+        rows.append(
+            {
+                "view": view,
+                **figures_of(found, step.graph, len(truth.objects)),
+                "angle": step.angle_travelled,
+                "path": step.path_travelled,
+                "planning_seconds": planning,
+                "perception_seconds": sum(
+                    s for stage, s in step.timings.items() if stage not in ("capture", "plan")
+                ),
+                "unharmed": taken[0],
+                "lifts": taken[1],
+            }
+        )
         planning = step.timings.get("plan", 0.0)
     missing = range(int(rows[-1]["view"]) + 1, episode.views + 1)
     return rows + [rows[-1] | dict.fromkeys(TIMES, 0.0) | {"view": view} for view in missing]
-
-
-def _row(step: Step, found: Score, planning: float) -> Row:
-    def f1(kind: str) -> float:
-        precision, recall = getattr(found, f"{kind}_precision"), getattr(found, f"{kind}_recall")
-        return 2.0 * precision * recall / (precision + recall) if precision + recall > 0.0 else 0.0
-
-    measured = {"vertex_f1": f1("vertex"), "edge_f1": f1("edge")}
-    return {
-        "view": step.index + 1,
-        **{name: measured[name] if name in measured else getattr(found, name) for name in SCORES},
-        "angle": step.angle_travelled,
-        "path": step.path_travelled,
-        "planning_seconds": planning,
-        "perception_seconds": sum(s for stage, s in step.timings.items() if stage not in ("capture", "plan")),
-    }
-
-
-def _removal_steps(
-    order: OrderName, graph: SupportGraph, truth: TrueScene, config: Config, seed: int
-) -> Sequence[TakeStep]:
-    objects = [o for o in graph.objects if o.role == "object"]
-    ids = [o.id for o in sorted(objects, key=lambda o: (-o.centre_world[2], o.label))]
-    match order:
-        case "one hand" | "two hands":
-            hands = 1 if order == "one hand" else 2
-            return plan_order(graph, config, hands=hands, seed=seed).steps if objects else ()
-        case "random":
-            ids = [objects[k].id for k in np.random.default_rng(seed).permutation(len(objects))]
-        case "true graph":
-            ids = _by_graph(ids, truth.edges, bodies_of(graph, truth))
-    return [_unrehearsed(i) for i in ids]
 
 
 def _by_graph(ids: Sequence[str], edges: frozenset[tuple[str, str]], bodies: Mapping[str, str]) -> list[str]:
@@ -273,10 +242,6 @@ def _by_graph(ids: Sequence[str], edges: frozenset[tuple[str, str]], bodies: Map
         done.append(next((i for i in left if i not in carrying), left[0]))
         left.remove(done[-1])
     return done
-
-
-def _unrehearsed(object_id: str) -> TakeStep:
-    return TakeStep(object_id, (), False, 1.0, "not rehearsed")
 
 
 def _digest(files: Iterable[Path]) -> str:

@@ -1,18 +1,19 @@
-"""A benchmark's report: the same tables and figures as Markdown and as one HTML page."""
+"""A benchmark's report: tables and figures of a suite's summary, as Markdown and as one HTML page of it."""
 
 from __future__ import annotations
 
 import base64
 import gzip
-import html
 import io
 import json
 import math
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from caryatid.benchmark.figures import (
     Figure,
@@ -21,7 +22,7 @@ from caryatid.benchmark.figures import (
     draw_group,
     is_removal,
     looks_of,
-    table_views,
+    told_views,
 )
 from caryatid.benchmark.statistics import summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
@@ -34,14 +35,22 @@ if TYPE_CHECKING:
 
 NONE = "–"
 """Where there is no figure."""
-BY_VIEW = (
-    ("f1", "F1", 3),
-    ("edge_f1", "F1 of edges", 3),
-    ("mean_iou", "Mean IoU", 3),
-    ("path", "Path [m]", 2),
+BY_VIEW = {"f1": "F1", "edge_f1": "F1 of edges", "mean_iou": "Mean IoU", "path": "Path [m]"}
+REMOVAL = {"unharmed": "Scenes taken apart without harm", "lifts": "Lifts without harm"}
+"""Measures with a column for each view, and their headings."""
+TO_THRESHOLD = {
+    "share": "episodes that reach it",
+    "median views": "median views",
+    "median path": "median path [m]",
+    "mean views": "views, mean curve",
+    "mean path": "path, mean curve [m]",
+    "path ratio": "… by that of {}",
+}
+"""Quantities of a threshold of F1, and their headings."""
+DIGITS = {"median views": 0, "mean views": 0} | dict.fromkeys(
+    ("path", "median path", "mean path", "path ratio", "gap"), 2
 )
-"""Measures with a column for each view: name, heading, digits."""
-REMOVAL = (("unharmed", "Scenes taken apart without harm", 3), ("lifts", "Lifts without harm", 3))
+"""Digits after the point of quantities that have not three."""
 NOTES = (
     "Means are over scenes; the seeds of a scene are averaged first. In brackets: the {confidence:g} % "
     "interval of the percentile bootstrap over scenes, {resamples:,} resamples; a single scene has none. "
@@ -62,11 +71,10 @@ PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
 <meta name="color-scheme" content="light dark"><title>Benchmark</title><style>
 body {{ font: 15px/1.5 system-ui, sans-serif; max-width: 1320px; margin: 0 auto; padding: 0 28px; }}
-h1, h2 {{ border-bottom: 1px solid #8885; }} .table {{ overflow-x: auto; }}
-table {{ border-collapse: collapse; font-size: 13.5px; margin: 6px 0 18px; }}
+h1, h2 {{ border-bottom: 1px solid #8885; }}
+table {{ display: block; overflow-x: auto; border-collapse: collapse; font-size: 13.5px; }}
 th, td {{ text-align: left; border-bottom: 1px solid #8885; padding: 4px 18px 4px 0; }}
-figure {{ display: inline-block; width: min(100%, 620px); margin: 8px 12px 8px 0; vertical-align: top; }}
-figure img {{ width: 100%; background: #fff; }} figcaption {{ font-size: 13px; opacity: .75; }}
+img {{ width: min(100%, 620px); background: #fff; }}
 </style></head><body>
 {body}
 </body></html>
@@ -97,18 +105,15 @@ class SuiteResult:
     failures: list[list[str]]
     summary: pd.DataFrame
 
-    @property
-    def methods(self) -> list[str]:
-        """Labels of the methods, in order."""
-        return list(self.summary["method"].unique())
-
     def f1(self) -> dict[str, dict[str, list[float]]]:
         """Mean F1 after each view of each method under each condition."""
-        rows = self.summary[(self.summary["family"] == "") & (self.summary["quantity"] == "f1")]
-        found: dict[str, dict[str, list[float]]] = {c: {} for c in self.summary["condition"].unique()}
-        for (condition, method), own in rows.groupby(["condition", "method"], sort=False):
-            found[condition][method] = own["value"].tolist()
-        return found
+        whole = self.summary[self.summary["family"] == ""]
+        return {
+            str(condition): {
+                method: curve["value"].tolist() for method, curve in curves_of(rows, "f1").items()
+            }
+            for condition, rows in whole.groupby("condition", sort=False)
+        }
 
 
 def summarise_store(
@@ -135,23 +140,21 @@ def summarise_store(
         chosen = str(next(method for method in wanted if method in methods))
         gap = known.gap if known and known.gap and methods.issuperset(known.gap) else None
         failed = table[table["error"].notna()]
-        failures = [
-            [
-                row.method,
-                row.condition,
-                Path(row.scene).name,
-                str(row.seed),
-                row.error.replace(row.scene, Path(row.scene).name),
-            ]
-            for row in failed.itertuples()
-        ]
-        episodes = len(table[["method", "condition", "scene", "seed"]].drop_duplicates())
+        short = failed["scene"].map(lambda scene: Path(scene).name)
+        error = [e.replace(s, n) for e, s, n in zip(failed["error"], failed["scene"], short, strict=True)]
+        failures = failed.assign(scene=short, error=error, seed=failed["seed"].astype(str))
         results.append(
             SuiteResult(
-                name, chosen, len(store.suites[name]), episodes, table["scene"].nunique(),
-                table["seed"].nunique(), failures, summarise(table, reference=chosen, gap=gap, config=config),
+                name,
+                chosen,
+                planned=len(store.suites[name]),
+                episodes=len(table[["method", "condition", "scene", "seed"]].drop_duplicates()),
+                scenes=table["scene"].nunique(),
+                seeds=table["seed"].nunique(),
+                failures=failures[["method", "condition", "scene", "seed", "error"]].to_numpy().tolist(),
+                summary=summarise(table, reference=chosen, gap=gap, config=config),
             )
-        )  # fmt: skip
+        )
     return results
 
 
@@ -209,207 +212,179 @@ def read_results(path: Path) -> tuple[list[SuiteResult], dict[str, str]]:
 
 def write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: Path, command: str) -> Path:
     """Write `index.html`, which loads nothing from anywhere, and each suite's figures as SVG and PNG."""
-    body = []
-    for suite, block in _blocks(results, about, command):
-        if isinstance(block, Figure):
-            (folder / suite).mkdir(parents=True, exist_ok=True)
-            (folder / suite / f"{block.name}.svg").write_text(block.svg, encoding="utf-8")
-            (folder / suite / f"{block.name}.png").write_bytes(block.png)
-        body.append(_html(block))
+    from markdown_it import MarkdownIt
+
+    def keep(suite: str, figure: Figure) -> str:
+        (folder / suite).mkdir(exist_ok=True)
+        (folder / suite / f"{figure.name}.svg").write_bytes(figure.svg)
+        (folder / suite / f"{figure.name}.png").write_bytes(figure.png)
+        return f"{suite}/{figure.name}.svg"
+
+    def inline(source: re.Match[str]) -> str:
+        return f"data:image/svg+xml;base64,{base64.b64encode((folder / source[0]).read_bytes()).decode()}"
+
+    reader = MarkdownIt("commonmark", {"html": False}).enable("table")
+    body = re.sub(r'(?<= src=")[^"]+', inline, reader.render(_markdown(results, about, command, keep)))
     page = folder / "index.html"
-    page.write_text(PAGE.format(body="\n".join(body)), encoding="utf-8")
+    page.write_text(PAGE.format(body=body), encoding="utf-8")
     return page
 
 
 def write_document(results: Sequence[SuiteResult], about: dict[str, str], path: Path, command: str) -> None:
     """Write a Markdown document, and its figures into a folder of its name beside it."""
-    folder, parts = path.with_suffix(""), []
+    folder = path.with_suffix("")
     folder.mkdir(parents=True, exist_ok=True)
-    for suite, block in _blocks(results, about, command):
-        if isinstance(block, Figure):
-            file = f"{suite}-{block.name}.svg"
-            (folder / file).write_text(block.svg, encoding="utf-8")
-            parts.append(f"![{_plain(block.title)}]({folder.name}/{file})\n\n*{_plain(block.caption)}*")
-        else:
-            parts.append(_markdown(block))
-    path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+
+    def keep(suite: str, figure: Figure) -> str:
+        (folder / f"{suite}-{figure.name}.svg").write_bytes(figure.svg)
+        return f"{folder.name}/{suite}-{figure.name}.svg"
+
+    path.write_text(_markdown(results, about, command, keep), encoding="utf-8")
 
 
-@dataclass(frozen=True, slots=True)
-class _Heading:
-    level: int
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class _Table:
-    title: str
-    head: list[str]
-    rows: list[list[str]]
-
-
-_Block = _Heading | _Table | Figure | str
-
-
-def _blocks(
-    results: Sequence[SuiteResult], about: dict[str, str], command: str
-) -> Iterator[tuple[str, _Block]]:
-    """What a report shows, from top to bottom, each with the name of its suite."""
-    yield "", _Heading(1, "Benchmark")
-    yield "", f"Run by {describe_provenance(about)}. This page is generated by `{command}`."
+def _markdown(
+    results: Sequence[SuiteResult], about: dict[str, str], command: str, keep: Callable[[str, Figure], str]
+) -> str:
+    """The report; `keep` stores a figure of a suite and says where it is."""
+    blocks = ["# Benchmark"]
+    blocks.append(f"Run by {_plain(describe_provenance(about))}. This page is generated by `{command}`.")
     for result in results:
-        yield from ((result.name, block) for block in _suite_blocks(result))
+        for block in _blocks(result):
+            if isinstance(block, Figure):
+                file, caption = keep(result.name, block), _plain(block.caption)
+                block = f"![{_plain(block.title)}]({file})\n\n*{caption}*"
+            blocks.append(block)
     config = StatisticsConfig()
-    yield "", _Heading(2, "How to read it")
-    for note in NOTES:
-        yield "", note.format(confidence=100.0 * config.confidence, resamples=config.resamples)
+    blocks.append("## How to read it")
+    blocks += [n.format(confidence=100.0 * config.confidence, resamples=config.resamples) for n in NOTES]
+    return "\n\n".join(blocks) + "\n"
 
 
-def _suite_blocks(result: SuiteResult) -> Iterator[_Block]:
-    known, summary, looks = SUITES.get(result.name), result.summary, looks_of(result.methods)
-    yield _Heading(2, result.name)
+@lru_cache(maxsize=16)
+def _blocks(result: SuiteResult) -> tuple[str | Figure, ...]:
+    """What the report shows of a suite, drawn once for the page and the document."""
+    return tuple(_suite(result))
+
+
+def _suite(result: SuiteResult) -> Iterator[str | Figure]:
+    """What the report shows of a suite, from top to bottom."""
+    known, summary = SUITES.get(result.name), result.summary
+    methods, conditions = list(summary["method"].unique()), list(summary["condition"].unique())
+    looks = looks_of(methods)
+    yield f"## {_plain(result.name)}"
     failed = f"{len(result.failures)} failed" if result.failures else "none failed"
-    yield (
+    yield _plain(
         f"{known.what if known else ''} {_count(result.episodes, 'episode')} of "
-        f"{_count(len(result.methods), 'method')} in {_count(result.scenes, 'scene')} with "
+        f"{_count(len(methods), 'method')} in {_count(result.scenes, 'scene')} with "
         f"{_count(result.seeds, 'seed')}; {failed}."
-    ).strip()
+    )
     if result.planned > result.episodes:
         missing = _count(result.planned - result.episodes, "episode")
         yield f"Not finished: {missing} of {result.planned:,} to be run."
-    conditions = list(summary["condition"].unique())
     if len(conditions) > 1:
         yield draw_conditions(summary, looks)
     for (condition, family), group in summary.groupby(["condition", "family"], sort=False):
         only = f", {family} scenes only" if family else ""
-        yield _Heading(3, f"{result.name}: {condition}{only}")
-        scenes = max(group[group["quantity"] == "scenes"]["value"], default=0)
-        label = family if len(conditions) < 2 else f"{family} {condition}"
-        told = _count(int(scenes), f"{family} scene" if family else "scene")
+        yield f"### {_plain(f'{result.name}: {condition}{only}')}"
         if len(conditions) < 2:
-            yield from draw_group(group, label, told, result.reference, looks)
+            scenes = max(group["value"][group["quantity"] == "scenes"], default=0)
+            counted = _count(int(scenes), f"{family} scene".strip())
+            yield from draw_group(group, family, counted, result.reference, looks)
         if not family or len(conditions) < 2:
             yield from _tables(group, result.reference, brief=bool(family) or len(conditions) > 1)
     if result.failures:
-        yield _Table("Failed episodes", ["method", "condition", "scene", "seed", "error"], result.failures)
+        head = ["method", "condition", "scene", "seed", "error"]
+        yield _table("Failed episodes", import_pandas().DataFrame(result.failures, columns=head))
 
 
-def _tables(group: pd.DataFrame, reference: str, *, brief: bool) -> Iterator[_Table]:
-    removal = is_removal(group)
-    measures = REMOVAL if removal else BY_VIEW[:1] if brief else BY_VIEW
-    for measure, title, digits in measures:
-        if curves := curves_of(group, measure):
-            counts = {m: _counts(group, m, ("scenes", "episodes", "failed")) for m in curves}
-            yield _by_view(f"{title}: mean and interval after so many views", curves, digits, counts)
-    main, title, _ = measures[0]
-    if differences := curves_of(group, f"{main} difference"):
-        counts = {m: _counts(group, m, ("paired scenes", "paired episodes")) for m in differences}
-        yield _by_view(f"{title} minus that of {reference}, paired", differences, 3, counts, signed=True)
-    if gaps := curves_of(group, "gap"):
-        yield _by_view("Share of the gap that is closed", gaps, 2, {}, signed=False)
-    if removal:
-        return
-    values = {(r.method, r.quantity, r.at): (r.value, r.low, r.high) for r in group.itertuples()}
-
-    def say(method: str, quantity: str, at: float, digits: int) -> str:
-        return _estimate(*values.get((method, quantity, at), (math.nan,) * 3), digits)
-
-    thresholds = sorted({r.at for r in group[group["quantity"] == "share"].itertuples()}, reverse=True)
+def _tables(group: pd.DataFrame, reference: str, *, brief: bool) -> Iterator[str]:
+    """Tables of the methods under one condition, each a part of the summary."""
+    figures = group[["quantity", "value", "low", "high"]].itertuples(index=False)
+    group = group.assign(text=[_text(*figure) for figure in figures])
+    measures = REMOVAL if is_removal(group) else {"f1": BY_VIEW["f1"]} if brief else BY_VIEW
+    for measure, heading in measures.items():
+        title = f"{heading}: mean and interval after so many views"
+        yield from _by_view(group, measure, title, ("scenes", "episodes", "failed"))
+    main = next(iter(measures))
+    title = f"{measures[main]} minus that of {reference}, paired"
+    yield from _by_view(group, f"{main} difference", title, ("paired scenes", "paired episodes"), least=2)
+    yield from _by_view(group, "gap", "Share of the gap that is closed")
     methods = list(curves_of(group, "f1"))
-    if thresholds:
-        rows = []
-        for at in thresholds:
-            for method in methods:
-                share = values.get((method, "share", at), (math.nan,))[0]
-                figures = (
-                    ("median views", 0),
-                    ("median path", 2),
-                    ("mean views", 0),
-                    ("mean path", 2),
-                    ("path ratio", 2),
-                )
-                cells = [say(method, quantity, at, digits) for quantity, digits in figures]
-                rows.append([method, f"{at:.2f}", f"{100.0 * share:.0f} %", *cells])
-        head = [
-            "method",
-            "F1",
-            "episodes that reach it",
-            "median views",
-            "median path [m]",
-            "views, mean curve",
-        ]
-        yield _Table(
-            "Until F1 reaches a threshold", [*head, "path, mean curve [m]", f"… by that of {reference}"], rows
-        )
-    if methods:
-        rows = []
-        for method in methods:
-            cells = [say(method, "area", 0, 3)]
-            for kind in ("planning", "perception"):
-                low, middle, high = (
-                    values.get((method, kind, q), (math.nan,))[0] for q in (0.025, 0.5, 0.975)
-                )
-                cells += [_time(middle), f"{_time(low)} – {_time(high)}"]
-            rows.append([method, *cells])
-        budget = max(
-            (value[0] for (_, quantity, _), value in values.items() if quantity == "budget"), default=0.0
-        )
-        head = ["method", f"F1 along the path, over {budget:.2f} m"]
-        head += [
-            f"{kind}, {what}" for kind in ("planning", "perception") for what in ("median", "middle 95 %")
-        ]
-        yield _Table(
-            "F1 along the path, and time to choose a view (planning) and to see one (perception)", head, rows
-        )
+    if main not in BY_VIEW or not methods:
+        return
+    reached = group[group["quantity"].isin(TO_THRESHOLD)].pivot(
+        index=["at", "method"], columns="quantity", values="text"
+    )
+    if order := list(product(sorted(reached.index.unique("at"), reverse=True), methods)):
+        reached = reached.reindex(index=order, columns=list(TO_THRESHOLD))
+        reached = reached.rename(columns=lambda quantity: TO_THRESHOLD[quantity].format(reference))
+        reached.insert(0, "F1", [f"{at:.2f}" for at, _ in order])
+        yield _table("Until F1 reaches a threshold", reached.droplevel("at").reset_index())
+    kinds = ("planning", "perception")
+    parts = group[group["quantity"].isin(("area", *kinds))].pivot(
+        index="method", columns=["quantity", "at"], values="text"
+    )
+    wanted = [("area", 0.0), *product(kinds, (0.025, 0.5, 0.975))]
+    parts = parts.reindex(index=methods, columns=wanted).astype("string").fillna(NONE)
+    budget = max(group["value"][group["quantity"] == "budget"], default=0.0)
+    cells = {"method": methods, f"F1 along the path, over {budget:.2f} m": parts["area", 0.0]}
+    for kind in kinds:
+        cells[f"{kind}, median"] = parts[kind, 0.5]
+        cells[f"{kind}, middle 95 %"] = parts[kind, 0.025] + " – " + parts[kind, 0.975]
+    title = "F1 along the path, and time to choose a view (planning) and to see one (perception)"
+    yield _table(title, import_pandas().DataFrame(cells))
 
 
 def _by_view(
-    title: str, curves: dict[str, pd.DataFrame], digits: int, counts: dict[str, str], *, signed: bool = False
-) -> _Table:
-    views = [v for v in table_views(curves) if not signed or v > 1] or [1]
-    rows = []
-    for method, curve in curves.items():
-        cells = []
-        for view in views:
-            value, low, high = (
-                curve.loc[view, ["value", "low", "high"]] if view in curve.index else (math.nan,) * 3
-            )
-            cell = _estimate(value, low, high, digits, signed=signed)
-            cells.append(f"**{cell}**" if signed and (low > 0.0 or high < 0.0) else cell)
-        rows.append([method, *cells, *([counts[method]] if counts else [])])
-    last = {3: ["scenes / episodes / failed"], 2: ["scenes / episodes"]}.get(
-        len(next(iter(counts.values()), "").split("/"))
-    )
-    return _Table(
-        title, ["method", *(f"view {view:.0f}" for view in views), *(last if counts and last else [])], rows
-    )
+    group: pd.DataFrame, quantity: str, title: str, counted: Sequence[str] = (), least: int = 1
+) -> Iterator[str]:
+    """A table of a quantity with a column for each view from the least on, if any method has it."""
+    rows = group[group["quantity"] == quantity]
+    if rows.empty:
+        return
+    methods = list(rows["method"].unique())
+    views = [view for view in told_views(rows["at"]) if view >= least] or [1]
+    cells = rows.pivot(index="method", columns="at", values="text").reindex(index=methods, columns=views)
+    cells = cells.rename(columns=lambda view: f"view {view:.0f}")
+    if counted:
+        counts = group[group["quantity"].isin(counted)].pivot(
+            index="method", columns="quantity", values="value"
+        )
+        name = " / ".join(name.removeprefix("paired ") for name in counted)
+        cells[name] = [" / ".join(f"{n:.0f}" for n in counts.loc[m, list(counted)]) for m in methods]
+    yield _table(title, cells.reset_index())
 
 
-def _counts(group: pd.DataFrame, method: str, names: Sequence[str]) -> str:
-    own = group[group["method"] == method].set_index("quantity")["value"]
-    return " / ".join(f"{own.get(name, 0):.0f}" for name in names)
+def _table(title: str, cells: pd.DataFrame) -> str:
+    lines = [cells.columns, ["---"] * cells.shape[1], *cells.astype("string").fillna(NONE).to_numpy()]
+    rows = ["| " + " | ".join(_plain(str(cell)) for cell in line) + " |" for line in lines]
+    return "\n".join([f"**{_plain(title)}.**", "", *rows])
 
 
-def _number(value: float, digits: int, *, signed: bool = False) -> str:
+def _text(quantity: str, value: float, low: float, high: float) -> str:
+    """A figure with its interval, in the digits of its quantity; bold is a difference that is not 0."""
+    if quantity in ("planning", "perception"):
+        return _time(value)
+    if quantity == "share":
+        return f"{100.0 * value:.0f} %"
+    digits, sign = DIGITS.get(quantity, 3), "+" if quantity.endswith(" difference") else ""
+
+    def number(value: float) -> str:
+        if math.isinf(value):
+            return "not reached"
+        text = f"{value:{sign}.{digits}f}"
+        return text.replace("-", "−") if float(text) else text.lstrip("+-")
+
     if math.isnan(value):
         return NONE
-    if math.isinf(value):
-        return "not reached"
-    text = f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
-    return text.replace("-", "−") if float(text) else text.lstrip("+-")
-
-
-def _estimate(value: float, low: float, high: float, digits: int, *, signed: bool = False) -> str:
-    text = _number(value, digits, signed=signed)
-    if math.isnan(low) or math.isinf(low) or text == NONE:
-        return text
-    return f"{text} [{_number(low, digits, signed=signed)}, {_number(high, digits, signed=signed)}]"
+    if math.isnan(low) or math.isinf(low):
+        return number(value)
+    text = f"{number(value)} [{number(low)}, {number(high)}]"
+    return f"**{text}**" if sign and (low > 0.0 or high < 0.0) else text
 
 
 def _time(seconds: float) -> str:
     """A time in the unit it is best read in, with three digits."""
-    if math.isnan(seconds):
-        return NONE
     for size, unit in ((1.0, "s"), (1e-3, "ms")):
         if seconds >= 0.9995 * size:
             return f"{seconds / size:#.3g} {unit}".replace(". ", " ")
@@ -423,30 +398,3 @@ def _count(number: int, one: str) -> str:
 def _plain(text: str) -> str:
     """Text that means nothing but itself in Markdown, bold figures aside."""
     return re.sub(r"([\\_<>|~]|\](?=[(\[]))", r"\\\1", " ".join(text.split()))
-
-
-def _markdown(block: Any) -> str:
-    if isinstance(block, _Heading):
-        return f"{'#' * block.level} {_plain(block.text)}"
-    if isinstance(block, _Table):
-        lines = [block.head, ["---"] * len(block.head), *block.rows]
-        cells = ["| " + " | ".join(_plain(cell) for cell in line) + " |" for line in lines]
-        return "\n".join([f"**{_plain(block.title)}.**", "", *cells])
-    return _plain(block)
-
-
-def _html(block: Any) -> str:
-    if isinstance(block, _Heading):
-        return f"<h{block.level}>{html.escape(block.text)}</h{block.level}>"
-    if isinstance(block, Figure):
-        data = base64.b64encode(block.svg.encode()).decode()
-        title, caption = html.escape(block.title), html.escape(block.caption)
-        image = f'<img alt="{title}" src="data:image/svg+xml;base64,{data}">'
-        return f"<figure>{image}<figcaption>{caption}</figcaption></figure>"
-    if isinstance(block, _Table):
-        rows = [f"<tr>{''.join(f'<th>{html.escape(name)}</th>' for name in block.head)}</tr>"]
-        for row in block.rows:
-            cells = (re.sub(r"^\*\*(.*)\*\*$", r"<b>\1</b>", html.escape(cell)) for cell in row)
-            rows.append(f"<tr>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>")
-        return f'<h4>{html.escape(block.title)}</h4><div class="table"><table>{"".join(rows)}</table></div>'
-    return f"<p>{html.escape(block)}</p>"

@@ -7,7 +7,8 @@ never reaches a threshold counts as longer than any other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,12 +25,13 @@ COLUMNS = ("condition", "family", "method", "quantity", "at", "value", "low", "h
 """Columns of a summary. `family` is empty for all scenes; `at` is the view, threshold or quantile."""
 QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 F1, PATH = MEASURES.index("f1"), MEASURES.index("path")
-SEED = 0
-"""Seed of the resamples, so that a result always gives the same figures."""
 ROUNDING = 1e-9
 """A mean this far below a threshold reaches it [1]: what sums of equal figures differ by."""
 UNREACHED = 1e12
 """Stands for infinity while percentiles are interpolated."""
+
+Figures = list[tuple[str, float, float, float, float]]
+"""Quantity, where it is taken, its value and the ends of its interval (NaN where there is none)."""
 
 
 def summarise(
@@ -56,22 +58,23 @@ def summarise(
         `episodes`, `failed`, and `paired scenes`, `paired episodes`.
     """
     config = config or StatisticsConfig()
-    rows: list[tuple[Any, ...]] = []
+    rows: list[tuple[str | float, ...]] = []
     for condition, part in table.groupby("condition", sort=False):
         families = list(part["family"].unique())
         for kind in ("", *(families if len(families) > 1 else ())):
-            chosen = part[part["family"] == kind] if kind else part
-            rows += [(condition, kind, *row) for row in _group(chosen, reference, gap, config)]
+            group = part[part["family"] == kind] if kind else part
+            for method, figures in _compare(group, reference, gap, config):
+                rows += [(condition, kind, method, *figure) for figure in figures]
     summary: pd.DataFrame = import_pandas().DataFrame(rows, columns=list(COLUMNS))
     return summary
 
 
-def bootstrap(table: Array, figures: Callable[[Array], Array], config: StatisticsConfig) -> Array:
+def bootstrap(samples: Array, figures: Callable[[Array], Array], config: StatisticsConfig) -> Array:
     """Figures of the mean over scenes, with percentile bootstrap intervals.
 
     Args:
-        table: What is known of each scene (S, K).
-        figures: Makes figures (..., F) of means (..., K); infinite where a threshold is not reached.
+        samples: What is known of each scene (S, ...).
+        figures: Makes figures (..., F) of means (...); infinite where a threshold is not reached.
         config: Resamples and confidence.
 
     Returns:
@@ -79,19 +82,19 @@ def bootstrap(table: Array, figures: Callable[[Array], Array], config: Statistic
     """
     from scipy.stats import bootstrap as resample
 
-    count = len(table)
-    value = figures(table.mean(axis=0))
-    if count < 2:
+    size = len(samples)
+    value = figures(samples.mean(axis=0))
+    if size < 2:
         return np.stack([value, np.full_like(value, np.nan), np.full_like(value, np.nan)], axis=1)
 
     def of_resamples(drawn: Array, axis: int) -> Array:
-        weights = (drawn[..., None] == np.arange(count)).mean(axis=-2)
-        return np.moveaxis(np.minimum(figures(weights @ table), UNREACHED), -1, 0)
+        weights = (drawn[..., None] == np.arange(size)).mean(axis=-2)
+        return np.moveaxis(np.minimum(figures(np.tensordot(weights, samples, 1)), UNREACHED), -1, 0)
 
     with np.errstate(invalid="ignore"):
         found = resample(
-            (np.arange(count),), of_resamples, n_resamples=config.resamples, batch=500, method="percentile",
-            confidence_level=config.confidence, rng=np.random.default_rng((SEED, count)),
+            (np.arange(size),), of_resamples, n_resamples=config.resamples, batch=500, method="percentile",
+            confidence_level=config.confidence, rng=np.random.default_rng((0, size)),
         ).confidence_interval  # fmt: skip
     ends = [np.where(end > 1e-3 * UNREACHED, np.inf, end) for end in (found.low, found.high)]
     return np.stack([value, *ends], axis=1)
@@ -132,137 +135,128 @@ def area_over_path(f1: Array, path: Array, budget: float) -> Array:
     """
     begins = np.minimum(path, budget)
     begins[:, 0] = 0.0
-    ends = np.concatenate([begins[:, 1:], np.full((len(begins), 1), budget)], axis=1)
-    return np.sum(f1 * (ends - begins), axis=1) / budget
+    return np.sum(f1 * np.diff(begins, append=budget), axis=1) / budget
 
 
-def _group(
+def _compare(
     table: pd.DataFrame, reference: str, gap: tuple[str, str] | None, config: StatisticsConfig
-) -> list[tuple[Any, ...]]:
-    """Figures of the methods that can be compared: (method, quantity, at, value, low, high)."""
-    done = table[table["error"].isna()]
-    methods: dict[str, pd.DataFrame] = {}
-    for method in table["method"].unique():
-        own = done[done["method"] == method].set_index(["scene", "seed", "view"])[list(MEASURES)]
-        if own.index.has_duplicates:
-            raise ValueError(f"two episodes of {method} have one scene and seed")
-        methods[method] = own.sort_index()
-    finals = [
-        own["path"].groupby(["scene", "seed"]).last().groupby("scene").mean().mean()
-        for own in methods.values()
-        if len(own)
-    ]
-    budget = float(np.median(finals)) if finals else 0.0
-    failed = table[table["error"].notna()]["method"].value_counts()
-    rows: list[tuple[Any, ...]] = []
-    for method, own in methods.items():
-        counted = {
-            "scenes": own.index.unique("scene").size,
-            "episodes": own.index.droplevel("view").nunique(),
-            "failed": failed.get(method, 0),
-        }
-        found = [(name, 0, float(count), np.nan, np.nan) for name, count in counted.items()]
+) -> Iterable[tuple[str, Figures]]:
+    """Figures of each method in a group of episodes that can be compared."""
+    done = table[table["error"].isna()].set_index(["method", "scene", "seed", "view"])[list(MEASURES)]
+    if done.index.has_duplicates:
+        raise ValueError("two episodes of a method have one scene and seed")
+    known = {str(method): own.droplevel("method").sort_index() for method, own in done.groupby("method")}
+    lengths = [own["path"].groupby(["scene", "seed"]).last() for own in known.values()]
+    budget = float(np.median([path.groupby("scene").mean().mean() for path in lengths])) if known else 0.0
+    for method, all_of_it in table.groupby("method", sort=False):
+        own = known.get(str(method), done.droplevel("method").iloc[:0])
+        failed = int(all_of_it["error"].notna().sum())
+        figures = [*_counts(own), ("failed", 0, float(failed), np.nan, np.nan)]
         if len(own):
-            found += _alone(own, budget, config)
-            if method != reference and len(methods.get(reference, ())):
-                found += _against(own, methods[reference], config)
-            if gap is not None and method not in gap and all(len(methods.get(name, ())) for name in gap):
-                found += _gap_closed(own, methods[gap[0]], methods[gap[1]], config)
-        rows += [(method, *row) for row in found]
-    return rows
+            figures += _alone(own, budget, config)
+            if method != reference and reference in known:
+                figures += _against(_paired([own, known[reference]]), config)
+            if gap is not None and method not in gap and all(end in known for end in gap):
+                figures += _gap_closed(_paired([own, *(known[end] for end in gap)]), config)
+        yield str(method), figures
 
 
-def _alone(own: pd.DataFrame, budget: float, config: StatisticsConfig) -> list[tuple[Any, ...]]:
-    """Curves of a method, its way to each threshold, the area under its F1, its times."""
-    curves, keys = _curves([own])[0], own.index.droplevel("view").unique()
-    views, thresholds = curves.shape[1], config.thresholds
-    episodes = own.to_numpy().reshape(len(keys), -1, len(MEASURES))
-    f1, path = episodes[:, :, F1], episodes[:, :, PATH]
-    reaches = [first_reach(f1, path, threshold, straight=False) for threshold in thresholds]
-    extra = [np.isfinite(seen) for seen, _ in reaches] + (
-        [area_over_path(f1, path, budget)] if budget else []
-    )
-    by_scene = (
-        import_pandas().DataFrame(np.stack(extra, axis=1).astype(float), index=keys).groupby("scene").mean()
-    )
-    size = views * len(MEASURES)
-
-    def figures(means: Array) -> Array:
-        curve = means[..., :size].reshape(*means.shape[:-1], views, len(MEASURES))
-        reached = [first_reach(curve[..., F1], curve[..., PATH], t, straight=True)[1] for t in thresholds]
-        return np.concatenate([means, np.stack(reached, axis=-1)], axis=-1)
-
-    names: list[tuple[str, float]] = [(measure, view) for view in range(1, views + 1) for measure in MEASURES]
-    names += [("share", t) for t in thresholds] + ([("area", 0)] if budget else [])
-    names += [("mean path", t) for t in thresholds]
-    found = bootstrap(np.hstack([curves.reshape(len(curves), -1), by_scene.to_numpy()]), figures, config)
-    rows: list[tuple[Any, ...]] = [(*name, *row) for name, row in zip(names, found.tolist(), strict=True)]
-    mean = curves.mean(axis=0)
-    for threshold, (seen, length) in zip(thresholds, reaches, strict=True):
-        at_mean, _ = first_reach(mean[:, F1], mean[:, PATH], threshold, straight=True)
-        told = {"median views": np.median(seen), "median path": np.median(length), "mean views": at_mean}
-        rows += [(name, threshold, float(value), np.nan, np.nan) for name, value in told.items()]
-    rows.append(("budget", 0, budget, np.nan, np.nan))
-    for name in TIMES:
-        times = own[name] if name == TIMES[1] else own[name][own.index.get_level_values("view") > 1]
-        for quantile in QUANTILES if len(times) else ():
-            value = float(np.quantile(times, quantile))
-            rows.append((name.removesuffix("_seconds"), quantile, value, np.nan, np.nan))
-    return rows
-
-
-def _against(own: pd.DataFrame, other: pd.DataFrame, config: StatisticsConfig) -> list[tuple[Any, ...]]:
-    """Paired differences from another method, and the ratio of paths to each threshold."""
-    own, other = _paired([own, other])
-    counts = own.index.unique("scene").size, own.index.droplevel("view").nunique()
-    names = ("paired scenes", "paired episodes")
-    rows: list[tuple[Any, ...]] = [
-        (n, 0, float(c), np.nan, np.nan) for n, c in zip(names, counts, strict=True)
+def _counts(own: pd.DataFrame, prefix: str = "") -> Figures:
+    """Numbers of scenes and of episodes."""
+    scenes, episodes = own.index.unique("scene").size, own.index.droplevel("view").nunique()
+    return [
+        (f"{prefix}scenes", 0, float(scenes), np.nan, np.nan),
+        (f"{prefix}episodes", 0, float(episodes), np.nan, np.nan),
     ]
-    if len(own) == 0:
-        return rows
-    ours, theirs = _curves([own, other])
-    shape = ours.shape[1:]
-
-    def paths(means: Array, threshold: float) -> Array:
-        return first_reach(means[..., F1], means[..., PATH], threshold, straight=True)[1]
-
-    def figures(means: Array) -> Array:
-        both = means.reshape(*means.shape[:-1], 2, *shape)
-        one, two = both[..., 0, :, :], both[..., 1, :, :]
-        ratios = []
-        for threshold in config.thresholds:
-            path, of = paths(one, threshold), paths(two, threshold)
-            # A resample that misses the threshold counts as infinitely far, against the method.
-            known = np.isfinite(path) & (of > 0.0)
-            ratios.append(np.divide(path, of, out=np.full_like(path, np.inf), where=known))
-        difference = (one - two).reshape(*means.shape[:-1], -1)
-        return np.concatenate([difference, np.stack(ratios, axis=-1)], axis=-1)
-
-    found = bootstrap(np.stack([ours, theirs], axis=1).reshape(len(ours), -1), figures, config).tolist()
-    labels = [(f"{measure} difference", view) for view in range(1, shape[0] + 1) for measure in MEASURES]
-    rows += [(*label, *row) for label, row in zip(labels, found, strict=False)]
-    for threshold, row in zip(config.thresholds, found[len(labels) :], strict=True):
-        if np.isfinite(row[0]) and 0.0 < paths(theirs.mean(axis=0), threshold) < np.inf:
-            rows.append(("path ratio", threshold, *row))
-    return rows
 
 
-def _gap_closed(
-    own: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame, config: StatisticsConfig
-) -> list[tuple[Any, ...]]:
-    """(F1 − that of low) / (F1 of high − that of low) after each view, over what all three have."""
-    paired = _paired([own, low, high])
-    if len(paired[0]) == 0:
+def _alone(own: pd.DataFrame, budget: float, config: StatisticsConfig) -> Figures:
+    """Curves of a method, its path to each threshold, the area under its F1, its times."""
+    curves, keys = _curves([own])[:, 0], own.index.droplevel("view").unique()
+    episodes = own.to_numpy().reshape(len(keys), -1, len(MEASURES))
+    reaches = [
+        first_reach(episodes[..., F1], episodes[..., PATH], threshold, straight=False)
+        for threshold in config.thresholds
+    ]
+    shares = {
+        ("share", t): np.isfinite(seen) for t, (seen, _) in zip(config.thresholds, reaches, strict=True)
+    }
+    if budget:
+        shares["area", 0.0] = area_over_path(episodes[..., F1], episodes[..., PATH], budget)
+    by_scene = import_pandas().DataFrame(shares, index=keys).astype(float).groupby("scene").mean()
+    figures = _named(_by_view(""), bootstrap(curves, _flat, config))
+    figures += _named(shares, bootstrap(by_scene.to_numpy(), lambda means: means, config))
+    paths = bootstrap(curves, lambda means: _paths(means, config.thresholds), config)
+    figures += _named([("mean path", t) for t in config.thresholds], paths)
+    mean = curves.mean(axis=0)
+    plain: list[tuple[str, float, Any]] = [("budget", 0.0, budget)]
+    for threshold, (seen, length) in zip(config.thresholds, reaches, strict=True):
+        at_mean, _ = first_reach(mean[:, F1], mean[:, PATH], threshold, straight=True)
+        plain += [("median views", threshold, np.median(seen)), ("median path", threshold, np.median(length))]
+        plain += [("mean views", threshold, at_mean)]
+    for name in TIMES:
+        chosen = own.index.get_level_values("view") > (1 if name == "planning_seconds" else 0)
+        for quantile in QUANTILES if chosen.any() else ():
+            seconds = np.quantile(own[name][chosen], quantile)
+            plain.append((name.removesuffix("_seconds"), quantile, seconds))
+    return figures + [(name, at, float(value), np.nan, np.nan) for name, at, value in plain]
+
+
+def _against(frames: Sequence[pd.DataFrame], config: StatisticsConfig) -> Figures:
+    """Paired differences from another method, and the ratio of paths to each threshold."""
+    counts = _counts(frames[0], "paired ")
+    if len(frames[0]) == 0:
+        return counts
+    both = _curves(frames)
+
+    def ratios(means: Array) -> Array:
+        ours, theirs = (
+            _paths(means[..., 0, :, :], config.thresholds),
+            _paths(means[..., 1, :, :], config.thresholds),
+        )
+        # A resample that misses the threshold counts as infinitely far, against the method.
+        known = np.isfinite(ours) & (theirs > 0.0)
+        return np.divide(ours, theirs, out=np.full_like(ours, np.inf), where=known)
+
+    difference = bootstrap(both, lambda means: _flat(means[..., 0, :, :] - means[..., 1, :, :]), config)
+    theirs = _paths(both.mean(axis=0)[1], config.thresholds)
+    shown = (theirs > 0.0) & (theirs < np.inf)
+    found = _named([("path ratio", t) for t in config.thresholds], bootstrap(both, ratios, config))
+    told = [row for row, known in zip(found, shown, strict=True) if known and np.isfinite(row[2])]
+    return counts + _named(_by_view(" difference"), difference) + told
+
+
+def _gap_closed(frames: Sequence[pd.DataFrame], config: StatisticsConfig) -> Figures:
+    """(F1 − that of low) / (F1 of high − that of low) after each view, of three frames: own, low and high."""
+    if len(frames[0]) == 0:
         return []
-    curves = [c[:, :, F1] for c in _curves(paired)]
 
-    def figures(means: Array) -> Array:
-        one, two, three = np.moveaxis(means.reshape(*means.shape[:-1], 3, -1), -2, 0)
-        return np.divide(one - two, three - two, out=np.full_like(one, np.nan), where=three != two)
+    def closed(means: Array) -> Array:
+        own, low, high = np.moveaxis(means, -2, 0)
+        return np.divide(own - low, high - low, out=np.full_like(own, np.nan), where=high != low)
 
-    found = bootstrap(np.hstack(curves), figures, config)
-    return [("gap", view, *row) for view, row in enumerate(found.tolist(), start=1)]
+    found = bootstrap(_curves(frames)[..., F1], closed, config)
+    return _named([("gap", view) for view in range(1, len(found) + 1)], found)
+
+
+def _flat(means: Array) -> Array:
+    """Means (..., V, M) as figures (..., V·M)."""
+    return means.reshape(*means.shape[:-2], -1)
+
+
+def _paths(means: Array, thresholds: Sequence[float]) -> Array:
+    """Path (..., T) [m] at which mean curves (..., V, M) reach each threshold."""
+    f1, path = means[..., F1], means[..., PATH]
+    return np.stack([first_reach(f1, path, t, straight=True)[1] for t in thresholds], axis=-1)
+
+
+def _by_view(suffix: str) -> Iterable[tuple[str, float]]:
+    """Names of the measures of each view, without an end."""
+    return ((measure + suffix, view) for view in count(1) for measure in MEASURES)
+
+
+def _named(names: Iterable[tuple[str, float]], found: Array) -> Figures:
+    return [(name, at, *row) for (name, at), row in zip(names, found.tolist(), strict=False)]
 
 
 def _paired(frames: Sequence[pd.DataFrame]) -> list[pd.DataFrame]:
@@ -274,9 +268,9 @@ def _paired(frames: Sequence[pd.DataFrame]) -> list[pd.DataFrame]:
     return [frame[key.isin(common)] for frame, key in zip(frames, keys, strict=True)]
 
 
-def _curves(frames: Sequence[pd.DataFrame]) -> list[Array]:
-    """Mean over the seeds of each scene (S, V, M), with the views all frames have."""
+def _curves(frames: Sequence[pd.DataFrame]) -> Array:
+    """Means over the seeds of each scene (S, frames, V, M), with the views all frames have."""
     means = [frame.groupby(["scene", "view"]).mean() for frame in frames]
     shaped = [m.to_numpy().reshape(m.index.unique("scene").size, -1, len(MEASURES)) for m in means]
     views = min(s.shape[1] for s in shaped)
-    return [s[:, :views] for s in shaped]
+    return np.stack([s[:, :views] for s in shaped], axis=1)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import os
 import platform
+import re
 import subprocess
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 from filelock import FileLock, Timeout
@@ -61,9 +63,9 @@ class ResultStore:
         self._lock = FileLock(f"{path}.lock", timeout=0)
         if fingerprint is None and not path.is_file():
             raise InputError(path, "there is no result file", "run a suite first: --suite NAME")
-        if fingerprint is not None:
-            self._lock_for_writing()
         try:
+            if fingerprint is not None:
+                self._open()
             self._read()
             if fingerprint is not None:
                 self._begin({**(about or {}), "format": FORMAT, "fingerprint": fingerprint})
@@ -74,9 +76,7 @@ class ResultStore:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -136,7 +136,8 @@ class ResultStore:
         if key not in self.outcomes or self.outcomes[key].error is not None:
             self.outcomes[key] = outcome
 
-    def _lock_for_writing(self) -> None:
+    def _open(self) -> None:
+        """Let nobody else write, and open the file for it."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
@@ -146,27 +147,23 @@ class ResultStore:
                 self.path, "another run is under way", "wait for its end, or choose another --out"
             ) from None
         except OSError as error:
-            self._lock.release()
             raise InputError(self.path, f"cannot be opened ({error})", "choose another folder") from None
 
     def _read(self) -> None:
         content = self.path.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]
         try:
-            lines = [json.loads(line) for line in whole.splitlines()]
-            if lines:
-                self.about = lines[0]["about"]
-            for line in lines[1:]:
+            about, *lines = [json.loads(line) for line in whole.splitlines()] or [{"about": {}}]
+            self.about = about["about"]
+            for line in lines:
                 if "suite" in line:
-                    self.suites[line["suite"]] = [
-                        Member(**m | {"episode": _episode(m["episode"])}) for m in line["members"]
-                    ]
+                    self.suites[line["suite"]] = [_member(**member) for member in line["members"]]
                 else:
                     self._keep(line["key"], Outcome(tuple(line["rows"]), line["error"]))
+            if not whole and (self._file is None or not b'{"about"'.startswith(content[:8])):
+                raise ValueError
         except (ValueError, KeyError, TypeError):
             raise InputError(self.path, "is no result file", "choose another folder") from None
-        if not lines and (self._file is None or not b'{"about"'.startswith(content[:8])):
-            raise InputError(self.path, "is no result file", "choose another folder")
         if self._file is not None and len(whole) < len(content):
             self._file.truncate(len(whole))
 
@@ -208,26 +205,24 @@ def import_pandas() -> Any:
 def collect_provenance() -> dict[str, str]:
     """Which code on which machine: version, commit, libraries, processor; nothing of who ran it or where."""
     package = Path(__file__).parents[1]
-    tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py")
-    commit = _git(package, "rev-parse", "HEAD") if tracked else ""
-    changed = _git(package, "status", "--porcelain", "--", ".") if commit else ""
+    commit = _git(package, "rev-parse", "HEAD") if _git(package, "ls-files", "__init__.py") else ""
+    processors = Path("/proc/cpuinfo")
+    model = processors.is_file() and re.search(r"model name\s*:\s*(.*)", processors.read_text("utf-8"))
     return {
-        "version": _version("caryatid"),
+        "version": version("caryatid"),
         "commit": commit or "unknown",
-        "dirty": str(bool(changed)),
+        "dirty": str(bool(commit and _git(package, "status", "--porcelain", "--", "."))),
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
-        "processor": _processor(),
+        "processor": " ".join(model[1].split()) if model else platform.processor() or "unknown",
         "cores": str(os.cpu_count() or "unknown"),
-        "libraries": ", ".join(f"{name} {_version(name)}" for name in LIBRARIES),
+        "libraries": ", ".join(f"{name} {version(name)}" for name in LIBRARIES),
     }
 
 
 def describe_provenance(about: Mapping[str, str]) -> str:
     """Code and machine in one sentence."""
-    known = {
-        n: about.get(n, "unknown") for n in ("version", "commit", "processor", "cores", "platform", "python")
-    }
+    known = defaultdict(lambda: "unknown", about)
     changed = ", with changes that are in no commit" if about.get("dirty") == "True" else ""
     return (
         f"caryatid {known['version']}, commit {known['commit'][:12]}{changed}, on {known['processor']}, "
@@ -235,33 +230,15 @@ def describe_provenance(about: Mapping[str, str]) -> str:
     )
 
 
-def _episode(known: dict[str, Any]) -> Episode:
-    return Episode(**known | {"settings": tuple(known["settings"])})
+def _member(episode: dict[str, Any], **about: str) -> Member:
+    return Member(Episode(**episode | {"settings": tuple(episode["settings"])}), **about)
 
 
 def _git(folder: Path, *arguments: str) -> str:
     """What git says; nothing where there is no git or it refuses."""
     command = ["git", "-C", str(folder), *arguments]
-    try:
-        answer = subprocess.run(command, capture_output=True, text=True, timeout=30.0, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return answer.stdout.strip()
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "unknown"
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
-            name, _, value = line.partition(":")
-            if name.strip() == "model name":
-                return " ".join(value.split())
-    except OSError:
-        pass
-    return platform.processor() or "unknown"
+    with suppress(OSError, subprocess.SubprocessError):
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=30.0, check=True
+        ).stdout.strip()
+    return ""

@@ -127,65 +127,64 @@ def find_suite(name: str) -> Suite:
     raise InputError("--suite", f"there is no suite '{name}'", f"choose one of {', '.join(SUITES)}")
 
 
-EPISODE_OPTIONS = {"fusion.method": "--fusion", "active.max_views": "--views"}
-"""Settings every episode has of its own → the option that changes them."""
-
-
-def with_planners(suite: Suite, planners: Sequence[str]) -> Suite:
-    """Return the suite with these planners in place of its methods, each with the default fusion."""
-    return replace(suite, methods=tuple(Method(name, name) for name in dict.fromkeys(planners)))
-
-
-def with_fusions(suite: Suite, fusions: Sequence[FusionMethod]) -> Suite:
-    """Return the suite with each of its planners fusing in these ways.
-
-    Methods that differ in their fusion alone become one for each way. One that stands alone keeps its
-    label; with several ways the label tells which.
-    """
-    alike = Counter((method.planner, method.settings) for method in suite.methods)
-    methods: dict[str, Method] = {}
-    for method in suite.methods:
-        alone = alike[method.planner, method.settings] == 1
-        name = method.label if alone else ", ".join((method.planner, *method.settings))
-        for fusion in dict.fromkeys(fusions):
-            label = f"{name} {fusion.upper()}" if len(set(fusions)) > 1 else name
-            methods.setdefault(label, replace(method, label=label, fusion=fusion))
-    return replace(suite, methods=tuple(methods.values()))
-
-
-def with_conditions(
-    suite: Suite, segmentations: Sequence[SegmentationMethod], noises: Sequence[NoiseModel]
+def change_suite(
+    suite: Suite,
+    *,
+    planners: Sequence[str] = (),
+    fusions: Sequence[FusionMethod] = (),
+    segmentations: Sequence[SegmentationMethod] = (),
+    noises: Sequence[NoiseModel] = (),
+    settings: Sequence[str] = (),
 ) -> Suite:
-    """Return the suite with these in place of its conditions, every segmentation under every noise."""
-    parts = {"labels": "labels", "auto": "automatic segments"}
-    cameras = {"none": "no noise", "carmine": "Carmine noise"}
-    return replace(
-        suite,
-        conditions=tuple(
-            Condition(f"{parts[segmentation]}, {cameras[noise]}", noise, segmentation)
-            for segmentation in dict.fromkeys(segmentations)
-            for noise in dict.fromkeys(noises)
-        ),
-    )
+    """Return a suite with other methods, conditions or settings; what is not given stays.
 
-
-def with_settings(suite: Suite, settings: Sequence[str]) -> Suite:
-    """Return the suite with settings changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
+    Args:
+        suite: What is changed.
+        planners: Take the place of its methods, each with the default fusion.
+        fusions: How each of its planners fuses; methods that differ in their fusion alone become one.
+        segmentations: Take the place of its conditions, together with every noise.
+        noises: Of the camera.
+        settings: Changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
 
     Raises:
         InputError: A setting does not exist, its value is not valid, or an option changes it.
     """
+    methods, conditions = suite.methods, suite.conditions
+    if planners:
+        methods = tuple(Method(name, name) for name in dict.fromkeys(planners))
+    if fusions:
+        methods = _fused(methods, list(dict.fromkeys(fusions)))
+    if segmentations or noises:
+        segments = {"labels": "labels", "auto": "automatic segments"}
+        cameras = {"none": "no noise", "carmine": "Carmine noise"}
+        cross = product(dict.fromkeys(segmentations or ("labels",)), dict.fromkeys(noises or ("carmine",)))
+        conditions = tuple(Condition(f"{segments[s]}, {cameras[n]}", n, s) for s, n in cross)
+    options = {"fusion.method": "--fusion", "active.max_views": "--views"}
     for setting in settings:
-        if option := EPISODE_OPTIONS.get(setting.partition("=")[0].strip()):
+        if option := options.get(setting.partition("=")[0].strip()):
             raise InputError(f"--set {setting}", "every episode has its own", f"use {option}")
     read_settings(None, settings)
-    return replace(
-        suite,
-        conditions=tuple(
-            replace(c, label=", ".join((c.label, *settings)), settings=(*c.settings, *settings))
-            for c in suite.conditions
-        ),
+    conditions = tuple(
+        replace(c, label=", ".join((c.label, *settings)), settings=(*c.settings, *settings))
+        for c in conditions
     )
+    return replace(suite, methods=methods, conditions=conditions)
+
+
+def _fused(methods: Sequence[Method], fusions: Sequence[FusionMethod]) -> tuple[Method, ...]:
+    """Methods with each of their planners fusing in these ways.
+
+    A method whose planner and settings no other has keeps its label; with several ways the label tells which.
+    """
+    alike = Counter((method.planner, method.settings) for method in methods)
+    found: dict[str, Method] = {}
+    for method in methods:
+        alone = alike[method.planner, method.settings] == 1
+        name = method.label if alone else ", ".join((method.planner, *method.settings))
+        for fusion in fusions:
+            label = f"{name} {fusion.upper()}" if len(fusions) > 1 else name
+            found.setdefault(label, replace(method, label=label, fusion=fusion))
+    return tuple(found.values())
 
 
 def _depth_noise(factor: float) -> tuple[str, ...]:
@@ -246,105 +245,103 @@ _NOISE = tuple(
 ) + tuple(Condition(label, settings=settings) for label, settings in _REGISTRATION.items())
 _AUTO = Condition("automatic segments, Carmine noise", segmentation="auto")
 
-SUITES: Mapping[str, Suite] = {
-    suite.name: suite
-    for suite in (
-        Suite(
-            "smoke",
-            "Whether everything runs: few scenes, few views.",
-            (*_FIG5, Method("attention", "attention"), Method("rear-side-voxel", "rear-side-voxel")),
-            ("tower", "pile-6-3", "dense-10-1"),
-            seeds=1,
-            views=3,
+_ALL = (
+    Suite(
+        "smoke",
+        "Whether everything runs: few scenes, few views.",
+        (*_FIG5, Method("attention", "attention"), Method("rear-side-voxel", "rear-side-voxel")),
+        ("tower", "pile-6-3", "dense-10-1"),
+        seeds=1,
+        views=3,
+    ),
+    Suite(
+        "fig5",
+        "The paper's Fig. 5: fusing points, graphs or both, against random views.",
+        _FIG5,
+        (*DESIGNED, *PILES, *DENSE[:16]),
+        views=10,
+    ),
+    Suite(
+        "planners",
+        "Who finds the support graph with the fewest views, where views differ: in dense heaps.",
+        (
+            *(Method(name, name) for name in _PLANNERS),
+            *(Method(f"{name}, w = 0", name, settings=(_FREE,)) for name in VOLUMETRIC),
         ),
-        Suite(
-            "fig5",
-            "The paper's Fig. 5: fusing points, graphs or both, against random views.",
-            _FIG5,
-            (*DESIGNED, *PILES, *DENSE[:16]),
-            views=10,
+        DENSE,
+        reference="random",
+        gap=("random", "oracle"),
+    ),
+    Suite(
+        "path",
+        "How far one has to go in dense heaps until the support graph is good.",
+        (
+            *(Method(name, name) for name in ("support", "random", "ring")),
+            Method("proximity-count, w = 0", "proximity-count", settings=(_FREE,)),
         ),
-        Suite(
-            "planners",
-            "Who finds the support graph with the fewest views, where views differ: in dense heaps.",
-            (
-                *(Method(name, name) for name in _PLANNERS),
-                *(Method(f"{name}, w = 0", name, settings=(_FREE,)) for name in VOLUMETRIC),
-            ),
-            DENSE,
-            reference="random",
-            gap=("random", "oracle"),
+        DENSE,
+        views=10,
+        reference="random",
+    ),
+    Suite(
+        "ablation",
+        "What the paper leaves open, one setting at a time, for the default planner.",
+        (
+            Method("support"),
+            *(Method(label, settings=(s,)) for label, s in _SUPPORT.items()),
+            *(Method(label, settings=s) for label, s in _TOP_DOWN.items()),
         ),
-        Suite(
-            "path",
-            "How far one has to go in dense heaps until the support graph is good.",
-            (
-                *(Method(name, name) for name in ("support", "random", "ring")),
-                Method("proximity-count, w = 0", "proximity-count", settings=(_FREE,)),
-            ),
-            DENSE,
-            views=10,
-            reference="random",
+        DENSE[:16],
+    ),
+    Suite(
+        "ablation-attention",
+        "What the paper leaves open, one setting at a time, for Algorithm 2 read with these settings.",
+        (
+            Method("attention", "attention"),
+            *(Method(label, "attention", settings=(s,)) for label, s in _ATTENTION.items()),
         ),
-        Suite(
-            "ablation",
-            "What the paper leaves open, one setting at a time, for the default planner.",
-            (
-                Method("support"),
-                *(Method(label, settings=(s,)) for label, s in _SUPPORT.items()),
-                *(Method(label, settings=s) for label, s in _TOP_DOWN.items()),
-            ),
-            DENSE[:16],
+        DENSE[:16],
+    ),
+    Suite(
+        "poses",
+        "What fusing points, graphs or both makes of views whose poses are taken as they come.",
+        tuple(
+            Method(fused.label + how, fusion=fused.fusion, settings=settings)
+            for how, settings in (("", ()), (", poses as they come", ("registration.enabled=false",)))
+            for fused in _FIG5[:3]
         ),
-        Suite(
-            "ablation-attention",
-            "What the paper leaves open, one setting at a time, for Algorithm 2 read with these settings.",
-            (
-                Method("attention", "attention"),
-                *(Method(label, "attention", settings=(s,)) for label, s in _ATTENTION.items()),
-            ),
-            DENSE[:16],
+        (*DESIGNED, *PILES[2::2], *DENSE[:8]),
+        seeds=1,
+        views=10,
+    ),
+    Suite(
+        "noise",
+        "What depth noise, wrong poses and automatic segments cost.",
+        (Method("support"), Method("random", "random")),
+        (*DESIGNED, *PILES[2::2], *DENSE[:8]),
+        (*_NOISE, _AUTO),
+        seeds=1,
+    ),
+    Suite(
+        "dismantle",
+        "Whether piles come apart without harm by what is known of them after 1, 3, 5 and 10 views.",
+        tuple(Method(order, order=order) for order in ORDERS),
+        (*DESIGNED, *HEAPED),
+        seeds=1,
+        views=10,
+        reference="highest first",
+    ),
+    Suite(
+        "full",
+        "Everything against everything: for a cluster.",
+        tuple(
+            Method(f"{planner} {fusion.upper()}", planner, fusion)
+            for planner, fusion in product(_PLANNERS, _FUSIONS)
         ),
-        Suite(
-            "poses",
-            "What fusing points, graphs or both makes of views whose poses are taken as they come.",
-            tuple(
-                Method(fused.label + how, fusion=fused.fusion, settings=settings)
-                for how, settings in (("", ()), (", poses as they come", ("registration.enabled=false",)))
-                for fused in _FIG5[:3]
-            ),
-            (*DESIGNED, *PILES[2::2], *DENSE[:8]),
-            seeds=1,
-            views=10,
-        ),
-        Suite(
-            "noise",
-            "What depth noise, wrong poses and automatic segments cost.",
-            (Method("support"), Method("random", "random")),
-            (*DESIGNED, *PILES[2::2], *DENSE[:8]),
-            (*_NOISE, _AUTO),
-            seeds=1,
-        ),
-        Suite(
-            "dismantle",
-            "Whether piles come apart without harm by what is known of them after 1, 3, 5 and 10 views.",
-            tuple(Method(order, order=order) for order in ORDERS),
-            (*DESIGNED, *HEAPED),
-            seeds=1,
-            views=10,
-            reference="highest first",
-        ),
-        Suite(
-            "full",
-            "Everything against everything: for a cluster.",
-            tuple(
-                Method(f"{planner} {fusion.upper()}", planner, fusion)
-                for planner, fusion in product(_PLANNERS, _FUSIONS)
-            ),
-            (*DESIGNED, *PILES, *DENSE),
-            (Condition("labels, no noise", "none"), Condition("labels, Carmine noise"), *_NOISE, _AUTO),
-            views=10,
-        ),
-    )
-}
+        (*DESIGNED, *PILES, *DENSE),
+        (Condition("labels, no noise", "none"), Condition("labels, Carmine noise"), *_NOISE, _AUTO),
+        views=10,
+    ),
+)
+SUITES: Mapping[str, Suite] = {suite.name: suite for suite in _ALL}
 """All suites by name."""

@@ -115,16 +115,14 @@ class Benchmark(Command):
         from caryatid.benchmark import suites
         from caryatid.benchmark.episodes import find_scenes
 
-        suite = suites.find_suite(name)
-        if self.planner:
-            suite = suites.with_planners(suite, self.planner)
-        if self.fusion:
-            suite = suites.with_fusions(suite, self.fusion)
-        if self.segmentation or self.noise:
-            conditions = self.segmentation or ("labels",), self.noise or ("carmine",)
-            suite = suites.with_conditions(suite, *conditions)
-        if self.set:
-            suite = suites.with_settings(suite, self.set)
+        suite = suites.change_suite(
+            suites.find_suite(name),
+            planners=self.planner,
+            fusions=self.fusion,
+            segmentations=self.segmentation,
+            noises=self.noise,
+            settings=self.set,
+        )
         if self.scenes:
             suite = replace(suite, scenes=tuple(find_scenes(self.scenes)))
         return replace(suite, seeds=self.seeds or suite.seeds, views=self.views or suite.views)
