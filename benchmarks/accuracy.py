@@ -1,7 +1,6 @@
 """How well the loop finds support graphs: F1 per view over scenes, planners, seeds, and on real frames.
 
     python benchmarks/accuracy.py suite [NAMES…] [--gate | --update]
-    python benchmarks/accuracy.py explore tower dense-10-1 --planner support random --seeds 3 --out rows.json
     python benchmarks/accuracy.py extract RECORDINGS… --segmentation labels
 
 `suite` measures the settings the committed baseline is of, all where no NAMES are given. RECORDINGS are BOP
@@ -10,31 +9,30 @@ folders with masks and gt.json. `caryatid benchmark` compares planners and setti
 
 from __future__ import annotations
 
-import json
-import os
-import sys
 import time
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from itertools import product
-from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
 import numpy as np
+import pandas as pd
 import tyro
-from measures import Measure, gate, read_baseline, show, write_baseline
+from measures import Gated, Measure, Spread, print_table, run_main
 from rich.console import Console
-from rich.table import Table
 
-from caryatid.benchmark.episodes import Episode, counts, family, find_scenes, run_episode, short_name
-from caryatid.benchmark.running import THREADS
-from caryatid.config import Config, NoiseModel, SegmentationMethod
+from caryatid.benchmark.episodes import Episode, family, figures_of, run_episode
+from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
+from caryatid.evaluation.scores import score_masks
+from caryatid.io import write_recording
+from caryatid.io.bop import read_recording
+from caryatid.scene import Scene
+from caryatid.simulation.scenes import is_builtin, load_scene
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, read_truth, write_truth
 
 BASELINE = Path(__file__).with_name("accuracy_baseline.json")
 LEAST_READINGS = 200
@@ -48,10 +46,15 @@ DENSE = tuple(f"dense-{10 + seed % 8}-{seed}" for seed in range(200, 216))
 """Heaps of 10–17 objects between screens and walls, of seeds nothing was developed with."""
 PACKED = tuple(f"packed-20-{seed}" for seed in range(1, 6))
 """Twenty objects, each touching another."""
+SHOWN = (
+    *("edge_precision", "edge_recall", "vertex_precision", "vertex_recall", "mean_iou", "found", "invented"),
+    *("planning_seconds", "perception_seconds"),
+)
+"""Columns of the table beside F1."""
 MEANS, POOLED = ("f1", "edge_recall", "mean_iou"), ("f1", "found", "invented")
 """Figures of a suite: means over scenes; `found` and `invented` of all scenes' objects."""
 Row = dict[str, Any]
-"""`scene`, `planner` (of a recording its segmentation), `seed`, `view` (from 1), and figures."""
+"""`scene`, `seed`, `view` (from 1), and figures."""
 
 
 @dataclass(frozen=True)
@@ -141,20 +144,11 @@ def run(task: Episode | Extraction) -> list[Row]:
     outcome = run_episode(task)
     if outcome.error is not None:
         raise CaryatidError(f"{task.scene}: {outcome.error}")
-    about = {"scene": short_name(task.scene), "planner": task.planner, "seed": task.seed}
-    return [
-        about | row | {"seconds": row["planning_seconds"] + row["perception_seconds"]} for row in outcome.rows
-    ]
+    return [{"scene": task.scene, "seed": task.seed} | row for row in outcome.rows]
 
 
 def extract(task: Extraction) -> list[Row]:
     """Extract a recording, and score the graph after each frame by the pixels of all frames so far."""
-    from caryatid.evaluation.scores import score_masks
-    from caryatid.io.bop import read_recording
-    from caryatid.scene import Scene
-    from caryatid.simulation.scenes import is_builtin
-    from caryatid.simulation.truth import read_truth
-
     config = read_settings(None, task.settings)
     if is_builtin(task.source):
         with TemporaryDirectory() as temporary:
@@ -165,6 +159,7 @@ def extract(task: Extraction) -> list[Row]:
     truth = read_truth(folder / "gt.json")
     scene = Scene(config, segmentation=task.segmentation, seed=task.seed)
     labels, true_labels, rows = [], [], []
+    known = {"scene": folder.name, "seed": task.seed}
     for index, frame in enumerate(read_recording(folder).frames):
         started = time.perf_counter()
         graph = scene.update(frame.load())
@@ -173,23 +168,13 @@ def extract(task: Extraction) -> list[Row]:
         labels.append(scene.labels)
         true_labels.append(frame.load_labels())
         found = score_masks(graph, labels, true_labels, truth.vertices, frozenset(truth.pairs))
-        known = {"scene": folder.name, "planner": task.segmentation, "seed": task.seed, "view": index + 1}
-        scores = {name: getattr(found, name) for name in SCORES}
-        sizes = counts(len(truth.vertices) - 1, graph, found)
-        rows.append(known | scores | sizes | {"seconds": seconds, "angle": 0.0, "path": 0.0})
+        times = {"planning_seconds": 0.0, "perception_seconds": seconds}
+        rows.append(known | {"view": index + 1} | figures_of(found, graph, len(truth.vertices) - 1) | times)
     return rows
-
-
-SCORES = ("f1", "edge_precision", "edge_recall", "vertex_precision", "vertex_recall", "mean_iou")
 
 
 def record_frame(scene: str, folder: Path, config: Config, seed: int) -> None:
     """Record the robot's first view of a built-in scene: one noisy frame without a pose, and gt.json."""
-    from caryatid.io import write_recording
-    from caryatid.simulation.scenes import load_scene
-    from caryatid.simulation.setup import make_simulation
-    from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, write_truth
-
     simulated = load_scene(scene)
     simulation = make_simulation(simulated, config, noise="carmine", seed=seed)
     view = simulation.camera.capture(simulation.robot.T_world_camera)
@@ -207,34 +192,32 @@ def record_frame(scene: str, folder: Path, config: Config, seed: int) -> None:
     write_truth(GroundTruth(("table", *(f"object{k}" for k in kept)), edges), folder / "gt.json")
 
 
-def figure(name: str, rows: Sequence[Row]) -> float:
-    """A figure of rows: a mean, or `found` and `invented` of all their objects together."""
-    true, returned, matched = (sum(r[n] for r in rows) for n in ("objects", "returned", "matched"))
-    if name == "found":
-        return float(matched / max(true, 1))
-    if name == "invented":
-        return float((returned - matched) / max(returned, 1))
-    return float(np.mean([r[name] for r in rows]))
+def figures(rows: pd.DataFrame) -> dict[str, float]:
+    """Means of rows, and the shares of their objects together that are `found` and `invented`."""
+    true, returned, matched = rows[["objects", "returned", "matched"]].sum()
+    shares = {"found": matched / max(true, 1), "invented": (returned - matched) / max(returned, 1)}
+    return rows.mean(numeric_only=True).to_dict() | shares
 
 
 def measures(rows_of: Mapping[str, Sequence[Row]]) -> list[Measure]:
     """Figures of suites from the rows of each, named `suite.scenes.figure@views`."""
-    kept = []
+    means = {}
     for name, rows in rows_of.items():
+        frame = pd.DataFrame(rows)
+        for (group, view), part in frame.groupby([frame["scene"].map(_group), "view"]):
+            means[name, group, view] = figures(part)
+    kept = []
+    for (name, group, view), found in means.items():
         suite = SUITES[name]
-        groups = list(dict.fromkeys(_group(scene) for scene in suite.scenes))
-        for group, views in product(groups, suite.scored):
-            prefix = name if len(groups) == 1 else f"{name}.{group}"
-            part, undisturbed = (
-                [r for r in some if r["view"] == views and _group(r["scene"]) == group]
-                for some in (rows, rows_of.get(suite.against, ()))
-            )
-            for f in suite.figures if part else ():
-                better = "lower" if f == "invented" else "higher"
-                kept.append(Measure(f"{prefix}.{f}@{views}", figure(f, part), "1", better, suite.tolerance))
-            if part and undisturbed:
-                fall = figure("f1", undisturbed) - figure("f1", part)
-                kept.append(Measure(f"{prefix}.fall@{views}", fall, "1", "lower", suite.tolerance))
+        if view not in suite.scored:
+            continue
+        prefix = name if len({_group(scene) for scene in suite.scenes}) == 1 else f"{name}.{group}"
+        wanted = {f: found[f] for f in suite.figures}
+        if undisturbed := means.get((suite.against, group, view)):
+            wanted["fall"] = undisturbed["f1"] - found["f1"]
+        for f, value in wanted.items():
+            better = "lower" if f in ("invented", "fall") else "higher"
+            kept.append(Measure(f"{prefix}.{f}@{view}", value, "1", better, suite.tolerance))
     return kept
 
 
@@ -242,64 +225,32 @@ def _group(scene: str) -> str:
     return kind if (kind := family(scene)) in ("dense", "packed") else "easy"
 
 
-def show_rows(rows: Sequence[Row], console: Console, title: str = "") -> None:
-    """Print F1 per view and the rest of the last view, a line a family and planner, and the worst scenes."""
-    last = max(r["view"] for r in rows)
-    table = Table(title=f"{title} mean over scenes and seeds, views 1…{last:.0f}".strip())
-    columns = (*SCORES[1:], "found", "invented", "angle", "path", "seconds")
-    for column in ("scenes", "planner", "F1 by view", *(c.replace("_", " ") for c in columns)):
-        table.add_column(column)
-    groups: dict[tuple[str, str], list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[family(row["scene"]), row["planner"]].append(row)
-    for (name, planner), part in sorted(groups.items()):
-        views = sorted({r["view"] for r in part})
-        by_view = [[r for r in part if r["view"] == v] for v in views]
-        f1 = " ".join(f"{figure('f1', view):.3f}" for view in by_view)
-        scenes = f"{name} ({len({r['scene'] for r in part})})"
-        table.add_row(scenes, planner, f1, *(f"{figure(c, by_view[-1]):.3f}" for c in columns))
-    console.print(table)
-    worst = sorted((r for r in rows if r["view"] == last), key=lambda r: r["f1"])[:6]
-    told = (f"{r['scene']} ({r['planner']}, seed {r['seed']}) {r['f1']:.3f}" for r in worst)
-    console.print("lowest: " + ", ".join(told))
+def show_rows(rows: Sequence[Row], console: Console, title: str) -> None:
+    """Print F1 per view and the rest of the last view, a line a family, and the worst scenes."""
+    frame = pd.DataFrame(rows)
+    frame["scenes"] = frame["scene"].map(family)
+    last = frame[frame["view"] == frame["view"].max()]
+    lines = []
+    for kind, part in last.groupby("scenes"):
+        by_view = frame[frame["scenes"] == kind].groupby("view")["f1"].mean()
+        known = figures(part)
+        f1 = " ".join(f"{value:.3f}" for value in by_view)
+        scenes = f"{kind} ({part['scene'].nunique()})"
+        lines.append({"scenes": scenes, "F1 by view": f1} | {name: known[name] for name in SHOWN})
+    console.print(f"{title}: means over scenes and seeds")
+    print_table(pd.DataFrame(lines).round(3), console)
+    worst = last.nsmallest(6, "f1")[["scene", "seed", "f1"]].itertuples(index=False)
+    console.print("lowest: " + ", ".join(f"{scene} (seed {seed}) {f1:.3f}" for scene, seed, f1 in worst))
 
 
 @dataclass(frozen=True)
-class Common:
-    """What all measurements share."""
-
-    jobs: int = 4
-    """Processes."""
-    out: Path | None = None
-    """JSON file for all rows."""
-
-    def measure(self, tasks: Sequence[Episode | Extraction]) -> list[list[Row]]:
-        """Rows of each task, run in processes."""
-        for name in THREADS:
-            os.environ.setdefault(name, "1")
-        with ProcessPoolExecutor(self.jobs, get_context("spawn")) as pool:
-            return list(pool.map(run, tasks))
-
-    def tell(self, rows_of: Mapping[str, list[Row]], console: Console) -> None:
-        """Print rows, and write them where asked to."""
-        for title, rows in rows_of.items():
-            show_rows(rows, console, title)
-        if self.out is not None:
-            self.out.write_text(json.dumps(rows_of, indent=1) + "\n", encoding="utf-8")
-
-
-@dataclass(frozen=True)
-class SuiteRun(Common):
+class SuiteRun(Gated):
     """Measure the settings the committed baseline is of."""
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """Suites. [default: all]"""
     seeds: int = 1
     """Seeds 0…n−1."""
-    gate: bool = False
-    """Fail where a figure is worse than the committed baseline."""
-    update: bool = False
-    """Make the figures the committed baseline; those of other suites stay."""
 
     def run(self, console: Console) -> int:
         """Measure, print, and compare."""
@@ -309,49 +260,20 @@ class SuiteRun(Common):
         seeds = range(self.seeds)
         tasks = [(n, SUITES[n].task(s, k)) for n in names for s in SUITES[n].scenes for k in seeds]
         rows: dict[str, list[Row]] = {name: [] for name in names}
-        for (name, _), part in zip(tasks, self.measure([task for _, task in tasks]), strict=True):
+        for (name, _), part in zip(tasks, self.each(run, [task for _, task in tasks]), strict=True):
             rows[name] += part
-        self.tell(rows, console)
-        found = measures(rows)
-        show("accuracy", found, TARGETS, console)
-        if self.update:
-            others = [m for m in read_baseline(BASELINE) if m.name.split(".")[0] not in names]
-            write_baseline([m for m in others if m.name.split(".")[0] in SUITES] + found, BASELINE)
-        return gate(found, BASELINE, console) if self.gate else 0
+        for name in names:
+            show_rows(rows[name], console, name)
+
+        def kept(name: str) -> bool:
+            return (suite := name.split(".")[0]) in SUITES and suite not in names
+
+        self.write(rows)
+        return self.finish(measures(rows), BASELINE, console, TARGETS, kept)
 
 
 @dataclass(frozen=True)
-class Explore(Common):
-    """Explore scenes, and score every view."""
-
-    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = BOTH
-    """Names of built-in scenes, scene folders, or folders of them."""
-    planner: tuple[str, ...] = ("support",)
-    """Who chooses the views."""
-    segmentation: SegmentationMethod = "labels"
-    """Where segments come from."""
-    noise: NoiseModel = "carmine"
-    """Noise of the camera."""
-    views: int = 5
-    """Views of an episode, including the first."""
-    seeds: int = 1
-    """Seeds 0…n−1."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Settings, e.g. `--set registration.enabled=false`."""
-
-    def run(self, console: Console) -> int:
-        """Explore and print."""
-        read_settings(None, self.set)
-        known = {"segmentation": self.segmentation, "noise": self.noise, "settings": self.set}
-        same = Episode("", views=self.views, **known)  # type: ignore[arg-type]
-        cross = product(find_scenes(self.scenes), self.planner, range(self.seeds))
-        tasks = [replace(same, scene=scene, planner=planner, seed=seed) for scene, planner, seed in cross]
-        self.tell({"explore": [row for part in self.measure(tasks) for row in part]}, console)
-        return 0
-
-
-@dataclass(frozen=True)
-class Extract(Common):
+class Extract(Spread):
     """Extract graphs from recordings, frame after frame, and score them."""
 
     recordings: Annotated[tuple[str, ...], tyro.conf.Positional] = EASY
@@ -364,18 +286,17 @@ class Extract(Common):
     def run(self, console: Console) -> int:
         """Extract and print."""
         tasks = [Extraction(folder, self.segmentation, self.set) for folder in self.recordings]
-        self.tell({"extract": [row for part in self.measure(tasks) for row in part]}, console)
+        rows = [row for part in self.each(run, tasks) for row in part]
+        show_rows(rows, console, "extract")
+        self.write(rows)
         return 0
 
 
 def main() -> int:
     """Run the measurement."""
-    commands: dict[str, Any] = {"suite": SuiteRun, "explore": Explore, "extract": Extract}
+    commands: dict[str, Any] = {"suite": SuiteRun, "extract": Extract}
     return tyro.extras.subcommand_cli_from_dict(commands).run(Console(width=200))
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except CaryatidError as error:
-        sys.exit(f"error: {error}")
+    run_main(main)

@@ -8,7 +8,6 @@ compares. A peer that cannot be imported is a row that says so.
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import sys
@@ -24,14 +23,13 @@ import peers
 import psutil
 import tyro
 from fit_speed import measure_fits
-from measures import gate, read_baseline, write_baseline
+from measures import gate, print_table, read_baseline, run_main, write_baseline
 from rich.console import Console
-from rich.table import Table
-from rows import COLUMNS, FULL, NOTHING, QUICK, Effort, Row, machine, measures
+from rows import FULL, NOTHING, QUICK, Effort, Row, machine, measures, table_of_rows
 from speed import AXES, measure_decision, measure_growth, measure_map, measure_start, measure_turns
 
 from caryatid.benchmark.store import collect_provenance, describe_provenance
-from caryatid.errors import CaryatidError, InputError
+from caryatid.errors import InputError
 
 BASELINE = Path(__file__).with_name("performance_baseline.json")
 """The committed ratios."""
@@ -80,13 +78,7 @@ def selected(wanted: Sequence[str]) -> list[str]:
 
 def show(rows: Sequence[Row], console: Console) -> None:
     """Print the table."""
-    table = Table(title="medians after warm-up")
-    for column in COLUMNS[:-1]:
-        words = column in ("row", "what", "peer")
-        table.add_column(column, justify="left" if words else "right", no_wrap=column != "what")
-    for row in rows:
-        table.add_row(*row.cells()[:-1], style="red" if row.met is False else None)
-    console.print(table)
+    print_table(table_of_rows(rows).drop(columns="note"), console)
     for note in dict.fromkeys(row.note for row in rows if row.note):
         console.print(f"{next(row.name for row in rows if row.note == note)}: {note}", highlight=False)
     wanted = [row for row in rows if row.target is not None]
@@ -97,11 +89,10 @@ def show(rows: Sequence[Row], console: Console) -> None:
 def write_docs(rows: Sequence[Row], folder: Path) -> None:
     """Write a CSV file for each group of rows, without empty columns, and what they were measured on."""
     folder.mkdir(exist_ok=True)
-    for group in dict.fromkeys(row.name.split(".")[0] for row in rows):
-        lines = [COLUMNS, *(row.cells() for row in rows if row.name.split(".")[0] == group)]
-        kept = [k for k in range(len(COLUMNS)) if any(line[k] != NOTHING for line in lines[1:])]
-        with (folder / f"{group}.csv").open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows([line[k] for k in kept] for line in lines)
+    table = table_of_rows(rows)
+    for group, part in table.groupby(table["row"].str.split(".").str[0], sort=False):
+        shown = part.loc[:, (part != NOTHING).any()]
+        shown.to_csv(folder / f"{group}.csv", index=False, lineterminator="\n")
     about = f"{describe_provenance(collect_provenance())}; {peers.versions()}"
     (folder / "machine.txt").write_text(f"Run by {about}.\n", encoding="utf-8")
 
@@ -168,7 +159,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except CaryatidError as error:
-        sys.exit(f"error: {error}")
+    run_main(main)

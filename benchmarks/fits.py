@@ -18,16 +18,13 @@ such a view can tell:
 
 from __future__ import annotations
 
-import os
-import sys
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
-from multiprocessing import get_context
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import tyro
-from measures import Measure, gate, show, write_baseline
+from measures import Gated, Measure, run_main
 from rich.console import Console
 from scipy.spatial import cKDTree
 
@@ -63,19 +60,13 @@ TARGETS = {
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Gated):
     """Fit shapes to synthetic half views."""
 
     trials: int = 200
     """Trials a shape."""
-    jobs: int = 2
-    """Processes."""
     verbose: bool = False
     """Print the worst trials."""
-    gate: bool = False
-    """Fail where a figure is worse than the committed baseline."""
-    update: bool = False
-    """Make the figures the committed baseline."""
 
 
 @dataclass(frozen=True)
@@ -208,26 +199,7 @@ def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
     return found
 
 
-def main() -> int:
-    """Run the measurement."""
-    args = tyro.cli(Args)
-    console = Console(width=120)
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-    found: list[Measure] = []
-    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
-        for prefix, sigma, count in SETTINGS:
-            tasks = [(kind, seed, sigma, count) for kind in KINDS for seed in range(args.trials)]
-            trials = list(pool.map(run_trial, tasks, chunksize=10))
-            found += measures(prefix, trials)
-            if args.verbose:
-                show_worst(trials, console)
-    show("fits of half views", found, TARGETS, console)
-    if args.update:
-        write_baseline(found, BASELINE)
-    return gate(found, BASELINE, console) if args.gate else 0
-
-
-def show_worst(trials: list[Trial], console: Console) -> None:
+def show_worst(trials: Sequence[Trial], console: Console) -> None:
     """Print the trials with a wrong shape, and those furthest off."""
     for trial in trials:
         if trial.found != trial.kind:
@@ -238,5 +210,22 @@ def show_worst(trials: list[Trial], console: Console) -> None:
         console.print(f"far off: {trial.note}: {figures}")
 
 
+def main() -> int:
+    """Run the measurement."""
+    args = tyro.cli(Args)
+    console = Console(width=120)
+    found: list[Measure] = []
+    rows = []
+    for prefix, sigma, count in SETTINGS:
+        tasks = [(kind, seed, sigma, count) for kind in KINDS for seed in range(args.trials)]
+        trials = args.each(run_trial, tasks, chunk=10)
+        rows += [{"setting": prefix} | asdict(trial) for trial in trials]
+        found += measures(prefix, trials)
+        if args.verbose:
+            show_worst(trials, console)
+    args.write(rows)
+    return args.finish(found, BASELINE, console, TARGETS)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    run_main(main)

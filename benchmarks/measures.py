@@ -1,14 +1,25 @@
-"""A measure: name, value, unit, direction and tolerance; and the comparison with a committed baseline."""
+"""What the benchmarks share: measures, the committed baselines they are compared with, processes, tables."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+import os
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
+import pandas as pd
 from rich.console import Console
-from rich.table import Table
+
+from caryatid.benchmark.running import THREADS
+from caryatid.errors import CaryatidError
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -29,10 +40,66 @@ class Measure:
     better: str
     tolerance: float
 
-    def worse_than(self, baseline: float) -> bool:
-        """Whether it is worse than the baseline by more than the tolerance."""
+    def worse_than(self, baseline: float, tolerance: float = 0.0) -> bool:
+        """Whether it is worse than a baseline by more than a tolerance."""
         loss = baseline - self.value if self.better == "higher" else self.value - baseline
-        return loss > self.tolerance
+        return loss > tolerance
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Options of a benchmark whose tasks are spread over processes."""
+
+    jobs: int = 4
+    """Processes."""
+    out: Path | None = None
+    """JSON file for all rows."""
+
+    def each(self, function: Callable[[T], R], tasks: Sequence[T], chunk: int = 1) -> list[R]:
+        """What a function gives for each task, run in processes."""
+        for name in THREADS:
+            os.environ.setdefault(name, "1")
+        with ProcessPoolExecutor(self.jobs, get_context("spawn")) as pool:
+            return list(pool.map(function, tasks, chunksize=chunk))
+
+    def write(self, rows: Any) -> None:
+        """Write the rows where asked to."""
+        if self.out is not None:
+            self.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Gated(Spread):
+    """Options of a benchmark with a committed baseline."""
+
+    gate: bool = False
+    """Fail where a figure is worse than the committed baseline."""
+    update: bool = False
+    """Make the figures the committed baseline; those of what was not measured stay."""
+
+    def finish(
+        self,
+        found: Sequence[Measure],
+        baseline: Path,
+        console: Console,
+        targets: Mapping[str, float] | None = None,
+        kept: Callable[[str], bool] = lambda name: False,
+    ) -> int:
+        """Print measures, keep and compare them as asked for; returns the exit status.
+
+        Args:
+            found: The measures.
+            baseline: The committed ones.
+            console: Where to print.
+            targets: What is asked for, by name.
+            kept: Names in the baseline that were not measured and stay there.
+        """
+        show(found, targets or {}, console)
+        if self.update:
+            names = {m.name for m in found}
+            others = [m for m in read_baseline(baseline) if m.name not in names and kept(m.name)]
+            write_baseline([*others, *found], baseline)
+        return gate(found, baseline, console) if self.gate else 0
 
 
 def write_baseline(measures: Iterable[Measure], path: Path) -> None:
@@ -48,30 +115,37 @@ def read_baseline(path: Path) -> list[Measure]:
 
 def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
     """Compare with a baseline; returns the exit status, 1 where a measure is worse than it may be."""
-    baseline = json.loads(path.read_text(encoding="utf-8"))
+    baseline = {m.name: m.value for m in read_baseline(path)}
     failed = 0
-    for measure in measures:
-        known = baseline.get(measure.name)
-        if known is None:
-            console.print(f"new: {measure.name} = {measure.value:.4g} {measure.unit}")
-        elif measure.worse_than(known["value"]):
+    for m in measures:
+        if m.name not in baseline:
+            console.print(f"new: {m.name} = {m.value:.4g} {m.unit}")
+        elif m.worse_than(baseline[m.name], m.tolerance):
             failed += 1
-            console.print(
-                f"worse: {measure.name} = {measure.value:.4g} {measure.unit}, "
-                f"was {known['value']:.4g} ± {measure.tolerance:g}"
-            )
+            was = f"was {baseline[m.name]:.4g} ± {m.tolerance:g}"
+            console.print(f"worse: {m.name} = {m.value:.4g} {m.unit}, {was}")
     console.print("gate: " + (f"{failed} measures are worse" if failed else "nothing is worse"))
     return min(failed, 1)
 
 
-def show(title: str, measures: Iterable[Measure], targets: Mapping[str, float], console: Console) -> None:
+def show(measures: Iterable[Measure], targets: Mapping[str, float], console: Console) -> None:
     """Print measures beside what is asked for."""
-    table = Table(title=title)
-    for column in ("measure", "value", "unit", "± tolerated", "asked for"):
-        table.add_column(column)
+    rows = []
     for m in measures:
         target, sign = targets.get(m.name), "≥" if m.better == "higher" else "≤"
-        missed = target is not None and (m.value < target if m.better == "higher" else m.value > target)
-        asked = "" if target is None else f"{sign} {target:g}" + (" missed" if missed else "")
-        table.add_row(m.name, f"{m.value:.3f}", m.unit, f"{m.tolerance:.3g}", asked)
-    console.print(table)
+        asked = "" if target is None else f"{sign} {target:g}" + (" missed" if m.worse_than(target) else "")
+        rows.append((m.name, f"{m.value:.3f}", m.unit, f"{m.tolerance:.3g}", asked))
+    print_table(pd.DataFrame(rows, columns=["measure", "value", "unit", "± tolerated", "asked for"]), console)
+
+
+def print_table(table: pd.DataFrame, console: Console) -> None:
+    """Print a table, all of it."""
+    console.print(table.to_string(index=False), markup=False, highlight=False, soft_wrap=True)
+
+
+def run_main(main: Callable[[], int]) -> None:
+    """Run a benchmark's main function and exit with its status, or with what went wrong."""
+    try:
+        sys.exit(main())
+    except CaryatidError as error:
+        sys.exit(f"error: {error}")

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numba
 import numpy as np
+import pandas as pd
 from measures import Measure
 from numba import njit, prange
 
@@ -21,10 +22,6 @@ PAUSE = 0.02
 TOLERANCE, EXPONENT_TOLERANCE = 0.3, 0.15
 """How much worse a ratio (as a share of itself) or an exponent of growth may become [1]."""
 NOTHING, MISSED = "–", "missed"
-COLUMNS = (
-    ("row", "what", "ours", "spread", "runs", "peer", "theirs")
-    + ("to peer", "pass of", "to limit", "target", "note")
-)  # fmt: skip
 Limit = tuple[float, float]
 """Bytes read and written, and multiplications and additions, that a stage cannot do without."""
 
@@ -102,26 +99,31 @@ class Row:
         figure = self.to_peer if self.peer else self.value
         return None if self.target is None or figure is None else figure <= self.target
 
-    def cells(self) -> tuple[str, ...]:
+    def cells(self) -> dict[str, str]:
         """The columns of the table."""
         verdict = {True: "met", False: MISSED, None: "not measured"}[self.met]
         asked = NOTHING
         if self.target is not None:
             asked = f"≤ {_ratio(self.target) if self.peer else _figure(self.target, self.unit)} {verdict}"
-        return (
-            self.name,
-            self.what,
-            _figure(self.value, self.unit),
-            _figure(self.spread, self.unit) if self.runs > 1 and self.unit != "1" else NOTHING,
-            str(self.runs),
-            self.peer or NOTHING,
-            _figure(self.peer_value, self.unit),
-            _ratio(self.to_peer),
-            self.limit or NOTHING,
-            _ratio(self.to_limit),
-            asked,
-            self.note or NOTHING,
-        )
+        return {
+            "row": self.name,
+            "what": self.what,
+            "ours": _figure(self.value, self.unit),
+            "spread": _figure(self.spread, self.unit) if self.runs > 1 and self.unit != "1" else NOTHING,
+            "runs": str(self.runs),
+            "peer": self.peer or NOTHING,
+            "theirs": _figure(self.peer_value, self.unit),
+            "to peer": _ratio(self.to_peer),
+            "pass of": self.limit or NOTHING,
+            "to limit": _ratio(self.to_limit),
+            "target": asked,
+            "note": self.note or NOTHING,
+        }
+
+
+def table_of_rows(rows: Iterable[Row]) -> pd.DataFrame:
+    """The table, a line a row."""
+    return pd.DataFrame([row.cells() for row in rows])
 
 
 def timed_row(

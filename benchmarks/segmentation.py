@@ -10,33 +10,31 @@ that hold a reading; what the scene model makes of it is for `accuracy.py` to sa
 
 from __future__ import annotations
 
-import json
-import os
-import sys
 import time
-from collections import defaultdict
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import pandas as pd
 import tyro
 from accuracy import EASY
-from measures import Measure, gate, write_baseline
+from measures import Gated, Measure, print_table, run_main
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.table import Table
 
 from caryatid.benchmark.episodes import family
-from caryatid.benchmark.running import THREADS
 from caryatid.config import Config, NoiseModel
 from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
 from caryatid.evaluation.scores import assign, mask_ious
+from caryatid.io.bop import read_recording
+from caryatid.segmentation.observation import observe
+from caryatid.segmentation.segments import segment
+from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
+from caryatid.sources import is_recording, open_source
 
 BUILT_IN = (*EASY, *(f"dense-{size}-{seed}" for seed, size in enumerate(range(10, 18, 2), start=1)))
 """What is segmented where no sources are given."""
@@ -45,12 +43,13 @@ LEAST_PIXELS = 200
 """True objects with fewer readings are not asked for, nor are parts of them invented [px]; 2 cm at 1 m."""
 MIN_IOU = 0.5
 """IoU of masks from which a part is an object [1]; method notes 5."""
+COUNTED = ("found", "invented", "split", "merged")
 SHARE = 0.2
 """A part that holds this share of an object's readings is a piece of it [1]."""
 
 
 @dataclass(frozen=True)
-class Args:
+class Args(Gated):
     """Segment views and compare with true masks."""
 
     sources: Annotated[tuple[str, ...], tyro.conf.Positional] = BUILT_IN
@@ -63,14 +62,6 @@ class Args:
     """Seed of the noise."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """Settings, e.g. `--set segmentation.concavity=12`."""
-    jobs: int = 4
-    """Processes."""
-    out: Path | None = None
-    """JSON file for all rows."""
-    gate: bool = False
-    """Fail where a figure is worse than the committed baseline."""
-    update: bool = False
-    """Make the figures the committed baseline."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +81,6 @@ class Row:
 
 def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
     """The views of a source, with true labels."""
-    from caryatid.io.bop import read_recording
-    from caryatid.sensing.view_sphere import ViewSphere
-    from caryatid.sources import is_recording, open_source
-
     if is_recording(source):
         yield from read_recording(source)
         return
@@ -145,9 +132,6 @@ def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> tuple[int, i
 
 def measure(task: tuple[str, Args]) -> list[Row]:
     """Segment the views of one source."""
-    from caryatid.segmentation.observation import observe
-    from caryatid.segmentation.segments import segment
-
     source, args = task
     config = read_settings(None, args.set)
     rows = []
@@ -166,71 +150,49 @@ def measure(task: tuple[str, Args]) -> list[Row]:
     return rows
 
 
-def measures(rows: list[Row]) -> list[Measure]:
-    """Shares found, split and merged of the true objects, and invented of the parts, for each family."""
-    found = []
-    for name in sorted({family(r.source) for r in rows}):
-        group = [r for r in rows if family(r.source) == name]
-        true, parts = sum(r.true for r in group), sum(r.parts for r in group)
-        for field, better, of in (
-            ("found", "higher", true),
-            ("invented", "lower", parts),
-            ("split", "lower", true),
-            ("merged", "lower", true),
-        ):
-            value = sum(getattr(r, field) for r in group) / max(of, 1)
-            found.append(Measure(f"{name}.{field}", value, "1", better, 0.02))
-    return found
+def shares(rows: pd.DataFrame) -> dict[str, float]:
+    """Shares found, split and merged of the true objects, and invented of the parts."""
+    sums = rows.sum(numeric_only=True)
+    return {name: sums[name] / max(sums["parts" if name == "invented" else "true"], 1) for name in COUNTED}
 
 
-def show(rows: list[Row], console: Console) -> None:
+def measures(rows: pd.DataFrame) -> list[Measure]:
+    """The shares of each family of scenes."""
+    return [
+        Measure(f"{name}.{field}", value, "1", "higher" if field == "found" else "lower", 0.02)
+        for name, group in rows.groupby(rows["source"].map(family))
+        for field, value in shares(group).items()
+    ]
+
+
+def show(rows: pd.DataFrame, console: Console) -> None:
     """Print one line a family, and the worst views."""
-    table = Table(title=f"{len(rows)} views, {sum(r.true for r in rows)} objects")
-    columns = ("sources", "views", "objects", "found", "invented", "split", "merged", "ms")
-    for column in columns:
-        table.add_column(column)
-    groups: dict[str, list[Row]] = defaultdict(list)
-    for row in rows:
-        groups[family(row.source)].append(row)
-        groups["all"].append(row)
-    for name, group in groups.items():
-        true, parts = sum(r.true for r in group), sum(r.parts for r in group)
-        table.add_row(
-            f"{name} ({len({r.source for r in group})})",
-            str(len(group)),
-            str(true),
-            *(
-                f"{100 * sum(getattr(r, f) for r in group) / max(n, 1):.1f} %"
-                for f, n in (("found", true), ("invented", parts), ("split", true), ("merged", true))
-            ),
-            f"{1000 * np.median([r.seconds for r in group]):.0f}",
-        )
-    console.print(table)
-    worst = sorted(rows, key=lambda r: r.found - r.true - r.invented)[:8]
-    console.print(
-        "worst: "
-        + ", ".join(f"{r.source} view {r.view}: {r.found} of {r.true}, {r.invented} invented" for r in worst)
-    )
+    families = list(rows.groupby(rows["source"].map(family)))
+    lines = [
+        {
+            "sources": f"{name} ({group['source'].nunique()})",
+            "views": len(group),
+            "objects": group["true"].sum(),
+            **{field: f"{100.0 * share:.1f} %" for field, share in shares(group).items()},
+            "ms": round(1000.0 * group["seconds"].median()),
+        }
+        for name, group in [*families, ("all", rows)]
+    ]
+    print_table(pd.DataFrame(lines), console)
+    worst = rows.loc[(rows["found"] - rows["true"] - rows["invented"]).nsmallest(8).index].itertuples()
+    console.print("worst: " + ", ".join(f"{r.source} view {r.view}: {r.found} of {r.true}" for r in worst))
 
 
 def main() -> int:
     """Run the measurement."""
     args = tyro.cli(Args)
     console = Console(width=160)
-    for name in THREADS:
-        os.environ.setdefault(name, "1")
-    with ProcessPoolExecutor(args.jobs, get_context("spawn")) as pool:
-        rows = [row for part in pool.map(measure, [(s, args) for s in args.sources]) for row in part]
+    parts = args.each(measure, [(source, args) for source in args.sources])
+    rows = pd.DataFrame([asdict(row) for part in parts for row in part])
     show(rows, console)
-    if args.out is not None:
-        args.out.write_text(json.dumps([asdict(r) for r in rows], indent=1) + "\n", encoding="utf-8")
-    if args.update:
-        write_baseline(measures(rows), BASELINE)
-    return gate(measures(rows), BASELINE, console) if args.gate else 0
+    args.write(rows.to_dict("records"))
+    return args.finish(measures(rows), BASELINE, console)
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except CaryatidError as error:
-        sys.exit(f"error: {error}")
+    run_main(main)

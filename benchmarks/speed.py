@@ -19,8 +19,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-from hashing import hash_voxels
-from peers import open3d_chain, told
+from peers import hash_voxels, open3d_chain, told
 from rows import PAUSE, Effort, Limit, Row, in_turns, median, timed, timed_row
 
 from caryatid import Config, Scene, SupportGraph, View, next_best_view
@@ -48,7 +47,7 @@ from caryatid.simulation.world import (
     Solid,
     build_spec,
     scene_from_spec,
-    table_top,
+    table_centre,
 )
 
 HEAP, VIEWS = "pile-10-1", 8
@@ -109,9 +108,7 @@ def record(scene: SimulatedScene, count: int = VIEWS, sensor: SensorConfig | Non
 
 def _ring(scene: SimulatedScene, robot: Robot, config: Config, count: int) -> Array:
     """Poses (V, 4, 4) around the table that the robot reaches, the first where it stands."""
-    top = table_top(scene)
-    centre = np.append(top.corners_world[:, :2].mean(axis=0), top.height)
-    sphere = ViewSphere.around(centre, config.active)
+    sphere = ViewSphere.around(table_centre(scene), config.active)
     reached = robot.candidates(sphere)
     first = sphere.direction_of(robot.T_world_camera)
     azimuths = np.arctan2(first[1], first[0]) + GOLDEN_ANGLE * np.arange(1, count)
