@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image
@@ -38,16 +39,9 @@ from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import SimulatedScene, box, build_spec, cylinder, scene_from_spec, sphere
-from caryatid.viz.drawings import (
-    Picture,
-    Projection,
-    draw_cloud,
-    draw_image,
-    draw_sphere,
-    own_style,
-    stage,
-)
+from caryatid.viz.drawings import Projection, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import draw_graph
+from caryatid.viz.pictures import Picture, own_style
 from caryatid.viz.strip import draw_lifts
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
@@ -86,7 +80,7 @@ def sheet(pictures: Sequence[Titled], width: int, columns: int, heading: str = "
                 middle = (column + 0.5) / columns
                 figure.text(middle, 1.0 - (top + TITLE / 2) / size[1], title, ha="center", va="center")
                 bottom = 1.0 - (top + TITLE + tall) / size[1]
-                picture.draw(figure, (column / columns + 0.005, bottom, 0.99 / columns, tall / size[1]))
+                picture.put(figure, (column / columns + 0.005, bottom, 0.99 / columns, tall / size[1]))
             top += height
         content = io.BytesIO()
         figure.savefig(content, format="png", metadata={"Software": None})
@@ -106,9 +100,8 @@ def story() -> tuple[SimulatedScene, Config, tuple[Step, ...]]:
 def plain(view: View, labels: NDArray[np.int32] | None = None, graph: SupportGraph | None = None) -> Picture:
     """A view, and its segments where labels are given, without the shapes."""
     none = np.zeros(view.depth.shape, np.int32)
-    return draw_image(
-        view, none if labels is None else labels, graph or SupportGraph(), view.depth.shape[1], small=True
-    )
+    shown = none if labels is None else labels
+    return draw_image(view, shown, graph or SupportGraph(), view.depth.shape[1], shapes=False)
 
 
 def planes(step: Step, supports: Sequence[Support]) -> Picture:
@@ -117,10 +110,8 @@ def planes(step: Step, supports: Sequence[Support]) -> Picture:
     assert view is not None
     base, projection = plain(view), Projection(view.pose, view.K, view.depth)
 
-    def draw(figure: Any, where: tuple[float, float, float, float]) -> None:
-        base.draw(figure, where)
-        height, width = view.depth.shape
-        axes, unit = stage(figure, where, (width, height))
+    def draw(axes: Axes) -> None:
+        base.draw(axes)
         for support in supports:
             at, normal = support.contact_world, support.normal_world
             if at is None or normal is None:
@@ -131,14 +122,7 @@ def planes(step: Step, supports: Sequence[Support]) -> Picture:
             corners = [at + PLANE * (a * u + b * v) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
             axes.fill(*projection.project(np.array(corners))[0].T, color=colour, alpha=0.5)
             foot, head = projection.project(np.stack([at, at + NORMAL * normal]))[0]
-            style = {
-                "arrowstyle": "-|>",
-                "color": colour,
-                "linewidth": 3.0 * unit,
-                "shrinkA": 0,
-                "shrinkB": 0,
-            }
-            axes.annotate("", tuple(head), tuple(foot), arrowprops=style)
+            axes.arrow(*foot, *(head - foot), color=colour, width=2.0, length_includes_head=True)
 
     return Picture(f"separating planes of {len(supports)} supports", base.width, base.height, draw)
 

@@ -15,7 +15,6 @@ from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.viz.drawings import Projection
-from caryatid.viz.report import Report, render_html
 
 SMALL = ReportConfig(image_width=160)
 K = np.array([[200.0, 0.0, 79.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
@@ -99,8 +98,3 @@ def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
 
 def good(f1: float) -> dict[str, float]:
     return {"precision": f1 + 0.02, "recall": f1 - 0.02, "f1": f1}
-
-
-def render_report(pages, **said) -> str:
-    """The HTML of a report of these pages."""
-    return render_html(Report(pages=pages, **said))

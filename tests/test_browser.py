@@ -98,7 +98,7 @@ def test_a_click_on_an_object_says_what_falls_without_it(live, tab):
     tab.page.mouse.click(*pixel_of(page, side, tab))
     tab.wait_for_text("Without o1")
     tab.wait_for_text("falls:")
-    assert "o2" in tab.page.locator(".caryatid").last.inner_text()
+    assert "o2" in tab.page.locator(".caryatid-cell").last.inner_text()
 
 
 def test_a_view_is_chosen_by_hand(live, tab):

@@ -105,20 +105,13 @@ def test_each_is_one_piece_of_markup_that_loads_and_runs_nothing(shown):
         assert len(html) < 100_000, name
 
 
-def test_styles_reach_no_further_than_the_cell(scene):
-    style = re.search(r"<style>(.*?)</style>", scene._repr_html_(), re.S)[1]
-    rules = [rule.strip() for rule in re.split(r"}", style) if rule.strip()]
-    assert len(rules) > 10
-    for rule in rules:
-        assert all(
-            part.strip().startswith(".caryatid-cell")
-            for part in re.split(r",(?![^(]*\))", rule.split("{")[0])
-        )
-
-
-def test_text_takes_the_colour_of_the_page(scene):
+def test_the_style_is_the_cells_own_and_its_colours_are_the_pages(scene):
     """A colour of its own would be lost on a dark page, or on a light one."""
     style = re.search(r"<style>(.*?)</style>", scene._repr_html_(), re.S)[1]
+    rules = [rule.split("{")[0] for rule in style.split("}") if rule.strip()]
+    parts = [part for rule in rules for part in re.split(r",(?![^(]*\))", rule)]
+    assert len(rules) > 10
+    assert all(part.strip().startswith(".caryatid-cell") for part in parts)
     assert "background: #" not in style
     assert not re.search(r"[{;]\s*color:(?!\s*inherit)", style)
     assert "--ink: currentColor" in style
@@ -144,35 +137,26 @@ def test_names_from_outside_are_escaped(scene, steps, views):
         assert "alert(1)" in words(html), type(thing)
 
 
-def test_a_scene_says_what_it_knows(scene):
+def test_facts_are_told(shown, scene, steps):
+    said = {
+        "scene": "3 views",
+        "graph": "2 objects, 2 supports",
+        "box": "100 × 200 × 0 mm",
+        "cylinder": "⌀ 80 × 200 mm",
+        "sphere": "⌀ 100 mm",
+        "order": "not safe",
+        "view": "160 × 120 px",
+        "view of depth": "pose not known",
+        "scene of nothing": "nothing has been seen yet",
+        "first step": steps[0].decision.why,
+        "last step": "2 views were asked for",
+    }
+    for name, fact in said.items():
+        assert fact in words(shown[name]._repr_html_()), name
+    assert "risk 25%" in words(shown["order"]._repr_html_())
     html = scene._repr_html_()
-    assert "3 views" in words(html)
-    assert "2 objects, 2 supports" in words(html)
-    for label in (1, 2):
-        assert object_colour(label) in html
     assert html.count("<svg") == 2
-
-
-def test_a_step_says_what_comes_next_or_why_it_stops(shown, steps):
-    assert steps[0].decision.why in words(shown["first step"]._repr_html_())
-    assert "2 views were asked for" in words(shown["last step"]._repr_html_())
-
-
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [
-        ("box", "100 × 200 × 0 mm"),
-        ("cylinder", "⌀ 80 × 200 mm"),
-        ("sphere", "⌀ 100 mm"),
-        ("order", "not safe"),
-        ("order", "risk 25%"),
-        ("view", "160 × 120 px"),
-        ("view of depth", "pose not known"),
-        ("scene of nothing", "nothing has been seen yet"),
-    ],
-)
-def test_facts_are_told(shown, name, said):
-    assert said in words(shown[name]._repr_html_())
+    assert all(object_colour(label) in html for label in (1, 2))
 
 
 def test_what_has_no_cell_is_an_error():
@@ -204,26 +188,6 @@ def test_plain_lines_tell_one_from_another():
     assert many.endswith("…)")
     candidates = Candidates(np.empty((0, 4, 4)), np.empty((0, 3)), np.empty(0), {"too low": 3})
     assert repr(candidates) == "Candidates(0; refused: 3 too low)"
-
-
-def test_a_scene_opens_the_viewer_in_the_page(views):
-    pytest.importorskip("viser")
-    scene = ct.Scene()
-    scene.update(views[0])
-    handle = scene.show()
-    try:
-        assert handle.url.startswith("http://127.0.0.1:")
-        assert f'<iframe src="{handle.url}"' in handle._repr_html_()
-        scene.update(views[1])
-        handle.update(scene)
-    finally:
-        handle.close()
-
-
-def test_without_the_viewer_the_error_names_the_extra(scene, monkeypatch):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(ct.InputError, match=re.escape('pip install "caryatid[view]"')):
-        scene.show()
 
 
 def test_nothing_is_drawn_before_somebody_asks():

@@ -13,8 +13,9 @@ from sphinx_gallery.scrapers import figure_rst
 from caryatid.fitting import primitives
 from caryatid.scene import Scene
 from caryatid.simulation.camera import SimulatedCamera
-from caryatid.viz.drawings import draw_solid, picture_png
+from caryatid.viz.drawings import draw_solid
 from caryatid.viz.graph_drawing import draw_graph
+from caryatid.viz.pictures import picture_png
 
 _seen: dict[str, Any] = {}
 """The last of each kind of what the program that runs has made."""
@@ -51,7 +52,7 @@ def take_picture(block: Any, variables: dict[str, Any], configuration: Any) -> s
     if graph is not None:
         path.write_bytes(picture_png(draw_graph(graph)))
     elif fit is not None:
-        path.write_bytes(picture_png(draw_solid(fit.shape, "#e69f00")))
+        path.write_bytes(picture_png(draw_solid(fit.shape)))
     else:
         Image.fromarray(view.rgb).save(path)
     _seen.clear()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ class View(ExploringCommand):
                 out.result({"address": page.url, "source": self.source})
             out.say(f"{self.source} at {page.url}; Ctrl-C ends")
             if not self.no_browser:
-                page.open_browser()
+                webbrowser.open(page.url)
             wait_for_interrupt()
 
     def _open_run(self, stack: ExitStack) -> Page:
@@ -128,7 +129,7 @@ def watched(name: str, config: Config, out: Output) -> Iterator[PageProcess]:
 
     page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
     out.say(f"{name} at {page.url}")
-    page.open_browser()
+    webbrowser.open(page.url)
     try:
         yield page
         out.say(f"the page stays at {page.url}; Ctrl-C ends")

@@ -15,9 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Shown", "show"]
 
-HEIGHT = 620
-"""Height of the page within a notebook [px]."""
-
 
 @dataclass(frozen=True, slots=True)
 class Shown:
@@ -43,9 +40,8 @@ class Shown:
         self.page.close()
 
     def _repr_html_(self) -> str:
-        """The page within a notebook."""
         source = escape(self.url, quote=True)
-        return f'<iframe src="{source}" width="100%" height="{HEIGHT}" style="border:0"></iframe>'
+        return f'<iframe src="{source}" width="100%" height="620" style="border:0"></iframe>'
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Shown:

@@ -19,11 +19,6 @@ from caryatid.runtime.threads import cores
 from caryatid.viewer.loop import Loop, candidate_under, taken_apart
 from caryatid.viewer.page import Page
 
-PICTURE_TIME = 0.12
-"""How long each picture of a lift is shown [s]."""
-WITHIN = np.deg2rad(6.0)
-"""How far from a click on the view sphere the view may be that is taken for it [rad]."""
-
 
 class Controls:
     """Buttons that work a loop, and the one thread that does the work.
@@ -42,23 +37,9 @@ class Controls:
         self._build()
 
     def start(self) -> None:
-        """Take the first view."""
-        self._do("taking the first view", self._turn)
-
-    def next_view(self) -> None:
-        """Take one turn of the loop."""
+        """Take the first view, or the next."""
         self._running.clear()
         self._do("taking a view", self._turn)
-
-    def run(self) -> None:
-        """Take turn after turn, until the loop would end by itself or `pause` is pressed."""
-        if not self._running.is_set():
-            self._running.set()
-            self._do("running", self._run_on)
-
-    def pause(self) -> None:
-        """Stop after the view that is being taken, or the lift that is being played."""
-        self._running.clear()
 
     def wait(self) -> None:
         """Wait until all that has been asked for is done and drawn."""
@@ -72,30 +53,35 @@ class Controls:
         self._worker.shutdown(wait=True, cancel_futures=True)
 
     def _build(self) -> None:
-        gui = self._page.server.gui
-        names = [*BUILT_IN, *sorted(offered()), *([ORACLE] if self._loop.planner == ORACLE else [])]
+        gui, loop = self._page.server.gui, self._loop
+        names = [*BUILT_IN, *sorted(offered()), *([ORACLE] if loop.planner == ORACLE else [])]
         with gui.add_folder("loop", order=-10):
-            self._next = self._button("next view", self.next_view, "Take one turn of the loop", 1)
-            self._go = self._button("run", self.run, "Take turn after turn", 2)
-            self._pause = self._button("pause", self.pause, "Stop after this turn", 3)
-            self._planner = gui.add_dropdown("planner", names, initial_value=self._loop.planner, order=4)
-            fusions = get_args(FusionMethod)
-            self._fusion = gui.add_dropdown("fusion", fusions, initial_value=self._loop.fusion, order=5)
+            self._next = self._button("next view", self.start, "Take one turn of the loop")
+            self._go = self._button("run", self._run, "Take turn after turn")
+            self._pause = self._button("pause", self._running.clear, "Stop after this turn")
+            self._planner = gui.add_dropdown("planner", names, initial_value=loop.planner)
+            self._fusion = gui.add_dropdown("fusion", get_args(FusionMethod), initial_value=loop.fusion)
             hint = "Then click the view sphere: the view you point at is taken next"
-            self._by_hand = gui.add_checkbox("choose the next view by hand", False, hint=hint, order=6)
+            self._by_hand = gui.add_checkbox("choose the next view by hand", False, hint=hint)
             hint = "Find a safe order to take everything away, and play it"
-            self._dismantle = self._button("dismantle", self.dismantle, hint, 7)
+            self._dismantle = self._button("dismantle", self._play_order, hint)
         self._pause.disabled = True
         self._planner.on_update(lambda _: self._do("planning again", self._replan))
         self._fusion.on_update(lambda _: self._do("taking the same views again", self._fuse_anew))
         self._by_hand.on_update(lambda _: self._listen(self._by_hand.value))
 
-    def _button(self, label: str, press: Callable[[], None], hint: str, order: int) -> Any:
-        button = self._page.server.gui.add_button(label, hint=hint, order=order)
+    def _button(self, label: str, press: Callable[[], None], hint: str) -> Any:
+        button = self._page.server.gui.add_button(label, hint=hint)
         button.on_click(lambda _: press())
         return button
 
-    def dismantle(self) -> None:
+    def _run(self) -> None:
+        """Take turn after turn, until the loop would end by itself or `pause` is pressed."""
+        if not self._running.is_set():
+            self._running.set()
+            self._do("running", self._run_on)
+
+    def _play_order(self) -> None:
         """Find a safe order and play it: in physics where there is a simulation, else as the order says."""
         if self._loop.moments and not self._running.is_set():
             self._running.set()
@@ -121,9 +107,8 @@ class Controls:
             self._worker.submit(done)
 
     def _say(self, text: str, *, busy: bool) -> None:
-        ended = self._loop.ended is not None
         self._page.say(text)
-        self._next.disabled = self._go.disabled = busy or ended
+        self._next.disabled = self._go.disabled = busy or self._loop.ended is not None
         self._pause.disabled = not busy
         self._dismantle.disabled = busy or not self._loop.moments
         self._planner.disabled = self._fusion.disabled = busy
@@ -137,7 +122,6 @@ class Controls:
         return self._loop.pause
 
     def _run_on(self) -> str | None:
-        said = None
         while self._running.is_set() and not self._closed:
             said = self._turn()
             if said is not None or self._loop.ended is not None:
@@ -170,17 +154,14 @@ class Controls:
             scene.on_click()(self._pointed)
 
     def _pointed(self, event: Any) -> None:
+        """Take the candidate within 6° of a click next, whatever the planner says."""
         step = self._loop.moments[-1].step if self._loop.moments else None
         if step is None or step.candidates is None:
             return
         origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
-        index = candidate_under(origin, direction, step.sphere, step.candidates, WITHIN)
+        index = candidate_under(origin, direction, step.sphere, step.candidates, np.deg2rad(6.0))
         if index is not None:
-            self.choose(index)
-
-    def choose(self, index: int) -> None:
-        """Take this candidate next, whatever the planner says."""
-        self._do("choosing", lambda: self._choose(index))
+            self._do("choosing", lambda: self._choose(index))
 
     def _choose(self, index: int) -> str:
         planned = self._loop.planned
@@ -203,5 +184,5 @@ class Controls:
             if done:
                 said = done
                 self._page.say(said)
-            time.sleep(PICTURE_TIME)
+            time.sleep(0.12)  # Each picture of a lift stands for so long [s].
         return f"{order.refusal or 'a safe order'}; {said}"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,15 +22,13 @@ from caryatid.planning.decision import Decision, Planner
 from caryatid.planning.planners import ORACLE
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.lifting import ASIDE
+from caryatid.simulation.world import SimulatedScene
 from caryatid.viewer.drawing import Moment
 
 if TYPE_CHECKING:
     from caryatid.planning.candidates import Candidates
     from caryatid.sensing.view_sphere import ViewSphere
     from caryatid.sources import Source
-
-PICTURES, RISE = 8, 0.5
-"""Pictures of a lift that is not simulated, and how far up such a lift goes [m]."""
 
 
 class Loop:
@@ -74,22 +72,9 @@ class Loop:
 
     def _begin(self) -> None:
         self.source = source = self._open_source(self.config)
-        self._first, camera = planner_for(
-            self._began_with,
-            source.camera,
-            source.truth,
-            self.config,
-            segmentation=self._segmentation,
-            seed=self._seed,
-        )
-        self._explorer = Explorer(
-            camera,
-            source.robot,
-            planner=self._planner(),
-            config=self.config,
-            segmentation=self._segmentation,
-            seed=self._seed,
-        )
+        how: dict[str, Any] = {"segmentation": self._segmentation, "seed": self._seed}
+        self._first, camera = planner_for(self._began_with, source.camera, source.truth, self.config, **how)
+        self._explorer = Explorer(camera, source.robot, planner=self._planner(), config=self.config, **how)
         self.moments: list[Moment] = []
         self.planned: Decision | None = None
         self.ended: str | None = None
@@ -155,12 +140,15 @@ class Loop:
             if moment is None:
                 return
             own, taken = moment.step.decision, before.step.decision
-            if taken is None or before is earlier[-1]:
+            same = (
+                own is not None
+                and taken is not None
+                and np.array_equal(own.T_world_camera, taken.T_world_camera)
+            )
+            if taken is None or same or before is earlier[-1]:
                 yield moment
-            elif own is None or not np.array_equal(own.T_world_camera, taken.T_world_camera):
-                yield self._go_to(taken, by_hand=before.by_hand)
             else:
-                yield moment
+                yield self._go_to(taken, by_hand=before.by_hand)
 
     def choose(self, index: int) -> Moment:
         """Go to this candidate next, whatever the planner says.
@@ -223,16 +211,16 @@ def taken_apart(
     """
     gone: set[str] = set()
     camera = source.camera
-    simulated = isinstance(camera, SimulatedCamera) and source.truth is not None
-    lifts = _lifts_in_physics(step, steps, source, config) if simulated else _lifts_as_ordered(steps)
-    for number, (taken, moved, disturbed) in enumerate(lifts):
-        for T_world_world in moved:
+    lifts = _lifts_as_ordered(steps)
+    if isinstance(camera, SimulatedCamera) and source.truth is not None:
+        lifts = _lifts_in_physics(camera.scene, steps, bodies_of(step.graph, source.truth), config)
+    for number, (taken, pictures, disturbed) in enumerate(lifts, start=1):
+        for T_world_world in pictures:
             yield _without(step, gone, taken.object_id, T_world_world), ""
         gone.add(taken.object_id)
         harm = f", {', '.join(disturbed)} disturbed" if disturbed else ""
-        text = f"{number + 1} of {len(steps)} taken: {taken.object_id}{harm}"
-        last = {} if not moved else {i: T for i, T in moved[-1].items() if i != taken.object_id}
-        yield _without(step, gone, taken.object_id, last), text
+        text = f"{number} of {len(steps)} taken: {taken.object_id}{harm}"
+        yield _without(step, gone, taken.object_id, pictures[-1] if pictures else {}), text
 
 
 Lift = tuple[TakeStep, list[dict[str, Array]], tuple[str, ...]]
@@ -240,37 +228,32 @@ Lift = tuple[TakeStep, list[dict[str, Array]], tuple[str, ...]]
 
 
 def _lifts_in_physics(
-    step: Step, steps: Sequence[TakeStep], source: Source, config: Config
+    scene: SimulatedScene, steps: Sequence[TakeStep], bodies: Mapping[str, str], config: Config
 ) -> Iterator[Lift]:
     """Take the scene apart in physics; the extracted shapes move as the bodies they stand for do."""
-    camera, truth = source.camera, source.truth
-    if not isinstance(camera, SimulatedCamera) or truth is None:
-        return
-    bodies = bodies_of(step.graph, truth)
-    names = list(camera.scene.object_bodies.values())
-    began = transforms.invert(_transforms(poses_of(camera.scene)))
-    for taken in dismantle(camera.scene, steps, bodies, config):
-        lifted = names.index(taken.body or names[0])
+    names = list(scene.object_bodies.values())
+    began = transforms.invert(_transforms(poses_of(scene)))
+    for taken in dismantle(scene, steps, bodies, config):
         pictures = []
         for state in taken.film:
-            if state[lifted, 2] < ASIDE / 2.0:
+            if taken.body is not None and state[names.index(taken.body), 2] < ASIDE / 2.0:
                 now = _transforms(state) @ began
                 pictures.append({i: now[names.index(body)] for i, body in bodies.items()})
         yield taken.step, pictures, taken.disturbed
 
 
 def _lifts_as_ordered(steps: Sequence[TakeStep]) -> Iterator[Lift]:
-    """Take objects straight up, where there is no physics to ask."""
+    """Take objects straight up by half a metre, where there is no physics to ask."""
     for step in steps:
-        heights = np.linspace(0.0, RISE, PICTURES)[1:]
+        heights = np.linspace(0.0, 0.5, 8)[1:]
         yield step, [{step.object_id: transforms.rigid(np.eye(3), (0.0, 0.0, h))} for h in heights], ()
 
 
-def _without(step: Step, gone: set[str], lifted: str, T_world_world: dict[str, Array]) -> Step:
+def _without(step: Step, gone: set[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:
     """A step as it looks while an object is being lifted and others are gone."""
-    graph = step.graph
+    graph, cloud = step.graph, step.cloud
     objects = tuple(
-        replace(o, shape=o.shape.moved(T_world_world[o.id])) if o.id in T_world_world else o
+        replace(o, shape=o.shape.moved(T_world_world.get(o.id, np.eye(4))))
         for o in graph.objects
         if o.id not in gone
     )
@@ -281,7 +264,6 @@ def _without(step: Step, gone: set[str], lifted: str, T_world_world: dict[str, A
     )
     moved = {i for i, T in T_world_world.items() if np.abs(T - np.eye(4)).max() > 2e-3}
     away = [o.label for o in graph.objects if o.id in gone | moved]
-    cloud = step.cloud
     if away and cloud.labels is not None:
         cloud = cloud.select(~np.isin(cloud.labels, away))
     shown = replace(graph, objects=objects, supports=supports)

@@ -4,34 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import webbrowser
-from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
-from html import escape
 from threading import RLock
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
 from caryatid.support.relations import predict_removal
 from caryatid.viewer import panels
-from caryatid.viewer.drawing import LAYERS, Moment, SceneDrawing, reduced
+from caryatid.viewer.drawing import LAYERS, NEXT, Moment, SceneDrawing
 from caryatid.viz.colours import SERIES
-
-POINT_SIZE = 0.003
-"""Diameter of a point at first [m]."""
-ACCENT = (11, 92, 148)
-FIELD_OF_VIEW = 0.72
-"""Of the eye [rad]; narrow, so that what is near does not hide what is far."""
-FAR, NEAR = 3.2, 1.7
-"""How far from the scene the eye begins over the floor [m]: with all cameras in sight, or the table only."""
-BESIDE = 380
-"""Width of the panel with the graph [px]."""
+from caryatid.viz.notebook import cell_html
+from caryatid.viz.report import Section
 
 
 class Page:
@@ -49,6 +36,9 @@ class Page:
 
     Attributes:
         url: Where the page is.
+        server: The `viser.ViserServer`, for controls of one's own.
+        drawing: The scene in the page.
+        moments: What has been added so far.
         working: Held by whoever runs compiled kernels, which not every threading layer lets two threads do.
 
     Raises:
@@ -65,78 +55,47 @@ class Page:
         small: bool = False,
     ) -> None:
         self.working = RLock()
+        self.server: Any = _serve(title, host, port)
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
+        self.moments: list[Moment] = []
+        self.drawing = SceneDrawing(self.server, self.choose)
         self._support = support or SupportConfig()
-        self._server = server = _serve(title, host, port)
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}"
-        self._moments: list[Moment] = []
         self._shown = -1
         self._chosen = ""
         self._staged: Moment | None = None
         self._graph_drawn: SupportGraph | None = None
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
-        server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=ACCENT)
-        server.scene.set_up_direction("+z")
-        self._drawing = SceneDrawing(server, self.choose)
-        self._distance = NEAR if small else FAR
-        self._build(small)
-
-    @property
-    def server(self) -> Any:
-        """The `viser.ViserServer`, for controls of one's own."""
-        return self._server
-
-    @property
-    def moments(self) -> tuple[Moment, ...]:
-        """What has been added so far."""
-        return tuple(self._moments)
+        self._small = small
+        self._build()
 
     @property
     def shown(self) -> Moment | None:
         """The moment on display."""
-        return self._moments[self._shown] if self._moments else None
-
-    @property
-    def drawing(self) -> SceneDrawing:
-        """The scene in the page."""
-        return self._drawing
+        return self.moments[self._shown] if self.moments else None
 
     def say(self, text: str) -> None:
         """Say something at the top of the page, in place of what was said before."""
-        self._notice.content = panels.in_page(f"<p>{escape(text)}</p>")
+        self._notice.content = cell_html(Section("", text))
         self._notice.visible = bool(text)
-
-    def open_browser(self) -> None:
-        """Open the page in the user's browser, if there is one."""
-        webbrowser.open(self.url)
 
     def add(self, moment: Moment) -> None:
         """Add a moment, or put it in place of that of the same view; who looks at the newest goes along."""
-        newest = self._shown == len(self._moments) - 1
-        moment = replace(moment, step=reduced(moment.step))
-        if moment.step.index < len(self._moments):
-            self._moments[moment.step.index] = moment
-        else:
-            self._moments.append(moment)
-            if newest:
-                self._shown = len(self._moments) - 1
-        if len(self._moments) == 1:
+        newest = self._shown == len(self.moments) - 1
+        self.moments[moment.step.index : moment.step.index + 1] = [moment.reduced()]
+        if newest:
+            self._shown = len(self.moments) - 1
+        if len(self.moments) == 1:
             self._look_at(moment)
         self.redraw()
 
     def go_to(self, index: int) -> None:
         """Show the moment after a view."""
-        index = min(max(index, 0), len(self._moments) - 1)
+        index = min(max(index, 0), len(self.moments) - 1)
         if index != self._shown:
             self._shown = index
             self._staged = None
             self.redraw()
-
-    def look_from(self, eye_world: ArrayLike, target_world: ArrayLike) -> None:
-        """Have everybody look from one point (3,) at another (3,) [m]."""
-        for client in self._server.get_clients().values():
-            client.camera.position = np.asarray(eye_world, dtype=np.float64)
-            client.camera.look_at = np.asarray(target_world, dtype=np.float64)
 
     def choose(self, object_id: str) -> None:
         """Show what is known of an object."""
@@ -154,7 +113,7 @@ class Page:
         if self._pending is None or self._pending.running() or self._pending.done():
             with contextlib.suppress(RuntimeError):
                 self._pending = self._drawer.submit(self._draw)
-                self._pending.add_done_callback(_said)
+                self._pending.add_done_callback(_log_failure)
 
     def wait(self) -> None:
         """Wait until all that has been asked for is drawn; what went wrong meanwhile is raised."""
@@ -166,112 +125,98 @@ class Page:
         """Stop serving the page."""
         self._drawer.shutdown(wait=True, cancel_futures=True)
         with _silent():
-            self._server.stop()
+            self.server.stop()
 
-    def _build(self, small: bool) -> None:
-        gui = self._server.gui
+    def _build(self) -> None:
+        gui = self.server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=NEXT)
+        self.server.scene.set_up_direction("+z")
         self._notice = gui.add_html("", order=-20, visible=False)
         self._slider = gui.add_slider("view", 0, 1, 1, 0, disabled=True, hint="Go back to an earlier view")
         self._slider.on_update(lambda _: self.go_to(int(self._slider.value)))
         self._told = gui.add_html("")
         with gui.add_folder("show", expand_by_default=False, order=90):
             for name in LAYERS:
-                self._layer(name)
+                box = gui.add_checkbox(name, True)
+                box.on_update(lambda event, name=name: self.drawing.show_layer(name, event.target.value))
             self._true_colours = gui.add_checkbox("colours of the camera", False)
-            self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 1000.0 * POINT_SIZE)
+            self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 3.0)
         for control in (self._true_colours, self._size):
             control.on_update(lambda _: self.redraw())
-        panel = gui.add_panel()
+        panel, about = gui.add_panel(), gui.add_panel()
         with panel.add_tab("supports"):
             self._graph = gui.add_html("")
-        self._scores = panel.add_tab("F1")
-        with self._scores:
-            self._no_chart = gui.add_html(panels.in_page("<p>The truth is not known here.</p>"))
+        with panel.add_tab("F1"):
+            self._no_chart = gui.add_html(cell_html(Section("", "The ground truth is not known here.")))
+            self._chart = gui.add_uplot(
+                (np.zeros(1), np.zeros(1)),
+                ({"label": "view"}, {"label": "F1", "stroke": SERIES[0], "width": 2, "points": {"size": 7}}),
+                title="F1 after each view",
+                scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
+                aspect=1.6,
+                visible=False,
+            )
         with panel.add_tab("key"):
             gui.add_html(panels.describe_signs())
-        self._chart: Any = None
-        if not small:
+        with about.add_tab("object"):
+            told = "Click an object in the scene to see what is known of it."
+            self._about = gui.add_html(cell_html(Section("", told)))
+        if not self._small:
             gui.main_panel.dock_right()
         panel.dock_left()
-        panel.set_width(BESIDE)
-        about = gui.add_panel()
-        with about.add_tab("object"):
-            self._about = gui.add_html(panels.in_page(panels.NOTHING_CHOSEN))
+        panel.set_width(380)
         about.dock_below(panel)
-        if small:
+        if self._small:
             panel.minimize()
-
-    def _layer(self, name: str) -> None:
-        box = self._server.gui.add_checkbox(name, True)
-        box.on_update(lambda _: self._drawing.show_layer(name, box.value))
 
     def _look_at(self, moment: Moment) -> None:
         """Have the eye begin over the shoulder of the first camera, or before the middle of what is there."""
-        camera = self._server.initial_camera
+        camera = self.server.initial_camera
         centre = moment.step.sphere.centre_world
         backward = np.array([-1.0, -0.7, 0.0])
         if len(moment.step.visited):
             x, y = moment.step.visited[0][:2]
             backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
         backward /= max(float(np.linalg.norm(backward)), 1e-9)
+        distance = 1.7 if self._small else 3.2  # The table only, or all cameras in sight [m].
         camera.look_at = centre
-        camera.position = centre + self._distance * (backward + [0.0, 0.0, 0.7])
-        camera.fov = FIELD_OF_VIEW
+        camera.position = centre + distance * (backward + [0.0, 0.0, 0.7])
+        camera.fov = 0.72  # Narrow, so that what is near does not hide what is far [rad].
 
     def _draw(self) -> None:
         moment, chosen = self._staged or self.shown, self._chosen
         if moment is None:
             return
-        self._drawing.show(
+        self.drawing.show(
             moment,
-            [m.step for m in self._moments[: self._shown + 1]],
+            [m.step for m in self.moments[: self._shown + 1]],
             chosen=chosen,
             point_size=self._size.value / 1000.0,
             true_colours=self._true_colours.value,
         )
-        last = len(self._moments) - 1
+        last = len(self.moments) - 1
         self._slider.max = max(last, 1)
         self._slider.disabled = last == 0
         self._slider.value = self._shown
-        self._told.content = panels.describe_view(moment, len(self._moments))
+        self._told.content = panels.describe_view(moment, len(self.moments))
         graph = moment.step.graph
         if graph is not self._graph_drawn:
             self._graph_drawn = graph
             self._graph.content = panels.describe_graph(graph)
-        self._draw_scores()
+        scores = np.array([np.nan if m.score is None else m.score for m in self.moments])
+        if not np.isnan(scores).all():
+            self._chart.data = np.arange(len(scores), dtype=np.float64), scores
+            self._chart.visible, self._no_chart.visible = True, False
         if chosen:
-            self._about.content = self._object(moment, chosen)
-
-    def _object(self, moment: Moment, chosen: str) -> str:
-        item = next((o for o in moment.step.graph.objects if o.id == chosen), None)
-        effects = None
-        if item is not None and item.role == "object":
-            with self.working:
-                effects = predict_removal(moment.step.graph, chosen, self._support)
-        return panels.describe_object(moment.step.graph, chosen, effects)
-
-    def _draw_scores(self) -> None:
-        scores = [np.nan if m.score is None else m.score for m in self._moments]
-        if np.isnan(scores).all():
-            return
-        x = np.arange(len(scores), dtype=np.float64)
-        data = (x, np.array(scores, dtype=np.float64))
-        if self._chart is not None:
-            self._chart.data = data
-            return
-        self._no_chart.visible = False
-        with self._scores:
-            self._chart = self._server.gui.add_uplot(
-                data,
-                ({"label": "view"}, {"label": "F1", "stroke": SERIES[0], "width": 2, "points": {"size": 7}}),
-                title="F1 after each view",
-                scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
-                aspect=1.6,
-            )
+            effects = None
+            if any(o.id == chosen and o.role == "object" for o in graph.objects):
+                with self.working:
+                    effects = predict_removal(graph, chosen, self._support)
+            self._about.content = panels.describe_object(graph, chosen, effects)
 
 
-def _said(drawn: Future[None]) -> None:
-    """Say what went wrong in the thread that draws; the page then shows what it showed before."""
+def _log_failure(drawn: Future[None]) -> None:
+    """Log what went wrong in the thread that draws; the page then shows what it showed before."""
     error = None if drawn.cancelled() else drawn.exception()
     if error is not None:
         logging.getLogger(__name__).error("a view could not be drawn", exc_info=error)
@@ -301,7 +246,7 @@ def _serve(title: str, host: str, port: int) -> Any:
 
 
 @contextlib.contextmanager
-def _silent() -> Iterator[None]:
+def _silent() -> Any:
     """Keep viser from printing."""
     import rich
 

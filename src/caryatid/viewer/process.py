@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
-import webbrowser
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from queue import SimpleQueue
-from threading import Thread
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
-from caryatid.viewer.drawing import Moment, reduced
+from caryatid.viewer.drawing import Moment
 from caryatid.viewer.page import Page, needs_viser
-
-NICENESS = 10
-"""Of the drawing process: where cores are scarce, the loop goes first."""
 
 
 class PageProcess:
@@ -47,46 +42,30 @@ class PageProcess:
         try:
             self.url: str = self._connection.recv()
         except EOFError:
-            raise InputError(
-                "viewer", f"cannot be served at {host}:{port}", "choose another address"
-            ) from None
-        self._queue: SimpleQueue[Moment | None] = SimpleQueue()
-        self._sender = Thread(target=self._send, name="viewer", daemon=True)
-        self._sender.start()
-
-    def open_browser(self) -> None:
-        """Open the page in the user's browser, if there is one."""
-        webbrowser.open(self.url)
+            remedy = "choose another address"
+            raise InputError("viewer", f"cannot be served at {host}:{port}", remedy) from None
+        self._sender = ThreadPoolExecutor(1, "viewer")
 
     def add(self, moment: Moment) -> None:
-        """Add a moment; it is sent as soon as those before it are."""
-        self._queue.put(moment)
+        """Add a moment; it is sent as soon as those before it are, unless the page is gone."""
+        self._sender.submit(lambda: self._connection.send(moment.reduced()))
 
     def close(self) -> None:
         """Stop serving the page, once all that was added has been sent."""
-        self._queue.put(None)
-        self._sender.join()
+        self._sender.shutdown()
         self._connection.close()
         self._process.join()
-
-    def _send(self) -> None:
-        while (moment := self._queue.get()) is not None:
-            try:
-                self._connection.send(Moment(reduced(moment.step), moment.score, moment.by_hand))
-            except OSError:
-                return
 
 
 def _serve(connection: Connection, title: str, support: SupportConfig, host: str, port: int) -> None:
     """Serve a page and show the moments that come, until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
-        os.nice(NICENESS)
+        os.nice(10)  # Where cores are scarce, the loop goes first.
     page = Page(title, support, host=host, port=port)
     connection.send(page.url)
-    while True:
-        try:
+    try:
+        while True:
             page.add(connection.recv())
-        except EOFError:
-            break
-    page.close()
+    except EOFError:
+        page.close()

@@ -86,9 +86,10 @@ def striped_colours(labels: NDArray[np.int32], u: Array, v: Array, pitch: float)
 
 def label_colours(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Return the colours (..., 3) of an array of labels (...); 0 = belongs to no object."""
-    values, position = np.unique(labels, return_inverse=True)
-    table = [rgb(NOTHING_COLOUR if v == 0 else object_colour(int(v))) for v in values]
-    return np.array(table, dtype=np.uint8).reshape(-1, 3)[position].reshape(*labels.shape, 3)
+    table = np.zeros((int(labels.max(initial=0)) + 1, 3), dtype=np.uint8)
+    for label in np.flatnonzero(np.bincount(labels.ravel())):
+        table[label] = rgb(NOTHING_COLOUR if label == 0 else object_colour(int(label)))
+    return table[labels]
 
 
 def ink_on(colour: str) -> str:

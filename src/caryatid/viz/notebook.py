@@ -6,12 +6,10 @@ is small, loads nothing, runs no script, and takes its colours from the page aro
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import singledispatch
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from caryatid.exploration import Step
 from caryatid.geometry.shapes import Cylinder, Shape, Sphere
@@ -21,37 +19,20 @@ from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
 from caryatid.scene import Scene
 from caryatid.sensing.views import Cloud, View
-from caryatid.viz.colours import NOTHING_COLOUR, object_colour
-from caryatid.viz.drawings import Picture, draw_cloud, draw_image, draw_solid, picture_svg
+from caryatid.viz.colours import object_colour
+from caryatid.viz.drawings import draw_cloud, draw_image, draw_solid
 from caryatid.viz.graph_drawing import draw_graph
-from caryatid.viz.report import sensor_azimuth, template
-from caryatid.viz.tables import Table, census, object_table, order_table, point_table, size_of, support_table
-
-IMAGE_WIDTH = 320
-"""Width a camera's image is reduced to [px]; smaller than in the report."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cell:
-    """All a notebook shows of one object.
-
-    Attributes:
-        title: What it is.
-        lead: The rest of the first line.
-        note: A sentence below it.
-        facts: Names and values.
-        pictures: Pictures and their captions, side by side.
-        tables: Tables, one below the other.
-        colour: Colour of the chip before the title, `#rrggbb`, or empty.
-    """
-
-    title: str
-    lead: str = ""
-    note: str = ""
-    facts: tuple[tuple[str, str], ...] = ()
-    pictures: tuple[tuple[Picture, str], ...] = ()
-    tables: tuple[Table, ...] = ()
-    colour: str = ""
+from caryatid.viz.pictures import picture_svg
+from caryatid.viz.report import Figure, Section, sensor_azimuth, template
+from caryatid.viz.tables import (
+    census,
+    count_of,
+    object_table,
+    order_table,
+    point_table,
+    size_of,
+    support_table,
+)
 
 
 def draw_cell(shown: object) -> str:
@@ -64,81 +45,85 @@ def draw_cell(shown: object) -> str:
     Raises:
         TypeError: There is no cell for this kind of object.
     """
-    return template("cell.html.jinja").render(cell=_cell(shown), svg=picture_svg)
+    return cell_html(_cell_of(shown))
+
+
+def cell_html(section: Section) -> str:
+    """Write a section as one piece of HTML for a notebook or the viewer; every text in it is escaped."""
+    return template("cell.html.jinja").render(cell=section, svg=picture_svg)
 
 
 @singledispatch
-def _cell(shown: object) -> Cell:
+def _cell_of(shown: object) -> Section:
     raise TypeError(f"a {type(shown).__name__} has no cell of its own")
 
 
-@_cell.register
-def _of_scene(scene: Scene) -> Cell:
+@_cell_of.register
+def _of_scene(scene: Scene) -> Section:
     if scene.views == 0:
-        return Cell("Scene", "nothing has been seen yet", note="update(view) takes in a first view.")
-    graph = scene.graph
-    count = f"{scene.views} view{'s' * (scene.views > 1)}, {len(scene.cloud):,} points"
-    pictures = (_graph(graph), _cloud(scene.cloud, graph, scene.T_world_camera))
-    tables = (object_table(graph), support_table(graph))
-    return Cell("Scene", f"{count}, {census(graph)}", pictures=pictures, tables=tables)
+        return Section("Scene", "nothing has been seen yet; update(view) takes in a first view.")
+    lead = f"{count_of(scene.views, 'view')}, {len(scene.cloud):,} points, {census(scene.graph)}"
+    figures = (_graph(scene.graph), _cloud(scene.cloud, scene.graph, scene.T_world_camera))
+    return Section(
+        "Scene", lead, figures=figures, tables=(object_table(scene.graph), support_table(scene.graph))
+    )
 
 
-@_cell.register
-def _of_step(step: Step) -> Cell:
-    pictures: tuple[tuple[Picture, str], ...] = ()
+@_cell_of.register
+def _of_step(step: Step) -> Section:
+    figures = [_graph(step.graph)]
     if step.view is not None:
-        pictures = (_image(step.view, step.labels, step.graph, "segments and fitted shapes"),)
+        figures.insert(0, _image(step.view, step.labels, step.graph, "segments and fitted shapes"))
     travelled = f"{np.degrees(step.angle_travelled):.0f}° and {step.path_travelled:.1f} m travelled"
-    return Cell(
+    return Section(
         f"View {step.index}",
         f"{census(step.graph)}; {travelled}",
-        note=f"Next: {step.decision.why}" if step.decision is not None else f"Stopped: {step.stop}",
-        pictures=(*pictures, _graph(step.graph)),
+        figures,
+        [("next", step.decision.why) if step.decision is not None else ("stopped", f"{step.stop}")],
         tables=(object_table(step.graph), support_table(step.graph), point_table(step.decision)),
     )
 
 
-@_cell.register
-def _of_graph(graph: SupportGraph) -> Cell:
-    pictures = (_graph(graph),) if graph.objects else ()
-    return Cell(
-        "SupportGraph", census(graph), pictures=pictures, tables=(object_table(graph), support_table(graph))
+@_cell_of.register
+def _of_graph(graph: SupportGraph) -> Section:
+    figures = (_graph(graph),) if graph.objects else ()
+    return Section(
+        "SupportGraph", census(graph), figures=figures, tables=(object_table(graph), support_table(graph))
     )
 
 
-@_cell.register
-def _of_object(item: SceneObject) -> Cell:
-    cell = _of_shape(item.shape)
-    facts = [("found in", f"{item.occurrences} of {item.opportunities} views")]
-    facts += [("residual", f"{1e3 * item.residual:.1f} mm{', a poor fit' if item.poor_fit else ''}")]
-    facts += [("why", item.why)] if item.why else []
-    facts += [("doubtful", item.doubt)] if item.doubt else []
-    lead = "support surface" if item.role == "support_surface" else cell.title.lower()
-    colour = object_colour(item.label)
-    pictures = ((draw_solid(item.shape, colour), ""),)
-    return Cell(item.id, lead, facts=(*cell.facts, *facts), pictures=pictures, colour=colour)
+@_cell_of.register
+def _of_object(item: SceneObject) -> Section:
+    residual = f"{1e3 * item.residual:.1f} mm{', a poor fit' if item.poor_fit else ''}"
+    facts = [("found in", f"{item.occurrences} of {item.opportunities} views"), ("residual", residual)]
+    facts += [(name, said) for name, said in (("why", item.why), ("doubtful", item.doubt)) if said]
+    lead = "support surface" if item.role == "support_surface" else item.shape.kind
+    figures = (Figure("", draw_solid(item.shape, item.label)),)
+    return Section(item.id, lead, figures, (*_size(item.shape), *facts), colour=object_colour(item.label))
 
 
-@_cell.register(Shape)
-def _of_shape(shape: Shape) -> Cell:
+@_cell_of.register(Shape)
+def _of_shape(shape: Shape) -> Section:
+    return Section(type(shape).__name__, facts=_size(shape), figures=(Figure("", draw_solid(shape)),))
+
+
+def _size(shape: Shape) -> tuple[tuple[str, str], ...]:
     x, y, z = shape.T_world_object[:3, 3]
     facts = [("size", f"{size_of(shape)} mm"), ("centre", f"{x:.3f}, {y:.3f}, {z:.3f} m")]
     if not isinstance(shape, Sphere):
         vertical = np.abs(shape.T_world_object[2, :3])
         upright = vertical[2] if isinstance(shape, Cylinder) else vertical.max()
         facts.append(("leans", f"{np.degrees(np.arccos(min(upright, 1.0))):.0f}° off the vertical"))
-    facts.append(("volume", f"{1e6 * shape.volume:,.0f} cm³"))
-    return Cell(type(shape).__name__, facts=tuple(facts), pictures=((draw_solid(shape, NOTHING_COLOUR), ""),))
+    return (*facts, ("volume", f"{1e6 * shape.volume:,.0f} cm³"))
 
 
-@_cell.register
-def _of_view(view: View) -> Cell:
+@_cell_of.register
+def _of_view(view: View) -> Section:
     height, width = view.depth.shape
     labels = np.zeros(view.depth.shape, dtype=np.int32) if view.labels is None else view.labels
-    depth = view.depth[view.valid]
     readings = "none"
-    if depth.size:
-        near, far = np.percentile(depth, (1.0, 99.0))
+    if view.valid.any():
+        near, far = np.percentile(view.depth[view.valid], (1.0, 99.0))
         readings = f"{view.valid.mean():.0%} of the pixels, {near:.2f} to {far:.2f} m"
     facts = (
         ("size", f"{width} × {height} px"),
@@ -149,54 +134,47 @@ def _of_view(view: View) -> Cell:
         ("focal length", f"{view.K[0, 0]:.1f} px"),
     )
     caption = "segments" if view.rgb is not None else "depth: near is bright"
-    return Cell("View", view.name, facts=facts, pictures=(_image(view, labels, SupportGraph(), caption),))
+    return Section("View", view.name, facts=facts, figures=(_image(view, labels, SupportGraph(), caption),))
 
 
-@_cell.register
-def _of_cloud(cloud: Cloud) -> Cell:
-    pictures = (_cloud(cloud, SupportGraph(), None),) if len(cloud) else ()
-    return Cell("Cloud", f"{cloud.name}, {len(cloud):,} points", pictures=pictures)
+@_cell_of.register
+def _of_cloud(cloud: Cloud) -> Section:
+    figures = (_cloud(cloud, SupportGraph(), None),) if len(cloud) else ()
+    return Section("Cloud", f"{cloud.name}, {len(cloud):,} points", figures=figures)
 
 
-@_cell.register
-def _of_decision(decision: Decision) -> Cell:
+@_cell_of.register
+def _of_decision(decision: Decision) -> Section:
     facts = (
         ("camera", _pose(decision.T_world_camera)),
         ("saliency", f"{decision.saliency:.3f}"),
         ("path cost", f"{decision.cost:.3f}"),
         ("score", f"{decision.score:.3f}"),
     )
-    return Cell("Decision", decision.why, facts=facts, tables=(point_table(decision),))
+    return Section("Decision", decision.why, facts=facts, tables=(point_table(decision),))
 
 
-@_cell.register
-def _of_order(order: Order) -> Cell:
-    count = len(order.steps)
-    lead = f"{count} object{'s' * (count != 1)} to take, {'safe' if order.safe else 'not safe'}"
-    return Cell("Order", lead, note=order.refusal, tables=(order_table(order),))
-
-
-def _graph(graph: SupportGraph) -> tuple[Picture, str]:
-    return draw_graph(graph), "supporter → supported; dashed: uncertain"
-
-
-def _cloud(cloud: Cloud, graph: SupportGraph, T_world_camera: Array | None) -> tuple[Picture, str]:
-    picture = draw_cloud(cloud, graph, sensor_azimuth(cloud, T_world_camera))
-    return picture, "the points, with the shapes fitted to them" if graph.objects else "the points"
-
-
-def _image(view: View, labels: NDArray[np.int32], graph: SupportGraph, caption: str) -> tuple[Picture, str]:
-    """A view as small as it is shown, so that it is drawn in a quarter of the time."""
-    step = max(1, round(view.depth.shape[1] / IMAGE_WIDTH))
-    height, width = (n // step * step for n in view.depth.shape)
-    small = View(
-        depth=view.depth[:height:step, :width:step],
-        K=np.diag([1.0 / step, 1.0 / step, 1.0]) @ view.K,
-        T_world_camera=view.T_world_camera,
-        rgb=None if view.rgb is None else np.asarray(Image.fromarray(view.rgb[:height, :width]).reduce(step)),
-        name=view.name,
+@_cell_of.register
+def _of_order(order: Order) -> Section:
+    lead = f"{count_of(len(order.steps), 'object')} to take, {'safe' if order.safe else 'not safe'}"
+    return Section(
+        "Order", lead, facts=[("refused", order.refusal)] * bool(order.refusal), tables=(order_table(order),)
     )
-    return draw_image(small, labels[:height:step, :width:step], graph, IMAGE_WIDTH), caption
+
+
+def _graph(graph: SupportGraph) -> Figure:
+    return Figure("", draw_graph(graph), "supporter → supported; dashed: uncertain")
+
+
+def _cloud(cloud: Cloud, graph: SupportGraph, T_world_camera: Array | None) -> Figure:
+    picture = draw_cloud(cloud, graph, sensor_azimuth(cloud, T_world_camera))
+    return Figure(
+        "", picture, "the points, with the shapes fitted to them" if graph.objects else "the points"
+    )
+
+
+def _image(view: View, labels: NDArray[np.int32], graph: SupportGraph, caption: str) -> Figure:
+    return Figure("", draw_image(view, labels, graph, 400), caption)
 
 
 def _pose(T_world_camera: Array | None) -> str:

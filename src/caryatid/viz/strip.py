@@ -15,10 +15,12 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.dismantling import Taken, posed, poses_of
+from caryatid.sensing.views import View
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.world import SimulatedScene
-from caryatid.viz.drawings import draw_pixels, name_on, picture_png, tinted
+from caryatid.viz.drawings import draw_image
+from caryatid.viz.pictures import picture_png
 from caryatid.viz.report import Figure
 
 HEADROOM = 0.25
@@ -50,7 +52,6 @@ def draw_lifts(
     for label, name in scene.object_bodies.items():
         label_of[label] = found[name].label if name in found else 0
     K = _zoomed(intrinsics(config.sensor), poses_of(scene)[:, :3], T_world_camera, config)
-    stride = max(1, round(2 * config.sensor.width / config.report.image_width))
     figures = []
     for number, t in enumerate(taken, start=1):
         if t.body is None:
@@ -58,10 +59,9 @@ def draw_lifts(
         rising = np.flatnonzero(t.film[:, names.index(t.body), 2] < ASIDE / 2.0)
         moment = t.film[rising[(len(rising) - 1) // 2]] if t.ok else t.film[-1]
         image = render(posed(scene, moment), T_world_camera, K, config.sensor)
-        labels = label_of[image.labels][::stride, ::stride]
-        pixels = tinted(image.rgb[::stride, ::stride], labels, labels.shape[1])
-        tags = [tag for item in found.values() if (tag := name_on(item, labels)) is not None]
-        picture = draw_pixels(pixels, tags, f"lift {number}")
+        view = View(image.depth.astype(np.float32), K, rgb=image.rgb, name=f"lift {number}")
+        objects = SupportGraph(tuple(found.values()))
+        picture = draw_image(view, label_of[image.labels], objects, config.report.image_width // 2)
         held = f", {', '.join(t.step.hold)} held" if t.held else ""
         outcome = "Nothing else moved" if t.ok else f"{', '.join(t.disturbed)} moved"
         figures.append(Figure(f"{number}: {t.step.object_id}{held}", picture, f"{outcome}; {t.step.why}."))
@@ -85,10 +85,9 @@ def stored_figures(figures: Sequence[Figure]) -> dict[str, bytes]:
     """The pictures of lifts as files of a run folder: `lifts/NN.png`, with headings and captions in them."""
     files = {}
     for number, figure in enumerate(figures, start=1):
-        text = PngInfo()
+        text, buffer = PngInfo(), io.BytesIO()
         text.add_itxt("heading", figure.heading)
         text.add_itxt("caption", figure.caption)
-        buffer = io.BytesIO()
         Image.open(io.BytesIO(picture_png(figure.picture))).save(buffer, "PNG", pnginfo=text)
         files[f"lifts/{number:02d}.png"] = buffer.getvalue()
     return files
@@ -100,6 +99,8 @@ def read_figures(folder: Path) -> tuple[Figure, ...]:
     for path in sorted((folder / "lifts").glob("*.png")):
         with Image.open(path) as image:
             pixels, text = np.asarray(image.convert("RGB")), image.info
-        picture = draw_pixels(pixels, (), f"lift {path.stem}")
+        nothing = np.zeros(pixels.shape[:2], dtype=np.int32)
+        view = View(nothing.astype(np.float32), np.eye(3), rgb=pixels, name=f"lift {path.stem}")
+        picture = draw_image(view, nothing, SupportGraph(), pixels.shape[1])
         figures.append(Figure(text.get("heading", ""), picture, text.get("caption", "")))
     return tuple(figures)
