@@ -12,43 +12,32 @@ from caryatid.errors import InputError
 from caryatid.io import open_dataset, read_recording, read_run
 
 FORMAT = """
-from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 
 import numpy as np
 
 from caryatid import View
-from caryatid.io import Dataset
-
-
-@dataclass(frozen=True)
-class Frame:
-    path: Path
-    number: int
-    time: int
-    has_labels: bool = True
-
-    @property
-    def name(self):
-        return self.path.name
-
-    @property
-    def T_world_camera(self):
-        return np.load(self.path)["T_world_camera"]
-
-    def load(self):
-        with np.load(self.path) as members:
-            arrays = {key: members[key] for key in ("depth", "K", "T_world_camera", "labels")}
-        return View(**arrays, name=self.name)
+from caryatid.io import Dataset, Frame
 
 
 def recognises(path):
     return (path / "frames.npzs").is_file()
 
 
+def load(path):
+    with np.load(path) as members:
+        arrays = {key: members[key] for key in ("depth", "K", "T_world_camera", "labels")}
+    return View(**arrays, name=path.name)
+
+
 def open_dataset(path, config, options):
     files = sorted(path.glob("*.npz"))
-    return Dataset(path, [Frame(file, n, 10**9 * n) for n, file in enumerate(files)])
+    poses = [np.load(file)["T_world_camera"] for file in files]
+    frames = [
+        Frame(file.name, n, partial(load, file), T, time=10**9 * n, has_labels=True)
+        for n, (file, T) in enumerate(zip(files, poses))
+    ]
+    return Dataset(path, frames)
 """
 
 

@@ -553,17 +553,17 @@ def test_a_camera_at_rest_gives_one_view_the_sharpest():
     times = np.arange(10) / 30.0
     sharpness = np.full(10, 1.0)
     sharpness[6] = 1.2
-    choice = choose_views(times, sharpness, along_a_line(np.zeros(10)), CONFIG)
-    assert (choice.kept, choice.alike) == ((6,), 9)
+    chosen = choose_views(times, sharpness, along_a_line(np.zeros(10)), CONFIG)
+    assert chosen == ([6], {"seen from where another view is": 9})
 
 
 def test_blurred_frames_are_left_out_and_sharp_ones_beside_them_taken():
     times = np.arange(40) * 0.1
     sharpness = np.where(np.arange(40) % 3 == 0, 10.0, 5.0)
-    choice = choose_views(times, sharpness, along_a_line(times), CONFIG)
-    assert len(choice.kept) > 8
-    assert all(k % 3 == 0 for k in choice.kept)
-    assert choice.blurred == 26
+    kept, others = choose_views(times, sharpness, along_a_line(times), CONFIG)
+    assert len(kept) > 8
+    assert all(k % 3 == 0 for k in kept)
+    assert others["blurred"] == 26
 
 
 def test_a_turn_without_a_step_is_another_view_and_coming_back_is_not():
@@ -571,15 +571,14 @@ def test_a_turn_without_a_step_is_another_view_and_coming_back_is_not():
     poses = np.stack(
         [transforms.rigid(transforms.rotation_from_vector((0.0, a, 0.0)), np.zeros(3)) for a in turns]
     )
-    choice = choose_views(np.arange(5) * 1.0, np.ones(5), poses, CONFIG)
-    assert choice.kept == (0, 2)
+    assert choose_views(np.arange(5) * 1.0, np.ones(5), poses, CONFIG)[0] == [0, 2]
 
 
 def test_of_too_many_those_farthest_apart_stay():
     positions = np.concatenate([np.linspace(0.0, 2.0, 11), [10.0, 20.0]])
     config = RecordingConfig(max_views=3)
-    choice = choose_views(np.arange(13) * 1.0, np.ones(13), along_a_line(positions), config)
-    assert (choice.kept, choice.spare) == ((0, 11, 12), 10)
+    chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along_a_line(positions), config)
+    assert chosen == ([0, 11, 12], {"more than are wanted": 10})
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(1, 12))
@@ -592,11 +591,11 @@ def test_views_are_few_apart_and_every_frame_is_accounted_for(seed, count, most)
     if seed % 2:
         poses[:, :3, :3] = np.eye(3)
     config = RecordingConfig(max_views=most)
-    choice = choose_views(times, rng.uniform(0.5, 1.0, count), poses, config)
-    assert len(choice.kept) + choice.blurred + choice.alike + choice.spare == count
-    assert (count == 0) == (len(choice.kept) == 0)
-    assert len(choice.kept) <= most
-    assert list(choice.kept) == sorted(set(choice.kept))
-    for k in choice.kept:
-        others = [j for j in choice.kept if j != k]
-        assert (apart(poses[others], poses[k], config) > 1.0).all()
+    kept, others = choose_views(times, rng.uniform(0.5, 1.0, count), poses, config)
+    assert len(kept) + sum(others.values()) == count
+    assert (count == 0) == (len(kept) == 0)
+    assert len(kept) <= most
+    assert kept == sorted(set(kept))
+    for k in kept:
+        rest = [j for j in kept if j != k]
+        assert (apart(poses[rest], poses[k], config) > 1.0).all()

@@ -21,7 +21,6 @@ from caryatid.viz.colours import ink_on, object_colour, rgb
 
 if TYPE_CHECKING:
     import mujoco
-    from trimesh.visual.material import PBRMaterial
 
 ENDINGS: Final[dict[ExportFormat, tuple[str, ...]]] = {
     "mjcf": (".xml",),
@@ -32,11 +31,8 @@ ENDINGS: Final[dict[ExportFormat, tuple[str, ...]]] = {
 }
 """How files of each format end."""
 
-
 _ROOT = "world"
 """Name of a URDF's root link."""
-
-
 _Z_UP = "z_up"
 """Name of the node whose frame is caryatid's world; the file itself has y up, as glTF wants."""
 _T_FILE_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -80,22 +76,19 @@ def export_graph(
         raise InputError(path, f"does not end as {chosen} does", f"end its name in {endings}")
     if not graph.objects:
         raise InputError("the scene model", "holds no objects", "nothing was written")
-    content = _content(graph, path, chosen, config or ExportConfig())
-    write_file(path, content)
-
-
-def _content(graph: SupportGraph, path: Path, format_: ExportFormat, config: ExportConfig) -> bytes:
-    match format_:
+    config = config or ExportConfig()
+    match chosen:
         case "mjcf":
-            return to_mjcf(graph, config).encode()
+            content = to_mjcf(graph, config).encode()
         case "urdf":
-            return to_urdf(graph, config).encode()
+            content = to_urdf(graph, config).encode()
         case "gltf":
-            return to_gltf(graph, config, binary=path.suffix.lower() == ".glb")
+            content = to_gltf(graph, config, binary=path.suffix.lower() == ".glb")
         case "graphml":
-            return to_graphml(graph).encode()
+            content = to_graphml(graph).encode()
         case "dot":
-            return to_dot(graph).encode()
+            content = to_dot(graph).encode()
+    write_file(path, content)
 
 
 def to_mjcf(graph: SupportGraph, config: ExportConfig) -> str:
@@ -147,17 +140,21 @@ def to_urdf(graph: SupportGraph, config: ExportConfig) -> str:
         if item.id == _ROOT:
             raise InputError("the scene model", f"an object is called '{_ROOT}'", "rename it in graph.json")
         link = SubElement(robot, "link", name=item.id)
-        _add_inertia(link, item.shape, config.density)
+        mass, moments = config.density * item.shape.volume, item.shape.moments
+        inertial = SubElement(link, "inertial")
+        SubElement(inertial, "mass", value=_numbers(mass))
+        diagonal = {name: _numbers(mass * m) for name, m in zip(("ixx", "iyy", "izz"), moments, strict=True)}
+        SubElement(inertial, "inertia", diagonal | dict.fromkeys(("ixy", "ixz", "iyz"), "0"))
         for part in ("visual", "collision"):
             geometry = SubElement(SubElement(link, part), "geometry")
             SubElement(geometry, *_urdf_shape(item.shape))
         material = SubElement(link[1], "material", name=f"colour of {item.id}")
-        SubElement(material, "color", rgba=_numbers(_rgba(item)))
+        SubElement(material, "color", rgba=_numbers(*_rgba(item)))
         joint = SubElement(robot, "joint", name=f"{_ROOT}_to_{item.id}", type="fixed")
         SubElement(joint, "parent", link=_ROOT)
         SubElement(joint, "child", link=item.id)
-        T_world_object = item.shape.T_world_object
-        SubElement(joint, "origin", xyz=_numbers(T_world_object[:3, 3]), rpy=_numbers(_rpy(T_world_object)))
+        T = item.shape.T_world_object
+        SubElement(joint, "origin", xyz=_numbers(*T[:3, 3]), rpy=_numbers(*_rpy(T)))
     indent(robot)
     return tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
 
@@ -177,19 +174,10 @@ def _add_surface(spec: mujoco.MjSpec, item: SceneObject) -> None:
 def _urdf_shape(shape: Shape) -> tuple[str, dict[str, str]]:
     match shape:
         case Cylinder():
-            return "cylinder", {"radius": f"{shape.radius:.9g}", "length": f"{shape.height:.9g}"}
+            return "cylinder", {"radius": _numbers(shape.radius), "length": _numbers(shape.height)}
         case Sphere():
-            return "sphere", {"radius": f"{shape.radius:.9g}"}
-    return "box", {"size": _numbers(shape.extents)}
-
-
-def _add_inertia(link: Element, shape: Shape, density: float) -> None:
-    mass = density * shape.volume
-    inertial = SubElement(link, "inertial")
-    SubElement(inertial, "mass", value=f"{mass:.9g}")
-    diagonal = dict(zip(("ixx", "iyy", "izz"), (f"{mass * m:.9g}" for m in shape.moments), strict=True))
-    products: Mapping[str, str] = dict.fromkeys(("ixy", "ixz", "iyz"), "0")
-    SubElement(inertial, "inertia", {**diagonal, **products})
+            return "sphere", {"radius": _numbers(shape.radius)}
+    return "box", {"size": _numbers(*shape.extents)}
 
 
 def _rpy(T_world_object: Array) -> Array:
@@ -209,7 +197,7 @@ def _rgba(item: SceneObject) -> tuple[float, float, float, float]:
     return red / 255.0, green / 255.0, blue / 255.0, 1.0
 
 
-def _numbers(values: Array | tuple[float, ...]) -> str:
+def _numbers(*values: float) -> str:
     return " ".join(f"{value + 0.0:.9g}" for value in values)
 
 
@@ -225,34 +213,20 @@ def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb, export_gltf
+    from trimesh.visual.material import PBRMaterial
 
     scene = trimesh.Scene(base_frame="file")
     scene.graph.update(frame_from="file", frame_to=_Z_UP, matrix=_T_FILE_WORLD)
     for item in graph.objects:
         mesh = item.shape.mesh(config.corners)
-        mesh.visual = trimesh.visual.TextureVisuals(material=_material(item))
+        colour = [*rgb(object_colour(item.label)), 255]
+        material = PBRMaterial(name=item.id, baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8)
+        mesh.visual = trimesh.visual.TextureVisuals(material=material)
         mesh.metadata = {"role": item.role, "shape": item.shape.kind, "size": item.shape.size}
-        T_world_object = item.shape.T_world_object
-        scene.add_geometry(
-            mesh, node_name=item.id, geom_name=item.id, parent_node_name=_Z_UP, transform=T_world_object
-        )
-    if binary:
-        data: bytes = export_glb(scene)
-        return data
-    files = export_gltf(scene, embed_buffers=True)
-    text: bytes = files["model.gltf"]
-    return text
-
-
-def _material(item: SceneObject) -> PBRMaterial:
-    from trimesh.visual.material import PBRMaterial
-
-    return PBRMaterial(
-        name=item.id,
-        baseColorFactor=[*rgb(object_colour(item.label)), 255],
-        metallicFactor=0.0,
-        roughnessFactor=0.8,
-    )
+        names = {"node_name": item.id, "geom_name": item.id, "parent_node_name": _Z_UP}
+        scene.add_geometry(mesh, **names, transform=item.shape.T_world_object)
+    content: bytes = export_glb(scene) if binary else export_gltf(scene, embed_buffers=True)["model.gltf"]
+    return content
 
 
 def to_graphml(graph: SupportGraph) -> str:
@@ -268,7 +242,7 @@ def to_graphml(graph: SupportGraph) -> str:
 
     plain = nx.DiGraph()
     for item in graph.objects:
-        x, y, z = (float(value) for value in item.centre_world)
+        x, y, z = item.centre_world.tolist()
         size = item.shape.size
         lengths = size.values() if isinstance(size, Mapping) else size
         plain.add_node(
@@ -285,13 +259,8 @@ def to_graphml(graph: SupportGraph) -> str:
             opportunities=item.opportunities,
         )
     for support in graph.supports:
-        plain.add_edge(
-            *support.pair,
-            kind=support.kind,
-            certain=support.certain,
-            occurrences=support.occurrences,
-            opportunities=support.opportunities,
-        )
+        names = ("kind", "certain", "occurrences", "opportunities")
+        plain.add_edge(*support.pair, **{name: getattr(support, name) for name in names})
     return "\n".join(nx.generate_graphml(plain)) + "\n"
 
 

@@ -14,7 +14,7 @@ from caryatid.errors import InputError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.io.datasets import Dataset, format_of, open_dataset
-from caryatid.io.importing import FrameFilter
+from caryatid.io.importing import choose_frames
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.sensing.views import Camera
@@ -100,7 +100,7 @@ def open_recording(folder: str, config: Config, segmentation: SegmentationMethod
     """
     recording = open_dataset(folder, config.recording)
     if recording.is_video:
-        recording = replace(recording, frames=FrameFilter(config.recording).choose(recording)[0])
+        recording = replace(recording, frames=choose_frames(recording, config.recording)[0])
     if segmentation == "labels" and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()

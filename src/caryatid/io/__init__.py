@@ -7,19 +7,19 @@ from typing import TYPE_CHECKING
 from caryatid.runtime.late import imported_late
 
 if TYPE_CHECKING:
-    from caryatid.io.bop import RecordedFrame, Recording, read_recording, write_recording
+    from caryatid.io.bop import read_recording, write_recording
     from caryatid.io.datasets import Dataset, Format, Frame, OpenOptions, Topics, open_dataset
     from caryatid.io.graph_json import graph_from_json, graph_text, graph_to_json, read_graph
-    from caryatid.io.importing import FrameFilter, Imported, choose_views, import_recording
+    from caryatid.io.importing import Imported, choose_frames, choose_views, import_recording
     from caryatid.io.point_clouds import StoredCloud, read_cloud, read_stored_cloud
     from caryatid.io.runs import Run, RunView, RunWriter, read_run
     from caryatid.io.video import TransformTree
 
 _HOMES = {
-    "bop": ["RecordedFrame", "Recording", "read_recording", "write_recording"],
+    "bop": ["read_recording", "write_recording"],
     "datasets": ["Dataset", "Format", "Frame", "OpenOptions", "Topics", "open_dataset"],
     "graph_json": ["graph_from_json", "graph_text", "graph_to_json", "read_graph"],
-    "importing": ["FrameFilter", "Imported", "choose_views", "import_recording"],
+    "importing": ["Imported", "choose_frames", "choose_views", "import_recording"],
     "point_clouds": ["StoredCloud", "read_cloud", "read_stored_cloud"],
     "runs": ["Run", "RunView", "RunWriter", "read_run"],
     "video": ["TransformTree"],
@@ -29,17 +29,15 @@ __all__ = [
     "Dataset",
     "Format",
     "Frame",
-    "FrameFilter",
     "Imported",
     "OpenOptions",
-    "RecordedFrame",
-    "Recording",
     "Run",
     "RunView",
     "RunWriter",
     "StoredCloud",
     "Topics",
     "TransformTree",
+    "choose_frames",
     "choose_views",
     "graph_from_json",
     "graph_text",

@@ -17,7 +17,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io import images
-from caryatid.io.datasets import Dataset, OpenOptions
+from caryatid.io.datasets import Dataset, Frame, OpenOptions
 from caryatid.io.json_files import Numbers, json_text, parse_json, read_json
 from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import SUPPORT_LABEL, View, check_intrinsics
@@ -47,97 +47,8 @@ class _Masks:
     masks: list[_Mask]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class RecordedFrame:
-    """One recorded frame, checked but not decoded yet.
-
-    Attributes:
-        number: Its number in the recording.
-        name: Folder and number, which is also the view's name.
-        depth_path: 16-bit depth image.
-        depth_scale: One unit of depth [mm].
-        rgb_path: Colour image, or None where the recording has no colour.
-        masks: Mask file and label (`obj_id`) of each object, or None where the frame has no segmentation.
-        K: Pinhole matrix (3, 3) [px].
-        T_world_camera: Pose (4, 4), or None where it is not known.
-        size: Width and height [px].
-        time: 0: a recording's frames are all worth keeping.
-    """
-
-    number: int
-    name: str
-    depth_path: Path
-    depth_scale: float
-    rgb_path: Path | None
-    masks: tuple[tuple[Path, int], ...] | None
-    K: Array
-    T_world_camera: Array | None
-    size: tuple[int, int]
-    time: int = 0
-
-    @property
-    def has_labels(self) -> bool:
-        """Whether it has masks."""
-        return self.masks is not None
-
-    def load(self) -> View:
-        """Decode the frame.
-
-        Raises:
-            InputError: A file has gone or is broken, the depth image is empty, or masks overlap.
-        """
-        depth = images.read_depth(self.depth_path, self.depth_scale)
-        if not depth.any():
-            reason = "the frame is empty: no pixel has a depth reading"
-            raise InputError(self.depth_path, reason, "leave this frame out")
-        rgb = None if self.rgb_path is None else images.read_colour(self.rgb_path)
-        labels = None if self.masks is None else self.load_labels()
-        return View(depth, self.K, self.T_world_camera, rgb, labels, name=self.name)
-
-    def load_labels(self) -> NDArray[np.int32]:
-        """Decode the masks alone: object number of each pixel (H, W), 0 = nothing.
-
-        Raises:
-            InputError: The frame has no masks, one is broken, or two overlap.
-        """
-        if self.masks is None:
-            raise InputError(self.name, "has no masks", "add mask_visib/ and scene_gt.json")
-        labels = np.zeros(self.size[::-1], dtype=np.int32)
-        for path, label in self.masks:
-            mask = images.read_mask(path)
-            taken = labels[mask]
-            if taken.any():
-                other = int(taken[taken > 0][0])
-                raise InputError(
-                    path,
-                    f"overlaps the mask of obj_id {other} in {int((taken > 0).sum())} pixels",
-                    "give each pixel to one object",
-                )
-            labels[mask] = label
-        return labels
-
-
-@dataclass(frozen=True, eq=False)
-class Recording(Dataset):
-    """The frames of a recording in their order."""
-
-    frames: Sequence[RecordedFrame]
-
-    @property
-    def folder(self) -> Path:
-        """The scene folder."""
-        return self.path
-
-    def frame(self, name: str) -> RecordedFrame:
-        """Return the frame whose number ends `name`, as in a view's name.
-
-        Raises:
-            InputError: There is none.
-        """
-        for frame in self.frames:
-            if frame.name.rpartition("/")[2] == name.rpartition("/")[2]:
-                return frame
-        raise InputError(self.folder, f"has no frame '{name}'", "give the recording the run was made from")
+Masks = tuple[tuple[Path, int], ...]
+"""Mask file and label (`obj_id`) of each object in a frame."""
 
 
 def recognises(path: Path) -> bool:
@@ -147,7 +58,7 @@ def recognises(path: Path) -> bool:
     )
 
 
-def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Recording:
+def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:
     """Read a scene folder; see `read_recording`.
 
     Raises:
@@ -156,7 +67,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> R
     return read_recording(path)
 
 
-def read_recording(folder: str | Path) -> Recording:
+def read_recording(folder: str | Path) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
     Cameras and poses are checked here, and every image for being whole and of the right size and mode;
@@ -182,17 +93,16 @@ def read_recording(folder: str | Path) -> Recording:
             raise InputError(
                 path, "has no entry in scene_camera.json", "add its camera there, or take the image out"
             )
-    masks = _read_mask_table(folder, set(cameras))
-    frames = tuple(_read_frame(folder, n, cameras[n], masks.get(n), camera_path) for n in sorted(cameras))
+    masks = _read_masks(folder, set(cameras))
+    frames = tuple(
+        _read_frame(folder, n, cameras[n], masks.get(n), f"{camera_path}: frame {n}") for n in sorted(cameras)
+    )
     without = [f.number for f in frames if f.T_world_camera is None]
     if len(frames) > 1 and without:
-        raise InputError(
-            camera_path,
-            f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c), the first is frame "
-            f"{without[0]}",
-            "several frames need poses; without them give a single frame",
-        )
-    return Recording(folder, frames)
+        reason = f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c)"
+        reason += f", the first is frame {without[0]}"
+        raise InputError(camera_path, reason, "several frames need poses; without them give a single frame")
+    return Dataset(folder, frames)
 
 
 class RecordingWriter(StagedFolder):
@@ -268,36 +178,48 @@ def write_recording(folder: str | Path, views: Sequence[View], depth_scale: floa
         writer.finish()
 
 
-def _read_frame(
-    folder: Path, number: int, document: Any, masks: tuple[tuple[Path, int], ...] | None, source: Path
-) -> RecordedFrame:
-    name = f"{source}: frame {number}"
-    camera = parse_json(_Camera, document, name)
-    depth_path = folder / "depth" / f"{number:06d}.png"
+def _read_frame(folder: Path, number: int, document: Any, masks: Masks | None, source: str) -> Frame:
+    camera = parse_json(_Camera, document, source)
+    depth_path, rgb_path = folder / f"depth/{number:06d}.png", None
     size = images.check_image(depth_path, images.DEPTH_MODES, "a 16-bit grey PNG")
-    rgb_path = None
+    sizes = {path: images.check_image(path, images.MASK_MODES, "a grey PNG") for path, _ in masks or ()}
     if (folder / "rgb").is_dir():
-        paths = [folder / "rgb" / f"{number:06d}{ending}" for ending in COLOUR_ENDINGS]
+        paths = [folder / f"rgb/{number:06d}{ending}" for ending in COLOUR_ENDINGS]
         rgb_path = next((path for path in paths if path.exists()), paths[0])
-    for path in ([] if rgb_path is None else [rgb_path]) + [path for path, _ in masks or ()]:
-        other = images.check_image(path, None if path is rgb_path else images.MASK_MODES, "a grey PNG")
-        if other != size:
-            raise InputError(
-                path,
-                f"is {other[0]}×{other[1]} pixels, the depth image {depth_path} is {size[0]}×{size[1]}",
-                "register the images to one size",
-            )
-    return RecordedFrame(
-        number=number,
-        name=f"{folder.resolve().name}/{number:06d}",
-        depth_path=depth_path,
-        depth_scale=camera.depth_scale,
-        rgb_path=rgb_path,
-        masks=masks,
-        K=check_intrinsics(camera.cam_K.reshape(3, 3), f"{name}: cam_K"),
-        T_world_camera=_pose(camera, name),
-        size=size,
+        sizes[rgb_path] = images.check_image(rgb_path)
+    for path, (width, height) in sizes.items():
+        if (width, height) != size:
+            reason = f"is {width}×{height} pixels, the depth image {depth_path} is {size[0]}×{size[1]}"
+            raise InputError(path, reason, "register the images to one size")
+    K, T_world_camera = (
+        check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K"),
+        _pose(camera, source),
     )
+    name = f"{folder.resolve().name}/{number:06d}"
+
+    def load() -> View:
+        depth = images.read_depth(depth_path, camera.depth_scale)
+        if not depth.any():
+            reason = "the frame is empty: no pixel has a depth reading"
+            raise InputError(depth_path, reason, "leave this frame out")
+        rgb = None if rgb_path is None else images.read_colour(rgb_path)
+        labels = None if masks is None else _read_labels(masks, depth.shape)
+        return View(depth, K, T_world_camera, rgb, labels, name=name)
+
+    return Frame(name, number, load, T_world_camera, has_labels=masks is not None)
+
+
+def _read_labels(masks: Masks, shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """Object number of each pixel (H, W), 0 = nothing."""
+    labels = np.zeros(shape, dtype=np.int32)
+    for path, label in masks:
+        mask = images.read_mask(path)
+        taken = labels[mask & (labels > 0)]
+        if len(taken):
+            reason = f"overlaps the mask of obj_id {taken[0]} in {len(taken)} pixels"
+            raise InputError(path, reason, "give each pixel to one object")
+        labels[mask] = label
+    return labels
 
 
 def _pose(camera: _Camera, name: str) -> Array | None:
@@ -314,12 +236,11 @@ def _pose(camera: _Camera, name: str) -> Array | None:
     return transforms.invert(transforms.as_rigid(T_camera_world, f"{name}: cam_R_w2c"))
 
 
-def _read_mask_table(folder: Path, known: set[int]) -> dict[int, tuple[tuple[Path, int], ...]]:
+def _read_masks(folder: Path, known: set[int]) -> dict[int, Masks]:
     mask_folder, gt_path = folder / "mask_visib", folder / "scene_gt.json"
     if not mask_folder.is_dir():
         return {}
-    table: dict[int, tuple[tuple[Path, int], ...]] = {}
-    expected: set[Path] = set()
+    table: dict[int, Masks] = {}
     for frame, entries in _by_frame(gt_path, "masks need it: the obj_id of each").items():
         source = f"{gt_path}: frame {frame}"
         if frame not in known:
@@ -327,19 +248,16 @@ def _read_mask_table(folder: Path, known: set[int]) -> dict[int, tuple[tuple[Pat
         remedy = f'give one {{"obj_id": …}} for each mask, from 1 to {SUPPORT_LABEL - 1}'
         labels = [mask.obj_id for mask in parse_json(_Masks, {"masks": entries}, source, remedy).masks]
         for twice in {label for label in labels if labels.count(label) > 1}:
-            raise InputError(
-                source, f"two masks have obj_id {twice}", "number each object of the scene by itself"
-            )
-        paths = [mask_folder / f"{frame:06d}_{index:06d}.png" for index in range(len(labels))]
-        table[frame] = tuple(zip(paths, labels, strict=True))
-        expected.update(paths)
-    for path in sorted(mask_folder.glob("*.png")):
-        if path not in expected:
-            match = re.fullmatch(r"(\d{6})_(\d{6})", path.stem)
-            which = f"mask {int(match[2])} of frame {int(match[1])}" if match else "that name"
-            raise InputError(
-                path, f"names no object: scene_gt.json has no entry for {which}", "add its obj_id there"
-            )
+            reason = f"two masks have obj_id {twice}"
+            raise InputError(source, reason, "number each object of the scene by itself")
+        names = (f"{frame:06d}_{index:06d}.png" for index in range(len(labels)))
+        table[frame] = tuple((mask_folder / name, label) for name, label in zip(names, labels, strict=True))
+    expected = {path for masks in table.values() for path, _ in masks}
+    for path in sorted(set(mask_folder.glob("*.png")) - expected):
+        match = re.fullmatch(r"(\d{6})_(\d{6})", path.stem)
+        which = f"mask {int(match[2])} of frame {int(match[1])}" if match else "that name"
+        reason = f"names no object: scene_gt.json has no entry for {which}"
+        raise InputError(path, reason, "add its obj_id there")
     return table
 
 
@@ -356,9 +274,6 @@ def _by_frame(path: Path, remedy: str) -> dict[int, Any]:
 def _depth_units(view: View, depth_scale: float) -> NDArray[np.uint16]:
     units = np.rint(view.depth.astype(np.float64) * (1000.0 / depth_scale))
     if units.max() > np.iinfo(np.uint16).max:
-        raise InputError(
-            view.name,
-            f"depth reaches {view.depth.max():.1f} m, 16 bits of {depth_scale:g} mm do not",
-            "take a larger depth_scale",
-        )
+        reason = f"depth reaches {view.depth.max():.1f} m, 16 bits of {depth_scale:g} mm do not"
+        raise InputError(view.name, reason, "take a larger depth_scale")
     return units.astype(np.uint16)

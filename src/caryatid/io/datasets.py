@@ -7,12 +7,15 @@ An input format is a module or object with two functions, `recognises(path)` and
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Final, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from caryatid.config import RecordingConfig
 from caryatid.errors import InputError
@@ -35,42 +38,37 @@ SPARE: Final = "more than are wanted"
 """Why a frame does not become a view."""
 
 
-class Frame(Protocol):
-    """One frame of a dataset, not decoded yet."""
+@dataclass(frozen=True, eq=False, slots=True)
+class Frame:
+    """One frame of a dataset, not decoded yet.
 
-    @property
-    def name(self) -> str:
-        """Name of the view it becomes."""
-        ...
+    Attributes:
+        name: Name of the view it becomes.
+        number: Its number in the dataset.
+        load: Decodes it. Raises `caryatid.io.images.BrokenImageError` where other frames may be whole, and
+            another `InputError` where it does not fit the dataset.
+        T_world_camera: Camera pose (4, 4), or None where it is not known.
+        time: When it was taken [ns]; 0 where that does not matter.
+        has_labels: Whether its view has labels.
+    """
 
-    @property
-    def number(self) -> int:
-        """Its number in the dataset."""
-        ...
+    name: str
+    number: int
+    load: Callable[[], View]
+    T_world_camera: Array | None = None
+    time: int = 0
+    has_labels: bool = False
 
-    @property
-    def time(self) -> int:
-        """When it was taken [ns]; 0 where that does not matter."""
-        ...
-
-    @property
-    def T_world_camera(self) -> Array | None:
-        """Camera pose (4, 4), or None where it is not known."""
-        ...
-
-    @property
-    def has_labels(self) -> bool:
-        """Whether its view has labels."""
-        ...
-
-    def load(self) -> View:
-        """Decode the frame.
+    def load_labels(self) -> NDArray[np.int32]:
+        """Decode it for its labels (H, W) alone.
 
         Raises:
-            caryatid.io.images.BrokenImageError: It cannot be decoded, but other frames may.
-            InputError: It does not fit the dataset.
+            InputError: It has none, or is broken.
         """
-        ...
+        labels = self.load().labels
+        if labels is None:
+            raise InputError(self.name, "has no masks", "add mask_visib/ and scene_gt.json")
+        return labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +111,17 @@ class Dataset(Sequence[View]):
     def has_labels(self) -> bool:
         """Every frame has labels."""
         return all(frame.has_labels for frame in self.frames)
+
+    def frame(self, name: str) -> Frame:
+        """Return the frame whose name ends as `name` does after its last slash.
+
+        Raises:
+            InputError: There is none.
+        """
+        for frame in self.frames:
+            if frame.name.rpartition("/")[2] == name.rpartition("/")[2]:
+                return frame
+        raise InputError(self.path, f"has no frame '{name}'", "give the recording the run was made from")
 
 
 @dataclass(frozen=True, slots=True)

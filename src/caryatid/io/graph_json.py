@@ -146,16 +146,12 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
     """
     name = str(source)
     if document.get("format") != FORMAT:
-        raise InputError(
-            name, f"no '{FORMAT}' file (format: {document.get('format')!r})", "give a graph.json"
-        )
+        reason = f"no '{FORMAT}' file (format: {document.get('format')!r})"
+        raise InputError(name, reason, "give a graph.json")
     given = parse_json(_Graph, document, name)
     if given.version != VERSION:
-        raise InputError(
-            name,
-            f"version {given.version} of the format is not known",
-            f"read it with the caryatid that wrote it, or write version {VERSION}",
-        )
+        remedy = f"read it with the caryatid that wrote it, or write version {VERSION}"
+        raise InputError(name, f"version {given.version} of the format is not known", remedy)
     ids = [o.id for o in given.objects]
     pairs = [(s.supporter, s.supported) for s in given.supports]
     for twice in {i for i in ids if ids.count(i) > 1}:
@@ -169,9 +165,8 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
             raise InputError(name, f"the edge {one} → {other} is there twice", "keep one of them")
     for known in [*(i for pair in pairs for i in pair), *given.stability]:
         if known not in ids:
-            raise InputError(
-                name, f"no object is called '{known}'", f"the objects are {', '.join(ids) or 'none'}"
-            )
+            there = f"the objects are {', '.join(ids) or 'none'}"
+            raise InputError(name, f"no object is called '{known}'", there)
     return SupportGraph(
         tuple(o.decoded(name) for o in given.objects),
         tuple(Support(*vars(s).values()) for s in given.supports),

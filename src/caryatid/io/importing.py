@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import laplace
+from scipy.spatial.transform import Rotation
 
 from caryatid.config import Config, RecordingConfig
 from caryatid.errors import InputError, PerceptionError
@@ -33,74 +33,6 @@ _REMEDIES: Final[Mapping[str, str]] = {
 }
 """What to do where no frame is usable for one reason."""
 _UP: Final = np.array([0.0, 0.0, 1.0])
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Choice:
-    """The frames to keep, and why the others are not kept.
-
-    Attributes:
-        kept: Indices, in the order of time.
-        blurred: How many are less sharp than others around them.
-        alike: How many show what a kept frame shows.
-        spare: How many were more than are wanted.
-    """
-
-    kept: tuple[int, ...]
-    blurred: int
-    alike: int
-    spare: int
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class FrameFilter:
-    """Chooses sharp frames of a dataset, each from another viewpoint.
-
-    Attributes:
-        config: What is sharp, what is another viewpoint, and how many frames are wanted.
-    """
-
-    config: RecordingConfig
-
-    def choose(self, dataset: Dataset) -> tuple[list[Frame], dict[str, int], float]:
-        """Look through a dataset.
-
-        Returns:
-            The chosen frames in the order of time, how many others there are by reason, and the farthest
-            reading of the usable ones [m].
-
-        Raises:
-            InputError: No frame can become a view.
-        """
-        skipped, reach = Counter(dataset.skipped), 0.0
-        usable: list[Frame] = []
-        sharpness: list[float] = []
-        for frame in dataset.frames:
-            try:
-                view = frame.load()
-            except BrokenImageError:
-                skipped[datasets.BROKEN] += 1
-                continue
-            readings = sharpness_of_depth(view.depth)
-            if readings < self.config.min_readings:
-                skipped[datasets.DARK] += 1
-                continue
-            usable.append(frame)
-            sharpness.append(readings if view.rgb is None else sharpness_of_colour(view.rgb))
-            reach = max(reach, float(view.depth.max()))
-        if not usable:
-            raise _nothing_usable(dataset.path, skipped)
-        times = np.array([(frame.time - usable[0].time) * 1e-9 for frame in usable])
-        poses = [frame.T_world_camera for frame in usable if frame.T_world_camera is not None]
-        posed = np.stack(poses) if len(poses) == len(usable) else None
-        choice = choose_views(times, np.array(sharpness), posed, self.config)
-        counts = {
-            datasets.BLURRED: choice.blurred,
-            datasets.ALIKE: choice.alike,
-            datasets.SPARE: choice.spare,
-        }
-        skipped.update({reason: count for reason, count in counts.items() if count})
-        return [usable[index] for index in choice.kept], dict(skipped), reach
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -148,7 +80,7 @@ def import_recording(
     config = config or Config()
     dataset = open_dataset(source, config.recording, OpenOptions(topics or Topics(), camera_file))
     with RecordingWriter(out) as writer:
-        chosen, skipped, reach = FrameFilter(config.recording).choose(dataset)
+        chosen, skipped, reach = choose_frames(dataset, config.recording)
         T_level_world = np.eye(4)
         if level and chosen[0].T_world_camera is not None:
             views = (frame.load() for frame in chosen)
@@ -166,24 +98,53 @@ def import_recording(
     return Imported(read, tuple(chosen), skipped, (*dataset.notes, *note))
 
 
-def reasons(skipped: Mapping[str, int]) -> str:
-    """How many were skipped, by reason, the most frequent one first."""
-    return ", ".join(f"{skipped[reason]} {reason}" for reason in sorted(skipped, key=lambda r: -skipped[r]))
+def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame], dict[str, int], float]:
+    """Choose sharp frames of a dataset, each from another viewpoint.
 
+    Sharpness is the variance of the Laplacian of the brightness. Without colour the share of pixels with a
+    reading takes its place: a depth camera in motion loses them at edges.
 
-def sharpness_of_colour(rgb: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian of the brightness of an image (H, W, 3): the higher, the sharper."""
-    return float(laplace(rgb.mean(axis=2, dtype=np.float32)).var())
+    Args:
+        dataset: The frames.
+        config: What is sharp, what is another viewpoint, and how many frames are wanted.
 
+    Returns:
+        The chosen frames in the order of time, how many others there are by reason, and the farthest reading
+        of the usable ones [m].
 
-def sharpness_of_depth(depth: NDArray[np.float32]) -> float:
-    """Share of pixels (H, W) with a reading: a depth camera in motion loses them at edges."""
-    return float((depth > 0.0).mean())
+    Raises:
+        InputError: No frame can become a view.
+    """
+    skipped, reach = Counter(dataset.skipped), 0.0
+    usable: list[Frame] = []
+    sharpness: list[float] = []
+    for frame in dataset.frames:
+        try:
+            view = frame.load()
+        except BrokenImageError:
+            skipped[datasets.BROKEN] += 1
+            continue
+        readings = float(view.valid.mean())
+        if readings < config.min_readings:
+            skipped[datasets.DARK] += 1
+            continue
+        usable.append(frame)
+        grey = None if view.rgb is None else view.rgb.mean(axis=2, dtype=np.float32)
+        sharpness.append(readings if grey is None else float(laplace(grey).var()))
+        reach = max(reach, float(view.depth.max()))
+    if not usable:
+        raise _nothing_usable(dataset.path, skipped)
+    times = np.array([(frame.time - usable[0].time) * 1e-9 for frame in usable])
+    poses = [frame.T_world_camera for frame in usable if frame.T_world_camera is not None]
+    posed = np.stack(poses) if len(poses) == len(usable) else None
+    kept, others = choose_views(times, np.array(sharpness), posed, config)
+    skipped.update(others)
+    return [usable[index] for index in kept], dict(skipped), reach
 
 
 def choose_views(
     times: Array, sharpness: Array, T_world_camera: Array | None, config: RecordingConfig
-) -> Choice:
+) -> tuple[list[int], dict[str, int]]:
     """Choose frames that are sharp for their time and seen from viewpoints apart from each other.
 
     Through time, the sharpest frame of the next moments that is seen from elsewhere than all chosen ones is
@@ -194,11 +155,14 @@ def choose_views(
         sharpness: How sharp they are (N,); only ratios count.
         T_world_camera: Their poses (N, 4, 4), or None where poses are not known: a single frame is chosen.
         config: What is sharp, and how far apart viewpoints are.
+
+    Returns:
+        Indices of the chosen frames in the order of time, and how many others there are by reason.
     """
     if len(times) == 0:
-        return Choice((), 0, 0, 0)
+        return [], {}
     if T_world_camera is None:
-        return Choice((int(np.argmax(sharpness)),), 0, 0, len(times) - 1)
+        return [int(np.argmax(sharpness))], _counted({datasets.SPARE: len(times) - 1})
     sharp = sharpness >= config.sharp_share * _most_around(times, sharpness, config.sharp_window)
     candidates = np.flatnonzero(sharp)
     chosen: list[int] = []
@@ -210,12 +174,8 @@ def choose_views(
         chosen.append(int(best))
         free &= apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
     kept = _farthest(T_world_camera[chosen], config)
-    return Choice(
-        tuple(sorted(chosen[i] for i in kept)),
-        blurred=int((~sharp).sum()),
-        alike=len(candidates) - len(chosen),
-        spare=len(chosen) - len(kept),
-    )
+    counts = {datasets.BLURRED: len(times) - len(candidates), datasets.ALIKE: len(candidates) - len(chosen)}
+    return sorted(chosen[i] for i in kept), _counted(counts | {datasets.SPARE: len(chosen) - len(kept)})
 
 
 def apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
@@ -230,6 +190,11 @@ def apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) 
     cosine = (np.einsum("nij,ij->n", T_world_camera[:, :3, :3], T_world_other[:3, :3]) - 1.0) / 2.0
     angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
     return np.maximum(distance / config.min_distance, angle / config.min_angle)
+
+
+def reasons(skipped: Mapping[str, int]) -> str:
+    """How many were skipped, by reason, the most frequent one first."""
+    return ", ".join(f"{skipped[reason]} {reason}" for reason in sorted(skipped, key=lambda r: -skipped[r]))
 
 
 def level_rotation(path: Path, views: Iterable[View], config: Config, rng: np.random.Generator) -> Array:
@@ -256,12 +221,8 @@ def level_rotation(path: Path, views: Iterable[View], config: Config, rng: np.ra
     if 2 * int(near.sum()) < len(ups):
         reason = f"only {int(near.sum())} of {len(ups)} views agree on where up is"
         raise InputError(path, reason, "leave --level out, and give a world that is level")
-    up = transforms.unit(ups[near].mean(axis=0))
-    axis = np.cross(up, _UP)
-    if np.linalg.norm(axis) < 1e-9:
-        axis = transforms.perpendicular(up)
-    angle = float(transforms.angle_between(up, _UP))
-    return transforms.rigid(transforms.rotation_from_vector(angle * transforms.unit(axis)), np.zeros(3))
+    turn, _ = Rotation.align_vectors(_UP[None], ups[near].mean(axis=0)[None])
+    return transforms.rigid(turn.as_matrix(), np.zeros(3))
 
 
 def _up_world(view: View, config: Config, rng: np.random.Generator) -> Array | None:
@@ -271,6 +232,11 @@ def _up_world(view: View, config: Config, rng: np.random.Generator) -> Array | N
     except PerceptionError:
         return None
     return transforms.rotate(view.pose, transforms.rotate(transforms.invert(T_level_camera), _UP))
+
+
+def _counted(counts: Mapping[str, int]) -> dict[str, int]:
+    """The reasons there were."""
+    return {reason: count for reason, count in counts.items() if count}
 
 
 def _most_around(times: Array, values: Array, window: float) -> Array:

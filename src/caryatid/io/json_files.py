@@ -6,16 +6,15 @@ import json
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import core_schema
 
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-
-if TYPE_CHECKING:
-    from pydantic import TypeAdapter
 
 T = TypeVar("T")
 
@@ -37,8 +36,6 @@ class Numbers:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Read the field with `read`."""
-        from pydantic_core import core_schema
-
         return core_schema.no_info_plain_validator_function(self.read)
 
     def read(self, value: Any) -> Array:
@@ -48,17 +45,15 @@ class Numbers:
             ValueError: They have another shape, hold something else than finite numbers, or are not rigid.
         """
         try:
-            array = np.array(value, dtype=np.float64) if _all_numbers(value) else np.array(np.nan)
+            array = np.array(value if _all_numbers(value) else np.nan, dtype=np.float64)
         except (ValueError, OverflowError):
             array = np.array(np.nan)
         if array.size == 0 and self.shape[0] < 0:
             array = array.reshape(0, *self.shape[1:])
-        fits = array.ndim == len(self.shape)
-        fits = fits and all(wanted in (-1, n) for wanted, n in zip(self.shape, array.shape, strict=True))
-        if not fits or not np.isfinite(array).all():
-            raise ValueError(
-                f"must be {'×'.join('N' if n < 0 else str(n) for n in self.shape)} finite numbers"
-            )
+        shape = tuple(n if n < 0 else m for n, m in zip(self.shape, array.shape, strict=False))
+        if array.ndim != len(self.shape) or shape != self.shape or not np.isfinite(array).all():
+            sizes = "×".join("N" if n < 0 else str(n) for n in self.shape)
+            raise ValueError(f"must be {sizes} finite numbers")
         try:
             return transforms.as_rigid(array, "") if self.rigid else array
         except InputError as error:
@@ -79,8 +74,6 @@ def parse_json(
     Raises:
         InputError: A key is missing, or a value is of another type; the sentence names the key.
     """
-    from pydantic import ValidationError
-
     try:
         read: T = _adapter(kind).validate_json(json.dumps(document, allow_nan=False), strict=True)
     except ValidationError as error:
@@ -150,8 +143,6 @@ def plain(value: Any) -> Any:
 
 @cache
 def _adapter(kind: Any) -> TypeAdapter[Any]:
-    from pydantic import TypeAdapter
-
     return TypeAdapter(kind)
 
 
@@ -162,9 +153,8 @@ def _sentence(error: Any) -> str:
     if error["type"] == "missing":
         return f"{where}the key '{last}' is missing"
     message = str(error.get("ctx", {}).get("error") or error["msg"])
-    message = message.replace("Input should be", "must be").replace(
-        "a dictionary or an instance of", "the object"
-    )
+    message = message.replace("Input should be", "must be")
+    message = message.replace("a dictionary or an instance of", "the object")
     return f"{where}'{last}' is {_shown(error['input'])}: {message}"
 
 

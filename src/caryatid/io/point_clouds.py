@@ -19,10 +19,11 @@ from caryatid.geometry.transforms import Array
 from caryatid.sensing.clouds import estimate_normals
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
-REMEDY: Final = "export the cloud again"
-MISSING: Final = "give a .pcd or .ply file"
 MAX_COMPRESSION: Final = 100
 """Bytes of points one byte of a file can hold: LZF writes at most 264 for 3."""
+
+Parsed = tuple[dict[str, NDArray[Any]], Array, tuple[int, int] | None]
+"""Fields of one value per point (N,), viewpoint (3,), and width and height of an organised cloud."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,13 +116,18 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     path = Path(path)
     if label_divisor < 1:
         raise InputError("label_divisor", f"is {label_divisor}", "give 1 or more")
-    match path.suffix.lower():
-        case ".pcd":
-            columns, viewpoint, size = _read_pcd(path)
-        case ".ply":
-            columns, viewpoint, size = _read_ply(path), np.zeros(3), None
-        case _:
-            raise InputError(path, "is no .pcd or .ply file", "convert it to one of these")
+    parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
+    if parse is None:
+        raise InputError(path, "is no .pcd or .ply file", "convert it to one of these")
+    try:
+        columns, viewpoint, size = parse(path.read_bytes())
+    except FileNotFoundError:
+        raise InputError(path, "the file is missing", "give a .pcd or .ply file") from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", "give a .pcd or .ply file") from error
+    except Exception as error:
+        reason = f"is broken, or the header lies: {_reason(error)}"
+        raise InputError(path, reason, "export the cloud again") from error
     stored = StoredCloud(
         points=_stack(columns, ("x", "y", "z")),
         normals=_normals(columns),
@@ -136,88 +142,65 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     return stored
 
 
-def _read_pcd(path: Path) -> tuple[dict[str, NDArray[Any]], Array, tuple[int, int] | None]:
-    """Fields of one value per point (N,), viewpoint (3,), and width and height of an organised cloud."""
+def _parse_pcd(content: bytes) -> Parsed:
+    """Whatever is wrong with the file is a ValueError, or what pypcd4 raises."""
     from pypcd4.pypcd4 import MetaData, PointCloud
 
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(path, "the file is missing", MISSING) from None
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", MISSING) from error
     end = re.search(rb"^DATA\b[^\n]*\n", content[:65536], re.MULTILINE)
     if end is None:
-        raise InputError(path, "is no PCD: its header has no DATA line", REMEDY)
+        raise ValueError("there is no DATA line")
     lines = content[: end.end()].decode("ascii", errors="replace").splitlines()
     if not any(line.startswith("COUNT") for line in lines):
-        fields = next((line.split()[1:] for line in lines if line.startswith("FIELDS")), [])
-        lines.insert(0, f"COUNT {' '.join('1' for _ in fields)}")
-    try:
-        header = MetaData.parse_header(lines)
-        dtype = header.build_dtype()
-    except Exception as error:
-        raise InputError(path, f"the header is not valid ({_reason(error)})", REMEDY) from None
+        names = next((line.split()[1:] for line in lines if line.startswith("FIELDS")), [])
+        lines.insert(0, "COUNT" + " 1" * len(names))
+    header = MetaData.parse_header(lines)
     if not len(header.fields) == len(header.size) == len(header.type) == len(header.count):
-        raise InputError(path, "the header's FIELDS, SIZE, TYPE and COUNT do not agree", REMEDY)
-    names = dtype.names or ()
-    if any(axis not in names or dtype[axis].kind != "f" for axis in "xyz"):
-        raise InputError(path, "has no fields x y z of floating point numbers", REMEDY)
-    if header.points == 0:
-        raise InputError(path, "holds no points", "give a cloud with points")
-    if header.width * header.height != header.points:
-        size = f"WIDTH {header.width} × HEIGHT {header.height}"
-        raise InputError(path, f"the header lies: {size} is not POINTS {header.points}", REMEDY)
+        raise ValueError("FIELDS, SIZE, TYPE and COUNT do not agree")
+    dtype = header.build_dtype()
+    columns = dtype.names or ()
+    if any(axis not in columns or dtype[axis].kind != "f" for axis in "xyz"):
+        raise ValueError("there are no fields x y z of floating point numbers")
+    if header.width * header.height != header.points or header.points == 0:
+        raise ValueError(f"WIDTH {header.width} × HEIGHT {header.height}, POINTS {header.points}")
+    if not np.isfinite(header.viewpoint).all():
+        raise ValueError("VIEWPOINT is not finite")
     body, needed = content[end.end() :], header.points * dtype.itemsize
+    promised = needed
     if header.data.value == "ascii":
         body = b"\n".join(b" ".join(row) for line in body.splitlines() if (row := line.split())) + b"\n"
-    compressed = header.data.value == "binary_compressed"
-    promised = struct.unpack("<II", body[:8])[1] if compressed and len(body) >= 8 else needed
-    rest = body[needed:] if header.data.value == "binary" else b""
-    try:
-        if promised != needed or needed > MAX_COMPRESSION * len(body.strip()):
-            raise ValueError(f"they take {needed} bytes, {len(body)} bytes follow")
-        if len(rest) >= dtype.itemsize and any(rest):
-            raise ValueError("more data follows")
-        text = header.compose_header().encode()
-        data = np.atleast_1d(PointCloud.from_fileobj(io.BytesIO(text + body)).pc_data)
-        if len(data) != header.points:
-            raise ValueError(f"data of {len(data)} points follows")
-    except Exception as error:
-        reason = f"the header lies or the file is truncated: POINTS {header.points}, but {_reason(error)}"
-        raise InputError(path, reason, REMEDY) from None
+    elif header.data.value == "binary":
+        if len(body) - needed >= dtype.itemsize and any(body[needed:]):
+            raise ValueError(f"POINTS {header.points}, but more data follows")
+    else:
+        promised = struct.unpack("<II", body[:8])[1]
+    if promised != needed or needed > MAX_COMPRESSION * len(body.strip()):
+        raise ValueError(f"POINTS {header.points} take {needed} bytes, {len(body)} bytes follow")
+    file = io.BytesIO(header.compose_header().encode() + body)
+    data = np.atleast_1d(PointCloud.from_fileobj(file).pc_data)
+    if len(data) != header.points:
+        raise ValueError(f"POINTS {header.points}, but data of {len(data)} points follows")
+    size = (header.width, header.height) if header.height > 1 else None
     viewpoint = np.array(header.viewpoint[:3], dtype=np.float64)
-    if not np.isfinite(viewpoint).all():
-        raise InputError(path, "VIEWPOINT is not finite", REMEDY)
-    size_px = (header.width, header.height) if header.height > 1 else None
-    return {name: data[name] for name in header.fields if name in names}, viewpoint, size_px
+    return {name: data[name] for name in header.fields if name in columns}, viewpoint, size
 
 
-def _read_ply(path: Path) -> dict[str, NDArray[Any]]:
+def _parse_ply(content: bytes) -> Parsed:
+    """Whatever is wrong with the file is a ValueError, or what trimesh raises."""
     from trimesh.exchange.ply import load_ply
 
-    try:
-        with path.open("rb") as file:
-            vertex = load_ply(file, fix_texture=False, skip_materials=True)["metadata"]["_ply_raw"]["vertex"]
-    except FileNotFoundError:
-        raise InputError(path, "the file is missing", MISSING) from None
-    except KeyError as error:
-        raise InputError(path, f"has no vertices with x y z ({error})", REMEDY) from error
-    except Exception as error:
-        reason = f"is no PLY, is truncated or its header lies ({_reason(error)})"
-        raise InputError(path, reason, REMEDY) from error
+    loaded = load_ply(io.BytesIO(content), fix_texture=False, skip_materials=True)
+    vertex = loaded["metadata"]["_ply_raw"]["vertex"]
     data = vertex.get("data")
     if data is None:
-        raise InputError(path, "holds no points", "give a cloud with points")
+        raise ValueError("there are no points")
     names = data.keys() if isinstance(data, dict) else data.dtype.names
-    columns = {name: np.asarray(data[name]).reshape(len(data[name]), -1)[:, 0] for name in names}
+    columns = {name.lower(): np.asarray(data[name]).reshape(len(data[name]), -1)[:, 0] for name in names}
     if not {"x", "y", "z"} <= columns.keys():
-        raise InputError(path, "has no vertices with x y z", REMEDY)
+        raise ValueError("there are no vertices with x y z")
     lengths = {len(column) for column in columns.values()}
     if lengths != {vertex["length"]}:
-        reason = f"the header lies: {vertex['length']} points said, {min(lengths)} there"
-        raise InputError(path, reason, REMEDY)
-    return {name.lower(): column for name, column in columns.items()}
+        raise ValueError(f"{vertex['length']} points said, {min(lengths)} there")
+    return columns, np.zeros(3), None
 
 
 def _reason(error: Exception) -> str:
@@ -225,6 +208,8 @@ def _reason(error: Exception) -> str:
     if hasattr(error, "errors"):
         first = error.errors()[0]
         return f"{str(first['loc'][0]).upper()}: {first['msg'].lower()}"
+    if isinstance(error, KeyError):
+        return f"there is no {error}"
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
@@ -244,16 +229,12 @@ def _labels(columns: dict[str, NDArray[Any]], divisor: int, path: Path) -> NDArr
         return None
     raw = columns["label"].astype(np.float64)
     if not np.isfinite(raw).all() or (raw != np.floor(raw)).any() or (raw < 0.0).any():
-        raise InputError(
-            path, "the field label holds what is no whole number from 0", "number objects from 1"
-        )
+        reason = "the field label holds what is no whole number from 0"
+        raise InputError(path, reason, "number objects from 1")
     labels = raw // divisor
     if (labels >= SUPPORT_LABEL).any():
-        raise InputError(
-            path,
-            f"the field label reaches {int(labels.max())}",
-            f"number objects from 1 to {SUPPORT_LABEL - 1}",
-        )
+        reason = f"the field label reaches {int(labels.max())}"
+        raise InputError(path, reason, f"number objects from 1 to {SUPPORT_LABEL - 1}")
     return labels.astype(np.int32)
 
 

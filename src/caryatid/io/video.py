@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from caryatid.config import RecordingConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset
+from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame
 from caryatid.sensing.views import View
 
 SECOND = 1_000_000_000
@@ -46,35 +46,6 @@ class TimedImage(Protocol):
 Image = TypeVar("Image", bound=TimedImage)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class VideoFrame:
-    """A depth image with the colour and the camera pose of its moment; a `Frame`.
-
-    Attributes:
-        name: Name of the view it becomes.
-        number: Its number among the depth images.
-        time: When it was taken [ns].
-        T_world_camera: Camera pose (4, 4), or None where it is not known.
-        decode: Decodes depth and colour.
-        far: Readings farther away are left out [m].
-        has_labels: False: masks are no part of what robots record.
-    """
-
-    name: str
-    number: int
-    time: int
-    T_world_camera: Array | None
-    decode: Callable[[], Decoded]
-    far: float
-    has_labels: bool = False
-
-    def load(self) -> View:
-        """Decode the frame."""
-        depth, rgb, K = self.decode()
-        depth = np.where(depth <= self.far, depth, np.float32(0.0))
-        return View(depth, K, self.T_world_camera, rgb, name=self.name)
-
-
 def make_video(
     path: Path,
     depths: Sequence[Image],
@@ -96,8 +67,7 @@ def make_video(
     Returns:
         The frames that have all that is wanted in the order of time, and how many have not.
     """
-    frames: list[VideoFrame] = []
-    skipped = Counter[str]()
+    frames, skipped = [], Counter[str]()
     ordered = sorted(colours or (), key=lambda colour: colour.time)
     times = [colour.time for colour in ordered]
     for number, depth in enumerate(depths):
@@ -114,10 +84,22 @@ def make_video(
             except MissingTransform:
                 skipped[NO_POSE] += 1
                 continue
-        decoded = partial(decode, depth, colour)
-        frames.append(VideoFrame(depth.name, number, depth.time, T_world_camera, decoded, config.far))
+        load = partial(_load, decode, depth, colour, T_world_camera, config.far)
+        frames.append(Frame(depth.name, number, load, T_world_camera, depth.time))
     frames.sort(key=lambda frame: (frame.time, frame.number))
     return Dataset(path, frames, skipped, is_video=True)
+
+
+def _load(
+    decode: Callable[[Image, Image | None], Decoded],
+    at: Image,
+    colour: Image | None,
+    T_world_camera: Array | None,
+    far: float,
+) -> View:
+    depth, rgb, K = decode(at, colour)
+    depth = np.where(depth <= far, depth, np.float32(0.0))
+    return View(depth, K, T_world_camera, rgb, name=at.name)
 
 
 def nearest(times: Sequence[int], time: int) -> int | None:
