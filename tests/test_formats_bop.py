@@ -55,9 +55,9 @@ def edit(folder, name, change):
     path.write_text(json.dumps(document))
 
 
-def refused(folder, said, load=False):
+def refused(folder, said):
     with pytest.raises(InputError) as caught:
-        list(read_recording(folder)) if load else read_recording(folder)
+        read_recording(folder)
     message = str(caught.value)
     assert said in message
     assert "\n" not in message
@@ -112,24 +112,15 @@ def test_views_are_read_one_by_one_and_not_kept(folder):
         recording[0]
 
 
-def test_several_frames_without_poses_are_refused(tmp_path):
-    write_recording(tmp_path / "scene", make_views(3, poses=False))
-    assert "3 of 3" in refused(tmp_path / "scene", "have no pose")
-
-
 @pytest.mark.parametrize("name", ["depth/000001.png", "rgb/000001.png", "mask_visib/000001_000001.png"])
-def test_a_missing_image_is_refused(folder, name):
-    (folder / name).unlink()
-    assert name in refused(folder, "missing")
-
-
-@pytest.mark.parametrize("name", ["depth/000001.png", "rgb/000001.png", "mask_visib/000001_000001.png"])
-@pytest.mark.parametrize("keep", [0.0, 0.3, 0.9])
-def test_a_truncated_image_is_refused_before_anything_is_decoded(folder, name, keep):
+def test_an_image_that_is_missing_or_truncated_is_refused_before_anything_is_decoded(folder, name):
     path = folder / name
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * keep)])
-    assert name in refused(folder, "000001")
+    for keep in (0.0, 0.3, 0.9):
+        path.write_bytes(content[: int(len(content) * keep)])
+        assert name in refused(folder, "000001")
+    path.unlink()
+    assert name in refused(folder, "missing")
 
 
 def test_a_truncated_jpeg_is_refused(folder):
@@ -145,13 +136,10 @@ def test_a_truncated_jpeg_is_refused(folder):
     refused(folder, "rgb/000001.jpg")
 
 
-@pytest.mark.parametrize("name", ["rgb/000001.png", "mask_visib/000001_000001.png"])
-def test_sizes_that_differ_are_refused(folder, name):
-    image = Image.open(folder / name)
-    image.resize((63, 48)).save(folder / name)
-    message = refused(folder, name)
-    assert "63×48" in message
-    assert "64×48" in message
+def test_a_mask_of_another_size_is_refused(folder):
+    name = "mask_visib/000001_000001.png"
+    Image.open(folder / name).resize((63, 48)).save(folder / name)
+    assert "is 63×48 pixels" in refused(folder, "000001.png is 64×48")
 
 
 @pytest.mark.parametrize("mode", ["L", "RGB", "1"])
@@ -160,58 +148,26 @@ def test_depth_that_is_not_16_bit_is_refused(folder, mode):
     refused(folder, f"mode {mode}, not a 16-bit grey PNG")
 
 
-def test_an_empty_frame_is_refused_when_it_is_read(folder):
-    Image.fromarray(np.zeros((48, 64), np.uint16)).save(folder / "depth/000001.png")
-    assert "empty" in refused(folder, "depth/000001.png", load=True)
-
-
-def test_masks_that_overlap_are_refused(folder):
-    path = folder / "mask_visib/000000_000001.png"
-    mask = np.array(Image.open(path))
-    mask[15:17, 10:12] = 255
-    Image.fromarray(mask).save(path)
-    message = refused(folder, "000000_000001.png", load=True)
-    assert "obj_id 7 in 4 pixels" in message
-
-
 def test_an_empty_mask_is_an_object_out_of_sight(folder):
     Image.new("L", (64, 48)).save(folder / "mask_visib/000000_000001.png")
     assert set(np.unique(read_recording(folder)[0].labels)) == {0, 7}
 
 
-def test_a_mask_that_names_no_object_is_refused(folder):
-    (folder / "mask_visib/000000_000000.png").rename(folder / "mask_visib/000000_000002.png")
-    refused(folder, "names no object: scene_gt.json has no entry for mask 2 of frame 0")
-
-
-def nothing(document):
-    document.clear()
-
-
 @pytest.mark.parametrize(
     ("name", "change", "said"),
     [
-        ("scene_camera.json", nothing, "has no frames"),
-        ("scene_camera.json", lambda d: d["1"].pop("cam_K"), "'cam_K' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(cam_K=[1, 2]), "9 finite numbers"),
         ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(0, 0.0), "focal lengths 0"),
         ("scene_camera.json", lambda d: d["1"].pop("depth_scale"), "'depth_scale' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(depth_scale=0), "depth_scale"),
         ("scene_camera.json", lambda d: d["1"].pop("cam_t_w2c"), "'cam_t_w2c' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[0.0] * 9), "no rotation"),
-        (
-            "scene_camera.json",
-            lambda d: d["1"].update(cam_R_w2c=[1.1, 0, 0, 0, 1, 0, 0, 0, 1]),
-            "no rotation",
-        ),
         ("scene_camera.json", lambda d: d.pop("1"), "no entry in scene_camera.json"),
         ("scene_camera.json", lambda d: d.update({"first": d["1"]}), "'first'"),
         ("scene_camera.json", lambda d: d.update({"01": d["1"]}), "'01'"),
         ("scene_camera.json", lambda d: d.update({"1": 5}), "must be an object"),
         ("scene_gt.json", lambda d: d["1"][0].pop("obj_id"), "'obj_id' is missing"),
-        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=0), "'obj_id' is 0"),
         ("scene_gt.json", lambda d: d["1"][0].update(obj_id=300), "two masks have obj_id 300"),
-        ("scene_gt.json", lambda d: d.pop("1"), "names no object"),
         ("scene_gt.json", lambda d: d.update({"1": {"obj_id": 1}}), "must be a valid array"),
         ("scene_gt.json", lambda d: d.update({"8": []}), "not in scene_camera.json"),
     ],

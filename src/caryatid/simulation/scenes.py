@@ -11,7 +11,7 @@ from typing import Any, Final, cast
 import mujoco
 
 from caryatid.config import PhysicsConfig
-from caryatid.errors import InputError, in_one_line
+from caryatid.errors import InputError
 from caryatid.simulation.generation import SIZES, GeneratedKind, generate
 from caryatid.simulation.truth import ground_truth, write_truth
 from caryatid.simulation.world import (
@@ -178,7 +178,8 @@ def _load_file(source: str, config: PhysicsConfig | None) -> SimulatedScene:
         with mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
-        raise InputError(path, f"is no MJCF ({in_one_line(error)})", "mend the XML") from None
+        reason = " ".join(str(error).split())
+        raise InputError(path, f"is no MJCF ({reason})", "mend the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     return scene_from_spec(spec, name or path.stem, str(path), config)
 

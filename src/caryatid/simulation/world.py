@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from caryatid.config import PhysicsConfig
-from caryatid.errors import InputError, in_one_line
+from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
@@ -102,7 +102,8 @@ def scene_from_spec(
         with mujoco_warnings_ignored():
             model = spec.compile()
     except ValueError as error:
-        raise InputError(source, f"MuJoCo refuses it: {in_one_line(error)}", "mend the MJCF") from None
+        reason = " ".join(str(error).split())
+        raise InputError(source, f"MuJoCo refuses it: {reason}", "mend the MJCF") from None
     if not np.isfinite(model.qpos0).all():
         raise InputError(source, "a body's pose holds NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
