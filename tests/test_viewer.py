@@ -313,9 +313,9 @@ def test_a_scene_shows_itself_in_a_notebook_if_viser_is_there(views, monkeypatch
         for view in views[:2]:
             scene.update(view)
             shown.update(scene)
-        shown.page.wait()
-        assert [m.step.index for m in shown.page.moments] == [0, 1]
-        assert "/shapes/o1" in [node.name for node in shown.page.drawing.nodes["shapes"]]
+        shown.wait()
+        assert [m.step.index for m in shown.moments] == [0, 1]
+        assert "/shapes/o1" in [node.name for node in shown.drawing.nodes["shapes"]]
         assert f'<iframe src="{shown.url}"' in shown._repr_html_()
     finally:
         shown.close()

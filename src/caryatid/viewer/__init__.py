@@ -5,46 +5,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from html import escape
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from caryatid.scene import Scene
     from caryatid.viewer.page import Page
 
-__all__ = ["Shown", "show"]
+__all__ = ["show"]
 
 
-@dataclass(frozen=True, slots=True)
-class Shown:
-    """A page that shows a scene, until it is closed.
-
-    Attributes:
-        url: Where it is.
-        page: The page.
-    """
-
-    url: str
-    page: Page
-
-    def update(self, scene: Scene) -> None:
-        """Add what a scene knows by now; the page's slider goes back to what it knew before."""
-        from caryatid.viewer.drawing import moment_of_scene
-
-        if scene.views:
-            self.page.add(moment_of_scene(scene))
-
-    def close(self) -> None:
-        """Stop serving the page."""
-        self.page.close()
-
-    def _repr_html_(self) -> str:
-        source = escape(self.url, quote=True)
-        return f'<iframe src="{source}" width="100%" height="620" style="border:0"></iframe>'
-
-
-def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Shown:
+def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
     """Open a page that shows what a scene knows.
 
     Args:
@@ -53,7 +23,7 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Shown:
         port: Port to listen at, or the next free one; 0 = any that is free.
 
     Returns:
-        A handle with the page's `url`; within a notebook it shows itself.
+        The page with its `url`, `update(scene)` and `close()`; within a notebook it shows itself.
 
     Raises:
         InputError: viser is not installed.
@@ -61,6 +31,5 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Shown:
     from caryatid.viewer.page import Page
 
     page = Page("caryatid", scene.config.support, host=host, port=port, small=True)
-    shown = Shown(page.url, page)
-    shown.update(scene)
-    return shown
+    page.update(scene)
+    return page

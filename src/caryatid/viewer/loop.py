@@ -176,21 +176,14 @@ def candidate_under(
         candidates: The views on it that can be reached.
         within: How far off the candidate may be, at the sphere's centre [rad].
     """
-    if len(candidates) == 0:
-        return None
     ray = direction_world / np.linalg.norm(direction_world)
-    offset = origin_world - sphere.centre_world
-    along = float(offset @ ray)
-    reach = along**2 - float(offset @ offset) + sphere.radius**2
-    if reach < 0.0:
+    offset = sphere.centre_world + sphere.radius * candidates.directions - origin_world
+    along = offset @ ray
+    aside = np.linalg.norm(offset - along[:, None] * ray, axis=1)
+    hit = (along > 0.0) & (aside <= within * sphere.radius)
+    if not hit.any():
         return None
-    for distance in (-along - np.sqrt(reach), -along + np.sqrt(reach)):
-        if distance > 0.0:
-            cosine = candidates.directions @ ((offset + distance * ray) / sphere.radius)
-            best = int(np.argmax(cosine))
-            if np.arccos(np.clip(cosine[best], -1.0, 1.0)) <= within:
-                return best
-    return None
+    return int(np.argmin(np.where(hit & (along < along[hit].min() + sphere.radius / 2.0), aside, np.inf)))
 
 
 def taken_apart(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from concurrent.futures import Future, ThreadPoolExecutor
+from html import escape
 from threading import RLock
 from typing import Any
 
@@ -13,9 +14,10 @@ import numpy as np
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.graph import SupportGraph
+from caryatid.scene import Scene
 from caryatid.support.relations import predict_removal
 from caryatid.viewer import panels
-from caryatid.viewer.drawing import LAYERS, NEXT, Moment, SceneDrawing
+from caryatid.viewer.drawing import LAYERS, NEXT, Moment, SceneDrawing, moment_of_scene
 from caryatid.viz.colours import SERIES
 from caryatid.viz.notebook import cell_html
 from caryatid.viz.report import Section
@@ -89,6 +91,11 @@ class Page:
             self._look_at(moment)
         self.redraw()
 
+    def update(self, scene: Scene) -> None:
+        """Add what a scene knows by now; the slider goes back to what it knew before."""
+        if scene.views:
+            self.add(moment_of_scene(scene))
+
     def go_to(self, index: int) -> None:
         """Show the moment after a view."""
         index = min(max(index, 0), len(self.moments) - 1)
@@ -126,6 +133,10 @@ class Page:
         self._drawer.shutdown(wait=True, cancel_futures=True)
         with _silent():
             self.server.stop()
+
+    def _repr_html_(self) -> str:
+        """The page within a notebook."""
+        return f'<iframe src="{escape(self.url)}" width="100%" height="620" style="border:0"></iframe>'
 
     def _build(self) -> None:
         gui = self.server.gui

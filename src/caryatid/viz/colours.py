@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +22,6 @@ PLAIN = 7
 """So many colours are told apart by everyone; the next so many are striped as well."""
 STRIPES = ((), (1,), (-1,), (1, -1))
 """Directions of the stripes on objects of the first, second, … such turn: 1 rises to the right, −1 falls."""
-STRIPE_WHITE = 0.5
-"""Share of white in a stripe."""
 SERIES = ("#0072b2", "#d55e00", "#56b4e9", "#882255", "#e69f00", "#8a8f96", "#f0e442", "#009e73")
 """Colours of a chart's lines and of its bars' parts, on light and dark; none of them means an object."""
 SURFACE_COLOUR = "#9c9184"
@@ -42,9 +42,8 @@ def rgb(colour: str) -> Colour:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
-def css(colour: Colour) -> str:
-    """Return `#rrggbb`."""
-    return "#{:02x}{:02x}{:02x}".format(*colour)
+def _css(colour: Iterable[float]) -> str:
+    return "#" + "".join(f"{round(c):02x}" for c in colour)
 
 
 def object_colour(label: int) -> str:
@@ -56,8 +55,7 @@ def object_colour(label: int) -> str:
         return SURFACE_COLOUR
     turn, position = divmod(label - 1, len(PALETTE))
     shade = (1.0, 0.72, 0.5)[turn % 3]
-    red, green, blue = (round(shade * c) for c in rgb(PALETTE[position]))
-    return css((red, green, blue))
+    return _css(shade * c for c in rgb(PALETTE[position]))
 
 
 def object_stripes(label: int) -> tuple[int, ...]:
@@ -81,7 +79,7 @@ def striped_colours(labels: NDArray[np.int32], u: Array, v: Array, pitch: float)
         for direction in object_stripes(int(label)):
             stripe |= (labels == label) & ((u + direction * v) % pitch < pitch / 3.0)
     colour = label_colours(labels).astype(np.float64)
-    return np.where(stripe[..., None], 255.0 * STRIPE_WHITE + (1.0 - STRIPE_WHITE) * colour, colour)
+    return np.where(stripe[..., None], (255.0 + colour) / 2.0, colour)
 
 
 def label_colours(labels: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -108,5 +106,4 @@ def scale(values: Array, stops: tuple[tuple[float, str], ...]) -> NDArray[np.uin
 
 def saliency_colour(saliency: float) -> str:
     """Return `#rrggbb` of one saliency value."""
-    red, green, blue = scale(np.array([saliency]), SALIENCY_STOPS)[0]
-    return css((int(red), int(green), int(blue)))
+    return _css(scale(np.array([saliency]), SALIENCY_STOPS)[0])

@@ -6,7 +6,7 @@ ten edges through vertices, where this draws none.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -54,33 +54,24 @@ def arrange(graph: SupportGraph) -> Layout:
     neighbours (fewer crossings) and spaced as near to it as their width allows.
     """
     layer: dict[Hashable, int] = dict(layers(graph).items())
-    rows: list[list[Hashable]] = [[] for _ in range(max(layer.values(), default=-1) + 1)]
-    for name, level in layer.items():
-        rows[level].append(name)
-    neighbours: dict[Hashable, list[Hashable]] = {name: [] for name in layer}
+    joined: nx.Graph[Hashable] = nx.Graph()
+    joined.add_nodes_from(layer)
     chains: dict[Pair, list[Hashable]] = {}
     for pair in (s.pair for s in graph.supports):
         first, last = layer[pair[0]], layer[pair[1]]
         up = 1 if last > first else -1
-        stops: list[Hashable] = (
-            [(pair, level) for level in range(first + up, last, up)] if first != last else []
-        )
-        for stop, level in zip(stops, range(first + up, last, up), strict=False):
-            layer[stop], neighbours[stop] = level, []
-            rows[level].append(stop)
-        chains[pair] = [pair[0], *stops, pair[1]]
-        for a, b in pairwise(chains[pair]):
-            neighbours[a].append(b)
-            neighbours[b].append(a)
-    if graph.support_surface is not None:
-        neighbours[graph.support_surface.id] = []  # It draws the others to the middle and stays there.
-    x = _abscissae(rows, neighbours)
-    low = min(x.values(), default=0.0)
+        between = {(pair, level): level for level in range(first + up, last, up)}
+        layer |= between
+        chains[pair] = [pair[0], *between, pair[1]]
+        nx.add_path(joined, chains[pair])
+    rows = [
+        [n for n, at in layer.items() if at == level] for level in range(max(layer.values(), default=-1) + 1)
+    ]
+    x = _abscissae(rows, joined, None if graph.support_surface is None else graph.support_surface.id)
+    low, width = min(x.values(), default=0.0), np.ptp(list(x.values())) if x else 0.0
     at = {name: (x[name] - low, float(level)) for name, level in layer.items()}
     route = {pair: [at[name] for name in chain] for pair, chain in chains.items()}
-    return Layout(
-        {o.id: at[o.id] for o in graph.objects}, route, max(x.values(), default=0.0) - low, len(rows)
-    )
+    return Layout({o.id: at[o.id] for o in graph.objects}, route, float(width), len(rows))
 
 
 def layers(graph: SupportGraph) -> dict[str, int]:
@@ -105,21 +96,25 @@ def layers(graph: SupportGraph) -> dict[str, int]:
 
 
 def _abscissae(
-    rows: Sequence[Sequence[Hashable]], neighbours: Mapping[Hashable, Sequence[Hashable]]
+    rows: Sequence[Sequence[Hashable]], joined: nx.Graph[Hashable], table: str | None
 ) -> dict[Hashable, float]:
-    """Return x of each name: rows ordered by their neighbours' means, spaced as wide as their vertices."""
+    """Return x of each name: rows ordered by their neighbours' means, spaced as wide as their vertices.
+
+    The table draws the others to the middle and stays there.
+    """
     from scipy.optimize import isotonic_regression
 
     x = {name: k - (len(row) - 1) / 2.0 for row in rows for k, name in enumerate(row)}
     for sweep in range(SWEEPS):
         for row in rows if sweep % 2 == 0 else reversed(rows):
-            wish = {n: float(np.mean([x[m] for m in neighbours[n] or [n]])) for n in row}
-            ordered = sorted(row, key=lambda n: (wish[n], x[n]))
-            half = np.array([0.5 if isinstance(name, str) else 0.2 for name in ordered])
-            if ordered:
-                offset = np.cumsum(half) + np.cumsum(half) - half
-                spaced = isotonic_regression(np.array([wish[n] for n in ordered]) - offset).x + offset
-                x.update(zip(ordered, spaced.tolist(), strict=True))
+            if not row or row[0] == table:
+                continue
+            wish = {name: float(np.mean([x[other] for other in joined[name] or [name]])) for name in row}
+            ordered = sorted(row, key=lambda name: (wish[name], x[name]))
+            width = np.array([1.0 if isinstance(name, str) else 0.4 for name in ordered])
+            offset = np.cumsum(width) - width / 2.0
+            spaced = isotonic_regression(np.array([wish[name] for name in ordered]) - offset).x + offset
+            x.update(zip(ordered, spaced.tolist(), strict=True))
     return x
 
 

@@ -69,7 +69,7 @@ class _Sheets:
         if section.text:
             self.text(section.text, 8.0)
         narrow = [figure for figure in section.figures if not figure.wide]
-        self._pictures(narrow, min(section.columns, 3))
+        self._pictures(narrow, 2 if len(narrow) == 4 else min(section.columns, 3))
         self._pictures([figure for figure in section.figures if figure.wide], 1)
         for lead, remark in section.facts:
             self.text(f"{lead}: {remark}", 8.5, bold=True)
@@ -93,6 +93,9 @@ class _Sheets:
             heights = [min(width * f.picture.height / f.picture.width, 4.6) for f in row]
             captions = [_wrapped(f.caption, width, 6.5) for f in row]
             below = max(len(lines) for lines in captions) * 9.5 / 72.0 + 0.12
+            left_over = self._top - MARGIN - 0.2 - below
+            if left_over > 0.7 * max(heights):
+                heights = [min(height, left_over) for height in heights]
             self._room(0.2 + max(heights) + below)
             for k, (figure, height, lines) in enumerate(zip(row, heights, captions, strict=True)):
                 left, bottom = MARGIN + k * (width + gap), self._top - 0.2 - height

@@ -23,11 +23,6 @@ from caryatid.viz.drawings import draw_image
 from caryatid.viz.pictures import picture_png
 from caryatid.viz.report import Figure
 
-HEADROOM = 0.25
-"""Room above the objects that a picture shows [m]: the lifted one is to be seen."""
-AROUND = 0.07
-"""Room around the objects' middles, as a share of their distance [1]: 10 cm at 1.5 m."""
-
 
 def draw_lifts(
     scene: SimulatedScene,
@@ -70,10 +65,11 @@ def draw_lifts(
 
 def _zoomed(K: Array, positions_world: Array, T_world_camera: Array, config: Config) -> Array:
     """Pinhole matrix (3, 3) [px] of the part of a picture that shows the objects, also on their way up."""
-    above = positions_world + (0.0, 0.0, HEADROOM)
+    above = positions_world + (0.0, 0.0, 0.25)  # Room for the lifted one [m].
     p = transforms.transform(transforms.invert(T_world_camera), np.concatenate([positions_world, above]))
     at = p[:, :2] / p[:, 2:]
-    low, high = at.min(axis=0) - AROUND, at.max(axis=0) + AROUND
+    # Room around the objects' middles, as a share of their distance: 10 cm at 1.5 m.
+    low, high = at.min(axis=0) - 0.07, at.max(axis=0) + 0.07
     size = np.array([config.sensor.width, config.sensor.height])
     zoomed = K.copy()
     zoomed[[0, 1], [0, 1]] = np.min(size / (high - low))
