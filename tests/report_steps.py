@@ -45,13 +45,13 @@ def make_view(graph: SupportGraph, rgb: bool = True) -> View:
     T_world_camera = transforms.look_at((1.0, 0.2, TOP + 0.6), (0.0, 0.0, TOP + 0.05))
     depth = np.zeros((120, 160), dtype=np.float32)
     labels = np.zeros((120, 160), dtype=np.int32)
-    projection = Projection(T_world_camera, K, depth)
-    for item in graph.objects:
-        points, _ = item.shape.surface(0.003)
-        pixels, z = projection.project(points)
-        for (u, v), distance in zip(np.rint(pixels).astype(int), z, strict=True):
-            if 0 <= u < 160 and 0 <= v < 120 and (depth[v, u] == 0.0 or distance < depth[v, u]):
-                depth[v, u], labels[v, u] = distance, item.label
+    points = [item.shape.surface(0.003)[0] for item in graph.objects]
+    of_point = np.repeat([item.label for item in graph.objects], [len(p) for p in points])
+    pixels, z = Projection(T_world_camera, K, depth).project(np.concatenate(points))
+    u, v = np.rint(pixels).astype(int).T
+    far_to_near = np.argsort(-z)
+    seen = far_to_near[((u >= 0) & (u < 160) & (v >= 0) & (v < 120))[far_to_near]]
+    depth[v[seen], u[seen]], labels[v[seen], u[seen]] = z[seen], of_point[seen]
     colour = np.full((120, 160, 3), 90, dtype=np.uint8) if rgb else None
     return View(depth, K, T_world_camera, colour, labels, name="view <7> & more")
 
@@ -68,6 +68,7 @@ def make_cloud(graph: SupportGraph) -> Cloud:
 
 def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
     graph = make_graph()
+    view = make_view(graph, rgb)
     directions = fibonacci_sphere(2000)
     sphere = ViewSphere(np.array([0.0, 0.0, TOP]), 1.5, directions)
     reached = np.flatnonzero((directions[:, 2] > 0.3) & (directions[:, 2] < 0.7))
@@ -81,8 +82,8 @@ def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:
     return Step(
         index=index,
         name="view <7> & more",
-        view=make_view(graph, rgb),
-        labels=make_view(graph).labels,
+        view=view,
+        labels=view.labels,
         graph=graph,
         cloud=make_cloud(graph),
         sphere=sphere,
