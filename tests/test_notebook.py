@@ -190,6 +190,7 @@ def test_plain_lines_tell_one_from_another():
     assert repr(candidates) == "Candidates(0; refused: 3 too low)"
 
 
+@pytest.mark.slow
 def test_nothing_is_drawn_before_somebody_asks():
     code = (
         "import sys, numpy as np, caryatid as ct; box = ct.Box(np.eye(4), np.ones(3)); repr(box); ct.Scene;"

@@ -329,7 +329,12 @@ def draw_sphere(step: Step) -> Picture:
     sphere, visited, decision = step.sphere, step.visited, step.decision
     chosen = None if decision is None else sphere.direction_of(decision.T_world_camera)
     points = () if decision is None else sorted(decision.points_of_interest, key=lambda p: p.saliency)
-    T_world_eye = _sphere_eye(step, chosen)
+    # From between the current and the chosen view both are on the near side, if they can be.
+    aim_x, aim_y, _ = visited[-1:].sum(axis=0) + (0.0 if chosen is None else chosen)
+    towards_eye = direction(float(np.arctan2(aim_y, aim_x)), np.deg2rad(32.0))
+    T_world_eye = transforms.look_at(
+        sphere.centre_world + 10.0 * sphere.radius * towards_eye, sphere.centre_world
+    )
     space = _parallel(T_world_eye, RADIUS / sphere.radius, (SIDE / 2.0, SIDE / 2.0))
     outlines = _outlines(step.graph.objects, space)
 
@@ -386,18 +391,6 @@ def draw_sphere(step: Step) -> Picture:
             axes.text(left + shift, top + 8.0 if shift < 0.0 else top - 5.0, text, **small)
 
     return Picture(f"view sphere with its saliency after view {step.index}", 2.0 * SIDE, SIDE, draw)
-
-
-def _sphere_eye(step: Step, chosen: Array | None) -> Array:
-    """Look from between the current and the chosen view, so that both are on the near side if they can."""
-    current = step.visited[-1] if len(step.visited) else np.array([1.0, 0.0, 0.0])
-    azimuth = float(np.arctan2(current[1], current[0]))
-    if chosen is not None:
-        turn = np.arctan2(chosen[1], chosen[0]) - azimuth
-        azimuth += float(np.arctan2(np.sin(turn), np.cos(turn))) / 2.0
-    centre = step.sphere.centre_world
-    eye_world = centre + 10.0 * step.sphere.radius * direction(azimuth, np.deg2rad(32.0))
-    return transforms.look_at(eye_world, centre)
 
 
 def _painted(step: Step, directions: Array, inside: NDArray[np.bool_]) -> NDArray[np.uint8]:
