@@ -70,16 +70,16 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
 def read_recording(folder: str | Path) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
-    Cameras and poses are checked here, and every image for being whole and of the right size and mode;
-    views are decoded when they are asked for. A rotation that has drifted from orthonormal by less than
-    `ROTATION_DRIFT` is replaced by the nearest rotation.
+    Cameras, poses and the table of masks are checked here, images when a view is asked for. A rotation that
+    has drifted from orthonormal by less than `ROTATION_DRIFT` is replaced by the nearest rotation.
 
     Args:
         folder: The scene folder. Lengths in it are millimetres.
 
     Raises:
-        InputError: A file is missing or broken, sizes differ, a camera or pose is not valid, a mask names
-            no object, several frames have no poses, or there is no frame.
+        InputError: A table is missing or broken, a camera or pose is not valid, a mask names no object,
+            several frames have no poses, or there is no frame. Loading a frame raises it where an image is
+            missing, broken, of another size or mode, or where masks overlap.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -95,7 +95,7 @@ def read_recording(folder: str | Path) -> Dataset:
             )
     masks = _read_masks(folder, set(cameras))
     frames = tuple(
-        _read_frame(folder, n, cameras[n], masks.get(n), f"{camera_path}: frame {n}") for n in sorted(cameras)
+        _frame(folder, n, cameras[n], masks.get(n), f"{camera_path}: frame {n}") for n in sorted(cameras)
     )
     without = [f.number for f in frames if f.T_world_camera is None]
     if len(frames) > 1 and without:
@@ -178,23 +178,16 @@ def write_recording(folder: str | Path, views: Sequence[View], depth_scale: floa
         writer.finish()
 
 
-def _read_frame(folder: Path, number: int, document: Any, masks: Masks | None, source: str) -> Frame:
+def _frame(folder: Path, number: int, document: Any, masks: Masks | None, source: str) -> Frame:
     camera = parse_json(_Camera, document, source)
-    depth_path, rgb_path = folder / f"depth/{number:06d}.png", None
-    size = images.check_image(depth_path, images.DEPTH_MODES, "a 16-bit grey PNG")
-    sizes = {path: images.check_image(path, images.MASK_MODES, "a grey PNG") for path, _ in masks or ()}
-    if (folder / "rgb").is_dir():
-        paths = [folder / f"rgb/{number:06d}{ending}" for ending in COLOUR_ENDINGS]
-        rgb_path = next((path for path in paths if path.exists()), paths[0])
-        sizes[rgb_path] = images.check_image(rgb_path)
-    for path, (width, height) in sizes.items():
-        if (width, height) != size:
-            reason = f"is {width}×{height} pixels, the depth image {depth_path} is {size[0]}×{size[1]}"
-            raise InputError(path, reason, "register the images to one size")
     K, T_world_camera = (
         check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K"),
         _pose(camera, source),
     )
+    depth_path, rgb_path = folder / f"depth/{number:06d}.png", None
+    if (folder / "rgb").is_dir():
+        paths = [folder / f"rgb/{number:06d}{ending}" for ending in COLOUR_ENDINGS]
+        rgb_path = next((path for path in paths if path.exists()), paths[0])
     name = f"{folder.resolve().name}/{number:06d}"
 
     def load() -> View:
@@ -202,24 +195,35 @@ def _read_frame(folder: Path, number: int, document: Any, masks: Masks | None, s
         if not depth.any():
             reason = "the frame is empty: no pixel has a depth reading"
             raise InputError(depth_path, reason, "leave this frame out")
-        rgb = None if rgb_path is None else images.read_colour(rgb_path)
-        labels = None if masks is None else _read_labels(masks, depth.shape)
+        rgb = None
+        if rgb_path is not None:
+            rgb = images.read_colour(rgb_path)
+            _check_size(rgb_path, rgb, depth)
+        labels = None if masks is None else _read_labels(masks, depth)
         return View(depth, K, T_world_camera, rgb, labels, name=name)
 
     return Frame(name, number, load, T_world_camera, has_labels=masks is not None)
 
 
-def _read_labels(masks: Masks, shape: tuple[int, ...]) -> NDArray[np.int32]:
+def _read_labels(masks: Masks, depth: NDArray[np.float32]) -> NDArray[np.int32]:
     """Object number of each pixel (H, W), 0 = nothing."""
-    labels = np.zeros(shape, dtype=np.int32)
+    labels = np.zeros(depth.shape, dtype=np.int32)
     for path, label in masks:
         mask = images.read_mask(path)
+        _check_size(path, mask, depth)
         taken = labels[mask & (labels > 0)]
         if len(taken):
             reason = f"overlaps the mask of obj_id {taken[0]} in {len(taken)} pixels"
             raise InputError(path, reason, "give each pixel to one object")
         labels[mask] = label
     return labels
+
+
+def _check_size(path: Path, image: NDArray[Any], depth: NDArray[np.float32]) -> None:
+    (height, width), (rows, columns) = image.shape[:2], depth.shape
+    if (height, width) != (rows, columns):
+        reason = f"is {width}×{height} pixels, the depth image is {columns}×{rows}"
+        raise InputError(path, reason, "register the images to one size")
 
 
 def _pose(camera: _Camera, name: str) -> Array | None:

@@ -26,29 +26,6 @@ class BrokenImageError(InputError):
     """An image that cannot be decoded; others of its recording may be whole."""
 
 
-def check_image(path: Path, modes: tuple[str, ...] | None = None, what: str = "") -> tuple[int, int]:
-    """Check that an image is whole and of the right kind; a PNG is not decoded for that.
-
-    Args:
-        path: A PNG or JPEG.
-        modes: Pillow modes allowed, or None for any.
-        what: What the image ought to be, for the error where the mode is another.
-
-    Returns:
-        Width and height [px].
-
-    Raises:
-        InputError: The file is missing, truncated, no image, or of another mode.
-    """
-    with _opened(path, modes=modes, what=what) as image:
-        size = image.size
-        if image.format == "PNG":
-            image.verify()
-        else:
-            image.load()
-    return size
-
-
 def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     """Read a 16-bit depth PNG.
 
@@ -81,7 +58,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises:
         InputError: Missing, truncated, or not of one channel.
     """
-    with _opened(path, modes=MASK_MODES, what="a grey PNG") as opened:
+    with _opened(path, "", MASK_MODES, "a grey PNG") as opened:
         return np.asarray(opened) > 0
 
 
@@ -133,8 +110,10 @@ def _opened(
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
-            file = image if isinstance(image, Path) else io.BytesIO(image)
-            with Image.open(file, formats=("PNG", "JPEG")) as opened:
+            with _open(image) as whole:
+                if whole.format == "PNG":
+                    whole.verify()  # decoding passes over a wrong checksum or a missing end
+            with _open(image) as opened:
                 if modes is not None and opened.mode not in modes:
                     reason = f"has pixels of mode {opened.mode}, not {what}"
                     raise BrokenImageError(source, reason, f"save it as {what}")
@@ -149,3 +128,8 @@ def _opened(
         raise BrokenImageError(source, f"cannot be read ({error.strerror})", remedy) from error
     except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as error:
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
+
+
+def _open(image: Path | bytes) -> Image.Image:
+    file = image if isinstance(image, Path) else io.BytesIO(image)
+    return Image.open(file, formats=("PNG", "JPEG"))
