@@ -33,9 +33,8 @@ from rosbags.typesys import get_types_from_msg
 
 from caryatid.config import RecordingConfig
 from caryatid.geometry import transforms
-from caryatid.io import read_recording, write_recording
+from caryatid.io import read_recording
 from caryatid.io.importing import apart, choose_views
-from caryatid.scene import Scene
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)
 ALL = (*TOPICS, "--rgb", RGB, "--tf", WORLD)
@@ -105,29 +104,6 @@ def test_transforms_of_the_first_kind(tmp_path, views):
     same_views(imported(tmp_path, tmp_path / "one.bag", *TOPICS, "--tf", WORLD), views, colour=False)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("source", ["bag", "tum"])
-def test_the_graph_is_that_of_the_direct_recording(tmp_path, views, source, settings):
-    """Masks are no part of what robots record; they are put beside both."""
-    if source == "bag":
-        recording = imported(tmp_path, bag_of(tmp_path, views, KINDS[2]), *ALL)
-        write_recording(tmp_path / "direct", views, depth_scale=1.0)
-    else:
-        camera = camera_file(tmp_path, views[0].K)
-        recording = imported(tmp_path, tum_folder(tmp_path, views), "--camera", camera)
-        write_recording(tmp_path / "direct", views, depth_scale=0.2)
-    ours, direct = Scene(settings, seed=3), Scene(settings, seed=3)
-    for view, original in zip(recording, read_recording(tmp_path / "direct"), strict=True):
-        ours.update(replace(view, labels=original.labels))
-        direct.update(original)
-    assert {s.pair for s in ours.graph.supports} == {("o0", "o1"), ("o1", "o2")}
-    assert [s.pair for s in ours.graph.supports] == [s.pair for s in direct.graph.supports]
-    for item, other in zip(ours.graph.objects, direct.graph.objects, strict=True):
-        assert (item.id, item.shape.kind) == (other.id, other.shape.kind)
-        points_world, _ = item.shape.surface(0.01)
-        assert np.abs(other.shape.signed_distance(points_world)).max() < 0.001
-
-
 def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views, capsys):
     recording = imported(tmp_path, bag_of(tmp_path, views), *TOPICS)
     assert len(recording) == 1
@@ -175,15 +151,12 @@ def test_depth_in_metres_without_what_is_no_reading(tmp_path, views, big):
 
 @pytest.mark.parametrize(
     ("form", "atol"),
-    [("16UC1; compressedDepth png", 0.00051), ("16UC1; compressedDepth", 0.00051),
-     ("32FC1; compressedDepth png", 0.0015), ("16UC1; png compressed 16UC1", 0.00051), ("png", 0.00051)],
-)  # fmt: skip
+    [("16UC1; compressedDepth", 0.00051), ("32FC1; compressedDepth png", 0.0015), ("png", 0.00051)],
+)
 def test_compressed_depth(tmp_path, views, form, atol):
     depth = views[0].depth
-    if "compressedDepth" in form:
-        data = compressed_depth(depth, form[:5])
-    else:
-        data = png(np.rint(depth * 1000.0).astype(np.uint16))
+    millimetres = np.rint(depth * 1000.0).astype(np.uint16)
+    data = compressed_depth(depth, form[:5]) if "compressedDepth" in form else png(millimetres)
     bag = one_frame(tmp_path, views, lambda b, t: b.compressed(t, data, form))
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert ((view.depth > 0.0) == (depth > 0.0)).all()
@@ -355,28 +328,19 @@ def test_depth_that_cannot_be_decoded(tmp_path, views, capsys, leftovers, make, 
     assert leftovers() == {"one.bag"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
-def test_a_bag_that_was_cut_off(tmp_path, views, kind, capsys):
+def test_a_bag_that_was_cut_off_or_has_wrong_bytes_is_read_or_refused_in_one_line(
+    tmp_path, views, kind, capsys, leftovers
+):
     bag = bag_of(tmp_path, views, kind)
     (file,) = [bag] if bag.is_file() else [p for p in bag.iterdir() if p.suffix in (".db3", ".mcap")]
-    whole = file.read_bytes()
-    before = set(tmp_path.iterdir())
-    for share in (0.001, 0.05, 0.3, 0.6, 0.9, 0.99):
+    whole, there = file.read_bytes(), leftovers()
+    for share in (0.001, 0.3, 0.99):
         file.write_bytes(whole[: int(share * len(whole))])
         assert "is damaged or was cut off" in refused(capsys, bag, *ALL, "--out", tmp_path / "out")
-        assert set(tmp_path.iterdir()) == before
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
-def test_a_bag_with_wrong_bytes_is_read_or_refused_in_one_line(tmp_path, views, kind, capsys):
-    bag = bag_of(tmp_path, views, kind)
-    (file,) = [bag] if bag.is_file() else [p for p in bag.iterdir() if p.suffix in (".db3", ".mcap")]
-    whole = file.read_bytes()
+        assert leftovers() == there
     rng = np.random.default_rng(0)
-    ends = set()
-    for _ in range(25):
+    for _ in range(15):
         damaged = bytearray(whole)
         for place in rng.integers(0, len(whole), 40):
             damaged[place] = rng.integers(0, 256)
@@ -384,14 +348,12 @@ def test_a_bag_with_wrong_bytes_is_read_or_refused_in_one_line(tmp_path, views, 
         damaged[rng.integers(100, 6000)] ^= 255
         damaged[-rng.integers(1, 3000)] ^= 255
         file.write_bytes(bytes(damaged))
-        capsys.readouterr()
-        ends.add(status := run_command("import", bag, *ALL, "--out", tmp_path / "out"))
+        status = run_command("import", bag, *ALL, "--out", tmp_path / "out")
         told = capsys.readouterr().err
         assert "a fault in caryatid" not in told
         assert (tmp_path / "out").exists() == (status == 0)
         assert status == 0 or told.count("\n") == 1
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-    assert 1 in ends
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
@@ -402,11 +364,10 @@ def test_an_empty_bag(tmp_path, kind, capsys):
     assert "the bag is empty" in refused(capsys, tmp_path / name, *TOPICS, "--out", tmp_path / "out")
 
 
-def test_what_is_neither_a_bag_nor_a_folder_of_the_benchmark(tmp_path, capsys, recording):
+def test_what_is_no_recording(tmp_path, capsys):
     (tmp_path / "x.zip").write_bytes(b"PK")
-    for source in (tmp_path / "x.zip",):
-        told = refused(capsys, source, *TOPICS, "--out", tmp_path / "out")
-        assert "is of no known format" in told
+    told = refused(capsys, tmp_path / "x.zip", *TOPICS, "--out", tmp_path / "out")
+    assert "is of no known format" in told
     assert "there is no such file" in refused(capsys, tmp_path / "no.bag", "--out", tmp_path / "out")
 
 
@@ -447,13 +408,10 @@ def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, name,
         replace(v, depth=np.kron(v.depth, np.ones((4, 4))), rgb=np.kron(v.rgb, np.ones((4, 4, 1), np.uint8)))
         for v in without_labels(views[:1])
     ]
-    (view,) = imported(tmp_path, tum_folder(tmp_path, large, name), "--quiet")
+    (view,) = imported(tmp_path, tum_folder(tmp_path, large, name))
     assert view.K[0, 0] == fx
-    shutil.rmtree(tmp_path / "out")
-    imported(tmp_path, tmp_path / name)
-    assert f"camera: as published for freiburg{name.partition('freiburg')[2][0]}, fx {fx:g}" in (
-        capsys.readouterr().err
-    )
+    number = name.partition("freiburg")[2][0]
+    assert f"camera: as published for freiburg{number}, fx {fx:g}" in capsys.readouterr().err
 
 
 def spoil(name, text):
@@ -508,7 +466,6 @@ def up_from(view, upright):
     return np.rad2deg(transforms.angle_between(up, right))
 
 
-@pytest.mark.slow
 def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views, capsys):
     folder = tum_folder(tmp_path, lying(views))
     options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
@@ -517,13 +474,6 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     assert max(up_from(view, upright) for view, upright in zip(levelled, views, strict=True)) < 0.5
     before, after = (transforms.invert(a.pose) @ b.pose for a, b in (views[:2], levelled[:2]))
     assert np.allclose(before, after, atol=1e-5)
-    scenes = []
-    for those in (views, levelled):
-        scenes.append(Scene(segmentation="auto", seed=3))
-        for view in without_labels(those):
-            scenes[-1].update(view)
-    counts = [(len(s.graph.objects), len(s.graph.supports)) for s in scenes]
-    assert counts[0] == counts[1]
 
 
 def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, capsys):
