@@ -112,7 +112,6 @@ def test_missing_readings_are_dropped_and_labels_spread_back(tmp_path_factory, m
         data[axis][hit] = value
     stored = read_stored_cloud(write(tmp_path_factory.mktemp("c") / "a.pcd", data, WIDTH=10, HEIGHT=6))
     cloud = stored.to_cloud(CloudConfig())
-    assert stored.size == (10, 6)
     assert len(cloud) == 60 - missing == stored.kept.sum()
     assert np.isfinite(cloud.points_world).all()
     assert np.isfinite(cloud.normals_world).all()
@@ -287,7 +286,6 @@ def test_what_is_no_ply_is_refused(tmp_path, content):
 def test_a_real_organised_cloud_agrees_with_its_recording():
     stored = read_stored_cloud(SHARED / "data/clouds/learn22.pcd", label_divisor=10)
     view = read_recording(SHARED / "data/mosd/learn22")[0]
-    assert stored.size == (640, 480)
     assert len(stored.points) == 307200
     assert (stored.labels == view.labels.ravel()).mean() > 0.999
     kept = stored.kept & view.valid.ravel()

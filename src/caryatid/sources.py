@@ -35,14 +35,12 @@ class Source:
         camera: Gives its views.
         robot: Stands at the first view.
         truth: What is really there, where known.
-        views: Views there are, or None without a limit.
     """
 
     name: str
     camera: Camera
     robot: Robot
     truth: TrueScene | None
-    views: int | None
 
 
 def is_recording(source: str) -> bool:
@@ -87,7 +85,7 @@ def open_source(
     known = read_truth(truth_file) if truth_file.is_file() else None
     truth = ground_truth(scene) if known is None else known
     stage = make_simulation(scene, config, noise=noise, seed=seed, robot=make)
-    return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth), None)
+    return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth))
 
 
 def open_recording(folder: str, config: Config, segmentation: SegmentationMethod | None) -> Dataset:
@@ -137,4 +135,4 @@ def check_segments(source: str, points: Mapping[int, int], config: Config) -> No
 def _open_recording(recording: Dataset) -> Source:
     camera = RecordingCamera(recording)
     poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
-    return Source(recording.path.name, camera, RecordingRobot(poses), None, len(recording))
+    return Source(recording.path.name, camera, RecordingRobot(poses), None)

@@ -82,7 +82,13 @@ def read_steps(run: Run) -> Iterator[Step]:
     Raises:
         InputError: A step is missing or broken, or the run was written by a version that kept no steps.
     """
-    check_steps(run)
+    if run.record["version"] == 1:
+        version = run.record.get("versions", {}).get("caryatid", "0.1.0")
+        raise InputError(
+            run.folder,
+            f"was written by caryatid {version}, which kept no views",
+            "make the run again; order, evaluate and export need only its graph",
+        )
     return (read_step(view.folder) for view in run.views)
 
 
@@ -94,21 +100,6 @@ def read_config(run: Run) -> Config:
     """
     path = str(run.folder / "run.json")
     return changed_settings(Config(), run.record.get("settings", {}), path)
-
-
-def check_steps(run: Run) -> None:
-    """Refuse a run folder without steps.
-
-    Raises:
-        InputError: It was written by a version that kept none.
-    """
-    if run.record["version"] == 1:
-        version = run.record.get("versions", {}).get("caryatid", "0.1.0")
-        raise InputError(
-            run.folder,
-            f"was written by caryatid {version}, which kept no views",
-            "make the run again; order, evaluate and export need only its graph",
-        )
 
 
 def _summary(step: Step) -> dict[str, Any]:

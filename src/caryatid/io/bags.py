@@ -22,7 +22,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io import images
 from caryatid.io.datasets import Dataset, OpenOptions
 from caryatid.io.images import BrokenImageError
-from caryatid.io.video import SECOND, Decoded, TransformTree, is_pose, make_video, nearest
+from caryatid.io.video import SECOND, Decoded, TimedImage, TransformTree, is_pose, make_video, nearest
 from caryatid.sensing.views import check_intrinsics
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
@@ -51,17 +51,15 @@ _CONFIG_HEADER: Final = struct.Struct("<iff")
 
 
 @dataclass(frozen=True, slots=True)
-class _Image:
-    """Where an image is in a bag, when it was taken [ns], and the frame of its camera.
+class _Image(TimedImage):
+    """Where an image is in a bag, and the frame of its camera.
 
     Of several received at the same time `twin` counts those before it.
     """
 
-    name: str
     topic: str
     received: int
     twin: int
-    time: int
     frame: str
 
 
@@ -208,7 +206,7 @@ class _Bag:
         for number, (_, received, message) in enumerate(self.messages([topic])):
             name = f"{self.path.name}: depth image {number}"
             time, frame = _stamp(message.header, received), _frame(message.header.frame_id)
-            found.append(_Image(name, topic, received, twins[received], time, frame))
+            found.append(_Image(name, time, topic, received, twins[received], frame))
             twins[received] += 1
             compressed = message.__msgtype__ == COMPRESSED
             millimetres = millimetres and (message.format[:5] if compressed else message.encoding) != "32FC1"

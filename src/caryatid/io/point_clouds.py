@@ -22,8 +22,8 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 MAX_COMPRESSION: Final = 100
 """Bytes of points one byte of a file can hold: LZF writes at most 264 for 3."""
 
-Parsed = tuple[dict[str, NDArray[Any]], Array, tuple[int, int] | None]
-"""Fields of one value per point (N,), viewpoint (3,), and width and height of an organised cloud."""
+Parsed = tuple[dict[str, NDArray[Any]], Array]
+"""Fields of one value per point (N,), and viewpoint (3,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -36,7 +36,6 @@ class StoredCloud:
         labels: Object number of each point (N,), 0 = nothing, or None.
         rgb: (N, 3) uint8, or None.
         viewpoint: Where the sensor was (3,) [m]; the origin where the file does not say.
-        size: Width and height of an organised cloud, or None.
         name: The file.
     """
 
@@ -45,7 +44,6 @@ class StoredCloud:
     labels: NDArray[np.int32] | None
     rgb: NDArray[np.uint8] | None
     viewpoint: Array
-    size: tuple[int, int] | None
     name: str
 
     @property
@@ -120,7 +118,7 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     if parse is None:
         raise InputError(path, "is no .pcd or .ply file", "convert it to one of these")
     try:
-        columns, viewpoint, size = parse(path.read_bytes())
+        columns, viewpoint = parse(path.read_bytes())
     except FileNotFoundError:
         raise InputError(path, "the file is missing", "give a .pcd or .ply file") from None
     except OSError as error:
@@ -134,7 +132,6 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
         labels=_labels(columns, label_divisor, path),
         rgb=_colours(columns),
         viewpoint=viewpoint,
-        size=size,
         name=path.name,
     )
     if not stored.kept.any():
@@ -179,9 +176,8 @@ def _parse_pcd(content: bytes) -> Parsed:
     data = np.atleast_1d(PointCloud.from_fileobj(file).pc_data)
     if len(data) != header.points:
         raise ValueError(f"POINTS {header.points}, but data of {len(data)} points follows")
-    size = (header.width, header.height) if header.height > 1 else None
     viewpoint = np.array(header.viewpoint[:3], dtype=np.float64)
-    return {name: data[name] for name in header.fields if name in columns}, viewpoint, size
+    return {name: data[name] for name in header.fields if name in columns}, viewpoint
 
 
 def _parse_ply(content: bytes) -> Parsed:
@@ -200,7 +196,7 @@ def _parse_ply(content: bytes) -> Parsed:
     lengths = {len(column) for column in columns.values()}
     if lengths != {vertex["length"]}:
         raise ValueError(f"{vertex['length']} points said, {min(lengths)} there")
-    return columns, np.zeros(3), None
+    return columns, np.zeros(3)
 
 
 def _reason(error: Exception) -> str:

@@ -17,7 +17,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io import images
 from caryatid.io.datasets import Dataset, OpenOptions, Topics
 from caryatid.io.json_files import parse_json, read_json
-from caryatid.io.video import SECOND, Decoded, TransformTree, is_pose, make_video
+from caryatid.io.video import SECOND, Decoded, TimedImage, TransformTree, is_pose, make_video
 from caryatid.sensing.views import check_intrinsics
 
 DEPTH_SCALE: Final = 0.2
@@ -63,13 +63,8 @@ class _Camera:
 
 
 @dataclass(frozen=True, slots=True)
-class _Image:
-    time: int
+class _Image(TimedImage):
     path: Path
-
-    @property
-    def name(self) -> str:
-        return str(self.path)
 
 
 def recognises(path: Path) -> bool:
@@ -136,7 +131,8 @@ def _read_poses(path: Path, max_gap: float) -> TransformTree:
 
 
 def _read_list(path: Path) -> list[_Image]:
-    return [_Image(time, path.parent / file) for time, (file,) in _read_rows(path, 2)]
+    files = ((time, path.parent / file) for time, (file,) in _read_rows(path, 2))
+    return [_Image(str(file), time, file) for time, file in files]
 
 
 def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from math import hypot, isfinite
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,18 +29,17 @@ Decoded = tuple[NDArray[np.float32], NDArray[np.uint8] | None, Array]
 """Depth (H, W) [m], colour (H, W, 3) or None, and pinhole matrix (3, 3) [px]."""
 
 
-class TimedImage(Protocol):
-    """An image that is not decoded yet."""
+@dataclass(frozen=True, slots=True)
+class TimedImage:
+    """An image that is not decoded yet.
 
-    @property
-    def name(self) -> str:
-        """What to call it."""
-        ...
+    Attributes:
+        name: What to call it.
+        time: When it was taken [ns].
+    """
 
-    @property
-    def time(self) -> int:
-        """When it was taken [ns]."""
-        ...
+    name: str
+    time: int
 
 
 Image = TypeVar("Image", bound=TimedImage)
