@@ -55,8 +55,8 @@ def test_a_run_is_read_back(tmp_path):
     assert len(run.graph.objects) == 2
     view = run.views[1]
     assert view.name == "scene/000001"
-    assert np.allclose(view.record["T_world_camera"], T)
-    assert np.allclose(view.record["K"], K)
+    assert np.allclose(view.T_world_camera, T)
+    assert np.allclose(view.K, K)
     assert view.record["choice"]["why"] == "o2 is held by nothing"
     assert (view.load_labels() == labels()).all()
     assert (tmp_path / "deep/RUN/report.html").read_text(encoding="utf-8") == "<html>σ</html>"
@@ -80,7 +80,7 @@ def test_clouds_have_one_label_a_point(tmp_path):
     assert view.load_labels().tolist() == [0, 3, 65535]
     assert view.load_labels().dtype == np.int32
     assert np.load(tmp_path / "RUN/views/00/labels.npy").dtype == np.int32
-    assert view.record["T_world_camera"] is None
+    assert view.T_world_camera is None
 
 
 def test_the_same_run_gives_the_same_bytes(tmp_path):
@@ -207,6 +207,7 @@ def test_labels_that_leave_16_bits_are_refused(tmp_path):
         ("graph.json", "{}", "caryatid/graph"),
         ("views/01/graph.json", None, "missing"),
         ("views/01/view.json", "{}", "'name' is missing"),
+        ("views/01/view.json", '{"name": "a", "T_world_camera": [1]}', "4×4"),
         ("views/01/labels.png", None, "missing"),
         ("views/01/labels.png", "text", "no image"),
     ],

@@ -6,7 +6,7 @@ import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
-from caryatid.io.json_files import json_text, parse_json, read_json
+from caryatid.io.json_files import Numbers, json_text, parse_json, read_json
 from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import SUPPORT_LABEL
 
@@ -135,6 +135,8 @@ class RunView:
         index: 0 for the first.
         name: The view's name.
         graph: The fused graph after this view.
+        T_world_camera: Camera pose (4, 4), or None.
+        K: Pinhole matrix (3, 3) [px], or None.
         record: All of view.json.
         folder: Its folder, `views/NN`.
     """
@@ -142,6 +144,8 @@ class RunView:
     index: int
     name: str
     graph: SupportGraph
+    T_world_camera: Array | None
+    K: Array | None
     record: dict[str, Any]
     folder: Path
 
@@ -194,9 +198,11 @@ class _RunFile:
     settings: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False)
 class _ViewFile:
     name: str
+    T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
+    K: Annotated[Array, Numbers(3, 3)] | None = None
 
 
 def read_run(folder: str | Path) -> Run:
@@ -236,5 +242,5 @@ def _view_folder(index: int) -> str:
 def _read_view(folder: Path, index: int) -> RunView:
     path = folder / "view.json"
     record = read_json(path, AGAIN)
-    name = parse_json(_ViewFile, record, path, AGAIN).name
-    return RunView(index, name, read_graph(folder / "graph.json"), record, folder)
+    given = vars(parse_json(_ViewFile, record, path, AGAIN))
+    return RunView(index, graph=read_graph(folder / "graph.json"), record=record, folder=folder, **given)
