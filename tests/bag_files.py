@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from caryatid.geometry import transforms
+from caryatid.io.images import png
 
 SECOND = 1_000_000_000
 START = 1_700_000_000 * SECOND
@@ -116,11 +117,10 @@ T_BASE_LENS = transforms.rigid(transforms.rotation_from_vector((-1.2, 0.9, -0.4)
 """Where the camera sits on the robot."""
 
 
-def write_bag(path, views, storage="sqlite3", *, slash="", without_pose=(), without_colour=()):
+def write_bag(path, views, storage="sqlite3", *, without_pose=(), without_colour=()):
     """Write views as a robot would: depth in mm, colour, camera, poses of the base before and after."""
     with BagFile(path, storage) as bag:
-        lens = slash + LENS
-        bag.write("/tf_static", bag.transform(START, slash + BASE, lens, T_BASE_LENS), START)
+        bag.write("/tf_static", bag.transform(START, BASE, LENS, T_BASE_LENS), START)
         bag.write("/chatter", bag.type("std_msgs/msg/String")(data="hello"), START)
         for index, view in enumerate(views):
             time = START + index * SECOND
@@ -134,13 +134,13 @@ def write_bag(path, views, storage="sqlite3", *, slash="", without_pose=(), with
                 for late, R, t in ((-10, back, -step / 3), (30, turn, step)):
                     T = transforms.rigid(T_world_base[:3, :3] @ R, T_world_base[:3, 3] + t)
                     when = time + late * SECOND // 1000
-                    bag.write("/tf", bag.transform(when, slash + WORLD, slash + BASE, T), when)
-            bag.write(INFO, bag.camera(time, view.K, size, lens), time)
+                    bag.write("/tf", bag.transform(when, WORLD, BASE, T), when)
+            bag.write(INFO, bag.camera(time, view.K, size), time)
             depth = np.rint(view.depth * 1000.0).astype(np.uint16)
-            bag.write(DEPTH, bag.image(time, depth, "16UC1", lens), time + 1000)
+            bag.write(DEPTH, bag.image(time, depth, "16UC1"), time + 1000)
             if index not in without_colour:
                 late = time + SECOND // 200
-                bag.write(RGB, bag.image(late, view.rgb, "rgb8", lens), late)
+                bag.write(RGB, bag.image(late, view.rgb, "rgb8"), late)
 
 
 def write_tum(folder, views):
@@ -161,12 +161,6 @@ def write_tum(folder, views):
         lists["groundtruth"].append(f"{time} {numbers}")
     for name, lines in lists.items():
         (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
-
-
-def png(pixels):
-    buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG")
-    return buffer.getvalue()
 
 
 def jpeg(pixels):

@@ -21,7 +21,6 @@ from bag_files import (
     BagFile,
     compressed_depth,
     jpeg,
-    png,
     write_bag,
     write_tum,
 )
@@ -34,6 +33,7 @@ from rosbags.typesys import get_types_from_msg
 from caryatid.config import RecordingConfig
 from caryatid.geometry import transforms
 from caryatid.io import read_recording
+from caryatid.io.images import png
 from caryatid.io.importing import apart, choose_views
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)

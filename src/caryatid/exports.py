@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
@@ -18,9 +18,6 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.staging import write_file
 from caryatid.viz.colours import ink_on, object_colour, rgb
-
-if TYPE_CHECKING:
-    import mujoco
 
 ENDINGS: Final[dict[ExportFormat, tuple[str, ...]]] = {
     "mjcf": (".xml",),
@@ -106,15 +103,17 @@ def to_mjcf(graph: SupportGraph, config: ExportConfig) -> str:
     """
     import mujoco
 
-    from caryatid.simulation.world import Solid, add_solid, empty_spec
+    from caryatid.simulation.world import TABLE, Solid, add_solid, empty_spec, quaternion
 
     spec = empty_spec("caryatid")
     try:
         for item in graph.objects:
-            if item.role == "support_surface":
-                _add_surface(spec, item)
-            else:
+            if item.role == "object":
                 add_solid(spec, item.id, Solid(item.shape, config.density, config.friction), _rgba(item))
+                continue
+            R, size = item.shape.T_world_object[:3, :3], item.shape.extents / 2.0
+            table = spec.worldbody.add_body(name=TABLE, pos=item.centre_world, quat=quaternion(R))
+            table.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=size, rgba=_rgba(item))
         spec.compile()
         text: str = spec.to_xml()
         mujoco.MjModel.from_xml_string(text)
@@ -157,18 +156,6 @@ def to_urdf(graph: SupportGraph, config: ExportConfig) -> str:
         SubElement(joint, "origin", xyz=_numbers(*T[:3, 3]), rpy=_numbers(*_rpy(T)))
     indent(robot)
     return tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _add_surface(spec: mujoco.MjSpec, item: SceneObject) -> None:
-    import mujoco
-
-    from caryatid.simulation.world import TABLE, quaternion
-
-    T_world_object = item.shape.T_world_object
-    table = spec.worldbody.add_body(
-        name=TABLE, pos=T_world_object[:3, 3], quat=quaternion(T_world_object[:3, :3])
-    )
-    table.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=item.shape.extents / 2.0, rgba=_rgba(item))
 
 
 def _urdf_shape(shape: Shape) -> tuple[str, dict[str, str]]:
