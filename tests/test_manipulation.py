@@ -102,7 +102,7 @@ class TestRehearsal:
         rehearsal = Rehearsal(tower(), CONFIG, np.random.default_rng(0))
         assert rehearsal.try_lift("o1").harmed == {"o2": 1.0, "o3": 1.0}
         assert rehearsal.left() == ["o1", "o2", "o3", "o4"]
-        rehearsal.take("o3", rehearsal.try_lift("o3"))
+        rehearsal.take(rehearsal.try_lift("o3"))
         assert rehearsal.left() == ["o1", "o2", "o4"]
         assert set(rehearsal.try_lift("o1").harmed) == {"o2"}
 

@@ -17,9 +17,6 @@ from caryatid.manipulation.order import Order, TakeStep
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.world import SimulatedScene, state_of
 
-LEAST_IOU = 0.01
-"""An extracted object stands for the body it overlaps most; overlapping less than this, for none [1]."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Taken:
@@ -46,8 +43,11 @@ class Taken:
 
 
 def bodies_of(graph: SupportGraph, truth: TrueScene, seed: int = 0) -> dict[str, str]:
-    """Body each extracted object stands for, by id: what a hand that reaches for it would take hold of."""
-    found = score(graph, truth, np.random.default_rng(seed), replace(EvaluationConfig(), min_iou=LEAST_IOU))
+    """Body each extracted object stands for, by id: what a hand that reaches for it would take hold of.
+
+    It is the one it overlaps most; one that overlaps by less than 0.01 (IoU) stands for none.
+    """
+    found = score(graph, truth, np.random.default_rng(seed), replace(EvaluationConfig(), min_iou=0.01))
     table = graph.support_surface
     return {i: body for i, body in found.matches.items() if table is None or i != table.id}
 

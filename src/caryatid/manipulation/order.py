@@ -62,15 +62,6 @@ class Order(Pictured):
         return f"Order({taken}; {self.refusal or 'safe'})"
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Option:
-    """A lift that could be next."""
-
-    object_id: str
-    hold: tuple[str, ...]
-    trial: Trial
-
-
 def plan_order(
     graph: SupportGraph,
     config: Config | None = None,
@@ -108,11 +99,11 @@ def plan_order(
         if goal is not None and goal not in left:
             break
         wanted = _in_turn(graph, left) if goal is None else _on_the_way(graph, goal, left, rehearsal)
-        option, tried = _safest(rehearsal, wanted, hands)
-        if option.trial.risk > 0.0 and not refusal:
-            refusal = _refusal(option, tried)
-        steps.append(_step(graph, option, rehearsal))
-        rehearsal.take(option.object_id, option.trial)
+        trial, tried = _safest(rehearsal, wanted, hands)
+        if trial.risk > 0.0 and not refusal:
+            refusal = _refusal(trial, tried)
+        steps.append(_step(graph, trial, rehearsal))
+        rehearsal.take(trial)
     return Order(tuple(steps), refusal)
 
 
@@ -140,49 +131,49 @@ def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: 
     return found
 
 
-def _safest(rehearsal: Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_Option, list[_Option]]:
+def _safest(rehearsal: Rehearsal, wanted: Sequence[str], hands: int) -> tuple[Trial, list[Trial]]:
     """The first lift that is safe, with one hand before two; else the least risky; and those tried before."""
-    tried: list[_Option] = []
+    tried: list[Trial] = []
     for object_id in wanted:
-        option = _Option(object_id, (), rehearsal.try_lift(object_id))
-        if option.trial.risk == 0.0:
-            return option, tried
-        tried.append(option)
-    tried.sort(key=lambda o: (o.trial.risk, len(o.trial.harmed)))
+        trial = rehearsal.try_lift(object_id)
+        if trial.risk == 0.0:
+            return trial, tried
+        tried.append(trial)
+    tried.sort(key=lambda t: (t.risk, len(t.harmed)))
     best = tried[0]
-    for option in _with_hold(rehearsal, tried) if hands > 1 else ():
-        if option.trial.risk < best.trial.risk:
-            best = option
-        if best.trial.risk == 0.0:
+    for trial in _with_hold(rehearsal, tried) if hands > 1 else ():
+        if trial.risk < best.risk:
+            best = trial
+        if best.risk == 0.0:
             break
     return best, tried
 
 
-def _with_hold(rehearsal: Rehearsal, tried: Sequence[_Option]) -> Iterator[_Option]:
+def _with_hold(rehearsal: Rehearsal, tried: Sequence[Trial]) -> Iterator[Trial]:
     """The same lifts while the other hand holds one of those that were disturbed, the most often first."""
-    for option in tried:
-        for held in sorted(option.trial.harmed, key=lambda i: (-option.trial.harmed[i], i)):
-            yield _Option(option.object_id, (held,), rehearsal.try_lift(option.object_id, [held]))
+    for trial in tried:
+        for held in sorted(trial.harmed, key=lambda i: (-trial.harmed[i], i)):
+            yield rehearsal.try_lift(trial.object_id, [held])
 
 
-def _step(graph: SupportGraph, option: _Option, rehearsal: Rehearsal) -> TakeStep:
-    trial, draws = option.trial, len(option.trial.lifts)
-    carried = [s.supported for s in graph.supports if s.supporter == option.object_id]
-    left = [i for i in carried if i in rehearsal.left()]
-    what = f"supports {', '.join(left)}" if left else "supports nothing that is left"
-    with_hold = f" while {', '.join(option.hold)} is held" if option.hold else ""
-    worst = ", ".join(f"{i} in {s * draws:.0f}" for i, s in trial.harmed.items())
+def _step(graph: SupportGraph, trial: Trial, rehearsal: Rehearsal) -> TakeStep:
+    left = rehearsal.left()
+    carried = [s.supported for s in graph.supports if s.supporter == trial.object_id and s.supported in left]
+    what = f"supports {', '.join(carried)}" if carried else "supports nothing that is left"
+    with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
+    draws = len(trial.lifts)
+    worst = ", ".join(f"{i} in {share * draws:.0f}" for i, share in trial.harmed.items())
     harm = f"nothing in {draws} rehearsals" if trial.risk == 0.0 else f"{worst} of {draws} rehearsals"
     why = f"it {what}; lifting it{with_hold} disturbed {harm}"
-    return TakeStep(option.object_id, option.hold, trial.risk == 0.0, trial.risk, why)
+    return TakeStep(trial.object_id, trial.hold, trial.risk == 0.0, trial.risk, why)
 
 
-def _refusal(option: _Option, tried: Sequence[_Option]) -> str:
+def _refusal(trial: Trial, tried: Sequence[Trial]) -> str:
     """Say which objects stand in one another's way."""
-    blocked = nx.DiGraph((o.object_id, i) for o in tried for i in o.trial.harmed)
+    blocked = nx.DiGraph((t.object_id, i) for t in tried for i in t.harmed)
     try:
-        edges = nx.find_cycle(blocked, option.object_id)
+        edges = nx.find_cycle(blocked, trial.object_id)
         said = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
         return f"no safe order: {said}; whichever goes first"
     except nx.NetworkXNoCycle:
-        return f"no safe order: lifting {option.object_id} disturbs {', '.join(option.trial.harmed)}"
+        return f"no safe order: lifting {trial.object_id} disturbs {', '.join(trial.harmed)}"

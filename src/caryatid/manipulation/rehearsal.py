@@ -31,11 +31,15 @@ class Trial:
     """A lift rehearsed in every drawn scene.
 
     Attributes:
+        object_id: What was lifted.
+        hold: What the other hand held meanwhile.
         risk: Share of the scenes in which another object was disturbed [1].
         harmed: In what share of them each object was [1], by id; those that never were are left out.
         lifts: What came of it in each scene.
     """
 
+    object_id: str
+    hold: tuple[str, ...]
     risk: float
     harmed: dict[str, float]
     lifts: tuple[Lift, ...]
@@ -94,7 +98,7 @@ class Rehearsal:
             lifts = self._each(lambda k: self._lift(k, object_id, hold))
             harm = [lift.disturbed | self._bereft(k, object_id, hold) for k, lift in enumerate(lifts)]
             risk = float(np.any(harm, axis=1).mean())
-            self._trials[asked] = Trial(risk, self._shares(harm), tuple(lifts))
+            self._trials[asked] = Trial(object_id, tuple(hold), risk, self._shares(harm), tuple(lifts))
         return self._trials[asked]
 
     def _shares(self, which: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
@@ -102,9 +106,9 @@ class Rehearsal:
         shares = np.mean(which, axis=0)
         return {i: float(s) for i, s in zip(self.ids, shares, strict=True) if s > 0.0}
 
-    def take(self, object_id: str, trial: Trial) -> None:
+    def take(self, trial: Trial) -> None:
         """Go on without an object whose lift was tried: where others moved, they are put back."""
-        index = self.ids.index(object_id)
+        index = self.ids.index(trial.object_id)
         self._trials.clear()
         for k, (lift, scene) in enumerate(zip(trial.lifts, self._scenes, strict=True)):
             calm = not lift.disturbed.any()

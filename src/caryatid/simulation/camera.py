@@ -13,7 +13,7 @@ from caryatid.config import NoiseConfig, NoiseModel, SensorConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.sensing.views import View, check_intrinsics
+from caryatid.sensing.views import View
 from caryatid.simulation.world import INVISIBLE_GROUP, SimulatedScene
 
 
@@ -107,10 +107,9 @@ class SimulatedCamera:
         noise_config: Figures of the noise.
         rng: Where the seed of all captures is drawn from.
         sensor: Image size, focal length and light.
-        K: Pinhole matrix (3, 3) [px] in place of the sensor's centred one.
 
     Raises:
-        InputError: The noise model is not one of the two, or K is not valid.
+        InputError: The noise model is not one of the two.
     """
 
     def __init__(
@@ -120,7 +119,6 @@ class SimulatedCamera:
         noise_config: NoiseConfig | None = None,
         rng: np.random.Generator | None = None,
         sensor: SensorConfig | None = None,
-        K: Array | None = None,
     ) -> None:
         if noise not in ("none", "carmine"):
             raise InputError("noise", f"'{noise}' is no noise model", "choose none or carmine")
@@ -128,7 +126,7 @@ class SimulatedCamera:
         self.noise = noise
         self.noise_config = noise_config or NoiseConfig()
         self.sensor = sensor or SensorConfig()
-        self.K = check_intrinsics(intrinsics(self.sensor) if K is None else K, "simulated camera")
+        self.K = intrinsics(self.sensor)
         self._seed = int((rng or np.random.default_rng(0)).integers(2**63))
         self._captures = 0
 

@@ -32,8 +32,6 @@ from caryatid.simulation.world import (
 GeneratedKind = Literal["pile", "dense", "packed"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {"pile": (1, 25), "dense": (10, 25), "packed": (2, 25)}
 """Kind of a scene → fewest and most objects, the screens of a dense one among them."""
-JITTER = 0.3
-"""How far off the middle of the one below an object is set down, as a share of its half extent [1]."""
 GAP = 0.002
 """Height over what is below from which an object is let go [m]."""
 PACKED_GAP = 0.0005
@@ -41,8 +39,6 @@ PACKED_GAP = 0.0005
 TRIES = 10
 """Times an object is set down anew while it falls off, rolls away or upsets others; then the one before
 it is taken up again as well."""
-MAX_HEIGHT = 0.36
-"""Nothing is set down so that it reaches higher over the table top [m]."""
 DOWN = np.array([[0.0, 0.0, -1.0]])
 AXES = np.eye(3)
 """Straight down (1, 3), and the world's axes (3, 3)."""
@@ -191,14 +187,14 @@ def _set_down(
 def _stands(scene: SimulatedScene, firm: Sequence[Solid], plan: _Plan, physics: PhysicsConfig) -> bool:
     """All objects are at rest on or over the table, and the firm ones, the first, about where they were.
 
-    An object whose middle is within a centimetre of the table's edge has as good as fallen. Setting another
-    one down may shift the firm ones by 4 cm.
+    An object whose middle is within a centimetre of the table's edge has as good as fallen; none may reach
+    higher than 36 cm over the table. Setting another one down may shift the firm ones by 4 cm.
     """
     shapes = true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01
     for label, shape in shapes.items():
         low, high = bounds(scene, label)
-        if low[2] < TABLE_HEIGHT - GAP or high[2] > TABLE_HEIGHT + MAX_HEIGHT:
+        if low[2] < TABLE_HEIGHT - GAP or high[2] > TABLE_HEIGHT + 0.36:
             return False
         if (np.abs(shape.T_world_object[:2, 3]) > half).any():
             return False
@@ -234,9 +230,9 @@ def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Solid:
 
 
 def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> _Drop:
-    """Put a shape at the origin over about the middle of one of the scene's objects."""
+    """Put a shape at the origin over one of the scene's objects, off its middle by 0.3 of its half extent."""
     below = list(true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
-    reach = JITTER * below.support(AXES)[:2]
+    reach = 0.3 * below.support(AXES)[:2]
     xy = below.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
     return _Drop(_let_go(shape, xy, scene), stacked=True)
 

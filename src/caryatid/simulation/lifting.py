@@ -22,9 +22,6 @@ from caryatid.simulation.world import displacement, mujoco_warnings_ignored
 ASIDE = 50.0
 """How far up an object is put when it has been lifted [m]; nothing meets it there."""
 
-CLEARANCE = 0.02
-"""An object is lifted until its lowest point is this far above all others [m], and then taken aside."""
-
 SEGMENT = 0.25
 """Time simulated between two looks at the objects [s]; what falls is seen falling."""
 
@@ -173,10 +170,10 @@ class Lifting:
         return np.array(data.qpos[self._qpos])
 
     def _rise(self, data: Any, watched: NDArray[np.bool_], index: int) -> float:
-        """How far up [m] an object has to go to be above all others."""
+        """How far up [m] an object has to go for its lowest point to be 2 cm above all others."""
         low, _ = self._span(data, index)
         tops = [self._span(data, int(k))[1] for k in np.flatnonzero(watched)]
-        return max(max(tops, default=low) - low, 0.0) + CLEARANCE
+        return max(max(tops, default=low) - low, 0.0) + 0.02
 
     def _span(self, data: Any, index: int) -> tuple[float, float]:
         """Heights [m] of an object's lowest and highest point: of the boxes around its geoms."""

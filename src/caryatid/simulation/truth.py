@@ -16,9 +16,6 @@ from caryatid.graph import Kind
 from caryatid.io.json_files import json_text, parse_json, read_json
 from caryatid.simulation.world import SimulatedScene, body_poses, displacement, state_of
 
-DISTURBED, DISTURBED_TURN = 0.02, 15.0
-"""`removal` lists what moves [m] or turns [deg] by more: it slid or fell, and did not merely settle."""
-
 _REMEDY = 'write {"vertices": […], "edges": [{"supporter", "supported", "kind"}, …]}'
 
 
@@ -83,8 +80,8 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
     return GroundTruth(
         tuple(names.values()),
         tuple(TrueEdge(supporter=names[a], supported=names[b], kind=kinds[a, b]) for a, b in sorted(kinds)),
-        {
-            names[a]: tuple(names[b] for b, by in moves.items() if _beyond(by, DISTURBED, DISTURBED_TURN))
+        {  # what is displaced by 2 cm or turned by 15° slid or fell, and did not merely settle
+            names[a]: tuple(names[b] for b, by in moves.items() if _beyond(by, 0.02, 15.0))
             for a, moves in removals.items()
         },
     )
