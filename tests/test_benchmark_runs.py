@@ -24,7 +24,7 @@ import caryatid
 from caryatid.benchmark.episodes import Episode, Outcome, content_of, run_episode
 from caryatid.benchmark.running import connect, run_locally, run_on_cluster, run_on_worker
 from caryatid.benchmark.store import RESULTS, ResultStore
-from caryatid.benchmark.suites import change_suite, find_suite
+from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.errors import CaryatidError, InputError
 from caryatid.runtime.fingerprint import fingerprint
 
@@ -169,36 +169,13 @@ def test_a_second_run_on_a_folder_is_refused_and_reading_is_not(started, tmp_pat
 def test_rows_are_the_same_on_any_number_of_processes(monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     before = dict(os.environ)
-    suite = change_suite(find_suite("smoke"), planners=["support", "random"])
+    suite = change_suite(SUITES["smoke"], planners=["support", "random"])
     suite = replace(suite, scenes=("tower", "dense-99-1"), seeds=1, views=2)
     episodes = [replace(m.episode, settings=QUICK) for m in suite.members()]
     found = [{e: without_times(o) for e, o in run_locally(episodes, jobs)} for jobs in (1, 2)]
     assert found[0] == found[1]
     assert [found[0][e].error is None for e in episodes] == [True, True, False, False]
     assert dict(os.environ) == before
-
-
-class Interrupting(list):
-    """Episodes at whose beginning Ctrl-C is pressed; they count how many were taken."""
-
-    taken = 0
-
-    def __iter__(self):
-        os.kill(os.getpid(), signal.SIGINT)
-        for episode in super().__iter__():
-            yield episode
-            self.taken += 1
-
-
-def test_an_interrupt_waits_until_all_processes_are_started():
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    episodes = Interrupting(Episode("tower", settings=QUICK, views=1, seed=seed) for seed in range(3))
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            next(run_locally(episodes, 2))
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert episodes.taken == len(episodes)
 
 
 # Workers of a cluster
@@ -261,7 +238,7 @@ def cluster(tmp_path):
 def test_a_run_that_loses_a_worker_is_complete_and_the_same(cluster, tmp_path, scene_file, monkeypatch):
     monkeypatch.chdir(scene_file.parents[1])
     folder = scene_file.parent.name
-    suite = change_suite(find_suite("smoke"), planners=["support", "random"])
+    suite = change_suite(SUITES["smoke"], planners=["support", "random"])
     suite = replace(suite, scenes=("tower", folder, "dense-99-1"), seeds=2, views=2)
     members = [replace(m, episode=replace(m.episode, settings=QUICK)) for m in suite.members()]
     cluster.add_worker(threads=2)

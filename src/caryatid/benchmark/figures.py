@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,15 +42,22 @@ Curves = dict[str, "pd.DataFrame"]
 """Label of a method → value, low and high by view or quantile."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, eq=False, slots=True)
 class Figure:
-    """A figure: name of its file without an ending, heading, what is to be seen in it, SVG and PNG."""
+    """A figure: name of its file without an ending, heading, what is to be seen in it, and the drawing."""
 
     name: str
     title: str
     caption: str
-    svg: bytes
-    png: bytes
+    drawing: Any
+
+    def save(self, path: Path) -> None:
+        """Write it as the ending says, SVG or PNG, with nothing of who drew it when."""
+        from matplotlib import style
+
+        metadata = {"Date": None, "Creator": None} if path.suffix == ".svg" else {"Software": None}
+        with style.context(["default", STYLE | {"svg.hashsalt": self.name}]):
+            self.drawing.savefig(path, dpi=160, metadata=metadata)
 
 
 def looks_of(methods: Sequence[str]) -> Looks:
@@ -87,12 +94,12 @@ def draw_group(
         if curves := curves_of(summary, measure):
             title, caption = f"{axis} over views", f"{axis} ({what}) after each view: {mean}."
             plot = partial(_draw_lines, looks=looks, curves=curves, label=axis)
-            yield _save(f"{measure} over views {label}", title, caption, 14, plot)
+            yield _draw(f"{measure} over views {label}", title, caption, 14, plot)
     f1, path = curves_of(summary, "f1"), curves_of(summary, "path")
     if f1 and path and not removal:
         caption = f"F1 over the path travelled, a mark for each view: {mean}."
         plot = partial(_draw_lines, looks=looks, curves=f1, label="F1", path=path)
-        yield _save(f"f1 over path {label}", "F1 over path", caption, 14, plot)
+        yield _draw(f"f1 over path {label}", "F1 over path", caption, 14, plot)
     main, (name, _) = next(iter(measures.items()))
     if differences := curves_of(summary, f"{main} difference"):
         caption = (
@@ -102,7 +109,7 @@ def draw_group(
         axis = f"{name} minus that of {reference}"
         plot = partial(_draw_rows, looks=looks, curves=differences, label=axis, zero=True)
         title = f"{name} compared with {reference}"
-        yield _save(f"{main} differences {label}", title, caption, len(differences), plot)
+        yield _draw(f"{main} differences {label}", title, caption, len(differences), plot)
     times = curves_of(summary, "planning")
     if times and not label and not removal:
         for method, time in times.items():
@@ -110,7 +117,7 @@ def draw_group(
             times[method] = middle.set_axis([1])
         caption = "Time the choice of a view takes: median and the middle 95 %."
         plot = partial(_draw_rows, looks=looks, curves=times, label="time of a choice [s]", scale="log")
-        yield _save("planning time", "Planning time", caption, len(times), plot)
+        yield _draw("planning time", "Planning time", caption, len(times), plot)
 
 
 def draw_conditions(summary: pd.DataFrame, looks: Looks) -> Figure:
@@ -123,7 +130,7 @@ def draw_conditions(summary: pd.DataFrame, looks: Looks) -> Figure:
     looks = {name: looks[name.rpartition(": ")[2]] for name in curves}
     caption = "Mean F1 under each condition, with intervals over scenes."
     plot = partial(_draw_rows, looks=looks, curves=curves, label="F1")
-    return _save("f1 by condition", "F1 by condition", caption, len(curves), plot)
+    return _draw("f1 by condition", "F1 by condition", caption, len(curves), plot)
 
 
 def is_removal(summary: pd.DataFrame) -> bool:
@@ -143,21 +150,16 @@ def told_views(views: Iterable[float]) -> list[float]:
     return sorted({v for v in (1, 2, 3, 5, 10, last) if 0 < v <= last})
 
 
-def _save(name: str, title: str, caption: str, rows: int, plot: Callable[[Any], None]) -> Figure:
-    """Draw a figure with matplotlib, so many rows high, as SVG and PNG."""
+def _draw(name: str, title: str, caption: str, rows: int, plot: Callable[[Any], None]) -> Figure:
+    """Draw a figure with matplotlib, so many rows high."""
     from matplotlib import style
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure as Canvas
+    from matplotlib.figure import Figure as Drawing
 
     name = re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
-    with style.context(["default", STYLE | {"svg.hashsalt": name}]):
-        figure = Canvas(figsize=(7.2, 0.9 + 0.22 * max(rows, 2)), facecolor="white", layout="constrained")
-        FigureCanvasAgg(figure)
-        plot(figure)
-        svg, png = io.BytesIO(), io.BytesIO()
-        figure.savefig(svg, format="svg", metadata={"Date": None, "Creator": None})
-        figure.savefig(png, format="png", dpi=160, metadata={"Software": None})
-    return Figure(name, title, caption, svg.getvalue(), png.getvalue())
+    with style.context(["default", STYLE]):
+        drawing = Drawing(figsize=(7.2, 0.9 + 0.22 * max(rows, 2)), facecolor="white", layout="constrained")
+        plot(drawing)
+    return Figure(name, title, caption, drawing)
 
 
 def _draw_lines(figure: Any, *, looks: Looks, curves: Curves, label: str, path: Curves | None = None) -> None:

@@ -24,10 +24,9 @@ from caryatid.benchmark.figures import (
     looks_of,
     told_views,
 )
-from caryatid.benchmark.statistics import summarise
+from caryatid.benchmark.statistics import CONFIG, summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES
-from caryatid.config import StatisticsConfig
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
@@ -116,15 +115,12 @@ class SuiteResult:
         }
 
 
-def summarise_store(
-    store: ResultStore, reference: str | None = None, config: StatisticsConfig | None = None
-) -> list[SuiteResult]:
+def summarise_store(store: ResultStore, reference: str | None = None) -> list[SuiteResult]:
     """Summarise every suite of which something is done.
 
     Args:
         store: The results.
         reference: Method the others are compared with, in the suites that have it, in place of the suite's.
-        config: Resamples, confidence, thresholds.
 
     Raises:
         InputError: No suite has such a method, or pandas is not installed.
@@ -152,7 +148,7 @@ def summarise_store(
                 scenes=table["scene"].nunique(),
                 seeds=table["seed"].nunique(),
                 failures=failures[["method", "condition", "scene", "seed", "error"]].to_numpy().tolist(),
-                summary=summarise(table, reference=chosen, gap=gap, config=config),
+                summary=summarise(table, reference=chosen, gap=gap),
             )
         )
     return results
@@ -216,8 +212,8 @@ def write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: Pa
 
     def keep(suite: str, figure: Figure) -> str:
         (folder / suite).mkdir(exist_ok=True)
-        (folder / suite / f"{figure.name}.svg").write_bytes(figure.svg)
-        (folder / suite / f"{figure.name}.png").write_bytes(figure.png)
+        figure.save(folder / suite / f"{figure.name}.png")
+        figure.save(folder / suite / f"{figure.name}.svg")
         return f"{suite}/{figure.name}.svg"
 
     def inline(source: re.Match[str]) -> str:
@@ -236,7 +232,7 @@ def write_document(results: Sequence[SuiteResult], about: dict[str, str], path: 
     folder.mkdir(parents=True, exist_ok=True)
 
     def keep(suite: str, figure: Figure) -> str:
-        (folder / f"{suite}-{figure.name}.svg").write_bytes(figure.svg)
+        figure.save(folder / f"{suite}-{figure.name}.svg")
         return f"{folder.name}/{suite}-{figure.name}.svg"
 
     path.write_text(_markdown(results, about, command, keep), encoding="utf-8")
@@ -254,9 +250,8 @@ def _markdown(
                 file, caption = keep(result.name, block), _plain(block.caption)
                 block = f"![{_plain(block.title)}]({file})\n\n*{caption}*"
             blocks.append(block)
-    config = StatisticsConfig()
     blocks.append("## How to read it")
-    blocks += [n.format(confidence=100.0 * config.confidence, resamples=config.resamples) for n in NOTES]
+    blocks += [n.format(confidence=100.0 * CONFIG.confidence, resamples=CONFIG.resamples) for n in NOTES]
     return "\n\n".join(blocks) + "\n"
 
 

@@ -21,12 +21,10 @@ from caryatid.geometry.transforms import Array
 if TYPE_CHECKING:
     import pandas as pd
 
+CONFIG = StatisticsConfig()
 COLUMNS = ("condition", "family", "method", "quantity", "at", "value", "low", "high")
 """Columns of a summary. `family` is empty for all scenes; `at` is the view, threshold or quantile."""
-QUANTILES = (0.025, 0.25, 0.5, 0.75, 0.975)
 F1, PATH = MEASURES.index("f1"), MEASURES.index("path")
-ROUNDING = 1e-9
-"""A mean this far below a threshold reaches it [1]: what sums of equal figures differ by."""
 UNREACHED = 1e12
 """Stands for infinity while percentiles are interpolated."""
 
@@ -39,7 +37,6 @@ def summarise(
     *,
     reference: str,
     gap: tuple[str, str] | None = None,
-    config: StatisticsConfig | None = None,
 ) -> pd.DataFrame:
     """Summarise the episodes of a suite.
 
@@ -48,7 +45,6 @@ def summarise(
         reference: Method the others are compared with.
         gap: Two methods, such as random choice and the oracle, of whose gap in F1 it is told how much each
             other method closes.
-        config: Resamples, confidence, thresholds.
 
     Returns:
         One row per figure with the columns `COLUMNS`. Quantities: every measure (`at`: view), `MEASURE
@@ -57,25 +53,23 @@ def summarise(
         over the path up to `budget` [m]; `planning` and `perception` [s] (`at`: quantile); `scenes`,
         `episodes`, `failed`, and `paired scenes`, `paired episodes`.
     """
-    config = config or StatisticsConfig()
     rows: list[tuple[str | float, ...]] = []
     for condition, part in table.groupby("condition", sort=False):
         families = list(part["family"].unique())
         for kind in ("", *(families if len(families) > 1 else ())):
             group = part[part["family"] == kind] if kind else part
-            for method, figures in _compare(group, reference, gap, config):
+            for method, figures in _compare(group, reference, gap):
                 rows += [(condition, kind, method, *figure) for figure in figures]
     summary: pd.DataFrame = import_pandas().DataFrame(rows, columns=list(COLUMNS))
     return summary
 
 
-def bootstrap(samples: Array, figures: Callable[[Array], Array], config: StatisticsConfig) -> Array:
+def bootstrap(samples: Array, figures: Callable[[Array], Array]) -> Array:
     """Figures of the mean over scenes, with percentile bootstrap intervals.
 
     Args:
         samples: What is known of each scene (S, ...).
         figures: Makes figures (..., F) of means (...); infinite where a threshold is not reached.
-        config: Resamples and confidence.
 
     Returns:
         Value, lower and upper end of each figure (F, 3); no ends (NaN) for a single scene.
@@ -93,8 +87,8 @@ def bootstrap(samples: Array, figures: Callable[[Array], Array], config: Statist
 
     with np.errstate(invalid="ignore"):
         found = resample(
-            (np.arange(size),), of_resamples, n_resamples=config.resamples, batch=500, method="percentile",
-            confidence_level=config.confidence, rng=np.random.default_rng((0, size)),
+            (np.arange(size),), of_resamples, n_resamples=CONFIG.resamples, batch=500, method="percentile",
+            confidence_level=CONFIG.confidence, rng=np.random.default_rng((0, size)),
         ).confidence_interval  # fmt: skip
     ends = [np.where(end > 1e-3 * UNREACHED, np.inf, end) for end in (found.low, found.high)]
     return np.stack([value, *ends], axis=1)
@@ -112,7 +106,7 @@ def first_reach(f1: Array, path: Array, threshold: float, *, straight: bool) -> 
     Returns:
         Number of the view (...,), from 1, and path (...,) [m].
     """
-    reached = f1 >= threshold - ROUNDING
+    reached = f1 >= threshold - 1e-9  # sums of equal figures differ by less
     index = np.argmax(reached, axis=-1)[..., None]
     end = np.take_along_axis(path, index, -1)
     if straight:
@@ -139,7 +133,7 @@ def area_over_path(f1: Array, path: Array, budget: float) -> Array:
 
 
 def _compare(
-    table: pd.DataFrame, reference: str, gap: tuple[str, str] | None, config: StatisticsConfig
+    table: pd.DataFrame, reference: str, gap: tuple[str, str] | None
 ) -> Iterable[tuple[str, Figures]]:
     """Figures of each method in a group of episodes that can be compared."""
     done = table[table["error"].isna()].set_index(["method", "scene", "seed", "view"])[list(MEASURES)]
@@ -153,11 +147,11 @@ def _compare(
         failed = int(all_of_it["error"].notna().sum())
         figures = [*_counts(own), ("failed", 0, float(failed), np.nan, np.nan)]
         if len(own):
-            figures += _alone(own, budget, config)
+            figures += _alone(own, budget)
             if method != reference and reference in known:
-                figures += _against(_paired([own, known[reference]]), config)
+                figures += _against(_paired([own, known[reference]]))
             if gap is not None and method not in gap and all(end in known for end in gap):
-                figures += _gap_closed(_paired([own, *(known[end] for end in gap)]), config)
+                figures += _gap_closed(_paired([own, *(known[end] for end in gap)]))
         yield str(method), figures
 
 
@@ -170,39 +164,39 @@ def _counts(own: pd.DataFrame, prefix: str = "") -> Figures:
     ]
 
 
-def _alone(own: pd.DataFrame, budget: float, config: StatisticsConfig) -> Figures:
+def _alone(own: pd.DataFrame, budget: float) -> Figures:
     """Curves of a method, its path to each threshold, the area under its F1, its times."""
     curves, keys = _curves([own])[:, 0], own.index.droplevel("view").unique()
     episodes = own.to_numpy().reshape(len(keys), -1, len(MEASURES))
     reaches = [
         first_reach(episodes[..., F1], episodes[..., PATH], threshold, straight=False)
-        for threshold in config.thresholds
+        for threshold in CONFIG.thresholds
     ]
     shares = {
-        ("share", t): np.isfinite(seen) for t, (seen, _) in zip(config.thresholds, reaches, strict=True)
+        ("share", t): np.isfinite(seen) for t, (seen, _) in zip(CONFIG.thresholds, reaches, strict=True)
     }
     if budget:
         shares["area", 0.0] = area_over_path(episodes[..., F1], episodes[..., PATH], budget)
     by_scene = import_pandas().DataFrame(shares, index=keys).astype(float).groupby("scene").mean()
-    figures = _named(_by_view(""), bootstrap(curves, _flat, config))
-    figures += _named(shares, bootstrap(by_scene.to_numpy(), lambda means: means, config))
-    paths = bootstrap(curves, lambda means: _paths(means, config.thresholds), config)
-    figures += _named([("mean path", t) for t in config.thresholds], paths)
+    figures = _named(_by_view(""), bootstrap(curves, _flat))
+    figures += _named(shares, bootstrap(by_scene.to_numpy(), lambda means: means))
+    paths = bootstrap(curves, _paths)
+    figures += _named([("mean path", t) for t in CONFIG.thresholds], paths)
     mean = curves.mean(axis=0)
     plain: list[tuple[str, float, Any]] = [("budget", 0.0, budget)]
-    for threshold, (seen, length) in zip(config.thresholds, reaches, strict=True):
+    for threshold, (seen, length) in zip(CONFIG.thresholds, reaches, strict=True):
         at_mean, _ = first_reach(mean[:, F1], mean[:, PATH], threshold, straight=True)
         plain += [("median views", threshold, np.median(seen)), ("median path", threshold, np.median(length))]
         plain += [("mean views", threshold, at_mean)]
     for name in TIMES:
         chosen = own.index.get_level_values("view") > (1 if name == "planning_seconds" else 0)
-        for quantile in QUANTILES if chosen.any() else ():
+        for quantile in (0.025, 0.5, 0.975) if chosen.any() else ():
             seconds = np.quantile(own[name][chosen], quantile)
             plain.append((name.removesuffix("_seconds"), quantile, seconds))
     return figures + [(name, at, float(value), np.nan, np.nan) for name, at, value in plain]
 
 
-def _against(frames: Sequence[pd.DataFrame], config: StatisticsConfig) -> Figures:
+def _against(frames: Sequence[pd.DataFrame]) -> Figures:
     """Paired differences from another method, and the ratio of paths to each threshold."""
     counts = _counts(frames[0], "paired ")
     if len(frames[0]) == 0:
@@ -211,22 +205,22 @@ def _against(frames: Sequence[pd.DataFrame], config: StatisticsConfig) -> Figure
 
     def ratios(means: Array) -> Array:
         ours, theirs = (
-            _paths(means[..., 0, :, :], config.thresholds),
-            _paths(means[..., 1, :, :], config.thresholds),
+            _paths(means[..., 0, :, :]),
+            _paths(means[..., 1, :, :]),
         )
         # A resample that misses the threshold counts as infinitely far, against the method.
         known = np.isfinite(ours) & (theirs > 0.0)
         return np.divide(ours, theirs, out=np.full_like(ours, np.inf), where=known)
 
-    difference = bootstrap(both, lambda means: _flat(means[..., 0, :, :] - means[..., 1, :, :]), config)
-    theirs = _paths(both.mean(axis=0)[1], config.thresholds)
+    difference = bootstrap(both, lambda means: _flat(means[..., 0, :, :] - means[..., 1, :, :]))
+    theirs = _paths(both.mean(axis=0)[1])
     shown = (theirs > 0.0) & (theirs < np.inf)
-    found = _named([("path ratio", t) for t in config.thresholds], bootstrap(both, ratios, config))
+    found = _named([("path ratio", t) for t in CONFIG.thresholds], bootstrap(both, ratios))
     told = [row for row, known in zip(found, shown, strict=True) if known and np.isfinite(row[2])]
     return counts + _named(_by_view(" difference"), difference) + told
 
 
-def _gap_closed(frames: Sequence[pd.DataFrame], config: StatisticsConfig) -> Figures:
+def _gap_closed(frames: Sequence[pd.DataFrame]) -> Figures:
     """(F1 − that of low) / (F1 of high − that of low) after each view, of three frames: own, low and high."""
     if len(frames[0]) == 0:
         return []
@@ -235,7 +229,7 @@ def _gap_closed(frames: Sequence[pd.DataFrame], config: StatisticsConfig) -> Fig
         own, low, high = np.moveaxis(means, -2, 0)
         return np.divide(own - low, high - low, out=np.full_like(own, np.nan), where=high != low)
 
-    found = bootstrap(_curves(frames)[..., F1], closed, config)
+    found = bootstrap(_curves(frames)[..., F1], closed)
     return _named([("gap", view) for view in range(1, len(found) + 1)], found)
 
 
@@ -244,10 +238,10 @@ def _flat(means: Array) -> Array:
     return means.reshape(*means.shape[:-2], -1)
 
 
-def _paths(means: Array, thresholds: Sequence[float]) -> Array:
+def _paths(means: Array) -> Array:
     """Path (..., T) [m] at which mean curves (..., V, M) reach each threshold."""
     f1, path = means[..., F1], means[..., PATH]
-    return np.stack([first_reach(f1, path, t, straight=True)[1] for t in thresholds], axis=-1)
+    return np.stack([first_reach(f1, path, t, straight=True)[1] for t in CONFIG.thresholds], axis=-1)
 
 
 def _by_view(suffix: str) -> Iterable[tuple[str, float]]:

@@ -116,17 +116,6 @@ class Suite:
         ]
 
 
-def find_suite(name: str) -> Suite:
-    """Return the suite of this name.
-
-    Raises:
-        InputError: There is none; the message lists those there are.
-    """
-    if name in SUITES:
-        return SUITES[name]
-    raise InputError("--suite", f"there is no suite '{name}'", f"choose one of {', '.join(SUITES)}")
-
-
 def change_suite(
     suite: Suite,
     *,

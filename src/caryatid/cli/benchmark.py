@@ -116,7 +116,7 @@ class Benchmark(Command):
         from caryatid.benchmark.episodes import find_scenes
 
         suite = suites.change_suite(
-            suites.find_suite(name),
+            suites.SUITES[name],
             planners=self.planner,
             fusions=self.fusion,
             segmentations=self.segmentation,
