@@ -18,7 +18,6 @@ such a view can tell:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -65,8 +64,6 @@ class Args(Gated):
 
     trials: int = 200
     """Trials a shape."""
-    verbose: bool = False
-    """Print the worst trials."""
 
 
 @dataclass(frozen=True)
@@ -199,17 +196,6 @@ def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
     return found
 
 
-def show_worst(trials: Sequence[Trial], console: Console) -> None:
-    """Print the trials with a wrong shape, and those furthest off."""
-    for trial in trials:
-        if trial.found != trial.kind:
-            console.print(f"wrong: {trial.note}")
-    worst = sorted(trials, key=lambda t: -max((abs(e) for _, e, _ in t.errors), default=0.0))
-    for trial in worst[:12]:
-        figures = ", ".join(f"{name} {error:.2f} (± {sigma:.2f})" for name, error, sigma in trial.errors)
-        console.print(f"far off: {trial.note}: {figures}")
-
-
 def main() -> int:
     """Run the measurement."""
     args = tyro.cli(Args)
@@ -221,8 +207,6 @@ def main() -> int:
         trials = args.each(run_trial, tasks, chunk=10)
         rows += [{"setting": prefix} | asdict(trial) for trial in trials]
         found += measures(prefix, trials)
-        if args.verbose:
-            show_worst(trials, console)
     args.write(rows)
     return args.finish(found, BASELINE, console, TARGETS)
 

@@ -28,6 +28,7 @@ from caryatid.benchmark.episodes import family
 from caryatid.config import Config, NoiseModel
 from caryatid.config.settings import read_settings
 from caryatid.errors import CaryatidError
+from caryatid.evaluation.oracle import spread_out
 from caryatid.evaluation.scores import assign, mask_ious
 from caryatid.io.bop import read_recording
 from caryatid.segmentation.observation import observe
@@ -87,17 +88,12 @@ def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
     opened = open_source(source, config, noise=args.noise, segmentation="labels", seed=args.seed)
     if opened.truth is None:
         raise CaryatidError(f"{source}: has no truth to score against")
-    centre = np.array([0.0, 0.0, opened.truth.table_top or 0.0])
-    found = opened.robot.candidates(ViewSphere.around(centre, config.active))
-    T_chosen = [opened.robot.T_world_camera]
-    nearest = np.full(len(found), -np.inf)
-    while True:
-        yield opened.camera.capture(T_chosen[-1])
-        if len(T_chosen) == min(args.views, len(found)):
-            return
-        away = T_chosen[-1][:3, 3] - centre
-        nearest = np.maximum(nearest, found.directions @ away / np.linalg.norm(away))
-        T_chosen.append(found.T_world_camera[int(np.argmin(nearest))])
+    sphere = ViewSphere.around(np.array([0.0, 0.0, opened.truth.table_top or 0.0]), config.active)
+    found = opened.robot.candidates(sphere)
+    first = opened.robot.T_world_camera
+    others = spread_out(found.directions, sphere.direction_of(first)[None], args.views - 1)
+    for T_world_camera in (first, *found.T_world_camera[others]):
+        yield opened.camera.capture(T_world_camera)
 
 
 def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> tuple[int, int, int, int, int, int]:

@@ -19,17 +19,13 @@ VERSIONS = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text
 
 
 def find_python(wanted: str) -> Path | None:
-    """Find an interpreter of a version, such as 3.12: this one, on the PATH, or one of pyenv or uv."""
-    candidates = [sys.executable, shutil.which(f"python{wanted}")]
+    """Find an interpreter of a version, such as 3.12: this one, on the PATH, or of pyenv."""
+    if sys.version.startswith(f"{wanted}."):
+        return Path(sys.executable)
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    for home in (pyenv, Path.home() / ".local/share/uv/python"):
-        candidates += [str(path) for path in sorted(home.glob(f"*{wanted}*/bin/python"), reverse=True)]
-    for candidate in filter(None, candidates):
-        code = "import sys; print('%d.%d' % sys.version_info[:2])"
-        told = subprocess.run([candidate, "-c", code], capture_output=True, text=True, check=False)
-        if told.stdout.strip() == wanted:
-            return Path(candidate)
-    return None
+    found = sorted(pyenv.glob(f"{wanted}*/bin/python"), reverse=True)
+    command = shutil.which(f"python{wanted}")
+    return Path(command) if command else next(iter(found), None)
 
 
 def try_out(python: Path, distribution: Path, folder: Path) -> dict[str, object]:
