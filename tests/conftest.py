@@ -153,20 +153,6 @@ def write_pcd(tmp_path):
 
 
 @pytest.fixture
-def write_ply(tmp_path):
-    """Write an ascii PLY."""
-
-    def write(points, name="cloud.ply"):
-        header = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n"
-        header += "".join(f"property float {axis}\n" for axis in "xyz") + "end_header\n"
-        path = tmp_path / name
-        path.write_text(header + "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in points))
-        return path
-
-    return write
-
-
-@pytest.fixture
 def leftovers(tmp_path):
     """Names in the test's folder, hidden ones too, that were not there when this was asked for."""
     before = set(os.listdir(tmp_path))

@@ -154,9 +154,10 @@ def test_a_segment_of_three_points(tmp_path, views, refused):
     view = replace(views[0], labels=labels)
     write_recording(tmp_path / "few", [view])
     refused("extract", tmp_path / "few", says="segment 2 has 3 points with depth, a shape needs 12")
-    assert run_command("extract", tmp_path / "few", "--segmentation", "auto", "--out", tmp_path / "auto") == 0
+    options = ("--quiet", "--no-report", "--out", tmp_path / "run")
+    assert run_command("extract", tmp_path / "few", "--segmentation", "auto", *options) == 0
     write_recording(tmp_path / "more", [view, *views[1:]])
-    assert run_command("extract", tmp_path / "more", "--out", tmp_path / "run", "--quiet") == 0
+    assert run_command("extract", tmp_path / "more", *options) == 0
     assert [len(v.graph.objects) for v in read_run(tmp_path / "run").views] == [2, 3, 3]
 
 
@@ -313,6 +314,7 @@ def test_a_read_only_place(recording, refused, monkeypatch):
     refused("extract", recording, names="runs/run", says="read-only file system")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not pathlib.Path("/proc/sys").is_dir(), reason="needs a folder nobody may write to")
 def test_a_place_nobody_may_write_to(recording):
     done = subprocess.run(

@@ -32,12 +32,13 @@ def plane(count=60, seed=0):
 
 
 def header(data, encoding, **changed):
+    names, kinds = data.dtype.names, [data.dtype[name] for name in data.dtype.names]
     lines = {
         "VERSION": "0.7",
-        "FIELDS": " ".join(data.dtype.names),
-        "SIZE": " ".join(str(data.dtype[n].itemsize) for n in data.dtype.names),
-        "TYPE": " ".join({"f": "F", "u": "U", "i": "I"}[data.dtype[n].kind] for n in data.dtype.names),
-        "COUNT": " ".join("1" for _ in data.dtype.names),
+        "FIELDS": " ".join(names),
+        "SIZE": " ".join(str(kind.itemsize) for kind in kinds),
+        "TYPE": " ".join(kind.kind.upper() for kind in kinds),
+        "COUNT": " ".join("1" for _ in names),
         "WIDTH": len(data),
         "HEIGHT": 1,
         "VIEWPOINT": "0 0 0 1 0 0 0",
@@ -136,12 +137,10 @@ def test_labels_that_are_no_object_numbers_are_refused(tmp_path, value, kind):
 
 
 def test_odd_but_honest_ascii_is_read(tmp_path):
-    path = tmp_path / "a.pcd"
-    text = (
-        "# c\nVERSION .7\r\nFIELDS x y z\r\nSIZE 4 4 4\r\nTYPE F F F\r\nWIDTH 2\r\nHEIGHT 1\r\nPOINTS 2\r\n"
-    )
-    path.write_bytes((text + "DATA ascii\r\n1  2\t3 \r\n\r\nnan nan nan\r\n").encode())
-    stored = read_stored_cloud(path)
+    lines = ["# c\nVERSION .7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "WIDTH 2", "HEIGHT 1", "POINTS 2"]
+    lines += ["DATA ascii", "1  2\t3 ", "", "nan nan nan", ""]
+    (tmp_path / "a.pcd").write_bytes("\r\n".join(lines).encode())
+    stored = read_stored_cloud(tmp_path / "a.pcd")
     assert stored.points[0].tolist() == [1, 2, 3]
     assert stored.kept.tolist() == [True, False]
 
