@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -22,105 +19,109 @@ Image = NDArray[np.float32]
 
 SHARES = 16
 """Shares of the image's rows that threads take [1]: every 16th row, as the readings are amid the image."""
-CHANCE = 3.0
-"""Standard deviations of a window's variance beyond which its readings scatter more than by chance."""
-TRUSTED = 3.5
-"""Standard deviations of a reading within which another window's plane may speak for it."""
-
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 """Numbers that leave sums in single precision."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class LocalSurface:
-    """What an inverse-depth image says of the surface around each pixel.
+def oriented_points(
+    view: View, config: CloudConfig, stride: int = 1, *, among: NDArray[np.bool_] | None = None
+) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Oriented points of a view: the readings in working range that have a normal, smoothed by local planes.
 
-    Attributes:
-        planes: 1/z = a·du + b·dv + c about each pixel: a, b, c (3, H, W) [1/m per px, 1/m]; c is 0 where too
-            few readings agree.
-        noise: Standard deviation of one reading [1/m]: the median over windows half their width apart.
+    A view with normals of its own (`view.normals_camera`) is taken as exact.
+
+    Args:
+        view: The view; without a pose, "world" below is the camera frame.
+        config: Working range and normal estimation.
+        stride: Take every stride-th row and column [px].
+        among: Which readings (H, W) to take, or None for all of them.
+
+    Returns:
+        Points (N, 3) [m] and unit normals (N, 3) in the world frame, and the flat pixel index (N,) of each.
     """
-
-    planes: Image
-    noise: float
-
-    def oriented(self, pixels: NDArray[np.intp], K: Array, T_world_camera: Array) -> tuple[Array, Array]:
-        """Points (N, 3) [m] and unit normals (N, 3), towards the camera, in the world.
-
-        Args:
-            pixels: Flat indices (N,) of pixels that have a plane.
-            K: Pinhole matrix (3, 3) [px].
-            T_world_camera: Camera pose (4, 4).
-        """
-        K, T = np.ascontiguousarray(K), np.ascontiguousarray(T_world_camera)
+    T = np.ascontiguousarray(np.eye(4) if view.T_world_camera is None else view.T_world_camera)
+    taken = view.valid & (view.depth >= config.min_depth) & (view.depth <= config.max_depth)
+    given = view.normals_camera
+    if given is None:
+        planes = local_planes(*_inverse_depth(view, taken, among, config), config.edge_jump, config.max_slope)
+        taken = planes[2] > 0.0
+    else:
+        taken &= np.einsum("hwi,hwi->hw", given, given) > 0.5
+        taken &= True if among is None else among
+    sampled = np.zeros_like(taken)
+    sampled[::stride, ::stride] = taken[::stride, ::stride]
+    pixels = np.flatnonzero(sampled)
+    if given is None:
         points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
-        _orient(pixels, self.planes, K, T, points, normals)
-        return points, normals
+        _orient(pixels, planes, np.ascontiguousarray(view.K), T, points, normals)
+        return points, normals, pixels
+    row, column = np.divmod(pixels, view.depth.shape[1])
+    z = np.take(view.depth, pixels).astype(np.float64)
+    x, y = (column - view.K[0, 2]) / view.K[0, 0] * z, (row - view.K[1, 2]) / view.K[1, 1] * z
+    normals_camera = np.take(given.reshape(-1, 3), pixels, axis=0).astype(np.float64)
+    return transforms.transform(T, np.stack([x, y, z], axis=-1)), transforms.rotate(T, normals_camera), pixels
 
 
-def local_surface(inverse_depth: Image, radius: int, edge_jump: float, max_slope: float) -> LocalSurface:
-    """Fit a plane to the surface around each pixel, up to its creases but not across them.
+def _inverse_depth(
+    view: View, taken: NDArray[np.bool_], among: NDArray[np.bool_] | None, config: CloudConfig
+) -> tuple[Image, int]:
+    """1/z (H, W) [1/m] of the readings in range, else 0, and the radius [px] of their windows.
 
-    A plane is linear in inverse depth: 1/z = a·du + b·dv + c, by least squares over the window around each
-    pixel. Where the readings of that window scatter more than by chance, the pixel takes the plane of the
-    steadiest of the eight windows that end at it, if this holds for its own reading too (the filter of
-    Kuwahara et al. 1976, with planes in place of means).
+    The median depth of all readings in range, of every fourth row and column, tells how wide a window is.
+    """
+    inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=taken)
+    radius = config.normal_window // 2
+    readings = view.depth[::4, ::4][taken[::4, ::4]]
+    if len(readings) > 0:
+        width = config.normal_size * view.K[0, 0] / float(np.median(readings))
+        radius = min(radius, max(1, round((width - 1.0) / 2.0)))
+    if among is not None:
+        inverse_depth[~among] = 0.0
+    return inverse_depth, radius
+
+
+def local_planes(inverse_depth: Image, radius: int, edge_jump: float, max_slope: float) -> Image:
+    """Fit a plane to the surface around each pixel, up to its creases and depth edges but not across them.
+
+    A plane is linear in inverse depth, 1/z = a·du + b·dv + c, and the noise of a structured-light sensor is
+    nearly even in it: least squares over 7 × 7 readings take it to a quarter or less. Where the readings of a
+    window scatter more than by chance, the pixel takes the plane of the steadiest of the eight windows that
+    end at it, if this holds for its own reading too (the filter of Kuwahara et al. 1976, with planes in place
+    of means).
 
     Args:
         inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
         radius: The window is 2·radius + 1 pixels wide [px].
         edge_jump: Readings further than this from the pixel's own lie beyond a depth edge [1/m].
         max_slope: Added to it a pixel of distance, so that steep surfaces hold together [1/m per px].
+
+    Returns:
+        a, b, c (3, H, W) [1/m per px, 1/m]; c is 0 where too few readings agree.
     """
     image = np.ascontiguousarray(inverse_depth, dtype=np.float32)
     planes = np.zeros((4, *image.shape), dtype=np.float32)
     sums = np.empty((SHARES, 10, image.shape[1]), dtype=np.float32)
     padded, jump, slope = np.pad(image, radius), np.float32(edge_jump), np.float32(max_slope)
-    for_each(_find_planes, SHARES, _Windows(padded, radius, jump, slope, sums, planes))
+    for_each(_find_planes, SHARES, (padded, radius, jump, slope, sums, planes))
     c, variance = planes[2], planes[3]
-    noise = _noise(planes, radius)
-    limit = np.float32(_limit(noise, radius))
+    # The usual standard deviation [1/m] of readings about their window's plane, over windows half apart.
+    apart = (slice(None, None, radius), slice(None, None, radius))
+    noise = float(np.sqrt(np.median(variance[apart][c[apart] > 0.0]))) if (c[apart] > 0.0).any() else 0.0
+    # Variance of a full window's readings that chance may reach: three standard deviations of it.
+    limit = np.float32(noise**2 * (1.0 + 3.0 * np.sqrt(2.0 / (2 * radius + 1) ** 2)))
     unsteady = np.flatnonzero((image > 0.0) & ((c == 0.0) | (variance > limit)))
-    steadier = _steadier(unsteady, image, planes, radius, limit, np.float32(TRUSTED * noise))
-    planes.reshape(4, -1)[:3, unsteady] = steadier
-    return LocalSurface(planes[:3], noise)
-
-
-def _noise(planes: NDArray[np.floating], radius: int) -> float:
-    """Usual standard deviation [1/m] of readings about their window's plane, over windows half apart."""
-    c, variance = planes[2:, ::radius, ::radius]
-    return float(np.sqrt(np.median(variance[c > 0.0]))) if (c > 0.0).any() else 0.0
-
-
-def _limit(noise: float, radius: int) -> float:
-    """Variance [1/m²] of a full window's readings that chance may reach."""
-    return noise**2 * (1.0 + CHANCE * np.sqrt(2.0 / (2 * radius + 1) ** 2))
-
-
-class _Windows(NamedTuple):
-    """What the planes of an image's windows are found from, and where they are written.
-
-    Attributes:
-        padded: 1/z [1/m] with a border of `radius` zeros (H + 2·radius, W + 2·radius), 0 = no reading.
-        radius: The windows are 2·radius + 1 pixels wide [px].
-        edge_jump: Readings further than this from the pixel's own lie beyond a depth edge [1/m].
-        max_slope: Added to it a pixel of distance [1/m per px].
-        sums: Room to work in (SHARES, 10, W).
-        planes: a, b, c of 1/z = a·du + b·dv + c and the variance about it (4, H, W), at first all zero.
-    """
-
-    padded: Image
-    radius: int
-    edge_jump: np.float32
-    max_slope: np.float32
-    sums: Image
-    planes: Image
+    # Another window's plane speaks for a reading within 3.5 standard deviations of it.
+    planes.reshape(4, -1)[:3, unsteady] = _steadier(
+        unsteady, image, planes, radius, limit, np.float32(3.5 * noise)
+    )
+    return planes[:3]
 
 
 @njit(cache=True)
-def _find_planes(share, windows):  # type: ignore[no-untyped-def]
-    """Write the planes of every 16th row's pixels; where readings are too few, the zeros stay."""
-    padded, radius, planes, sums = windows.padded, windows.radius, windows.planes, windows.sums[share]
+def _find_planes(share, data):  # type: ignore[no-untyped-def]
+    """Write a, b, c and the variance about them of every 16th row; zeros stay where readings are few."""
+    padded, radius, edge_jump, max_slope, sums, planes = data
+    sums = sums[share]
     for row in range(share, planes.shape[1], SHARES):
         here, left, right = row + radius, radius, radius + planes.shape[2]
         while left < right and padded[here, left] <= ZERO:
@@ -135,7 +136,7 @@ def _find_planes(share, windows):  # type: ignore[no-untyped-def]
         for dv in range(radius + 1):
             for du in range(radius + 1):
                 weight = np.float32((0.5 if dv == 0 else 1.0) * (0.5 if du == 0 else 1.0))
-                allowed = windows.edge_jump + windows.max_slope * np.float32(max(dv, du))
+                allowed = edge_jump + max_slope * np.float32(max(dv, du))
                 a, b = _part(padded, here - dv, left - du, count), _part(padded, here - dv, left + du, count)
                 c, d = _part(padded, here + dv, left - du, count), _part(padded, here + dv, left + du, count)
                 _add_corners(own, a, b, c, d, np.float32(du), np.float32(dv), weight, allowed, sums)
@@ -242,63 +243,6 @@ def _orient(pixels, planes, K, T, points, normals):  # type: ignore[no-untyped-d
             normals[i, k] = (T[k, 0] * nx + T[k, 1] * ny + T[k, 2] * nz) / length
 
 
-CHUNK = 100_000
-"""Points whose neighbourhoods are held in memory at once [1]; bounds memory, changes no result."""
-
-SPARSE = 4
-"""Every fourth row and column of an image give its median depth [px]."""
-
-
-def surface_from_depth(
-    view: View, config: CloudConfig, *, among: NDArray[np.bool_] | None = None
-) -> LocalSurface:
-    """Smooth a view's depth by local planes that end at creases and depth edges, and measure its noise.
-
-    A plane is linear in inverse depth over the image, and the noise of a structured-light sensor nearly even
-    in it. Over 7 × 7 readings it falls to a quarter or less.
-
-    Args:
-        view: Depth [m] and intrinsics [px]; no pose needed.
-        config: Window, working range and depth edges.
-        among: Which readings (H, W) to take, or None for all of them.
-    """
-    inverse_depth, radius = _inverse_depth(view, config)
-    if among is not None:
-        inverse_depth[~among] = 0.0
-    return local_surface(inverse_depth, radius, config.edge_jump, config.max_slope)
-
-
-def oriented_points(
-    view: View, config: CloudConfig, stride: int = 1, *, among: NDArray[np.bool_] | None = None
-) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Oriented points of a view: the readings in working range that have a normal, smoothed by local planes.
-
-    A view with normals of its own (`view.normals_camera`) is taken as exact.
-
-    Args:
-        view: The view; without a pose, "world" below is the camera frame.
-        config: Working range and normal estimation.
-        stride: Take every stride-th row and column [px].
-        among: Which readings (H, W) to take, or None for all of them.
-
-    Returns:
-        Points (N, 3) [m] and unit normals (N, 3) in the world frame, and the flat pixel index (N,) of each.
-    """
-    T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
-    if view.normals_camera is None:
-        surface = surface_from_depth(view, config, among=among)
-        pixels = _strided(surface.planes[2] > 0.0, stride)
-        return *surface.oriented(pixels, view.K, T), pixels
-    given = view.normals_camera
-    kept = _in_range(view, config) & (np.einsum("hwi,hwi->hw", given, given) > 0.5)
-    pixels = _strided(kept if among is None else kept & among, stride)
-    row, column = np.divmod(pixels, view.depth.shape[1])
-    z = np.take(view.depth, pixels).astype(np.float64)
-    x, y = (column - view.K[0, 2]) / view.K[0, 0] * z, (row - view.K[1, 2]) / view.K[1, 1] * z
-    normals_camera = np.take(given.reshape(-1, 3), pixels, axis=0).astype(np.float64)
-    return transforms.transform(T, np.stack([x, y, z], axis=-1)), transforms.rotate(T, normals_camera), pixels
-
-
 def estimate_normals(points: Array, viewpoint: Array, neighbours: int) -> Array:
     """Normals of an unorganised cloud: the direction of least spread among each point's neighbours.
 
@@ -325,12 +269,15 @@ def estimate_normals(points: Array, viewpoint: Array, neighbours: int) -> Array:
         return normals
     tree = cKDTree(points)
     count = min(max(neighbours, 1), len(points))
-    for start in range(0, len(points), CHUNK):
-        part = slice(start, start + CHUNK)
+    # Neighbourhoods of some points at a time bound the memory.
+    for start in range(0, len(points), 100_000):
+        part = slice(start, start + 100_000)
         _, index = tree.query(points[part], k=count)
         offsets = points[index.reshape(-1, count)] - points[part, None, :]
         offsets -= offsets.mean(axis=1, keepdims=True)
-        normals[part] = _least_direction(np.einsum("nki,nkj->nij", offsets, offsets))
+        values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
+        unique = values[:, 1] > 1e-6 * np.maximum(values[:, 2], 1e-18)
+        normals[part] = np.where(unique[:, None], vectors[:, :, 0], 0.0)
     towards = transforms.unit(np.asarray(viewpoint, dtype=np.float64) - points)
     degenerate = np.einsum("ij,ij->i", normals, normals) < 0.5
     normals[degenerate] = towards[degenerate]
@@ -356,34 +303,3 @@ def thin(points: Array, voxel: float) -> NDArray[np.intp]:
         raise InputError("thin", f"voxel size {voxel:g} is not positive", "give metres above zero")
     points = np.asarray(points, dtype=np.float64)
     return most_central(points, np.zeros(len(points), dtype=np.int32), np.array([voxel]))
-
-
-def _in_range(view: View, config: CloudConfig) -> NDArray[np.bool_]:
-    return (view.depth >= config.min_depth) & (view.depth <= config.max_depth)
-
-
-def _strided(mask: NDArray[np.bool_], stride: int) -> NDArray[np.intp]:
-    """Flat indices of the pixels of a mask (H, W) in every stride-th row and column."""
-    sampled = np.zeros_like(mask)
-    sampled[::stride, ::stride] = mask[::stride, ::stride]
-    return np.flatnonzero(sampled)
-
-
-def _inverse_depth(view: View, config: CloudConfig) -> tuple[NDArray[np.float32], int]:
-    """1/z (H, W) [1/m] of the readings in range, else 0, and the radius [px] of their windows."""
-    inverse_depth = np.divide(
-        np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=_in_range(view, config)
-    )
-    radius = config.normal_window // 2
-    readings = view.depth[::SPARSE, ::SPARSE][inverse_depth[::SPARSE, ::SPARSE] > 0.0]
-    if len(readings) > 0:
-        width = config.normal_size * view.K[0, 0] / float(np.median(readings))
-        radius = min(radius, max(1, round((width - 1.0) / 2.0)))
-    return inverse_depth, radius
-
-
-def _least_direction(covariance: Array) -> Array:
-    """Unit eigenvector (N, 3) of the smallest eigenvalue of (N, 3, 3); zero where it is not unique."""
-    values, vectors = np.linalg.eigh(covariance)
-    flat = values[:, 1] > 1e-6 * np.maximum(values[:, 2], 1e-18)
-    return np.where(flat[:, None], vectors[:, :, 0], 0.0)
