@@ -1,8 +1,7 @@
 """Compiled paths of rays through a voxel grid.
 
 A ray is the part t ∈ [t_from, t_to] of the segment start + t · (end − start), t from 0 at the start to 1
-at the end. `traverse` finds all its voxels at once; with `enter` and `advance` it goes from one voxel to the
-next (Amanatides and Woo, 1987), where what has been met decides whether to go on.
+at the end. `traverse` finds all its voxels at once.
 """
 
 from __future__ import annotations
@@ -10,8 +9,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-
-from caryatid.geometry.transforms import Array
 
 Grid = NDArray[np.uint8]
 """One byte a voxel, indexed [x, y, z]."""
@@ -113,92 +110,3 @@ def _slabs(
         found[1, n] = np.int32(slab + j_between * strides[1] + k_between * strides[2])
         found[2, n] = np.int32(slab + j_out * strides[1] + k_out * strides[2])
     return slabs
-
-
-@njit(cache=True)
-def enter(
-    shape: Voxel, start: Triple, ray: Triple, t_from: float, t_to: float
-) -> tuple[float, float, Voxel, Triple, Triple]:
-    """Cut a ray to a grid and find where it enters.
-
-    Args:
-        shape: Voxels of the grid along each axis.
-        start: Start of the ray in voxels from the grid's corner.
-        ray: Its direction, length 1 in t, in voxels.
-        t_from: Where it begins.
-        t_to: Where it ends.
-
-    Returns:
-        Begin and end within the grid (nothing is left where the end is not beyond the begin), the first
-        voxel, how much t there is between planes of each axis, and t at the next plane of each axis.
-    """
-    for axis in range(3):
-        position, direction, count = start[axis], ray[axis], shape[axis]
-        if direction == 0.0:
-            if position < 0.0 or position >= count:
-                t_to = t_from
-            continue
-        near, far = -position / direction, (count - position) / direction
-        t_from, t_to = max(t_from, min(near, far)), min(t_to, max(near, far))
-    x, y, z = start
-    dx, dy, dz = ray
-    if t_from >= t_to:
-        return t_from, t_from, (-1, -1, -1), (np.inf, np.inf, np.inf), (np.inf, np.inf, np.inf)
-    i = min(max(int(np.floor(x + t_from * dx)), 0), shape[0] - 1)
-    j = min(max(int(np.floor(y + t_from * dy)), 0), shape[1] - 1)
-    k = min(max(int(np.floor(z + t_from * dz)), 0), shape[2] - 1)
-    step = (
-        abs(1.0 / dx) if dx != 0.0 else np.inf,
-        abs(1.0 / dy) if dy != 0.0 else np.inf,
-        abs(1.0 / dz) if dz != 0.0 else np.inf,
-    )
-    ahead = (
-        (i + (1 if dx > 0.0 else 0) - x) / dx if dx != 0.0 else np.inf,
-        (j + (1 if dy > 0.0 else 0) - y) / dy if dy != 0.0 else np.inf,
-        (k + (1 if dz > 0.0 else 0) - z) / dz if dz != 0.0 else np.inf,
-    )
-    return t_from, t_to, (i, j, k), step, ahead
-
-
-@njit(cache=True)
-def advance(voxel: Voxel, ray: Triple, step: Triple, ahead: Triple) -> tuple[Voxel, Triple]:
-    """Go on to the next voxel of a ray: the one beyond the nearest plane.
-
-    Args:
-        voxel: Where the ray is.
-        ray: Its direction.
-        step: How much t there is between planes of each axis.
-        ahead: t at the next plane of each axis.
-
-    Returns:
-        The next voxel, and t at the next planes from there.
-    """
-    i, j, k = voxel
-    x, y, z = ahead
-    if x <= y and x <= z:
-        return (i + (1 if ray[0] > 0.0 else -1), j, k), (x + step[0], y, z)
-    if y <= z:
-        return (i, j + (1 if ray[1] > 0.0 else -1), k), (x, y + step[1], z)
-    return (i, j, k + (1 if ray[2] > 0.0 else -1)), (x, y, z + step[2])
-
-
-@njit(cache=True)
-def within(voxel: Voxel, shape: Voxel) -> bool:
-    """Whether a voxel belongs to a grid."""
-    return 0 <= voxel[0] < shape[0] and 0 <= voxel[1] < shape[1] and 0 <= voxel[2] < shape[2]
-
-
-def traversed_reference(
-    shape: tuple[int, ...], start: Array, end: Array, t_from: float, t_to: float, origin: Array, size: float
-) -> NDArray[np.intp]:
-    """Voxels (K, 3) a ray traverses: between two neighbouring plane crossings it is inside one voxel."""
-    position, direction = (start - origin) / size, (end - start) / size
-    crossings = [np.array([t_from, t_to])]
-    for axis in range(3):
-        if direction[axis] != 0.0:
-            crossings.append((np.arange(shape[axis] + 1) - position[axis]) / direction[axis])
-    t = np.unique(np.concatenate(crossings))
-    t = t[(t >= t_from) & (t <= t_to)]
-    middle = (t[1:] + t[:-1]) / 2.0
-    voxels = np.floor(position + middle[:, None] * direction).astype(np.intp)
-    return voxels[((voxels >= 0) & (voxels < shape)).all(axis=1)]

@@ -23,7 +23,6 @@ planners know of no shapes.
 from __future__ import annotations
 
 from functools import cache, partial
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -31,7 +30,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from caryatid.config import ActiveVisionConfig
-from caryatid.geometry.rays import Triple, advance, enter, within
+from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.transforms import Array, unit
 from caryatid.planning.candidates import Looks
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
@@ -155,46 +154,6 @@ def _shares(values: Array) -> Array:
     return values / total if total > 0.0 else np.zeros_like(values)
 
 
-class _Views(NamedTuple):
-    """The arguments of `gather`, and what it returns."""
-
-    states: NDArray[np.int8]
-    layers: NDArray[np.float32]
-    T_world_camera: Array
-    rays_camera: Array
-    origin: Array
-    size: float
-    gathered: Array
-
-
-@njit(cache=True)
-def _gather_ray(
-    states: NDArray[np.int8], layers: NDArray[np.float32], start: Triple, ray: Triple, gathered: Array
-) -> None:
-    """Add what one ray gathers, start and direction in voxel units, to `gathered` (5,)."""
-    shape = states.shape
-    t, end, voxel, step, ahead = enter(shape, start, ray, 0.0, np.inf)
-    visible, run = 1.0, 0.0
-    while t < end and within(voxel, shape):
-        state = states[voxel]
-        occupancy, entropy, proximity = layers[voxel]
-        gathered[0] += visible * entropy
-        if state == UNKNOWN:
-            gathered[1] += visible * entropy
-            gathered[4] += proximity
-            run += entropy
-        elif state == OCCUPIED:
-            if run > 0.0:
-                gathered[2] += 1.0
-                gathered[3] += run
-            return
-        else:
-            run = 0.0
-        visible *= 1.0 - occupancy
-        t = min(ahead[0], ahead[1], ahead[2])
-        voxel, ahead = advance(voxel, ray, step, ahead)
-
-
 def gather(
     states: NDArray[np.int8],
     layers: NDArray[np.float32],
@@ -217,21 +176,49 @@ def gather(
         (C, 5), a column each of `VOLUMETRIC`.
     """
     gathered = np.zeros((len(T_world_camera), len(VOLUMETRIC)))
-    views = _Views(states, layers, T_world_camera, rays_camera, origin, size, gathered)
-    for_each(_gather_one, len(T_world_camera), views)
+    data = (states, layers, T_world_camera, rays_camera, origin, size, gathered)
+    for_each(_gather_one, len(T_world_camera), data)
     return gathered
 
 
 @njit(cache=True)
-def _gather_one(c: int, views: _Views) -> None:
+def _gather_one(c, data):  # type: ignore[no-untyped-def]
     """Sum what the rays of one candidate gather."""
-    T, size, origin = views.T_world_camera[c], views.size, views.origin
+    states, layers, T_world_camera, rays, origin, size, gathered = data
+    T, found = T_world_camera[c], room(states.shape)
     start = ((T[0, 3] - origin[0]) / size, (T[1, 3] - origin[1]) / size, (T[2, 3] - origin[2]) / size)
-    for r in range(len(views.rays_camera)):
-        x, y, z = views.rays_camera[r, 0], views.rays_camera[r, 1], views.rays_camera[r, 2]
+    for r in range(len(rays)):
+        x, y, z = rays[r, 0], rays[r, 1], rays[r, 2]
         ray = (
             (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z) / size,
             (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z) / size,
             (T[2, 0] * x + T[2, 1] * y + T[2, 2] * z) / size,
         )
-        _gather_ray(views.states, views.layers, start, ray, views.gathered[c])
+        slabs = traverse(found, states.shape, start, ray, 0.0, np.inf)
+        _gather_ray(states.reshape(-1), layers.reshape(-1, 3), found, slabs, gathered[c])
+
+
+@njit(cache=True)
+def _gather_ray(states, layers, found, slabs, gathered):  # type: ignore[no-untyped-def]
+    """Add what one ray gathers up to the first occupied voxel to `gathered` (5,)."""
+    visible, run, before = 1.0, 0.0, np.uint32(np.iinfo(np.uint32).max)
+    for n in range(slabs):
+        for m in range(3):
+            voxel = np.uint32(found[m, n])
+            if voxel == before:
+                continue
+            before = voxel
+            occupancy, entropy, state = layers[voxel, 0], layers[voxel, 1], states[voxel]
+            gathered[0] += visible * entropy
+            if state == UNKNOWN:
+                gathered[1] += visible * entropy
+                gathered[4] += layers[voxel, 2]
+                run += entropy
+            elif state == OCCUPIED:
+                if run > 0.0:
+                    gathered[2] += 1.0
+                    gathered[3] += run
+                return
+            else:
+                run = 0.0
+            visible *= 1.0 - occupancy
