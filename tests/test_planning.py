@@ -54,7 +54,7 @@ from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.robots.recording import RecordingRobot
 from caryatid.sensing.view_sphere import ViewSphere, direction
-from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
+from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, Solid, VoxelMap
 
 PAPER = replace(CONFIG, saliency="paper", edge_point="midpoint")
 LITERAL = {"saliency": "paper", "edge_point": "midpoint", "path_cost": "angle"}
@@ -312,17 +312,17 @@ class TestExpectedVisibility:
     def test_unseen_space_is_what_is_over_the_table_unknown_and_not_solid(self):
         """A lattice of 1 over a table turned by 90°, cells of 2, heights 0, 1, 2 of 4."""
         x, y, z = np.arange(-3.0, 4.0), np.arange(-3.0, 4.0), np.arange(3.0)
-        states = np.zeros((4, 4, 2), dtype=np.int8)
-        states[3] = 1
-        solid = np.zeros((2, 2, 2), dtype=np.int8)
-        solid[0, 0, 0] = 1
+        seen = np.zeros((4, 4, 2), dtype=np.uint8)
+        seen[3] = 1
+        grid = np.zeros((2, 2, 2), dtype=np.uint8)
+        grid[0, 0, 0] = 1
+        voxels = VoxelMap(np.array([-4.0, -4.0, 0.0]), 0 * seen, seen, VoxelConfig(size=2.0))
+        solid = Solid(np.zeros(3), grid, voxels)
         turned = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, np.pi / 2.0)), np.zeros(3))
+        table = Box(turned, np.array([3.0, 5.0, 0.1]))
         triangle = np.array([[-2.5, -2.5], [2.5, -2.5], [-2.5, 2.5]])
         for heap in (triangle, triangle[::-1].copy(), np.vstack([triangle, triangle[:1]])):
-            points, on_table, in_heap = unseen_space(
-                x, y, z, 4.0, turned, np.array([1.5, 2.5]), heap, states, np.array([-4.0, -4.0, 0.0]),
-                solid, np.array([0.0, 0.0, 0.0]), 2.0,
-            )  # fmt: skip
+            points, on_table, in_heap = unseen_space(x, y, z, 4.0, table, heap, solid)
             wanted = {
                 (a, b, c)
                 for a in (-2, -1, 0, 1)

@@ -6,17 +6,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry.polygons import hull
-from caryatid.geometry.shapes import Primitives
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.sensing.visibility import shown
-from caryatid.sensing.voxel_map import Solid, VoxelMap
+from caryatid.sensing.voxel_map import UNKNOWN, Solid, VoxelMap
 from caryatid.support.stability import ground_outline
 
 SPACE = "unseen space"
@@ -126,11 +125,7 @@ def space_samples(graph: SupportGraph, solid: Solid) -> Samples:
     x, y, z = (np.arange(a, b, SPACE_SPACING) for a, b in zip(low, high, strict=True))
     outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object"]
     heap = hull(np.concatenate(outlines))
-    voxels = solid.voxels
-    points, on_table, in_heap = unseen_space(
-        x, y, z, float(high[2] - low[2]), table.shape.T_world_object, table.shape.extents[:2] / 2.0, heap,
-        voxels.states, voxels.origin_world, solid.grid.view(np.int8), solid.origin_world, voxels.config.size,
-    )  # fmt: skip
+    points, on_table, in_heap = unseen_space(x, y, z, float(high[2] - low[2]), table.shape, heap, solid)
     weights = SPACE_WEIGHT * on_table + HEAP_WEIGHT * in_heap
     return Samples(points, np.zeros_like(points), weights, np.zeros(len(points), dtype=np.intp), (SPACE,))
 
@@ -192,11 +187,9 @@ def _nothing() -> Samples:
     return Samples(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.intp), ())
 
 
-@njit(cache=True, error_model="numpy")
 def unseen_space(
-    x: Array, y: Array, z: Array, height: float, T_world_table: Array, half: Array, heap: Array,
-    states: NDArray[np.int8], origin: Array, solid: NDArray[np.int8], solid_origin: Array, size: float,
-) -> tuple[Array, Array, Array]:  # fmt: skip
+    x: Array, y: Array, z: Array, height: float, table: Shape, heap: Array, solid: Solid
+) -> tuple[Array, Array, Array]:
     """Pick the points of a lattice that are over a table, in voxels no view has seen, and in nothing solid.
 
     Args:
@@ -204,67 +197,31 @@ def unseen_space(
         y: The same (Y,) [m].
         z: The same (Z,) [m], from the lowest on.
         height: How far over the lowest points a point is worth nothing [m]; there they are worth 1.
-        T_world_table: Pose (4, 4) of the table.
-        half: Half extents (2,) of its top [m].
+        table: Its z is up.
         heap: Corners (M, 2) [m] of a convex polygon on the ground, in either turn; the last may be the first.
-        states: State (X, Y, Z) of each voxel: 0 = unseen.
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        solid: Not 0 = solid (X, Y, Z).
-        solid_origin: Corner (3,) [m] of its voxel [0, 0, 0].
-        size: Edge of a voxel [m].
+        solid: What is solid, and what views have seen.
 
     Returns:
         Points (N, 3) [m]; their worth (N,) in shares of that of all the lattice over the table, seen or not;
         and in shares of that of all over the heap.
     """
-    most = len(x) * len(y) * len(z)
-    points, on_table, in_heap = np.empty((most, 3)), np.empty(most), np.empty(most)
-    table_total, heap_total, count = 0.0, 0.0, 0
-    for b in y:
-        for a in x:
-            among = 1.0 if _within(heap, a, b) else 0.0
-            for c in z:
-                u, v, w = a - T_world_table[0, 3], b - T_world_table[1, 3], c - T_world_table[2, 3]
-                if (
-                    abs(T_world_table[0, 0] * u + T_world_table[1, 0] * v + T_world_table[2, 0] * w) > half[0]
-                    or abs(T_world_table[0, 1] * u + T_world_table[1, 1] * v + T_world_table[2, 1] * w)
-                    > half[1]
-                ):
-                    continue
-                lowness = 1.0 - (c - z[0]) / height
-                table_total += lowness
-                heap_total += among * lowness
-                if (
-                    _value(states, origin, size, a, b, c) == 0
-                    and _value(solid, solid_origin, size, a, b, c) == 0
-                ):
-                    points[count, 0], points[count, 1], points[count, 2] = a, b, c
-                    on_table[count], in_heap[count] = lowness, among * lowness
-                    count += 1
-    on_table, in_heap = on_table[:count] / max(table_total, 1e-9), in_heap[:count] / max(heap_total, 1e-9)
-    return points[:count], on_table, in_heap
+    points = np.stack(np.meshgrid(y, x, z, indexing="ij"), axis=-1).reshape(-1, 3)[:, [1, 0, 2]]
+    T, half = table.T_world_object, table.extents / 2.0
+    u, v, w = (points - T[:3, 3]).T
+    over = np.abs(T[0, 0] * u + T[1, 0] * v + T[2, 0] * w) <= half[0]
+    over &= np.abs(T[0, 1] * u + T[1, 1] * v + T[2, 1] * w) <= half[1]
+    points = points[over]
+    lowness = 1.0 - (points[:, 2] - z[0]) / height
+    among = np.where(_within(heap, points), lowness, 0.0)
+    unseen = (solid.voxels.state_at(points) == UNKNOWN) & ~solid.holds(points)
+    on_table, in_heap = (worth[unseen] / max(float(worth.sum()), 1e-9) for worth in (lowness, among))
+    return points[unseen], on_table, in_heap
 
 
-@njit(cache=True)
-def _within(polygon: NDArray[np.float64], x: float, y: float) -> bool:
-    """Whether a point is inside a convex polygon, and not on its border."""
-    left, right = False, False
-    for n in range(len(polygon)):
-        ax, ay = polygon[n - 1, 0], polygon[n - 1, 1]
-        bx, by = polygon[n, 0], polygon[n, 1]
-        if ax == bx and ay == by:
-            continue
-        turn = (bx - ax) * (y - ay) - (by - ay) * (x - ax)
-        left, right = left or turn >= 0.0, right or turn <= 0.0
-    return left != right
-
-
-@njit(cache=True, error_model="numpy")
-def _value(grid: NDArray[np.int8], origin: Array, size: float, x: float, y: float, z: float) -> int:
-    """What a grid holds at a point; 0 outside."""
-    i = int(np.floor((x - origin[0]) / size))
-    j = int(np.floor((y - origin[1]) / size))
-    k = int(np.floor((z - origin[2]) / size))
-    if 0 <= i < grid.shape[0] and 0 <= j < grid.shape[1] and 0 <= k < grid.shape[2]:
-        return int(grid[i, j, k])
-    return 0
+def _within(polygon: Array, points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 2+) are inside a convex polygon (M, 2), and not on its border."""
+    start, along = np.roll(polygon, 1, axis=0), polygon - np.roll(polygon, 1, axis=0)
+    start, along = start[along.any(axis=1)], along[along.any(axis=1)]
+    offset = points[:, None, :2] - start
+    turn = along[:, 0] * offset[..., 1] - along[:, 1] * offset[..., 0]
+    return (turn > 0.0).all(axis=1) != (turn < 0.0).all(axis=1)
