@@ -103,24 +103,26 @@ def sample_reachability(
     if count < 1:
         raise InputError("count", f"{count} postures make no map", "draw some hundred thousand")
     bins = _Bins(config.view_directions)
-    reached = np.zeros((0, 0, 0, config.view_directions), dtype=np.uint8)
-    low = np.zeros(3, dtype=np.intp)
-    fresh = 1.0
+    held = []
     chunk = min(CHUNK, -(-count // 10))
     for start in range(0, count, chunk):
         joints = rng.uniform(bounds[:, 0], bounds[:, 1], (min(chunk, count - start), len(bounds)))
         T_base_camera = _checked_poses(forward(joints), len(joints))
-        if len(T_base_camera) == 0:
-            continue
         cells = np.floor(T_base_camera[:, :3, 3] / config.cell).astype(np.intp)
-        reached, low = _grown(reached, low, cells.min(axis=0), cells.max(axis=0) + 1)
-        directions, bits = bins.of(T_base_camera)
-        x, y, z = (cells - low).T
-        fresh = float((reached[x, y, z, directions] == 0).mean())
-        np.bitwise_or.at(reached, (x, y, z, directions), bits)
-    if not reached.any():
+        if len(cells):
+            held.append(np.column_stack([cells, *bins.of(T_base_camera)]))
+    if not held:
         raise InputError("forward", "holds no posture possible, all are NaN", "check it and the limits")
-    return ReachabilityMap(reached, low.astype(np.float64) * config.cell, config.cell, fresh)
+    places, early = np.concatenate(held), sum(map(len, held[:-1]))
+    low = np.append(places[:, :3].min(axis=0), 0)
+    bits = places[:, 4].astype(np.uint8)
+    shape = places[:, :3].max(axis=0) + 1 - low[:3]
+    reached = np.zeros((*shape, config.view_directions), dtype=np.uint8)
+    before, last = (tuple((part - low).T) for part in (places[:early, :4], places[early:, :4]))
+    np.bitwise_or.at(reached, before, bits[:early])
+    fresh = float((reached[last] == 0).mean())
+    np.bitwise_or.at(reached, last, bits[early:])
+    return ReachabilityMap(reached, low[:3].astype(np.float64) * config.cell, config.cell, fresh)
 
 
 def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityMap) -> None:
@@ -195,19 +197,6 @@ def _checked_poses(T_base_camera: ArrayLike, count: int) -> Array:
     if odd.any():
         transforms.as_rigid(poses[int(np.argmax(odd))], "forward")
     return poses
-
-
-def _grown(
-    reached: NDArray[np.uint8], low: NDArray[np.intp], least: NDArray[np.intp], end: NDArray[np.intp]
-) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """Make room for cells from `least` (3,) to before `end` (3,); return the map and its lowest cell (3,)."""
-    if reached.size == 0:
-        return np.zeros((*(end - least), reached.shape[3]), dtype=np.uint8), least
-    before = np.maximum(low - least, 0)
-    after = np.maximum(end - low - reached.shape[:3], 0)
-    if not (before.any() or after.any()):
-        return reached, low
-    return np.pad(reached, [*zip(before, after, strict=True), (0, 0)]), low - before
 
 
 def _checked_map(held: dict[str, Any], file: Path) -> ReachabilityMap:

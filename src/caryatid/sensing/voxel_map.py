@@ -199,13 +199,16 @@ class Solid:
 
 
 def values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
-    """What the voxels of a grid (X, Y, Z) hold at points (N, 3) [m]; 0 outside.
+    """What the voxels of a grid hold at points; 0 outside.
 
     Args:
-        grid: Its values.
-        points: Where to look.
+        grid: Its values (X, Y, Z).
+        points: Where to look (N, 3) [m].
         origin: Corner (3,) [m] of voxel [0, 0, 0].
         size: Edge of a voxel [m].
+
+    Returns:
+        The values (N,).
     """
     index = np.floor((points - origin) / size).astype(np.intp)
     inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
