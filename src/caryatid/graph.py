@@ -19,9 +19,6 @@ Role = Literal["object", "support_surface"]
 Kind = Literal["bottom-up", "lean", "top-down"]
 """How a support holds: from below, from the side, or by weight from above."""
 
-EDGES_TOLD = 8
-"""Edges a graph's `repr` names at the most."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SceneObject(Pictured):
@@ -165,7 +162,7 @@ class SupportGraph(Pictured):
 
     def __repr__(self) -> str:
         edges = [f"{s.supporter} → {s.supported}{'' if s.certain else '?'}" for s in self.supports]
-        told = edges if len(edges) <= EDGES_TOLD else [*edges[: EDGES_TOLD - 1], "…"]
+        told = edges if len(edges) <= 8 else [*edges[:7], "…"]
         counts = f"vertices={len(self.objects)}, edges={len(edges)}"
         return f"SupportGraph({counts}{': ' if told else ''}{', '.join(told)})"
 

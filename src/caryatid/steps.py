@@ -26,9 +26,6 @@ from caryatid.robots import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
 
-COMPRESSION = 1
-"""Level of zlib: higher ones take longer and save little."""
-
 PARTS = {"cloud": Cloud, "sphere": ViewSphere, "view": View, "candidates": Candidates, "decision": Decision}
 """The parts of a step that hold arrays."""
 
@@ -146,7 +143,8 @@ def _encoded(step: Step) -> bytes:
         document["robot"] = step.robot
     arrays["document"] = np.frombuffer(json.dumps(document, default=_plain).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=COMPRESSION) as archive:
+    # Higher levels of compression take longer and save little.
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, array in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)

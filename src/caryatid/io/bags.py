@@ -45,7 +45,6 @@ COLOUR_ENCODINGS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = {
 """Encodings of colour → number of channels, and those that are red, green and blue."""
 _WANTED: Final = {"--depth": (IMAGE, COMPRESSED), "--rgb": (IMAGE, COMPRESSED), "--info": (CAMERA,)}
 _CALLED: Final = {"--depth": "images", "--rgb": "images", "--info": "cameras"}
-_MILLIMETRES: Final = 0.001
 _CONFIG_HEADER: Final = struct.Struct("<iff")
 """What comes before a compressed depth image: its format, and two parameters of inverse depth."""
 
@@ -273,7 +272,7 @@ def _depth(message: Any, source: str) -> NDArray[np.float32]:
     if message.encoding not in DEPTH_ENCODINGS:
         raise _unknown(source, message.encoding, DEPTH_ENCODINGS, "depth")
     pixels = _pixels(message, DEPTH_ENCODINGS[message.encoding], 1, source)[:, :, 0]
-    return _cleaned(pixels.astype(np.float32) if pixels.dtype.kind == "f" else pixels * _MILLIMETRES)
+    return _cleaned(pixels.astype(np.float32) if pixels.dtype.kind == "f" else pixels * 0.001)
 
 
 def _colour(message: Any, source: str) -> NDArray[np.uint8]:
@@ -305,12 +304,12 @@ def _compressed_depth(message: Any, source: str) -> NDArray[np.float32]:
         reason = f"its depth is compressed as '{message.format}'"
         raise InputError(source, reason, "record it raw, or compressed as PNG")
     if "compressedDepth" not in codec:
-        return _cleaned(images.read_units(data, source) * _MILLIMETRES)
+        return _cleaned(images.read_units(data, source) * 0.001)
     if len(data) < _CONFIG_HEADER.size:
         raise BrokenImageError(source, "an image is cut off", "record it again")
     units = images.read_units(data[_CONFIG_HEADER.size :], source)
     if encoding != "32FC1":
-        return _cleaned(units * _MILLIMETRES)
+        return _cleaned(units * 0.001)
     _, scale, offset = _CONFIG_HEADER.unpack_from(data)
     with np.errstate(divide="ignore", invalid="ignore"):
         return _cleaned(np.where(units > 0, scale / (units - np.float64(offset)), 0.0))
