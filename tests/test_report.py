@@ -23,7 +23,7 @@ from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.planning.candidates import Candidates
 from caryatid.sensing.views import Cloud, View
-from caryatid.viz import Report, draw_view, render_html, render_pdf
+from caryatid.viz import Figure, Report, make_report, render_html, render_pdf
 from caryatid.viz.colours import object_colour, rgb
 from caryatid.viz.drawings import Projection, bar_chart, draw_cloud, draw_image, draw_sphere, line_chart
 from caryatid.viz.graph_drawing import arrange, draw_graph, layers
@@ -35,10 +35,14 @@ VOID = {"meta", "input", "br", "link", "img", "hr"}
 
 @pytest.fixture(scope="module")
 def report() -> Report:
-    pages = [draw_view(make_step(0), SMALL), draw_view(make_step(1, decide=False), SMALL)]
-    settings = {"source": "a<b>.xml", "seed": 0, "report": SMALL}
-    title, scores = "Run <script>alert(1)</script> $x$", [good(0.5), good(0.9)]
-    return Report(title, pages, settings, scores, [pages[0].figures[0]])
+    return make_report(
+        "Run <script>alert(1)</script> $x$",
+        [make_step(0), make_step(1, decide=False)],
+        settings={"source": "a<b>.xml", "seed": 0, "report": SMALL},
+        scores=[good(0.5), good(0.9)],
+        strip=[Figure("1: o2", draw_graph(make_graph()), "Nothing else moved")],
+        config=SMALL,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,14 +102,14 @@ def test_it_is_one_well_formed_file_that_loads_nothing(html):
 def test_it_names_each_object_edge_figure_and_setting(report, html):
     page = Page(html)
     for item in make_graph().objects:
-        assert sum(kind.startswith(f"node {item.id}") for kind in page.classes) == 2
+        assert sum(kind.startswith(f"node {item.id}") for kind in page.classes) == 3
     for support in make_graph().supports:
         assert (
             sum(kind.startswith(f"edge {support.supporter} {support.supported} ") for kind in page.classes)
-            == 2
+            == 3
         )
         assert f"{support.occurrences} of {support.opportunities}" in page.text
-    for figure in (f for view in report.pages for f in view.figures):
+    for figure in (f for section in report.sections for f in section.figures):
         assert figure.heading in page.text
         assert figure.caption in page.text
     for said in (
@@ -147,21 +151,22 @@ def test_charts_appear_with_scores_and_travel_only_and_changes_are_said():
     fewer = replace(
         make_step(1), graph=replace(graph, objects=graph.objects[:3], supports=graph.supports[:2])
     )
-    pages = [draw_view(make_step(0), SMALL), draw_view(fewer, SMALL)]
-    still = [replace(p, step=replace(p.step, path_travelled=0.0, angle_travelled=0.0)) for p in pages]
+    steps = [make_step(0), fewer]
+    still = [replace(step, path_travelled=0.0, angle_travelled=0.0) for step in steps]
 
-    def titles(pages, scores=()):
-        return [figure.picture.name for figure in Report("t", pages, {}, scores).charts]
+    def summary(steps, scores=()):
+        report = make_report("t", steps, scores=scores, config=SMALL)
+        return [figure.picture.name for figure in report.sections[0].figures], report.sections[3].text
 
     scores = [good(0.5), good(0.9)]
-    assert titles(pages, scores)[:2] == ["F1 over views", "F1 over path length"]
-    assert titles(still, scores)[:2] == ["F1 over views", "Found so far"]
-    assert titles(pages) == ["Found so far", "Time of each stage"]
-    with pytest.raises(ValueError, match="1 scores for 2 views"):
-        Report("t", pages, {}, scores[:1])
-    facts = Report("t", pages).sections[3].text
+    assert summary(steps, scores)[0][:2] == ["F1 over views", "F1 over path length"]
+    assert summary(still, scores)[0][:2] == ["F1 over views", "Found so far"]
+    charts, facts = summary(steps)
+    assert charts == ["Found so far", "Time of each stage"]
     assert "objects gone: o7" in facts
     assert "supports gone: o0 → o2, o2 → o1" in facts
+    with pytest.raises(ValueError, match="1 scores for 2 views"):
+        summary(steps, scores[:1])
 
 
 def test_charts_show_every_value_and_leave_gaps():
@@ -181,16 +186,19 @@ def test_charts_show_every_value_and_leave_gaps():
 
 def test_any_step_is_drawn():
     """Without colour, decision, pose, view, objects or points."""
-    plain, step = draw_view(make_step(rgb=False, decide=False), SMALL), make_step()
-    assert len(plain.figures) == 4
-    assert "depth image" in plain.figures[0].caption
-    cloud = draw_view(replace(step, view=None, decision=None, candidates=None), SMALL)
-    assert [figure.heading[:9] for figure in cloud.figures] == ["What supp", "The cloud", "The cloud"]
-    assert cloud.thumbnail is None
+    step = make_step()
     empty = Cloud(np.empty((0, 3)), np.empty((0, 3)), name="nothing")
-    nothing = draw_view(replace(step, view=None, graph=SupportGraph(), cloud=empty, decision=None), SMALL)
-    Page(render_html(Report("t", [plain, cloud, nothing])))
-    assert render_pdf(Report("t", [nothing]))
+    plain = make_step(rgb=False, decide=False)
+    cloud = replace(step, view=None, decision=None, candidates=None)
+    nothing = replace(step, view=None, graph=SupportGraph(), cloud=empty, decision=None)
+    report = make_report("t", [plain, cloud, nothing], config=SMALL)
+    Page(render_html(report))
+    views = [section for section in report.sections if section.title.startswith("View")]
+    assert len(views[0].figures) == 4
+    assert "depth image" in views[0].figures[0].caption
+    assert [figure.heading[:9] for figure in views[1].figures] == ["What supp", "The cloud", "The cloud"]
+    assert "Contact sheet" not in [section.title for section in report.sections]
+    assert render_pdf(make_report("t", [nothing]))
 
 
 def test_sizes_stability_and_unseen_sides_are_said():
@@ -333,7 +341,7 @@ def test_tags_end_up_apart_and_inside():
 def test_drawing_is_reproducible_and_leaves_the_step_alone():
     step = make_step()
     before = (step.cloud.points_world.copy(), step.labels.copy(), step.view.depth.copy())
-    first, again = (render_html(Report("t", [draw_view(step, SMALL)])) for _ in range(2))
+    first, again = (render_html(make_report("t", [step], config=SMALL)) for _ in range(2))
     assert first == again
     for array, copy in zip((step.cloud.points_world, step.labels, step.view.depth), before, strict=True):
         assert np.array_equal(array, copy)
@@ -346,7 +354,7 @@ def test_ten_views_stay_small():
     step = make_step()
     view = View(np.ones((480, 640), np.float32), K_vga, step.view.pose, noisy)
     labels = rng.integers(0, 8, (480, 640)).astype(np.int32)
-    assert len(render_html(Report("t", [draw_view(replace(step, view=view, labels=labels))]))) < 8e5
+    assert len(render_html(make_report("t", [replace(step, view=view, labels=labels)]))) < 8e5
 
 
 # The command

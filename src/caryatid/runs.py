@@ -18,7 +18,7 @@ from caryatid.graph import SupportGraph
 from caryatid.io.runs import RunWriter, read_run
 from caryatid.io.staging import write_file
 from caryatid.steps import read_config, read_steps, write_step
-from caryatid.viz import Report, draw_view, render_html, render_pdf
+from caryatid.viz import make_report, render_html, render_pdf
 from caryatid.viz.strip import read_figures
 
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
@@ -134,9 +134,14 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     config, record = read_config(run), run.record
     settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
     settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
-    pages = [draw_view(step, config.report) for step in read_steps(run)]
-    title = f"caryatid: {Path(record['source']).name}"
-    report = Report(title, pages, settings, record.get("scores", ()), read_figures(folder))
+    report = make_report(
+        f"caryatid: {Path(record['source']).name}",
+        read_steps(run),
+        settings=settings,
+        scores=record.get("scores", ()),
+        strip=read_figures(folder),
+        config=config.report,
+    )
     files = {} if pdf is None else {pdf: render_pdf(report)}
     files[folder / "report.html"] = render_html(report).encode()
     for path, content in files.items():

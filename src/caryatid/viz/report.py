@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import ReportConfig
+from caryatid.graph import SupportGraph
 from caryatid.sensing.views import Cloud
 from caryatid.viz.drawings import bar_chart, draw_cloud, draw_image, draw_sphere, line_chart
 from caryatid.viz.graph_drawing import BESIDE, draw_graph
@@ -77,179 +78,167 @@ class Section:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ViewPage:
-    """One view, drawn.
-
-    Attributes:
-        step: What is known after it, without its images and clouds.
-        figures: The pictures.
-        thumbnail: The view's picture for the contact sheet; None for a cloud.
-    """
-
-    step: Step
-    figures: tuple[Figure, ...]
-    thumbnail: Picture | None
-
-    @property
-    def number(self) -> str:
-        """The view's number as its folder in the run has it."""
-        return f"{self.step.index:02d}"
-
-    @property
-    def objects(self) -> int:
-        """How many objects are known, without the support surface."""
-        return sum(o.role == "object" for o in self.step.graph.objects)
-
-    @property
-    def uncertain(self) -> int:
-        """How many supports are uncertain."""
-        return sum(not s.certain for s in self.step.graph.supports)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class Report:
     """All a report says.
 
     Attributes:
         title: Its heading.
-        pages: The views in order, at least one.
-        settings: Names and values of the run's settings; mappings and dataclasses in it are flattened.
-        scores: F1, precision and recall after each view by name; empty where there is no ground truth.
-        strip: Pictures of the objects being taken away, in order.
-
-    Raises:
-        ValueError: There are scores, but not one for each page, or there is no page.
+        cards: Big figures of the summary: name, figure, what it is made of.
+        sections: Summary, contact sheet, the views, what was taken apart, settings.
     """
 
     title: str
-    pages: Sequence[ViewPage]
-    settings: Mapping[str, object] = field(default_factory=dict)
-    scores: Sequence[Mapping[str, float]] = ()
-    strip: Sequence[Figure] = ()
-
-    def __post_init__(self) -> None:
-        if not self.pages:
-            raise ValueError("a report needs at least one view")
-        if self.scores and len(self.scores) != len(self.pages):
-            raise ValueError(f"{len(self.scores)} scores for {len(self.pages)} views")
-
-    @property
-    def sections(self) -> list[Section]:
-        """Everything, in order: summary, contact sheet, the views, what was taken apart, settings."""
-        sections = [Section("Summary", figures=self.charts, anchor="summary", columns=4)]
-        if thumbnails := self._thumbnails():
-            text = "Every view with the segments found in it, and why it was taken."
-            sections.append(Section("Contact sheet", text, thumbnails, anchor="contacts", columns=4))
-        sections += [self._view(number) for number in range(len(self.pages))]
-        if self.strip:
-            text = "Each object lifted straight up in physics, in the order found."
-            sections.append(Section("Taken apart", text, self.strip, anchor="taken", columns=3))
-        return [*sections, Section("Settings", tables=(settings_table(self.settings),), anchor="settings")]
-
-    @property
-    def cards(self) -> list[tuple[str, str, str]]:
-        """Big figures of the summary: name, figure, what it is made of."""
-        page = self.pages[-1]
-        last, uncertain, supports = page.step, page.uncertain, len(page.step.graph.supports)
-        kinds = [o.shape.kind for o in last.graph.objects if o.role == "object"]
-        counts = ", ".join(count_of(kinds.count(kind), kind) for kind in sorted(set(kinds)))
-        seconds = [sum(page.step.timings.values()) for page in self.pages]
-        cards = [
-            ("objects", str(len(kinds)), counts or "none found"),
-            ("supports", str(supports), f"{supports - uncertain} certain, {uncertain} uncertain"),
-            ("views", str(len(self.pages)), last.stop or "all there were"),
-            ("per view", f"{np.mean(seconds):.2f} s", f"slowest {max(seconds):.2f} s"),
-        ]
-        if last.angle_travelled > 0.0 or last.path_travelled > 0.0:
-            path = f"around the scene; path length {last.path_travelled:.1f} m"
-            cards.append(("travelled", f"{np.rad2deg(last.angle_travelled):.0f}°", path))
-        if self.scores:
-            final = self.scores[-1]
-            note = f"precision {final['precision']:.3f}, recall {final['recall']:.3f}"
-            cards.insert(0, ("F1", f"{final['f1']:.3f}", note))
-        return cards
-
-    @property
-    def charts(self) -> list[Figure]:
-        """The summary's charts: scores over views and path, what was found, time."""
-        steps, number = [page.step for page in self.pages], [float(p.step.index) for p in self.pages]
-        charts = []
-        if self.scores:
-            names = ("F1", "precision", "recall")
-            lines = {name: [score[name.lower()] for score in self.scores] for name in names}
-            charts.append(line_chart("F1 over views", "view", number, lines, "share"))
-            path, unit = [step.path_travelled for step in steps], "path [m]"
-            if path[-1] == 0.0:
-                path = [float(np.rad2deg(step.angle_travelled)) for step in steps]
-                unit = "angle around the scene [°]"
-            if path[-1] > path[0]:
-                charts.append(line_chart("F1 over path length", unit, path, {"F1": lines["F1"]}, "F1"))
-        if len(steps) > 1:
-            found = {
-                "objects": [page.objects for page in self.pages],
-                "supports": [len(step.graph.supports) for step in steps],
-                "uncertain supports": [page.uncertain for page in self.pages],
-            }
-            charts.append(line_chart("Found so far", "view", number, found, "number"))
-        times = [step.timings for step in steps]
-        if any(times):
-            charts.append(bar_chart("Time of each stage", "view", times, "time [s]"))
-        return [Figure("", chart) for chart in charts]
-
-    def _thumbnails(self) -> list[Figure]:
-        """The views that have a picture, each with its score and why it was taken; none of a single view."""
-        figures, reason = [], "the first view"
-        for number, page in enumerate(self.pages if len(self.pages) > 1 else ()):
-            score = f" · F1 {self.scores[number]['f1']:.3f}" if self.scores else ""
-            heading, reason = f"View {page.number}{score}", f"{reason[:1].upper()}{reason[1:]}"
-            if page.thumbnail is not None:
-                figures.append(Figure(heading, page.thumbnail, reason, link=f"view{page.number}"))
-            reason = "" if page.step.decision is None else page.step.decision.why
-        return figures
-
-    def _view(self, number: int) -> Section:
-        """A view: its counts, its score and what it changed, pictures, what comes next, tables."""
-        page = self.pages[number]
-        step, decision = page.step, page.step.decision
-        facts = [step.name, count_of(page.objects, "object"), count_of(len(step.graph.supports), "support")]
-        facts += [f"F1 {self.scores[number]['f1']:.3f}"] if self.scores else []
-        facts += [changes(self.pages[number - 1].step.graph, step.graph)] if number else []
-        remarks = []
-        if decision is not None:
-            numbers = (
-                f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
-            )
-            remarks.append(("Next view", f"{decision.why.rstrip('.')} ({numbers})."))
-        if step.stop:
-            remarks.append(("Stopped", step.stop))
-        tables = [object_table(step.graph), support_table(step.graph)]
-        if decision is not None and decision.points_of_interest:
-            tables.append(point_table(decision))
-        columns = 3 if len(page.figures) == 3 else 2
-        title, text, anchor = f"View {page.number}", " · ".join(facts), f"view{page.number}"
-        return Section(title, text, page.figures, remarks, tables, anchor=anchor, columns=columns)
+    cards: Sequence[tuple[str, str, str]]
+    sections: Sequence[Section]
 
 
-def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
-    """Draw one step, so that its images and clouds need not be kept.
+def make_report(
+    title: str,
+    steps: Iterable[Step],
+    *,
+    settings: Mapping[str, object] | None = None,
+    scores: Sequence[Mapping[str, float]] = (),
+    strip: Sequence[Figure] = (),
+    config: ReportConfig | None = None,
+) -> Report:
+    """Describe a run; each step is drawn as it comes, and its images and clouds are not kept.
 
     Args:
-        step: What `explore` yields, or `extract` takes from a recording or a cloud.
+        title: Heading of the report.
+        steps: What `explore` yields, or `extract` takes from a recording or a cloud; at least one.
+        settings: Names and values of the run's settings; mappings and dataclasses in it are flattened.
+        scores: F1, precision and recall after each view by name; empty where there is no ground truth.
+        strip: Pictures of the objects being taken away, in order.
         config: Sizes of the pictures.
+
+    Raises:
+        ValueError: There are scores, but not one for each step, or there is no step.
     """
     width = (config or ReportConfig()).image_width
+    seen: list[Step] = []
+    views: list[Section] = []
+    thumbnails = []
+    for number, step in enumerate(steps):
+        f1 = f"F1 {scores[number]['f1']:.3f}" if number < len(scores) else ""
+        before = seen[-1] if seen else None
+        views.append(_view(step, before, f1, width))
+        if step.view is not None:
+            picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
+            why = "The first view" if before is None or before.decision is None else before.decision.why
+            heading = " · ".join(filter(None, (views[-1].title, f1)))
+            caption = f"{why[:1].upper()}{why[1:]}"
+            thumbnails.append(Figure(heading, picture, caption, link=views[-1].anchor))
+        nothing = step.cloud.select(np.zeros(0, dtype=np.intp))
+        seen.append(replace(step, view=None, labels=step.labels[:0], cloud=nothing, candidates=None))
+    if not seen:
+        raise ValueError("a report needs at least one view")
+    if scores and len(scores) != len(seen):
+        raise ValueError(f"{len(scores)} scores for {len(seen)} views")
+    sections = [Section("Summary", figures=_charts(seen, scores), anchor="summary", columns=4)]
+    if len(thumbnails) > 1:
+        text = "Every view with the segments found in it, and why it was taken."
+        sections.append(Section("Contact sheet", text, thumbnails, anchor="contacts", columns=4))
+    sections += views
+    if strip:
+        text = "Each object lifted straight up in physics, in the order found."
+        sections.append(Section("Taken apart", text, strip, anchor="taken", columns=3))
+    sections.append(Section("Settings", tables=(settings_table(settings or {}),), anchor="settings"))
+    return Report(title, _cards(seen, scores), sections)
+
+
+def _cards(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[tuple[str, str, str]]:
+    last = steps[-1]
+    kinds = [o.shape.kind for o in last.graph.objects if o.role == "object"]
+    counts = ", ".join(count_of(kinds.count(kind), kind) for kind in sorted(set(kinds)))
+    supports, uncertain = len(last.graph.supports), _uncertain(last.graph)
+    seconds = [sum(step.timings.values()) for step in steps]
+    cards = [
+        ("objects", str(len(kinds)), counts or "none found"),
+        ("supports", str(supports), f"{supports - uncertain} certain, {uncertain} uncertain"),
+        ("views", str(len(steps)), last.stop or "all there were"),
+        ("per view", f"{np.mean(seconds):.2f} s", f"slowest {max(seconds):.2f} s"),
+    ]
+    if last.angle_travelled > 0.0 or last.path_travelled > 0.0:
+        path = f"around the scene; path length {last.path_travelled:.1f} m"
+        cards.append(("travelled", f"{np.rad2deg(last.angle_travelled):.0f}°", path))
+    if scores:
+        note = f"precision {scores[-1]['precision']:.3f}, recall {scores[-1]['recall']:.3f}"
+        cards.insert(0, ("F1", f"{scores[-1]['f1']:.3f}", note))
+    return cards
+
+
+def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[Figure]:
+    """Scores over views and path, what was found, time."""
+    number, charts = [float(step.index) for step in steps], []
+    if scores:
+        lines = {name: [s[name.lower()] for s in scores] for name in ("F1", "precision", "recall")}
+        charts.append(line_chart("F1 over views", "view", number, lines, "share"))
+        path, unit = [step.path_travelled for step in steps], "path [m]"
+        if path[-1] == 0.0:
+            path = [float(np.rad2deg(step.angle_travelled)) for step in steps]
+            unit = "angle around the scene [°]"
+        if path[-1] > path[0]:
+            charts.append(line_chart("F1 over path length", unit, path, {"F1": lines["F1"]}, "F1"))
+    if len(steps) > 1:
+        found = {
+            "objects": [_objects(step.graph) for step in steps],
+            "supports": [len(step.graph.supports) for step in steps],
+            "uncertain supports": [_uncertain(step.graph) for step in steps],
+        }
+        charts.append(line_chart("Found so far", "view", number, found, "number"))
+    times = [step.timings for step in steps]
+    if any(times):
+        charts.append(bar_chart("Time of each stage", "view", times, "time [s]"))
+    return [Figure("", chart) for chart in charts]
+
+
+def _objects(graph: SupportGraph) -> int:
+    return sum(o.role == "object" for o in graph.objects)
+
+
+def _uncertain(graph: SupportGraph) -> int:
+    return sum(not s.certain for s in graph.supports)
+
+
+def _view(step: Step, before: Step | None, f1: str, width: int) -> Section:
+    """A view: its counts, its score and what it changed, pictures, what comes next, tables."""
+    graph, decision = step.graph, step.decision
+    parts = [step.name, count_of(_objects(graph), "object"), count_of(len(graph.supports), "support"), f1]
+    parts += [] if before is None else [changes(before.graph, graph)]
+    facts = []
+    if decision is not None:
+        numbers = (
+            f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
+        )
+        facts.append(("Next view", f"{decision.why.rstrip('.')} ({numbers})."))
+    if step.stop:
+        facts.append(("Stopped", step.stop))
+    tables = [object_table(graph), support_table(graph)]
+    if decision is not None and decision.points_of_interest:
+        tables.append(point_table(decision))
+    figures, number = _figures(step, width), f"{step.index:02d}"
+    return Section(
+        f"View {number}",
+        " · ".join(filter(None, parts)),
+        figures,
+        facts,
+        tables,
+        anchor=f"view{number}",
+        columns=3 if len(figures) == 3 else 2,
+    )
+
+
+def _figures(step: Step, width: int) -> list[Figure]:
     graph, cloud, view = step.graph, step.cloud, step.view
     figures = []
-    thumbnail = None
     if view is not None:
-        picture = draw_image(view, step.labels, graph, width)
-        thumbnail = draw_image(view, step.labels, graph, width // 2, shapes=False)
         kind = "colour image" if view.rgb is not None else "depth image, near bright and far dark"
         caption = (
             f"The {kind} around the objects, tinted by its segments, with the outlines of the shapes fitted "
             "so far. Outlines are thin where something nearer hides them; an object with a pale name has no "
             "pixel here."
         )
+        picture = draw_image(view, step.labels, graph, width)
         figures.append(Figure("What the camera saw", picture, caption))
     caption = (
         "Arrows run from supporter to supported; beside them, in how many of the views that could have shown "
@@ -269,9 +258,7 @@ def draw_view(step: Step, config: ReportConfig | None = None) -> ViewPage:
         figures.append(Figure(f"The cloud {side}", draw_cloud(cloud, graph, azimuth + turn), caption))
     if step.candidates is not None or step.decision is not None:
         figures.append(Figure("Where to look next", draw_sphere(step), _sphere_caption(step), wide=True))
-    nothing = cloud.select(np.zeros(0, dtype=np.intp))
-    kept = replace(step, view=None, labels=step.labels[:0], cloud=nothing, candidates=None)
-    return ViewPage(kept, tuple(figures), thumbnail)
+    return figures
 
 
 def sensor_azimuth(cloud: Cloud, T_world_camera: NDArray[np.float64] | None) -> float:
@@ -318,4 +305,4 @@ def render_html(report: Report) -> str:
         """A picture whose name, and so whose ids, no other picture of the page has."""
         return picture_svg(replace(picture, name=f"{section.title}, {number}: {picture.name}"))
 
-    return template("page.html.jinja").render(report=report, sections=report.sections, svg=svg)
+    return template("page.html.jinja").render(report=report, svg=svg)
