@@ -121,7 +121,7 @@ class TestCommandLine:
         told = json.loads(capsys.readouterr().out)
         T, config = np.array(told["T_world_camera"]), Config()
         with Session.open(table, read_only=True) as session:
-            centre, floor = session.scene.sphere.centre_world, table_floor(session.scene, config)
+            centre, floor = session.scene.sphere.centre_world, table_floor(session.scene)
         arm = find_robot(f"arm:{map_file}")(Surroundings(centre, floor, config))
         assert isinstance(arm.solve(T), Posture)
         sphere = arm.view_sphere(ViewSphere.around(centre, config.active))

@@ -35,9 +35,8 @@ def files(tmp_path, views):
 
 @pytest.fixture
 def folder(tmp_path):
-    assert (
-        run_command("session", "new", tmp_path / "s", "--segmentation", "labels", "--seed", 3, "--quiet") == 0
-    )
+    options = ("--segmentation", "labels", "--seed", 3, "--quiet")
+    assert run_command("session", "new", tmp_path / "s", *options) == 0
     return tmp_path / "s"
 
 
@@ -112,37 +111,31 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("case", BAD)
-def test_a_camera_that_cannot_be_used_is_one_line(folder, files, capsys, case):
-    camera, said = BAD[case]
-    options = files(0, **camera)
+def test_views_that_cannot_be_used_are_one_line_each(folder, files, capsys):
+    def refused(options, said):
+        assert run_command("session", "add", folder, *options) == 1
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.startswith("error: ")
+        assert captured.err.count("\n") == 1
+        assert said in captured.err
+        assert not list((folder / "views").iterdir())
+
     capsys.readouterr()
-    assert run_command("session", "add", folder, *options) == 1
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("error: ")
-    assert captured.err.count("\n") == 1
-    assert said in captured.err
-    assert not list((folder / "views").iterdir())
+    for camera, said in BAD.values():
+        refused(files(0, **camera), said)
+    for name in ("depth.png", "camera.json", "labels.png"):
+        options = files(0)
+        (folder.parent / name).write_bytes(b"{")
+        refused(options, name.split(".")[0])
+        (folder.parent / name).unlink()
+        refused(options, name)
 
 
-@pytest.mark.parametrize("name", ["depth.png", "camera.json", "labels.png"])
-@pytest.mark.parametrize("content", [None, b"{"])
-def test_files_that_cannot_be_read_are_named(folder, files, capsys, name, content):
+def test_what_is_no_session_is_said(tmp_path, files, capsys):
     options = files(0)
-    path = folder.parent / name
-    path.unlink() if content is None else path.write_bytes(content)
-    assert run_command("session", "add", folder, *options) == 1
-    said = capsys.readouterr().err
-    assert name.split(".")[0] in said
-    assert said.count("\n") == 1
-    assert not list((folder / "views").iterdir())
-
-
-@pytest.mark.parametrize("step", ["add", "next", "graph", "undo"])
-def test_what_is_no_session_is_said(tmp_path, files, capsys, step):
-    options = files(0) if step == "add" else []
     before = sorted(tmp_path.rglob("*"))
-    assert run_command("session", step, tmp_path, *options) == 1
-    assert "holds no session; begin one with `caryatid session new`" in capsys.readouterr().err
+    for step, words in {"add": options, "next": [], "graph": [], "undo": []}.items():
+        assert run_command("session", step, tmp_path, *words) == 1
+        assert "holds no session; begin one with `caryatid session new`" in capsys.readouterr().err
     assert sorted(tmp_path.rglob("*")) == before

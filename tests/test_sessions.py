@@ -77,7 +77,7 @@ def test_settings_are_kept(folder, views):
     with Session.begin(folder, config, planner="random"):
         pass
     with Session.open(folder) as session:
-        assert session.beginning.config == config
+        assert session.beginning.settings == config
         assert session.beginning.planner == "random"
 
 
@@ -179,7 +179,7 @@ def test_a_damaged_state_is_made_anew(begun, views, damage):
 
 
 def test_a_state_of_other_code_is_made_anew(begun, views, monkeypatch):
-    monkeypatch.setattr("caryatid.sessions.session.fingerprint", lambda: "other")
+    monkeypatch.setattr("caryatid.sessions.snapshots.fingerprint", lambda: "other")
     updates = []
     original = Scene.update
     monkeypatch.setattr(Scene, "update", lambda scene, view: updates.append(1) or original(scene, view))
@@ -208,7 +208,7 @@ def full(*arguments, **named):
 
 
 def test_a_disk_that_refuses_states_loses_no_view(begun, views, monkeypatch):
-    monkeypatch.setattr("caryatid.sessions.session.write_file", full)
+    monkeypatch.setattr("caryatid.sessions.snapshots.write_file", full)
     with Session.open(begun) as session:
         session.add(views[2])
     monkeypatch.undo()
@@ -255,7 +255,7 @@ class Intruder:
 
 def test_a_snapshot_that_came_from_elsewhere_runs_no_code(begun, views, tmp_path, monkeypatch):
     payload = pickle.dumps(Intruder(tmp_path / "touched"))
-    monkeypatch.setattr("caryatid.sessions.session.pickle.dumps", lambda *_, **__: payload)
+    monkeypatch.setattr("caryatid.sessions.snapshots.pickle.dumps", lambda *_, **__: payload)
     with Session.open(begun) as session:
         session.add(views[2])
     monkeypatch.undo()

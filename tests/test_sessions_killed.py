@@ -7,7 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import durability
-from durability import Starter, depth_png, labels_png, views_around
+from durability import address_of, sent, start, views_around
 from robot_client import RobotClient
 
 from caryatid.sessions import Session
@@ -41,43 +42,28 @@ def test_however_a_service_is_killed_no_view_is_lost(tmp_path, around):
 
 
 def test_many_clients_at_once_lose_nothing(tmp_path, around):
-    outcome = durability.put_load(tmp_path, around * 2, clients=4, sessions=2, options=("--open-sessions", 1))
-    assert sorted(n for order in outcome.order.values() for n in order) == list(range(16))
-    assert all(len(order) == 8 for order in outcome.order.values())
+    options = ("--open-sessions", 1)
+    orders, *_ = durability.put_load(tmp_path, around * 2, clients=4, sessions=2, options=options)
+    assert sorted(n for order in orders.values() for n in order) == list(range(16))
+    assert all(len(order) == 8 for order in orders.values())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_service_that_is_told_to_stop_finishes_the_view_in_hand(tmp_path, around, number):
-    starter = Starter()
-    process = starter.start(["serve", tmp_path / "s", "--port", 0, "--json"], tmp_path / "said")
-    robot = RobotClient(durability.address_of(tmp_path / "said"))
+    process = start(["serve", tmp_path / "s", "--port", 0, "--json"], tmp_path / "said")
+    robot = RobotClient(address_of(tmp_path / "said"))
     robot.begin("table", segmentation="labels")
-    view, answers = around[0], []
-    thread = threading.Thread(
-        target=lambda: answers.append(
-            robot.add(
-                "table",
-                depth_png(view),
-                view.K.tolist(),
-                view.pose.tolist(),
-                labels=labels_png(view),
-                number=0,
-            )
-        )
-    )
-    thread.start()
-    while not any((tmp_path / "s/table/views").glob("*")) and thread.is_alive():
+    with ThreadPoolExecutor() as pool:
+        answer = pool.submit(robot.add, "table", **sent(around[0]), number=0)
         # The first view takes long: kernels are loaded. Told to stop as soon as the request is under way.
-        thread.join(0.15)
-        break
-    os.kill(process, number)
-    assert starter.end() == 0
-    thread.join(20.0)
-    assert [answer["view"] for answer in answers] == [0]
+        time.sleep(0.15)
+        os.kill(process.pid, number)
+        process.join()
+    assert process.exitcode == 0
+    assert answer.result()["view"] == 0
     with Session.open(tmp_path / "s/table") as session:
         assert session.views == 1
     assert "Traceback" not in (tmp_path / "said").read_text()
-    starter.close()
 
 
 def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):

@@ -333,9 +333,10 @@ def reason_to_stop(views: int, changed: bool, config: ActiveVisionConfig) -> str
 
 def next_best_view(
     scene: Scene,
-    robot: Robot,
+    robot: Robot | None,
     visited: Array | None = None,
     *,
+    candidates: Candidates | None = None,
     planner: Planner | str = "support",
     seed: int = 0,
 ) -> Decision:
@@ -343,9 +344,10 @@ def next_best_view(
 
     Args:
         scene: What is known, of at least one view.
-        robot: Says which views it can reach.
+        robot: Says which views it can reach; None where they are given, with `visited`.
         visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
             current one last; None = where the robot is.
+        candidates: The views to choose from; None = those the robot reaches.
         planner: Chooses among them, or its name.
         seed: Seed of random planners.
 
@@ -359,15 +361,19 @@ def next_best_view(
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
     chooser = make_planner(planner) if isinstance(planner, str) else planner
     sphere = view_sphere_of(robot, scene.sphere)
-    if visited is None:
+    if robot is not None and visited is None:
         visited = sphere.direction_of(robot.T_world_camera)[None]
-    return _decide(scene, robot, sphere, robot.candidates(sphere), visited, chooser, seed)[0]
+    if robot is not None and candidates is None:
+        candidates = robot.candidates(sphere)
+    if visited is None or candidates is None:
+        raise PlanningError("there is no robot; give the views so far, and those to choose from")
+    return _decide(scene, robot, sphere, candidates, visited, chooser, seed)[0]
 
 
 @one_blas_thread
 def _decide(
     scene: Scene,
-    robot: Robot,
+    robot: Robot | None,
     sphere: ViewSphere,
     candidates: Candidates,
     visited: Array,

@@ -24,7 +24,7 @@ from caryatid.cli.options import (
     planner_name,
     shown_as,
 )
-from caryatid.config import FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:

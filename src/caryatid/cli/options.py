@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
-from caryatid.config.settings import read_settings
+from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
-from caryatid.planning.planners import BUILT_IN, ORACLE, make_planner, offered
-from caryatid.robots import ARM, HUMANOID, find_robot
 
-DEFAULTS = Config()
-"""Settings without file and flags."""
+if TYPE_CHECKING:
+    from caryatid.config import Config
 
 SAID = tyro.conf.arg(help_behavior_hint="")
 """An option whose help text says everything, including what happens without it."""
@@ -26,6 +24,13 @@ SAID = tyro.conf.arg(help_behavior_hint="")
 def defaults_to(value: object) -> object:
     """An option that is None when left out; the help names what applies then."""
     return tyro.conf.arg(help_behavior_hint=f"(default: {value})")
+
+
+def default_of(setting: str) -> object:
+    """An option for a setting, such as `active.max_views`, whose default applies when it is left out."""
+    from caryatid.config import Config
+
+    return defaults_to(attrgetter(setting)(Config()))
 
 
 def shown_as(metavar: str) -> object:
@@ -56,12 +61,16 @@ def whole_number(least: int) -> PrimitiveConstructorSpec[int | None]:
 
 def planner_name() -> PrimitiveConstructorSpec[str]:
     """`oracle`, or a name `make_planner` knows, including planners of other packages."""
+    from caryatid.planning.planners import BUILT_IN, ORACLE, make_planner, offered
+
     names = (*BUILT_IN, *sorted(offered()), ORACLE)
     return _name(lambda name: name in {*BUILT_IN, ORACLE} or make_planner(name), names, names)
 
 
 def robot_name() -> PrimitiveConstructorSpec[str]:
     """A name `find_robot` knows; files and modules are checked when they are opened."""
+    from caryatid.robots import ARM, HUMANOID, find_robot
+
     shown = (HUMANOID, f"{ARM}FILE.npz", "module:callable", "…")
     return _name(lambda name: ":" in name or find_robot(name), shown)
 
@@ -128,16 +137,18 @@ class Settings:
     set: Assignments = ()
     """Set one setting, such as `--set fit.hypotheses=200`; overrides the file."""
 
-    def read(self, options: Mapping[str, object] | None = None, base: Config = DEFAULTS) -> Config:
+    def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
         """The configuration: option > --set > file > default.
 
         Args:
             options: Name of a setting → value of the option for it, or None when left out.
-            base: The defaults.
+            base: The defaults; None = those of `Config`.
 
         Raises:
             InputError: A file, name or value is not valid.
         """
+        from caryatid.config.settings import read_settings
+
         given = [f"{name}={value}" for name, value in (options or {}).items() if value is not None]
         return read_settings(self.config, (*self.set, *given), base)
 
@@ -146,12 +157,12 @@ class Settings:
 class Modelling(Settings):
     """How views become a scene model."""
 
-    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), defaults_to(DEFAULTS.fusion.method)] = None
+    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
     """What to fuse over views: points, graphs, or both."""
     seed: Annotated[int, whole_number(0)] = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""
 
-    def read(self, options: Mapping[str, object] | None = None, base: Config = DEFAULTS) -> Config:
+    def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
         """The configuration, as `Settings.read` returns it, with --fusion."""
         return super().read({"fusion.method": self.fusion, **(options or {})}, base)
 
@@ -181,7 +192,7 @@ class ModellingCommand(Command):
 class ExploringCommand(ModellingCommand):
     """A command that explores a scene."""
 
-    views: Annotated[OptionalCount, defaults_to(DEFAULTS.active.max_views)] = None
+    views: Annotated[OptionalCount, default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
     planner: Annotated[str, planner_name()] = "support"
     """Planner of the next view; oracle knows the ground truth and works in simulation only."""

@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 import tyro
 
 from caryatid.cli.options import (
-    DEFAULTS,
     Command,
     Flag,
     ModellingCommand,
@@ -18,6 +17,7 @@ from caryatid.cli.options import (
     OptionalText,
     RunPath,
     SettingsCommand,
+    default_of,
     defaults_to,
     one_of,
     shown_as,
@@ -57,7 +57,7 @@ class Import(SettingsCommand):
     level: Flag = False
     """Rotate the world so that the table is level, for poses whose z does not point up; most views must
     show the table."""
-    views: Annotated[OptionalCount, defaults_to(DEFAULTS.recording.max_views)] = None
+    views: Annotated[OptionalCount, default_of("recording.max_views")] = None
     """Maximum number of views."""
 
     def __call__(self) -> None:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from caryatid.cli.options import (
-    DEFAULTS,
     Count,
     ExploringCommand,
     Flag,
@@ -25,11 +24,11 @@ from caryatid.cli.options import (
     defaults_to,
     shown_as,
 )
-from caryatid.config import Config
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
+    from caryatid.config import Config
     from caryatid.exploration import Step
     from caryatid.io.runs import RunWriter
     from caryatid.runs import RunRecorder
@@ -107,7 +106,9 @@ class Demo(ModellingCommand):
     """Print the time of each stage at the end; with --json as part of the document."""
 
     def __call__(self) -> None:
-        fewer = replace(DEFAULTS, active=replace(DEFAULTS.active, max_views=DEMO_VIEWS))
+        from caryatid.config.settings import read_settings
+
+        fewer = read_settings(None, [f"active.max_views={DEMO_VIEWS}"])
         config = self.modelling.read({"active.max_views": self.views}, fewer)
         shared = {name: getattr(self, name) for name in ("out", "view", "profile", "modelling", "general")}
         Explore(source=self.scene, noise="carmine", **shared).run(config)

@@ -101,7 +101,7 @@ class Add(Command):
         from caryatid.sessions import Capture, Session
 
         with _views_kept(), Session.open(self.folder) as session:
-            limits = session.beginning.config.session
+            limits = session.beginning.settings.session
             capture = Capture.from_files(self.depth, self.camera, self.rgb, self.labels, limits)
             added = session.add(capture, self.number)
         document = {"view": added.number, "changed": added.changed, "graph": graph_to_json(added.graph)}
@@ -128,11 +128,14 @@ class Next(Command):
     def __call__(self) -> None:
         from caryatid.cli.output import Output
         from caryatid.sessions import Session
-        from caryatid.sessions.next_view import read_candidates
+        from caryatid.sessions.next_view import Reachable
 
         with Session.open(self.folder, read_only=True) as session:
-            reach = (None, None) if self.candidates is None else read_candidates(self.candidates)
-            Output(General(json=True)).result(session.next(*reach).to_json())
+            given = None if self.candidates is None else Reachable.read(self.candidates)
+            following = (
+                session.next() if given is None else session.next(given.T_world_camera, given.path_length)
+            )
+        Output(General(json=True)).result(following.to_json())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,29 +228,30 @@ class Serve(SettingsCommand):
     def __call__(self) -> None:
         config = self.settings.read()
         try:
-            from caryatid.service.serving import run_service
+            from caryatid.service.pool import SessionPool
+            from caryatid.service.serving import check_token, run_service
         except ModuleNotFoundError as error:
             if error.name not in NEEDED:
                 raise
             raise InputError("serve", f"needs {error.name}", 'pip install "caryatid[serve]"') from None
         from caryatid.cli.output import Output
-
-        out = Output(self.general)
+        from caryatid.io.staging import write_errors
 
         def listening(address: str) -> None:
             text = f"serving {self.folder} at {address}, its pages at {address}/docs; Ctrl-C stops"
             _print(self.general, {"address": address, "folder": self.folder}, text)
 
+        token = self.token or os.environ.get("CARYATID_TOKEN") or None
+        check_token(self.host, token)
+        with write_errors(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+        Output(self.general).compile()
         run_service(
-            self.folder,
-            config,
+            SessionPool(self.folder, config, self.open_sessions, self.waiting),
             host=self.host,
             port=self.port,
-            token=self.token or os.environ.get("CARYATID_TOKEN") or None,
-            open_sessions=self.open_sessions,
-            waiting=self.waiting,
+            token=token,
             max_request=self.max_request * 1_000_000,
-            compiling=out.say,
             listening=listening,
         )
 

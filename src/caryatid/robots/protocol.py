@@ -147,11 +147,11 @@ def count_reasons(code: NDArray[np.intp], reasons: Sequence[str]) -> dict[str, i
     return {reason: count for reason, count in counts.items() if count}
 
 
-def view_sphere_of(robot: Robot, proposed: ViewSphere) -> ViewSphere:
+def view_sphere_of(robot: Robot | None, proposed: ViewSphere) -> ViewSphere:
     """Return the sphere a robot's views lie on: its own where it inherits `OwnViews`, else the proposed."""
     return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
 
 
-def refusal_of(robot: Robot, T_world_camera: Array) -> Unreachable | None:
+def refusal_of(robot: Robot | None, T_world_camera: Array) -> Unreachable | None:
     """Why a robot that inherits `OwnViews` does not take a candidate (4, 4) on a closer look, or None."""
     return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None

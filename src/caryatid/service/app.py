@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import secrets
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from importlib.metadata import version
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from fastapi import Depends, FastAPI, HTTPException, Path, Request, Response
@@ -18,11 +17,10 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from caryatid.config import Config
+from caryatid.config import SegmentationMethod
 from caryatid.config.settings import changed_settings
 from caryatid.errors import CaryatidError, InputError, PlanningError
 from caryatid.io.graph_json import graph_to_json
-from caryatid.io.json_files import json_text
 from caryatid.service.pool import FullError, MissingError, SessionPool
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.session import SessionBusyError, TakenError, WrongNumberError
@@ -40,59 +38,63 @@ STATUS: dict[type[CaryatidError], int] = {
 }
 """Statuses of errors; of all others 422: what was given cannot be used."""
 
+MAX_CANDIDATES = 100_000
+"""Maximum number of candidates [1]; more than the view sphere has."""
+
 Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 Matrix3 = Annotated[list[Row3], Field(min_length=3, max_length=3)]
 Matrix4 = Annotated[list[Row4], Field(min_length=4, max_length=4)]
 Base64 = Annotated[str, Field(json_schema_extra={"contentEncoding": "base64"})]
+Length = Annotated[FiniteFloat, Field(ge=0.0)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-
-MAX_CANDIDATES = 100_000
-"""Maximum number of candidates [1]; more than the view sphere has."""
+SessionName = Annotated[Name, Path(description="Name of the session")]
 
 
-class _Document(BaseModel):
+class Document(BaseModel):
+    """A JSON object of these keys and no others."""
+
     model_config = ConfigDict(extra="forbid")
 
 
-class Problem(_Document):
+class Problem(Document):
     """What went wrong, in one sentence."""
 
     detail: str = Field(description="What, where, and what can be done about it")
 
 
-class NewSession(_Document):
-    """A session to begin."""
+class SessionOptions(Document):
+    """What a session is begun with."""
 
-    name: Name = Field(description="What it is to be called")
-    segmentation: Literal["labels", "auto"] | None = Field(
-        None, description="Where parts come from; null = labels where the first view has them"
+    name: Name = Field(description="Its name")
+    segmentation: SegmentationMethod | None = Field(
+        None, description="Where segments come from; null = labels where the first view has them"
     )
     seed: int = Field(0, ge=0, le=2**63 - 1, description="Seed of every random choice")
-    planner: str = Field("support", description="Who chooses the next view")
+    planner: str = Field("support", description="Planner of the next view")
+
+
+class NewSession(SessionOptions):
+    """A session to begin."""
+
     settings: dict[str, dict[str, Any]] = Field(
-        default_factory=dict,
-        description="As `caryatid config --json` lists them: stage → name → value",
+        {}, description="As `caryatid config --json` lists them: stage → name → value"
     )
 
 
-class SessionAnswer(_Document):
+class SessionAnswer(SessionOptions):
     """A session."""
 
-    name: str = Field(description="What it is called")
-    views: int = Field(description="How many it has")
-    segmentation: Literal["labels", "auto"] | None = Field(description="Where parts come from")
-    seed: int = Field(description="Seed of every random choice")
-    planner: str = Field(description="Who chooses the next view")
+    views: int = Field(description="Number of its views")
 
 
-class SessionList(_Document):
+class SessionList(Document):
     """All sessions."""
 
     sessions: list[str] = Field(description="Their names")
 
 
-class Camera(_Document):
+class Camera(Document):
     """The camera of a view."""
 
     K: Matrix3 = Field(description="Pinhole matrix [px]")
@@ -100,7 +102,7 @@ class Camera(_Document):
     depth_scale: FiniteFloat = Field(1.0, gt=0.0, description="Millimetres of one unit of a depth PNG")
 
 
-class NewView(_Document):
+class NewView(Document):
     """A view; its images are files in base64."""
 
     camera: Camera = Field(description="Where it was taken, and with what")
@@ -110,71 +112,73 @@ class NewView(_Document):
         None, description="Grey PNG, or .npy (H, W) of whole numbers: the object of each pixel, 0 = nothing"
     )
     number: int | None = Field(
-        None,
-        ge=0,
-        description="Which view it is to be, 0 the first; asked again, it is not added again",
+        None, ge=0, description="Number it is to have, 0 the first; a view that is there is not added again"
     )
 
     def capture(self) -> Capture:
-        """The view, not decoded yet.
+        """The view, its images not decoded yet.
 
         Raises:
-            InputError: An image is no base64, or the pose is none.
+            InputError: An image is no base64.
         """
-        images = {
-            key: _decoded(key, text)
-            for key, text in (("depth", self.depth), ("rgb", self.rgb), ("labels", self.labels))
-            if text is not None
-        }
-        name = "view" if self.number is None else f"view {self.number}"
-        K, T = np.array(self.camera.K), np.array(self.camera.T_world_camera)
-        return Capture.checked(images, K, T, self.camera.depth_scale, "camera", name)
+        images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
+        return Capture(
+            {key: _decoded(key, text) for key, text in images.items() if text is not None},
+            np.array(self.camera.K),
+            np.array(self.camera.T_world_camera),
+            self.camera.depth_scale,
+            name="view" if self.number is None else f"view {self.number}",
+        )
 
 
-class ViewAnswer(_Document):
+class GraphAnswer(Document):
+    """What is known."""
+
+    graph: dict[str, Any] = Field(description="graph.json")
+
+
+class ViewAnswer(GraphAnswer):
     """What came of a view."""
 
-    view: int = Field(description="Which it is, 0 the first")
+    view: int = Field(description="Its number, 0 the first")
     changed: bool = Field(description="Whether it changed the graph")
-    graph: dict[str, Any] = Field(description="graph.json")
 
 
-class UndoAnswer(_Document):
+class UndoAnswer(GraphAnswer):
     """What is left."""
 
-    views: int = Field(description="How many are left")
-    graph: dict[str, Any] = Field(description="graph.json")
+    views: int = Field(description="Number of views left")
 
 
-class Candidates(_Document):
+class Candidates(Document):
     """Views a robot reaches."""
 
     T_world_camera: list[Matrix4] = Field(
         max_length=MAX_CANDIDATES, description="Poses [m], OpenCV camera frame, world z up"
     )
-    path_length: list[Annotated[FiniteFloat, Field(ge=0.0)]] | None = Field(
-        None, max_length=MAX_CANDIDATES, description="Way to each [m]; null = straight lines"
+    path_length: list[Length] | None = Field(
+        None, max_length=MAX_CANDIDATES, description="Path length to each [m]; null = straight lines"
     )
 
 
-class Gaze(_Document):
+class Gaze(Document):
     """Where the head looks, against the platform [rad]."""
 
     yaw: float = Field(description="To the left")
     pitch: float = Field(description="Upwards")
 
 
-class NextAnswer(_Document):
+class NextAnswer(Document):
     """Where to look next."""
 
-    view: int = Field(description="Which it would be, 0 the first")
+    view: int = Field(description="Number it would have, 0 the first")
     T_world_camera: list[list[float]] = Field(description="Pose [m], OpenCV camera frame, world z up")
     candidate: int = Field(description="Which of the candidates it is")
     platform: list[float] | None = Field(description="x, y, yaw [m, rad]; null with candidates")
     camera_height: float | None = Field(description="Over the floor [m]; null with candidates")
     gaze: Gaze | None = Field(description="How the head turns; null with candidates")
     expected_gain: float = Field(description="Saliency s of eq. 3")
-    cost: float = Field(description="Cost h of the way, eq. 3")
+    cost: float = Field(description="Cost h of the path, eq. 3")
     score: float = Field(description="c = s − h, eq. 3")
     why: str = Field(description="One sentence for a person to read")
     stop: str | None = Field(description="Why looking on may not pay, or null")
@@ -190,15 +194,11 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
         422: "What was given cannot be used; nothing has changed",
         503: "Too much waits; try again",
     }.items()
-}
+} | {413: {"description": "Larger than a request may be", "content": {"text/plain": {}}}}
 """Answers to requests that fail, by their status."""
-PROBLEMS[413] = {"description": "Larger than a request may be", "content": {"text/plain": {}}}
-
 
 BEARER = HTTPBearer(auto_error=False, description="The token the service was started with")
 """Where requests carry their token."""
-
-SessionName = Annotated[Name, Path(description="Name of the session")]
 
 
 def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: str = "127.0.0.1") -> FastAPI:
@@ -213,9 +213,8 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        pool.start()
-        yield
-        pool.stop()
+        with pool:
+            yield
 
     app = FastAPI(
         title="caryatid",
@@ -229,46 +228,45 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
     if token is None:
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=[*LOCAL, host])
     app.add_exception_handler(CaryatidError, _refuse)
-    app.add_exception_handler(RequestValidationError, _refuse_request)
+    app.add_exception_handler(RequestValidationError, _refuse)
     _add_pages(app, pool)
     return app
 
 
 def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.get("/sessions", response_model=SessionList)
-    async def list_sessions() -> Response:
+    async def list_sessions() -> Any:
         """List the sessions."""
-        return _json({"sessions": await pool.do(pool.names)})
+        return {"sessions": await pool.do(pool.names)}
 
     @app.post("/sessions", status_code=201, response_model=SessionAnswer)
-    async def begin_session(given: NewSession) -> Response:
+    async def begin_session(given: NewSession) -> Any:
         """Begin a session."""
 
         def work() -> dict[str, Any]:
-            config: Config = changed_settings(pool.config, given.settings, "settings")
-            session = pool.begin(given.name, config, given.segmentation, given.seed, given.planner)
-            return _described(given.name, session)
+            config = changed_settings(pool.config, given.settings, "settings")
+            options = given.model_dump(include={"segmentation", "seed", "planner"})
+            return _described(given.name, pool.begin(given.name, config, **options))
 
-        return _json(await pool.do(work), 201)
+        return await pool.do(work)
 
     @app.get("/sessions/{name}", response_model=SessionAnswer)
-    async def describe_session(name: SessionName) -> Response:
+    async def describe_session(name: SessionName) -> Any:
         """Say what a session is, and how many views it has."""
-        return _json(await pool.do(lambda: _described(name, pool.session(name))))
+        return await pool.do(lambda: _described(name, pool.session(name)))
 
     @app.post("/sessions/{name}/views", status_code=201, response_model=ViewAnswer)
-    async def add_view(name: SessionName, given: NewView) -> Response:
+    async def add_view(name: SessionName, given: NewView) -> Any:
         """Take in a view; when this answers, it is on the disk and stays."""
 
         def work() -> dict[str, Any]:
             added = pool.session(name).add(given.capture(), given.number)
-            graph = graph_to_json(added.graph)
-            return {"view": added.number, "changed": added.changed, "graph": graph}
+            return {"view": added.number, "changed": added.changed, "graph": graph_to_json(added.graph)}
 
-        return _json(await pool.do(work), 201)
+        return await pool.do(work)
 
     @app.delete("/sessions/{name}/views/last", response_model=UndoAnswer)
-    async def undo_view(name: SessionName) -> Response:
+    async def undo_view(name: SessionName) -> Any:
         """Take the last view back."""
 
         def work() -> dict[str, Any]:
@@ -277,7 +275,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
                 raise WrongNumberError(name, "has no views to take back", "add one first")
             return {"views": session.undo(), "graph": graph_to_json(session.graph)}
 
-        return _json(await pool.do(work))
+        return await pool.do(work)
 
     @app.get("/sessions/{name}/graph")
     async def tell_graph(name: SessionName) -> dict[str, Any]:
@@ -285,19 +283,15 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         return await pool.do(lambda: graph_to_json(pool.session(name).graph))
 
     @app.get("/sessions/{name}/next", response_model=NextAnswer)
-    async def tell_next(name: SessionName) -> Response:
+    async def tell_next(name: SessionName) -> Any:
         """Say where to look next, for the robot the session was begun with."""
-        return _json(await pool.do(lambda: pool.session(name).next().to_json()))
+        return await pool.do(lambda: pool.session(name).next().to_json())
 
     @app.post("/sessions/{name}/next", response_model=NextAnswer)
-    async def choose_next(name: SessionName, given: Candidates) -> Response:
+    async def choose_next(name: SessionName, given: Candidates) -> Any:
         """Choose where to look next among the views that your robot reaches."""
-
-        def work() -> dict[str, Any]:
-            poses = np.array(given.T_world_camera).reshape(-1, 4, 4)
-            return pool.session(name).next(poses, given.path_length).to_json()
-
-        return _json(await pool.do(work))
+        reach = given.T_world_camera, given.path_length
+        return await pool.do(lambda: pool.session(name).next(*reach).to_json())
 
 
 def _bearer(token: str) -> Callable[..., Any]:
@@ -309,43 +303,26 @@ def _bearer(token: str) -> Callable[..., Any]:
     return check
 
 
-def _described(name: str, session: Session) -> dict[str, Any]:
-    b = session.beginning
-    return {
-        "name": name,
-        "views": session.views,
-        "segmentation": b.segmentation,
-        "seed": b.seed,
-        "planner": b.planner,
-    }
-
-
-def _json(document: dict[str, Any], status: int = 200) -> Response:
-    return Response(json_text(document), status, media_type="application/json")
-
-
-async def _refuse(request: Request, error: Exception) -> Response:
-    status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 422)
-    return _problem(status, str(error), {"Retry-After": "1"} if status == 503 else None)
-
-
-async def _refuse_request(request: Request, error: Exception) -> Response:
-    """Say what does not fit in one sentence, and not what was sent."""
-    if not isinstance(error, RequestValidationError):
-        raise error
-    first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"])
-    return _problem(422, f"{where}: {first['msg']}")
-
-
-def _problem(status: int, text: str, headers: dict[str, str] | None = None) -> Response:
-    # Names that were sent may hold halves of characters, which no answer can.
-    detail = " ".join(text.encode("utf-8", "replace").decode().splitlines())
-    return JSONResponse({"detail": detail}, status, headers)
-
-
 def _decoded(key: str, text: str) -> bytes:
     try:
         return base64.b64decode(text, validate=True)
-    except (binascii.Error, ValueError):
+    except ValueError:
         raise InputError(key, "is no base64", "encode the bytes of the file") from None
+
+
+def _described(name: str, session: Session) -> dict[str, Any]:
+    b = session.beginning
+    chosen = {"segmentation": b.segmentation, "seed": b.seed, "planner": b.planner}
+    return {"name": name, "views": session.views} | chosen
+
+
+async def _refuse(request: Request, error: Exception) -> Response:
+    """Say what does not fit in one sentence, and not what was sent."""
+    status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 422)
+    text = str(error)
+    if isinstance(error, RequestValidationError):
+        first = error.errors()[0]
+        text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+    # Names that were sent may hold halves of characters, which no answer can.
+    detail = " ".join(text.encode("utf-8", "replace").decode().splitlines())
+    return JSONResponse({"detail": detail}, status, {"Retry-After": "1"} if status == 503 else None)

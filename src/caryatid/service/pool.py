@@ -9,12 +9,12 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from math import prod
 from pathlib import Path
-from threading import Lock
 from typing import Any, TypeVar
 
-from caryatid.config import Config, SegmentationMethod
+from caryatid.config import Config
 from caryatid.errors import CaryatidError, InputError
 from caryatid.sessions import Session
 
@@ -35,7 +35,7 @@ class MissingError(CaryatidError):
 
 
 class SessionPool:
-    """The sessions in one folder.
+    """The sessions in one folder. Of its methods only `do` is called by others than the thread of the pool.
 
     Args:
         folder: Holds the sessions, each in a folder of its name.
@@ -50,65 +50,49 @@ class SessionPool:
         self._max_open = open_sessions
         self._max_waiting = waiting
         self._waiting = 0
-        self._counting = Lock()
         self._open: OrderedDict[str, Session] = OrderedDict()
-        self._worker: ThreadPoolExecutor | None = None
 
-    def start(self) -> None:
-        """Start the thread."""
+    def __enter__(self) -> None:
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="sessions")
+
+    def __exit__(self, *error: object) -> None:
+        """Finish what is waiting, and close the sessions."""
+        self._worker.submit(self._keep_open, 0).result()
+        self._worker.shutdown()
 
     async def do(self, work: Callable[[], T]) -> T:
         """Run some work on the sessions after everything that is waiting already.
 
         Args:
-            work: Called in the thread that works on the sessions.
+            work: Called in the thread of the pool; done to its end even if nobody waits for it any more.
 
         Raises:
             FullError: Too many requests are waiting.
         """
-        if self._worker is None:
-            raise RuntimeError("the pool has not been started")
-        with self._counting:
-            if self._waiting >= self._max_waiting:
-                raise FullError(f"{self._waiting} requests wait already; try again")
-            self._waiting += 1
-        future = self._worker.submit(work)
+        if self._waiting >= self._max_waiting:
+            raise FullError(f"{self._waiting} requests wait already; try again")
+        self._waiting += 1
+        future = asyncio.get_running_loop().run_in_executor(self._worker, work)
         future.add_done_callback(self._done)
-        return await asyncio.shield(asyncio.wrap_future(future))
-
-    def stop(self) -> None:
-        """Finish what is waiting, and close the sessions."""
-        if self._worker is not None:
-            self._worker.submit(self._keep_open, 0).result()
-            self._worker.shutdown()
-            self._worker = None
+        return await asyncio.shield(future)
 
     def names(self) -> list[str]:
         """Names of all sessions."""
         return sorted(path.parent.name for path in self.folder.glob("*/session.json"))
 
-    def begin(
-        self, name: str, config: Config, segmentation: SegmentationMethod | None, seed: int, planner: str
-    ) -> Session:
-        """Begin a session; the arguments are those of `Session.begin`.
+    def begin(self, name: str, config: Config, **options: Any) -> Session:
+        """Begin a session; the options are those of `Session.begin`.
 
         Raises:
             InputError: There is one of that name, or a setting asks for more memory than a session may have.
         """
-        voxels = 1.0
-        for length in config.voxels.extent:
-            voxels *= length / config.voxels.size
+        voxels = prod(length / config.voxels.size for length in config.voxels.extent)
         if voxels > MAX_VOXELS:
             raise InputError("voxels.size", f"makes {voxels:.3g} voxels", f"{MAX_VOXELS} are allowed")
         if config.active.sphere_points > MAX_SPHERE_POINTS:
             reason = f"{config.active.sphere_points} are too many"
             raise InputError("active.sphere_points", reason, f"{MAX_SPHERE_POINTS} are allowed")
-        self._open[name] = Session.begin(
-            self.folder / name, config, segmentation=segmentation, seed=seed, planner=planner
-        )
-        self._keep_open(self._max_open)
-        return self._open[name]
+        return self._opened(name, Session.begin(self.folder / name, config, **options))
 
     def session(self, name: str) -> Session:
         """Return a session, opened from disk where it is not open.
@@ -117,18 +101,20 @@ class SessionPool:
             MissingError: There is none of that name.
             SessionBusyError: Another process has it open.
         """
-        if name not in self._open:
-            if not (self.folder / name / "session.json").is_file():
-                raise MissingError(f"there is no session '{name}'; begin it first")
-            self._open[name] = Session.open(self.folder / name)
+        if name not in self._open and not (self.folder / name / "session.json").is_file():
+            raise MissingError(f"there is no session '{name}'; begin it first")
+        return self._opened(name, self._open.get(name) or Session.open(self.folder / name))
+
+    def _opened(self, name: str, session: Session) -> Session:
+        """Keep a session open, as the one used last."""
+        self._open[name] = session
         self._open.move_to_end(name)
         self._keep_open(self._max_open)
-        return self._open[name]
+        return session
 
     def _keep_open(self, most: int) -> None:
         while len(self._open) > most:
             self._open.popitem(last=False)[1].close()
 
-    def _done(self, future: Future[Any]) -> None:
-        with self._counting:
-            self._waiting -= 1
+    def _done(self, future: asyncio.Future[Any]) -> None:
+        self._waiting -= 1

@@ -6,60 +6,63 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
+from annotated_types import Gt
 from numpy.typing import NDArray
 
 from caryatid.config import SessionConfig
 from caryatid.errors import InputError
-from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.images import DEPTH_MODES, MASK_MODES, decode_image, png
 from caryatid.io.json_files import Numbers, parse_json, read_json
-from caryatid.sensing.views import View, check_intrinsics
+from caryatid.sensing.views import View
 
 REMEDY: Final = "take this view and all later ones out of the session's folder"
 """What to do where a kept view is damaged."""
 
-_NPY: Final = b"\x93NUMPY"
 _MODES: Final = {
     "depth": (DEPTH_MODES, "a 16-bit grey PNG"),
     "rgb": (("RGB", "RGBA", "L", "LA", "P"), "a colour PNG or JPEG"),
     "labels": (tuple(m for m in MASK_MODES if m != "1"), "a grey PNG"),
 }
-_ARRAYS: Final = {
-    "depth": ("f", 2, "(H, W) of floats in metres"),
-    "rgb": ("u", 3, "(H, W, 3) of uint8"),
-    "labels": ("iu", 2, "(H, W) of whole numbers"),
-    "normals": ("f", 3, "(H, W, 3) of floats"),
+_ARRAYS: Final[dict[str, tuple[type[np.generic], tuple[int, ...], str]]] = {
+    "depth": (np.floating, (), "(H, W) of floats in metres"),
+    "rgb": (np.uint8, (3,), "(H, W, 3) of uint8"),
+    "labels": (np.integer, (), "(H, W) of whole numbers"),
+    "normals": (np.floating, (3,), "(H, W, 3) of floats"),
 }
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Entry:
-    """What is known of a kept view without decoding it.
+class CameraFile:
+    """camera.json: what is known of a view without decoding its images.
 
     Attributes:
-        digest: Digest of its content.
-        T_world_camera: Camera pose (4, 4) as it was handed in.
+        K: Pinhole matrix (3, 3) [px].
+        T_world_camera: Camera pose (4, 4).
+        depth_scale: Millimetres of one unit of a depth PNG.
+        name: What to call the view in messages.
+        digest: Digest of camera and images; empty where the view is not kept yet.
     """
 
-    digest: str
-    T_world_camera: Annotated[Array, Numbers(4, 4)]
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Camera:
-    """camera.json."""
-
     K: Annotated[Array, Numbers(3, 3)]
-    T_world_camera: Annotated[Array, Numbers(4, 4)]
-    depth_scale: float = 1.0
-    name: str = ""
+    T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)]
+    depth_scale: Annotated[float, Gt(0.0)] = 1.0
+    name: str = "view"
     digest: str = ""
+
+    @classmethod
+    def read(cls, path: Path, remedy: str) -> CameraFile:
+        """Read camera.json.
+
+        Raises:
+            InputError: It is missing or broken, or the pose is no rigid transform.
+        """
+        return parse_json(cls, read_json(path, remedy), path, remedy)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -115,65 +118,8 @@ class Capture:
         """
         named = {"depth": depth, "rgb": rgb, "labels": labels}
         images = {key: _read(path, config.max_bytes) for key, path in named.items() if path is not None}
-        given = parse_json(
-            _Camera, read_json(camera), camera, "give K (3×3) and T_world_camera (4×4, in metres)"
-        )
-        return cls.checked(images, given.K, given.T_world_camera, given.depth_scale, str(camera), str(depth))
-
-    @classmethod
-    def checked(
-        cls,
-        images: Mapping[str, bytes],
-        K: Array,
-        T_world_camera: Array,
-        depth_scale: float,
-        source: str,
-        name: str,
-    ) -> Capture:
-        """Return a capture after checking its camera.
-
-        Args:
-            images: Files by `depth`, `rgb` and `labels`.
-            K: Pinhole matrix (3, 3) [px].
-            T_world_camera: Camera pose (4, 4).
-            depth_scale: Millimetres of one unit of a depth PNG.
-            source: What to call the camera in errors.
-            name: What to call the view.
-
-        Raises:
-            InputError: No pinhole matrix, no rigid transform, or no scale.
-        """
-        if not 0.0 < depth_scale < np.inf:
-            raise InputError(
-                source, f"'depth_scale' is {depth_scale:g}", "give the millimetres of one depth unit"
-            )
-        K = check_intrinsics(K, f"{source}: K")
-        return cls(
-            images,
-            K,
-            transforms.as_rigid(T_world_camera, f"{source}: T_world_camera"),
-            depth_scale,
-            name=name,
-        )
-
-    @property
-    def digest(self) -> str:
-        """Digest of its content; the name does not count."""
-        digest = hashlib.sha256(json.dumps(self._camera()).encode())
-        for key in sorted(self.images):
-            digest.update(f"{key} {len(self.images[key])}\0".encode() + self.images[key])
-        return digest.hexdigest()
-
-    @property
-    def entry(self) -> Entry:
-        """What is known of it without decoding it."""
-        return Entry(self.digest, self.T_world_camera)
-
-    def files(self) -> dict[str, bytes]:
-        """Return the files that are kept: name → content."""
-        document = self._camera() | {"name": self.name, "digest": self.digest}
-        files = {f"{key}{_suffix(content)}": content for key, content in self.images.items()}
-        return files | {"camera.json": (json.dumps(document, indent=1) + "\n").encode()}
+        given = CameraFile.read(camera, "give K (3×3) and T_world_camera (4×4, in metres)")
+        return cls(images, given.K, given.T_world_camera, given.depth_scale, name=str(depth))
 
     @classmethod
     def read(cls, folder: Path) -> Capture:
@@ -182,21 +128,38 @@ class Capture:
         Raises:
             InputError: Something is missing, or is not what was written.
         """
-        path = folder / "camera.json"
-        camera = parse_json(_Camera, read_json(path, REMEDY), path, REMEDY)
-        images = {file.stem: _read(file, None) for file in folder.iterdir() if file.stem in _ARRAYS}
-        capture = cls.checked(
-            images, camera.K, camera.T_world_camera, camera.depth_scale, str(path), camera.name
-        )
-        if capture.digest != camera.digest:
+        camera = CameraFile.read(folder / "camera.json", REMEDY)
+        images = {file.stem: _read(file) for file in folder.iterdir() if file.stem in _ARRAYS}
+        capture = cls(images, camera.K, camera.T_world_camera, camera.depth_scale, name=camera.name)
+        if capture.camera.digest != camera.digest:
             raise InputError(folder, "is not what was written there", REMEDY)
         return capture
+
+    @property
+    def camera(self) -> CameraFile:
+        """Its camera.json; the name does not count for the digest."""
+        seen = {
+            "K": self.K.tolist(),
+            "T_world_camera": self.T_world_camera.tolist(),
+            "depth_scale": self.depth_scale,
+        }
+        digest = hashlib.sha256(json.dumps(seen).encode())
+        for key in sorted(self.images):
+            digest.update(f"{key} {len(self.images[key])}\0".encode() + self.images[key])
+        return CameraFile(self.K, self.T_world_camera, self.depth_scale, self.name, digest.hexdigest())
+
+    def files(self) -> dict[str, bytes]:
+        """Return the files that are kept: name → content."""
+        document = json.dumps(asdict(self.camera), indent=1, default=np.ndarray.tolist)
+        files = {f"{key}{_suffix(content)}": content for key, content in self.images.items()}
+        return files | {"camera.json": f"{document}\n".encode()}
 
     def decode(self, config: SessionConfig) -> View:
         """Decode the images.
 
         Raises:
-            InputError: One is broken, too large, of the wrong kind, or sizes differ.
+            InputError: One is broken, too large, of the wrong kind, or sizes differ; the camera is no pinhole
+                camera, or its pose no rigid transform.
         """
         if "depth" not in self.images:
             raise InputError(self.name, "has no depth", "give a depth image")
@@ -217,26 +180,9 @@ class Capture:
             name=self.name,
         )
 
-    def _camera(self) -> dict[str, Any]:
-        return {
-            "K": self.K.tolist(),
-            "T_world_camera": self.T_world_camera.tolist(),
-            "depth_scale": self.depth_scale,
-        }
-
-
-def read_entry(folder: Path) -> Entry:
-    """Read what is known of a kept view without decoding it.
-
-    Raises:
-        InputError: Its camera.json is missing or broken.
-    """
-    path = folder / "camera.json"
-    return parse_json(Entry, read_json(path, REMEDY), path, REMEDY)
-
 
 def _decoded(key: str, content: bytes, name: str, most: int) -> NDArray[Any]:
-    if content.startswith(_NPY):
+    if _suffix(content) == ".npy":
         return _array(key, content, name, most)
     if key not in _MODES:
         raise InputError(name, "is no .npy", "save it with numpy.save")
@@ -249,32 +195,21 @@ def _decoded(key: str, content: bytes, name: str, most: int) -> NDArray[Any]:
 
 def _array(key: str, content: bytes, name: str, most: int) -> NDArray[Any]:
     """Read a .npy of plain numbers; its header is checked before anything is allocated."""
-    file, remedy = io.BytesIO(content), "save it with numpy.save"
-    header = np.lib.format
+    file, header, remedy = io.BytesIO(content), np.lib.format, "save it with numpy.save"
     try:
         first = header.read_magic(file) == (1, 0)
-        read = header.read_array_header_1_0 if first else header.read_array_header_2_0
-        shape, _, dtype = read(file)
+        shape, _, dtype = (header.read_array_header_1_0 if first else header.read_array_header_2_0)(file)
     except (ValueError, EOFError, SyntaxError, OverflowError, MemoryError, RecursionError) as error:
         raise InputError(name, f"is no .npy ({str(error).splitlines()[0]})", remedy) from None
-    kinds, dimensions, wanted = _ARRAYS[key]
-    if (
-        dtype.hasobject
-        or dtype.kind not in kinds
-        or len(shape) != dimensions
-        or 0 in shape
-        or shape[2:] not in ((), (3,))
-    ):
-        raise InputError(name, f"is {shape} of {dtype}", f"give {wanted}")
-    if key == "rgb" and dtype != np.uint8:
+    kind, channels, wanted = _ARRAYS[key]
+    if not np.issubdtype(dtype, kind) or len(shape) < 2 or shape[2:] != channels or 0 in shape:
         raise InputError(name, f"is {shape} of {dtype}", f"give {wanted}")
     if shape[0] * shape[1] > most:
         raise InputError(name, f"has shape {shape}, {most} pixels are allowed", "give a smaller image")
     if len(content) - file.tell() != int(np.prod(shape)) * dtype.itemsize:
         raise InputError(name, "the array is truncated or has more than it says", remedy)
-    file.seek(0)
-    array: NDArray[Any] = header.read_array(file, allow_pickle=False)
-    return np.ascontiguousarray(array).astype(dtype.newbyteorder("="), copy=False)
+    array = np.load(io.BytesIO(content), allow_pickle=False)
+    return np.ascontiguousarray(array, dtype.newbyteorder("="))
 
 
 def _npy(array: NDArray[Any]) -> bytes:
@@ -284,14 +219,14 @@ def _npy(array: NDArray[Any]) -> bytes:
 
 
 def _suffix(content: bytes) -> str:
-    if content.startswith(_NPY):
+    if content.startswith(b"\x93NUMPY"):
         return ".npy"
     return ".jpg" if content.startswith(b"\xff\xd8") else ".png"
 
 
-def _read(path: Path, most: int | None) -> bytes:
+def _read(path: Path, most: float = np.inf) -> bytes:
     try:
-        if most is not None and path.stat().st_size > most:
+        if path.stat().st_size > most:
             raise InputError(path, f"is larger than {most} bytes", "give a smaller file")
         return path.read_bytes()
     except FileNotFoundError:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
@@ -14,10 +13,6 @@ from caryatid.sensing.views import View
 
 SAME_CAMERA = 1e-3
 """Pinhole matrices that differ by less than this share of the focal length are of the same camera [1]."""
-NARROWEST, WIDEST = 50.0, 0.05
-"""Focal lengths a depth camera may have, in image widths [1]: 1° and 168° of view."""
-SAMPLES = 4000
-"""Readings, about, that are tested for a jump of the pose [1]; their share is right to 1 %."""
 
 
 def check_view(view: View, scene: Scene, first: View | None) -> None:
@@ -32,40 +27,28 @@ def check_view(view: View, scene: Scene, first: View | None) -> None:
         InputError: Its camera is implausible, pose or depth are in other units than metres, its camera or
             size differ from the first view's, labels are missing or unexpected, or the pose cannot be right.
     """
-    _check_camera(view, scene.config)
+    _check_camera(view, scene.config.session.max_coordinate)
     if first is not None:
         _check_same_camera(view, first)
-    if scene.segmentation == "labels" and view.labels is None:
-        raise InputError(
-            view.name, "has no labels", "give a label image, or a session with --segmentation auto"
-        )
-    if scene.segmentation is None and first is not None and (first.labels is None) != (view.labels is None):
-        reason = "has labels, the views so far have none"
-        if view.labels is None:
-            reason = "has no labels, the views so far have some"
-        raise InputError(view.name, reason, "give them for every view, or for none")
+    _check_labels(view, scene, first)
     _check_pose(view, scene)
 
 
-def _check_camera(view: View, config: Config) -> None:
+def _check_camera(view: View, most: float) -> None:
     height, width = view.depth.shape
-    fx, fy, cx, cy = view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]
-    sound = WIDEST * width <= fx <= NARROWEST * width and WIDEST * width <= fy <= NARROWEST * width
+    (fx, _, cx), (_, fy, cy) = view.K[:2]
+    # Focal lengths of 0.05 and 50 image widths are 168° and 1° of view.
+    sound = min(fx, fy) >= 0.05 * width and max(fx, fy) <= 50.0 * width
     if not (sound and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
-        raise InputError(
-            view.name,
-            f"no camera of {width}×{height} pixels has {_described(view.K)}",
-            "give K in pixels of this image",
-        )
+        reason = f"no camera of {width}×{height} pixels has {_described(view.K)}"
+        raise InputError(view.name, reason, "give K in pixels of this image")
     pinhole = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     if not np.allclose(view.K, pinhole, atol=SAME_CAMERA * fx):
         raise InputError(view.name, "K is no pinhole matrix", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
-    most = config.session.max_coordinate
     far = float(np.abs(view.pose[:3, 3]).max())
     if far > most:
-        raise InputError(
-            view.name, f"the camera is {far:.4g} m from the world's origin", "give T_world_camera in metres"
-        )
+        reason = f"the camera is {far:.4g} m from the world's origin"
+        raise InputError(view.name, reason, "give T_world_camera in metres")
     if float(view.depth.max()) > most:
         raise InputError(view.name, f"holds depths of {view.depth.max():.4g} m", "give depth in metres")
 
@@ -78,6 +61,17 @@ def _check_same_camera(view: View, first: View) -> None:
     if not np.allclose(view.K, first.K, atol=SAME_CAMERA * float(first.K[0, 0])):
         reason = f"its camera has {_described(view.K)}, that of the views so far has {_described(first.K)}"
         raise InputError(view.name, reason, remedy)
+
+
+def _check_labels(view: View, scene: Scene, first: View | None) -> None:
+    if scene.segmentation == "labels" and view.labels is None:
+        remedy = "give a label image, or a session with --segmentation auto"
+        raise InputError(view.name, "has no labels", remedy)
+    if scene.segmentation is None and first is not None and (first.labels is None) != (view.labels is None):
+        reason = "has labels, the views so far have none"
+        if view.labels is None:
+            reason = "has no labels, the views so far have some"
+        raise InputError(view.name, reason, "give them for every view, or for none")
 
 
 def _check_pose(view: View, scene: Scene) -> None:
@@ -126,8 +120,8 @@ def _described(K: Array) -> str:
 
 
 def _sampled(view: View, nearest: float, farthest: float) -> Array:
-    """Some of the view's points (N, 3) [m] in the world, evenly over the image."""
-    stride = max(1, int(np.sqrt(view.depth.size / SAMPLES)))
+    """About 4000 of the view's points (N, 3) [m] in the world, evenly over the image: shares right to 1 %."""
+    stride = max(1, int(np.sqrt(view.depth.size / 4000)))
     picked = view.points_camera[stride // 2 :: stride, stride // 2 :: stride].reshape(-1, 3)
     within = (picked[:, 2] >= nearest) & (picked[:, 2] <= farthest)
     return transforms.transform(view.pose, picked[within])

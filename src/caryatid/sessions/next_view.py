@@ -9,7 +9,6 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from caryatid.config import Config
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import next_best_view
 from caryatid.geometry import transforms
@@ -17,16 +16,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
-from caryatid.robots import (
-    HUMANOID,
-    OwnViews,
-    Posture,
-    Surroundings,
-    Unreachable,
-    find_robot,
-    refusal_of,
-    view_sphere_of,
-)
+from caryatid.robots import HUMANOID, Posture, Robot, Surroundings, find_robot, view_sphere_of
 from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
@@ -66,11 +56,47 @@ class NextView:
         }
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Reachable:
+    """Views that a robot says it reaches.
+
+    Attributes:
+        T_world_camera: Camera poses (N, 4, 4).
+        path_length: Path length (N,) [m] to each, or None for straight lines.
+    """
+
+    T_world_camera: Annotated[Array, Numbers(-1, 4, 4)]
+    path_length: Annotated[Array, Numbers(-1)] | None = None
+
+    @classmethod
+    def read(cls, path: Path) -> Reachable:
+        """Read candidates.json.
+
+        Raises:
+            InputError: A key is missing, or not a list of poses, or of lengths.
+        """
+        return parse_json(cls, read_json(path), path)
+
+    def candidates(self, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
+        """The views to choose from, as they are to a robot whose camera is at a pose (4, 4).
+
+        Raises:
+            InputError: One is no pose, or path lengths are not as many, or negative.
+        """
+        named = enumerate(self.T_world_camera)
+        poses = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
+        lengths = _straight(T_world_camera, poses) if self.path_length is None else self.path_length
+        if lengths.shape != (len(poses),) or not (lengths >= 0.0).all():
+            remedy = "give as many as candidates, 0 or more"
+            raise InputError("path_length", "is not one length a candidate", remedy)
+        return Candidates(poses, sphere.direction_of(poses), lengths, {})
+
+
 def plan_next(
     scene: Scene,
     T_world_cameras: Sequence[Array],
     planner: str,
-    candidates: tuple[Array, Array | None] | None,
+    reachable: Reachable | None,
     stop: str | None,
     robot_name: str = HUMANOID,
 ) -> NextView:
@@ -80,8 +106,7 @@ def plan_next(
         scene: What is known, of at least one view.
         T_world_cameras: Where the views so far were taken (4, 4), the last one last.
         planner: Name of the planner.
-        candidates: Poses (N, 4, 4) the robot reaches and the path length (N,) [m] to each, or None for
-            straight lines; None for those of the robot of this name, which knows the table.
+        reachable: What the robot reaches; None = what the robot of this name reaches, which knows the table.
         stop: Why another view may not pay, or None.
         robot_name: As `find_robot` knows it.
 
@@ -91,42 +116,26 @@ def plan_next(
     """
     if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; add a first view")
-    robot: _Given | _NearTable
-    if candidates is None:
-        robot = _NearTable(scene, robot_name, T_world_cameras[-1])
+    robot: Robot | None = None
+    if reachable is not None:
+        sphere = scene.sphere
+        candidates = reachable.candidates(T_world_cameras[-1], sphere)
     else:
-        robot = _Given(T_world_cameras[-1], *candidates)
-    sphere = view_sphere_of(robot, scene.sphere)
+        floor = table_floor(scene)
+        robot = find_robot(robot_name)(Surroundings(scene.sphere.centre_world, floor, scene.config))
+        sphere = view_sphere_of(robot, scene.sphere)
+        candidates = _reached(robot, T_world_cameras[-1], sphere, scene.sphere.centre_world)
     visited = np.stack([sphere.direction_of(T) for T in T_world_cameras])
-    decision = next_best_view(scene, robot, visited, planner=planner, seed=scene.seed)
-    posture = robot.solve(decision.T_world_camera)
+    decision = next_best_view(scene, robot, visited, candidates=candidates, planner=planner, seed=scene.seed)
+    posture = None if robot is None else robot.solve(decision.T_world_camera)
     return NextView(len(T_world_cameras), decision, posture if isinstance(posture, Posture) else None, stop)
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Reachable:
-    """What a robot says it reaches."""
-
-    T_world_camera: Annotated[Array, Numbers(-1, 4, 4)]
-    path_length: Annotated[Array, Numbers(-1)] | None = None
-
-
-def read_candidates(path: Path) -> tuple[Array, Array | None]:
-    """Read poses (N, 4, 4) a robot reaches and the path length (N,) [m] to each, None where it is missing.
-
-    Raises:
-        InputError: A key is missing, or not a list of poses, or of lengths.
-    """
-    given = parse_json(_Reachable, read_json(path), path)
-    return given.T_world_camera, given.path_length
-
-
-def table_floor(scene: Scene, config: Config) -> FloorGrid:
+def table_floor(scene: Scene) -> FloorGrid:
     """The floor around the table: under its top, and everything on it, nobody can stand.
 
     Args:
         scene: What is known, of at least one view.
-        config: How the robot stands.
 
     Raises:
         PlanningError: No view is known yet.
@@ -139,78 +148,20 @@ def table_floor(scene: Scene, config: Config) -> FloorGrid:
     centre = np.array([*shape.T_world_object[:2, 3], top / 2.0])
     sides = np.array([half[0], half[1], max(abs(top) / 2.0, STEP)])
     R = shape.T_world_object[:3, :3]
-    return FloorGrid.from_boxes([centre], [sides], [R], config.robot, scene.sphere.centre_world[:2])
+    return FloorGrid.from_boxes([centre], [sides], [R], scene.config.robot, scene.sphere.centre_world[:2])
 
 
-class _NearTable(OwnViews):
-    """A robot by the table, which stands where the last view was taken."""
+def _reached(robot: Robot, T_world_camera: Array, sphere: ViewSphere, centre_world: Array) -> Candidates:
+    """What a robot reaches from where its camera is, as it is held or without roll.
 
-    def __init__(self, scene: Scene, name: str, T_world_camera: Array) -> None:
-        self.T_world_camera = T_world_camera
-        floor = table_floor(scene, scene.config)
-        if scene.sphere is None:
-            raise PlanningError("nothing has been seen yet; add a first view")
-        around = Surroundings(scene.sphere.centre_world, floor, scene.config)
-        self._robot = find_robot(name)(around)
-        self._placed = self._place(around.centre_world)
-
-    def _place(self, centre_world: Array) -> bool:
-        """Put it where the camera is, as it is held or without roll; returns whether it can stand there."""
-        eye = self.T_world_camera[:3, 3]
-        poses = [self.T_world_camera]
-        if np.linalg.norm(eye - centre_world) > 1e-6:
-            poses.append(transforms.look_at(eye, centre_world))
-        for T in poses:
-            if isinstance(self._robot.solve(T), Posture):
-                self._robot.move_to(T)
-                return True
-        return False
-
-    def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
-        return view_sphere_of(self._robot, proposed)
-
-    def confirm(self, T_world_camera: Array) -> Unreachable | None:
-        return refusal_of(self._robot, T_world_camera)
-
-    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        return self._robot.solve(T_world_camera)
-
-    def candidates(self, sphere: ViewSphere) -> Candidates:
-        """Views it reaches, with straight paths where it cannot stand at the camera's place."""
-        found = self._robot.candidates(sphere)
-        if self._placed:
-            return found
-        return found.from_elsewhere(_straight(self.T_world_camera, found.T_world_camera))
-
-    def move_to(self, T_world_camera: Array) -> float:
-        return self._robot.move_to(T_world_camera)
-
-
-class _Given:
-    """A robot that has said itself which views it reaches."""
-
-    def __init__(self, T_world_camera: Array, poses: Array, path_length: Array | None) -> None:
-        self.T_world_camera = T_world_camera
-        self._poses = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in enumerate(poses)])
-        self._poses = self._poses.reshape(-1, 4, 4)
-        self._path_length = (
-            _straight(T_world_camera, self._poses)
-            if path_length is None
-            else np.asarray(path_length, np.float64)
-        )
-        if self._path_length.shape != (len(self._poses),) or not (self._path_length >= 0.0).all():
-            raise InputError(
-                "path_length", "is not one length a candidate", "give as many as candidates, 0 or more"
-            )
-
-    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        return Unreachable("the robot itself knows how it stands")
-
-    def candidates(self, sphere: ViewSphere) -> Candidates:
-        return Candidates(self._poses, sphere.direction_of(self._poses), self._path_length, {})
-
-    def move_to(self, T_world_camera: Array) -> float:
-        raise PlanningError("the robot moves itself")
+    Where it cannot stand there, paths are straight lines.
+    """
+    for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], centre_world)):
+        if isinstance(robot.solve(T), Posture):
+            robot.move_to(T)
+            return robot.candidates(sphere)
+    found = robot.candidates(sphere)
+    return found.from_elsewhere(_straight(T_world_camera, found.T_world_camera))
 
 
 def _straight(T_world_camera: Array, poses: Array) -> Array:

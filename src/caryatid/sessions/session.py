@@ -10,68 +10,38 @@ A view's folder appears whole, once it is on the disk, by a rename, and goes by 
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
-import pickle
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
-from types import TracebackType
 from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from annotated_types import Ge
 from filelock import FileLock, Timeout
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
 from caryatid.exploration import reason_to_stop
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text
 from caryatid.io.json_files import parse_json, read_json
-from caryatid.io.staging import (
-    StagedFolder,
-    clear_partials,
-    remove_folder,
-    sync,
-    write_errors,
-    write_file,
-)
-from caryatid.objects.fusion import changed
+from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, find_robot
-from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import Capture, Entry, read_entry
+from caryatid.sessions.captures import REMEDY, CameraFile, Capture
 from caryatid.sessions.checks import check_view
-from caryatid.sessions.next_view import NextView, plan_next
+from caryatid.sessions.next_view import NextView, Reachable, plan_next
+from caryatid.sessions.snapshots import Snapshots, State
 
 FORMAT: Final = "caryatid/session"
 VERSION: Final = 1
 """Format of session.json."""
-FIRST_RELEASE: Final = "0.1.0"
-"""Its sessions do not name the release they were begun with; later ones do."""
-STATE_FORMAT: Final = "2"
-"""Part of every snapshot's digest; to be raised when this module stores something else."""
-STEPS: Final = (1, 8, 64)
-"""The newest snapshot after a multiple of each of these numbers of views is kept [1], for undo."""
-ARRAYS: Final = {
-    ("builtins", "set"),
-    ("collections", "Counter"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-}
-"""What a snapshot may name besides classes of caryatid: a session that came from elsewhere runs no code."""
 
 
 class TakenError(InputError):
@@ -87,51 +57,26 @@ class WrongNumberError(InputError):
 
 
 @dataclass(frozen=True, slots=True)
-class _File:
-    """What is read of session.json."""
+class Beginning:
+    """What a session was begun with.
+
+    Attributes:
+        segmentation: `labels`, `auto`, or None to use labels where the first view has them.
+        seed: Seed of every random choice.
+        planner: Name of the planner that chooses the next view.
+        robot: Name of the robot that takes it.
+        settings: All settings.
+    """
 
     segmentation: SegmentationMethod | None
     seed: Annotated[int, Ge(0)]
     planner: str
     robot: str
-    settings: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Beginning:
-    """What a session was begun with.
-
-    Attributes:
-        config: All settings.
-        segmentation: `labels`, `auto`, or None to use labels where the first view has them.
-        seed: Seed of every random choice.
-        planner: Name of the planner that chooses the next view.
-        robot: Name of the robot that takes it.
-    """
-
-    config: Config
-    segmentation: SegmentationMethod | None
-    seed: int
-    planner: str
-    robot: str = HUMANOID
+    settings: Config
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of session.json."""
-        return {
-            "format": FORMAT,
-            "version": VERSION,
-            "caryatid": version("caryatid"),
-            "segmentation": self.segmentation,
-            "seed": self.seed,
-            "planner": self.planner,
-            "robot": self.robot,
-            "settings": asdict(self.config),
-        }
-
-    @property
-    def digest(self) -> str:
-        """Digest of everything but the release."""
-        return hashlib.sha256(json.dumps(self.to_json() | {"caryatid": ""}).encode()).hexdigest()
+        return {"format": FORMAT, "version": VERSION, "caryatid": version("caryatid")} | asdict(self)
 
     @classmethod
     def read(cls, path: Path) -> Beginning:
@@ -143,18 +88,16 @@ class Beginning:
         if not path.is_file():
             raise InputError(path.parent, "holds no session", "begin one with `caryatid session new`")
         document = read_json(path)
-        release = document.get("caryatid", FIRST_RELEASE)
+        release = document.get("caryatid", "0.1.0")  # the first release did not say which it was
         if document.get("format") != FORMAT or document.get("version") != VERSION:
             reason = f"is no '{FORMAT}' of version {VERSION}; caryatid {release} wrote it"
             raise InputError(path, reason, "use the release that wrote it")
-        given = parse_json(_File, document, path)
         try:
-            settings = changed_settings(Config(), given.settings, str(path))
+            return parse_json(cls, document, path)
         except InputError as error:
-            reason = f"was begun with caryatid {release}, whose settings this release does not take"
+            reason = f"was begun with caryatid {release} and does not fit this release ({error.reason})"
             remedy = "open it with that release, or add its views to a new session"
-            raise InputError(path, f"{reason} ({error.reason})", remedy) from None
-        return cls(settings, given.segmentation, given.seed, given.planner, given.robot)
+            raise InputError(path, reason, remedy) from None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -172,20 +115,6 @@ class Added:
     changed: bool
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _State:
-    """The scene after some views, and whether the last of them changed the graph."""
-
-    scene: Scene
-    changed: bool
-
-    def after(self, view: View) -> _State:
-        """Return the state with one more view; this one stays as it is."""
-        scene = self.scene.copy()
-        before = scene.graph
-        return _State(scene, changed(before, scene.update(view), scene.config.fusion))
-
-
 class Session:
     """A scene model in a folder; `begin` or `open` one.
 
@@ -200,7 +129,8 @@ class Session:
         if lock is not None:
             for folder in (path, path / "views", path / "state"):
                 clear_partials(folder)
-        self._views = self._entries()
+        self._snapshots = Snapshots(path / "state", json.dumps(asdict(beginning)))
+        self._views = self._kept()
         self._first = self._decoded(0) if self._views else None
         self._state = self._restored(self._views)
 
@@ -238,12 +168,12 @@ class Session:
             folder.mkdir(parents=True, exist_ok=True)
             if (folder / "session.json").exists():
                 raise TakenError(folder, "holds a session already", "use that one, or give another folder")
-            others = [p for p in folder.iterdir() if p.name not in ("views", "state", "lock")]
-            if any(not p.name.startswith(".") for p in others):
+            others = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+            if others - {"views", "state", "lock"}:
                 raise TakenError(folder, "already exists and holds other files", "give a new folder")
             for name in ("views", "state"):
                 (folder / name).mkdir(exist_ok=True)
-        beginning = Beginning(config or Config(), segmentation, seed, planner, robot)
+        beginning = Beginning(segmentation, seed, planner, robot, config or Config())
         text = json.dumps(beginning.to_json(), indent=1) + "\n"
         write_file(folder / "session.json", text.encode(), durable=True)
         sync(folder.resolve().parent)
@@ -274,9 +204,7 @@ class Session:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -316,10 +244,10 @@ class Session:
         self._check_writable()
         capture = Capture.of(view) if isinstance(view, View) else view
         if number is not None and number != self.views:
-            if number == self.views - 1 and capture.digest == self._views[-1].digest:
+            if number == self.views - 1 and capture.camera.digest == self._views[-1].digest:
                 return Added(number, self.graph, self._state.changed)
             raise WrongNumberError(capture.name, f"is to be view {number}, the next one is view {self.views}")
-        decoded = capture.decode(self.beginning.config.session)
+        decoded = capture.decode(self.beginning.settings.session)
         check_view(decoded, self.scene, self._first)
         state = self._state.after(decoded)
         graph_text(state.scene.graph)  # a view whose graph cannot be written is refused, and not kept
@@ -327,17 +255,13 @@ class Session:
         for name, content in capture.files().items():
             folder.write(name, content)
         folder.publish()
-        self._views.append(capture.entry)
+        self._views.append(capture.camera)
         self._first = self._first or decoded
         self._state = state
-        self._write_snapshot(state, self._views)
+        self._snapshots.write(state, [v.digest for v in self._views])
         return Added(self.views - 1, state.scene.graph, state.changed)
 
-    def next(
-        self,
-        candidates: ArrayLike | None = None,
-        path_length: Sequence[float] | NDArray[np.float64] | None = None,
-    ) -> NextView:
+    def next(self, candidates: ArrayLike | None = None, path_length: ArrayLike | None = None) -> NextView:
         """Choose where to look next.
 
         Args:
@@ -349,13 +273,13 @@ class Session:
             PlanningError: There is no view yet, or none can be reached.
             InputError: Candidates are no poses.
         """
-        stop = reason_to_stop(self.views, self._state.changed, self.beginning.config.active)
-        reach = None
+        beginning, reachable = self.beginning, None
         if candidates is not None:
-            poses = np.asarray(candidates, dtype=np.float64).reshape(-1, 4, 4)
-            reach = poses, None if path_length is None else np.asarray(path_length, dtype=np.float64)
-        poses_so_far = [v.T_world_camera for v in self._views]
-        return plan_next(self.scene, poses_so_far, self.beginning.planner, reach, stop, self.beginning.robot)
+            lengths = None if path_length is None else np.asarray(path_length, dtype=np.float64)
+            reachable = Reachable(np.asarray(candidates, dtype=np.float64).reshape(-1, 4, 4), lengths)
+        stop = reason_to_stop(self.views, self._state.changed, beginning.settings.active)
+        poses = [v.T_world_camera for v in self._views]
+        return plan_next(self.scene, poses, beginning.planner, reachable, stop, beginning.robot)
 
     def undo(self) -> int:
         """Remove the last view.
@@ -383,77 +307,30 @@ class Session:
     def _folder(self, number: int) -> Path:
         return self.path / "views" / f"{number:06d}"
 
-    def _entries(self) -> list[Entry]:
-        """What is known of each view without decoding it, in order."""
-        names = sorted(path.name for path in (self.path / "views").glob("[0-9]*"))
-        for number, name in enumerate(names):
-            if name != f"{number:06d}":
-                raise InputError(
-                    self.path / "views",
-                    f"holds no view {number:06d}",
-                    "put it back, or take the later ones out",
-                )
-        return [read_entry(self._folder(number)) for number in range(len(names))]
+    def _kept(self) -> list[CameraFile]:
+        """The cameras of the views that are kept, in order."""
+        folders = sorted((self.path / "views").glob("[0-9]*"))
+        for number, folder in enumerate(folders):
+            if folder != self._folder(number):
+                remedy = "put it back, or take the later ones out"
+                raise InputError(folder.parent, f"holds no view {number:06d}", remedy)
+        return [CameraFile.read(folder / "camera.json", REMEDY) for folder in folders]
 
     def _decoded(self, number: int) -> View:
-        return Capture.read(self._folder(number)).decode(self.beginning.config.session)
+        return Capture.read(self._folder(number)).decode(self.beginning.settings.session)
 
-    def _restored(self, views: Sequence[Entry]) -> _State:
+    def _restored(self, views: Sequence[CameraFile]) -> State:
         """The state after some views, from the newest usable snapshot and the views after it."""
-        state = next(self._read_snapshots(views), None)
+        digests = [view.digest for view in views]
+        state = next(self._snapshots.read(digests), None)
         if state is None:
             b = self.beginning
-            state = _State(Scene(b.config, segmentation=b.segmentation, seed=b.seed), changed=False)
+            state = State(Scene(b.settings, segmentation=b.segmentation, seed=b.seed))
         for number in range(state.scene.views, len(views)):
             state = state.after(self._decoded(number))
             if self._lock is not None and number + 2 >= len(views):
-                self._write_snapshot(state, views[: number + 1])
+                self._snapshots.write(state, digests[: number + 1])
         return state
-
-    def _read_snapshots(self, views: Sequence[Entry]) -> Iterator[_State]:
-        """Snapshots that this code made of the first of these views, the newest first."""
-        for number in sorted(self._snapshots(), reverse=True):
-            if number <= len(views):
-                with suppress(Exception):  # whatever a damaged file leads to: the views are still there
-                    content = self._snapshot(number).read_bytes()
-                    seal, payload = content[:32], content[32:]
-                    if seal == self._seal(views[:number], payload):
-                        state = _Unpickler(io.BytesIO(payload)).load()
-                        if isinstance(state, _State) and state.scene.views == number:
-                            yield state
-
-    def _write_snapshot(self, state: _State, views: Sequence[Entry]) -> None:
-        """Keep a state, and remove snapshots that are not needed any more; a failure costs only time."""
-        with suppress(Exception):
-            payload = pickle.dumps(state, protocol=5)
-            write_file(self._snapshot(len(views)), self._seal(views, payload) + payload)
-            kept = {n - n % step for n in (len(views), len(views) - 1) for step in STEPS}
-            for path in (self.path / "state").iterdir():
-                if path.name not in {self._snapshot(n).name for n in kept}:
-                    path.unlink()
-
-    def _seal(self, views: Sequence[Entry], payload: bytes) -> bytes:
-        """Digest of the code, the settings and the views that made a snapshot, and of the snapshot itself."""
-        made_of = [STATE_FORMAT, fingerprint(), self.beginning.digest, *(v.digest for v in views)]
-        return hashlib.sha256(" ".join(made_of).encode() + b"\0" + payload).digest()
-
-    def _snapshot(self, views: int) -> Path:
-        return self.path / "state" / f"{views:06d}.pickle"
-
-    def _snapshots(self) -> list[int]:
-        return [int(p.stem) for p in (self.path / "state").glob("*.pickle") if p.stem.isdecimal()]
-
-
-class _Unpickler(pickle.Unpickler):
-    """Makes nothing but arrays and objects of caryatid."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        known = (module, name) in ARRAYS
-        if known or (module.split(".")[0] == "caryatid" and "." not in name):
-            found = super().find_class(module, name)
-            if known or isinstance(found, type):
-                return found
-        raise pickle.UnpicklingError(f"{module}.{name} is not part of a scene")
 
 
 def _locked(path: Path) -> FileLock:
