@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shutil
 from dataclasses import replace
@@ -64,6 +65,13 @@ def capture(scene_file: Path, azimuths_deg: tuple[float, ...]):
         view = camera.capture(transforms.look_at(eye_world, centre_world))
         views.append(replace(view, normals_camera=None))
     return views
+
+
+def npy(array: np.ndarray, **options) -> bytes:
+    """The content of a .npy file."""
+    file = io.BytesIO()
+    np.save(file, array, **options)
+    return file.getvalue()
 
 
 def without_poses(views):

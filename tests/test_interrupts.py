@@ -57,9 +57,9 @@ def whole(folder, views):
 @pytest.mark.parametrize("moment", ["view 00", "next view", "view 02"])
 def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     folder = tmp_path / "runs" / "run"
-    folder.parent.mkdir()
-    words = ["explore", scene_file, "--out", folder, "--views", 50, "--no-early-stop", *SMALL]
-    command = Command(*words)
+    words = ["explore", scene_file, "--out", folder, "--no-early-stop", *SMALL]
+    assert run_command(*words, "--views", 1, "--quiet") == 0, "an older run, which gives way to what is kept"
+    command = Command(*words, "--views", 50)
     command.wait_for(moment)
     status, out, told = command.interrupt()
     assert (status, out) == (130, "")
@@ -67,16 +67,6 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     count = "1 view is" if len(run.views) == 1 else f"{len(run.views)} views are"
     assert told == f"interrupted: {count} kept in {folder}; `caryatid report {folder}` makes the report"
     assert len(run.record["scores"]) == len(run.views)
-
-
-def test_an_older_run_gives_way_to_what_was_kept(tmp_path, scene_file):
-    folder = tmp_path / "runs" / "run"
-    words = ["explore", scene_file, "--out", folder, "--no-early-stop", *SMALL]
-    assert run_command(*words, "--views", 1, "--quiet") == 0
-    command = Command(*words, "--views", 50)
-    command.wait_for("view 01")
-    assert command.interrupt()[0] == 130
-    whole(folder, 2)
 
 
 def test_an_extraction_keeps_its_views(tmp_path, recording):
@@ -120,9 +110,9 @@ def test_a_dismantling_keeps_its_views_and_lifts(tmp_path, moment):
 def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):
     assert run_command("explore", scene_file, "--out", tmp_path / "run", "--views", 1, *SMALL, "--quiet") == 0
     before = sorted(tmp_path.rglob("*"))
-    command = Command("order", tmp_path / "run", "--set", "rehearsal.draws=5000")
+    command = Command("order", tmp_path / "run", "--set", "rehearsal.draws=20000")
     with pytest.raises(subprocess.TimeoutExpired):
-        command._process.wait(3.0)
+        command._process.wait(6.0)  # by then it has imported everything, even on a busy machine
     assert command.interrupt() == (130, "", "interrupted: nothing was written")
     assert sorted(tmp_path.rglob("*")) == before
 

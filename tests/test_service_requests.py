@@ -7,6 +7,7 @@ import asyncio
 import httpx
 import pytest
 import schemathesis
+from conftest import npy
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
@@ -17,7 +18,7 @@ from schemathesis.specs.openapi.checks import (
     response_schema_conformance,
     status_code_conformance,
 )
-from test_service import TOKEN, body, npy, text
+from test_service import TOKEN, body, text
 
 from caryatid.config import Config
 from caryatid.errors import InputError

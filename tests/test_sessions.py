@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import pickle
 import subprocess
@@ -11,16 +10,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import run_command
-from PIL import Image
+from conftest import npy, run_command
 
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
+from caryatid.io.images import png
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions import Capture, Session
+from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.session import SessionBusyError, WrongNumberError
 
 
@@ -434,21 +434,10 @@ def test_a_pose_that_is_a_little_off_is_no_jump(begun, views, degrees):
 # Files of images
 
 
-def png(array):
-    file = io.BytesIO()
-    Image.fromarray(array).save(file, "PNG")
-    return file.getvalue()
-
-
-def npy(array, **options):
-    file = io.BytesIO()
-    np.save(file, array, **options)
-    return file.getvalue()
-
-
 def capture(view, **images):
     depth = npy(view.depth)
-    return Capture({"depth": depth, "labels": png(view.labels.astype(np.uint16))} | images, view.K, view.pose)
+    images = {"depth": depth, "labels": png(view.labels.astype(np.uint16))} | images
+    return Capture(images, CameraRecord(view.K, view.pose))
 
 
 BROKEN = {
@@ -502,7 +491,7 @@ def test_a_view_comes_back_bit_by_bit(tmp_path, views):
     again = Capture.read(tmp_path).decode(Config().session)
     for field in ("depth", "K", "T_world_camera", "rgb", "labels"):
         assert np.array_equal(getattr(again, field), getattr(view, field))
-    assert Capture.read(tmp_path).digest == first.digest
+    assert Capture.read(tmp_path).record.digest == first.record.digest
 
 
 # Folders
@@ -549,7 +538,7 @@ def test_a_session_of_the_first_release_is_read_or_refused_by_its_name(begun, vi
         ("version", 2, "of version 1"),
         ("segmentation", "magic", "'segmentation' is"),
         ("seed", -1, "'seed' is -1"),
-        ("settings", {"fit": {"hypotheses": 0}}, "begun with caryatid 9.9.9, .*fit.hypotheses"),
+        ("settings", {"fit": {"hypotheses": 0}}, "caryatid 9.9.9 .*settings.fit: 'hypotheses' is 0"),
     ],
 )
 def test_a_session_that_was_begun_otherwise_is_said(begun, key, value, said):

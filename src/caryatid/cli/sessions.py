@@ -72,7 +72,15 @@ class New(ModellingCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Add(Command):
+class Step(Command):
+    """A command on a session."""
+
+    folder: Folder
+    """Folder of the session."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Add(Step):
     """Add a view; when the command ends with 0, the view is on the disk and stays.
 
     camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm of one unit of depth, else 1}
@@ -82,8 +90,6 @@ class Add(Command):
       caryatid session add table --depth depth.npy --rgb rgb.png --labels labels.png --camera camera.json
     """
 
-    folder: Folder
-    """Folder of the session."""
     depth: Annotated[Path, tyro.conf.arg(metavar="D.png")]
     """Depth image: 16-bit PNG, or .npy in metres; 0 or NaN = no reading."""
     camera: Annotated[Path, tyro.conf.arg(metavar="C.json")]
@@ -110,7 +116,7 @@ class Add(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Next(Command):
+class Next(Step):
     """Print where to look next: camera pose, platform, gaze, expected gain, and why; as JSON.
 
     candidates.json: {"T_world_camera": [4×4 …] that the robot reaches, "path_length": [m …], optional}
@@ -120,8 +126,6 @@ class Next(Command):
       caryatid session next table --candidates candidates.json
     """
 
-    folder: Folder
-    """Folder of the session."""
     candidates: Annotated[OptionalPath, shown_as("C.json")] = None
     """Poses to choose from, instead of those the session's robot reaches."""
 
@@ -139,15 +143,12 @@ class Next(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Graph(Command):
+class Graph(Step):
     """Print the support graph so far, as graph.json.
 
     To try:
       caryatid session graph table > graph.json
     """
-
-    folder: Folder
-    """Folder of the session."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import Output
@@ -159,15 +160,12 @@ class Graph(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Undo(Command):
+class Undo(Step):
     """Take the last view back.
 
     To try:
       caryatid session undo table
     """
-
-    folder: Folder
-    """Folder of the session."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import counted, summary

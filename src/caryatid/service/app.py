@@ -23,6 +23,7 @@ from caryatid.errors import CaryatidError, InputError, PlanningError
 from caryatid.io.graph_json import graph_to_json
 from caryatid.service.pool import FullError, MissingError, SessionPool
 from caryatid.sessions import Capture, Session
+from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.session import SessionBusyError, TakenError, WrongNumberError
 
 LOCAL = ["127.0.0.1", "localhost", "[::1]"]
@@ -121,14 +122,11 @@ class NewView(Document):
         Raises:
             InputError: An image is no base64.
         """
-        images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
-        return Capture(
-            {key: _decoded(key, text) for key, text in images.items() if text is not None},
-            np.array(self.camera.K),
-            np.array(self.camera.T_world_camera),
-            self.camera.depth_scale,
-            name="view" if self.number is None else f"view {self.number}",
-        )
+        given = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
+        images = {key: _decoded(key, text) for key, text in given.items() if text is not None}
+        K, T_world_camera = np.array(self.camera.K), np.array(self.camera.T_world_camera)
+        name = "view" if self.number is None else f"view {self.number}"
+        return Capture(images, CameraRecord(K, T_world_camera, self.camera.depth_scale, name))
 
 
 class GraphAnswer(Document):
@@ -194,8 +192,9 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
         422: "What was given cannot be used; nothing has changed",
         503: "Too much waits; try again",
     }.items()
-} | {413: {"description": "Larger than a request may be", "content": {"text/plain": {}}}}
+}
 """Answers to requests that fail, by their status."""
+PROBLEMS[413] = {"description": "Larger than a request may be", "content": {"text/plain": {}}}
 
 BEARER = HTTPBearer(auto_error=False, description="The token the service was started with")
 """Where requests carry their token."""

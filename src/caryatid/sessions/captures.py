@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -38,7 +38,7 @@ _ARRAYS: Final[dict[str, tuple[type[np.generic], tuple[int, ...], str]]] = {
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class CameraFile:
+class CameraRecord:
     """camera.json: what is known of a view without decoding its images.
 
     Attributes:
@@ -56,7 +56,7 @@ class CameraFile:
     digest: str = ""
 
     @classmethod
-    def read(cls, path: Path, remedy: str) -> CameraFile:
+    def read(cls, path: Path, remedy: str = REMEDY) -> CameraRecord:
         """Read camera.json.
 
         Raises:
@@ -72,17 +72,11 @@ class Capture:
     Attributes:
         images: Files: `depth` and, where given, `rgb` and `labels`; PNG (rgb also JPEG), or .npy: depth
             (H, W) floats [m], rgb (H, W, 3) uint8, labels (H, W) whole numbers.
-        K: Pinhole matrix (3, 3) [px].
-        T_world_camera: Camera pose (4, 4).
-        depth_scale: Millimetres of one unit of a depth PNG.
-        name: What to call the view in messages.
+        camera: The camera that took them; its digest does not count.
     """
 
     images: Mapping[str, bytes]
-    K: Array
-    T_world_camera: Array
-    depth_scale: float = 1.0
-    name: str = field(default="view", kw_only=True)
+    camera: CameraRecord
 
     @classmethod
     def of(cls, view: View) -> Capture:
@@ -98,7 +92,7 @@ class Capture:
             images["labels"] = png(view.labels.astype(np.uint16))
         if view.normals_camera is not None:
             images["normals"] = _npy(view.normals_camera)
-        return cls(images, view.K, view.pose, name=view.name)
+        return cls(images, CameraRecord(view.K, view.pose, name=view.name))
 
     @classmethod
     def from_files(
@@ -118,8 +112,8 @@ class Capture:
         """
         named = {"depth": depth, "rgb": rgb, "labels": labels}
         images = {key: _read(path, config.max_bytes) for key, path in named.items() if path is not None}
-        given = CameraFile.read(camera, "give K (3×3) and T_world_camera (4×4, in metres)")
-        return cls(images, given.K, given.T_world_camera, given.depth_scale, name=str(depth))
+        given = CameraRecord.read(camera, "give K (3×3) and T_world_camera (4×4, in metres)")
+        return cls(images, replace(given, name=str(depth)))
 
     @classmethod
     def read(cls, folder: Path) -> Capture:
@@ -128,29 +122,26 @@ class Capture:
         Raises:
             InputError: Something is missing, or is not what was written.
         """
-        camera = CameraFile.read(folder / "camera.json", REMEDY)
+        camera = CameraRecord.read(folder / "camera.json")
         images = {file.stem: _read(file) for file in folder.iterdir() if file.stem in _ARRAYS}
-        capture = cls(images, camera.K, camera.T_world_camera, camera.depth_scale, name=camera.name)
-        if capture.camera.digest != camera.digest:
+        capture = cls(images, camera)
+        if capture.record.digest != camera.digest:
             raise InputError(folder, "is not what was written there", REMEDY)
         return capture
 
     @property
-    def camera(self) -> CameraFile:
-        """Its camera.json; the name does not count for the digest."""
-        seen = {
-            "K": self.K.tolist(),
-            "T_world_camera": self.T_world_camera.tolist(),
-            "depth_scale": self.depth_scale,
-        }
-        digest = hashlib.sha256(json.dumps(seen).encode())
+    def record(self) -> CameraRecord:
+        """The camera with the digest of all but the name."""
+        names = ("K", "T_world_camera", "depth_scale")
+        seen = {name: getattr(self.camera, name) for name in names}
+        digest = hashlib.sha256(json.dumps(seen, default=np.ndarray.tolist).encode())
         for key in sorted(self.images):
             digest.update(f"{key} {len(self.images[key])}\0".encode() + self.images[key])
-        return CameraFile(self.K, self.T_world_camera, self.depth_scale, self.name, digest.hexdigest())
+        return replace(self.camera, digest=digest.hexdigest())
 
     def files(self) -> dict[str, bytes]:
         """Return the files that are kept: name → content."""
-        document = json.dumps(asdict(self.camera), indent=1, default=np.ndarray.tolist)
+        document = json.dumps(asdict(self.record), indent=1, default=np.ndarray.tolist)
         files = {f"{key}{_suffix(content)}": content for key, content in self.images.items()}
         return files | {"camera.json": f"{document}\n".encode()}
 
@@ -161,23 +152,24 @@ class Capture:
             InputError: One is broken, too large, of the wrong kind, or sizes differ; the camera is no pinhole
                 camera, or its pose no rigid transform.
         """
+        camera = self.camera
         if "depth" not in self.images:
-            raise InputError(self.name, "has no depth", "give a depth image")
+            raise InputError(camera.name, "has no depth", "give a depth image")
         decoded = {
-            key: _decoded(key, content, f"{self.name}: {key}", config.max_pixels)
+            key: _decoded(key, content, f"{camera.name}: {key}", config.max_pixels)
             for key, content in self.images.items()
         }
         depth = decoded["depth"]
         if depth.dtype.kind in "iu":
-            depth = (depth.astype(np.float64) * (self.depth_scale / 1000.0)).astype(np.float32)
+            depth = (depth.astype(np.float64) * (camera.depth_scale / 1000.0)).astype(np.float32)
         return View(
             depth=depth,
-            K=self.K,
-            T_world_camera=self.T_world_camera,
+            K=camera.K,
+            T_world_camera=camera.T_world_camera,
             rgb=decoded.get("rgb"),
             labels=decoded.get("labels"),
             normals_camera=decoded.get("normals"),
-            name=self.name,
+            name=camera.name,
         )
 
 

@@ -34,7 +34,7 @@ from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, find_robot
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import REMEDY, CameraFile, Capture
+from caryatid.sessions.captures import CameraRecord, Capture
 from caryatid.sessions.checks import check_view
 from caryatid.sessions.next_view import NextView, Reachable, plan_next
 from caryatid.sessions.snapshots import Snapshots, State
@@ -244,9 +244,11 @@ class Session:
         self._check_writable()
         capture = Capture.of(view) if isinstance(view, View) else view
         if number is not None and number != self.views:
-            if number == self.views - 1 and capture.camera.digest == self._views[-1].digest:
+            if number == self.views - 1 and capture.record.digest == self._views[-1].digest:
                 return Added(number, self.graph, self._state.changed)
-            raise WrongNumberError(capture.name, f"is to be view {number}, the next one is view {self.views}")
+            raise WrongNumberError(
+                capture.camera.name, f"is to be view {number}, the next one is view {self.views}"
+            )
         decoded = capture.decode(self.beginning.settings.session)
         check_view(decoded, self.scene, self._first)
         state = self._state.after(decoded)
@@ -255,7 +257,7 @@ class Session:
         for name, content in capture.files().items():
             folder.write(name, content)
         folder.publish()
-        self._views.append(capture.camera)
+        self._views.append(capture.record)
         self._first = self._first or decoded
         self._state = state
         self._snapshots.write(state, [v.digest for v in self._views])
@@ -307,19 +309,19 @@ class Session:
     def _folder(self, number: int) -> Path:
         return self.path / "views" / f"{number:06d}"
 
-    def _kept(self) -> list[CameraFile]:
+    def _kept(self) -> list[CameraRecord]:
         """The cameras of the views that are kept, in order."""
         folders = sorted((self.path / "views").glob("[0-9]*"))
         for number, folder in enumerate(folders):
             if folder != self._folder(number):
                 remedy = "put it back, or take the later ones out"
                 raise InputError(folder.parent, f"holds no view {number:06d}", remedy)
-        return [CameraFile.read(folder / "camera.json", REMEDY) for folder in folders]
+        return [CameraRecord.read(folder / "camera.json") for folder in folders]
 
     def _decoded(self, number: int) -> View:
         return Capture.read(self._folder(number)).decode(self.beginning.settings.session)
 
-    def _restored(self, views: Sequence[CameraFile]) -> State:
+    def _restored(self, views: Sequence[CameraRecord]) -> State:
         """The state after some views, from the newest usable snapshot and the views after it."""
         digests = [view.digest for view in views]
         state = next(self._snapshots.read(digests), None)
