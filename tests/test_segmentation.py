@@ -282,9 +282,12 @@ def test_the_inside_of_a_bowl_belongs_to_the_bowl():
 def test_hollowness_knows_inside_from_outside():
     around = np.random.default_rng(0).normal(size=(500, 3)) * (1.0, 1.0, 0.3) + (0.0, 0.0, 2.0)
     outward = transforms.unit(around)
-    assert hollowness(np.hstack([0.1 * outward, -outward])) > 0.2
-    assert hollowness(np.hstack([0.1 * outward, outward])) < -0.2
-    assert abs(hollowness(np.hstack([around * (1.0, 1.0, 0.0), np.tile(UP, (500, 1))]))) < 1e-9
+    points = np.concatenate([0.1 * outward, 0.1 * outward, around * (1.0, 1.0, 0.0)])
+    normals = np.concatenate([-outward, outward, np.tile(UP, (500, 1))])
+    inside, outside, flat = hollowness(points, normals, np.repeat(np.arange(3), 500))
+    assert inside > 0.2
+    assert outside < -0.2
+    assert abs(flat) < 1e-9
 
 
 def test_a_gap_is_hidden_only_by_what_is_nearer():

@@ -17,18 +17,10 @@ from caryatid.sensing.clouds import thin
 
 Index = NDArray[np.intp]
 
-TOUCHING = ((0, 1), (1, 0), (1, 1), (1, -1))
-"""Rows down and columns right of a sample's later neighbours, diagonals too."""
-EDGES_ACROSS = 3.0
-"""Sample edges that cross a border for each sample along it, on a grid with diagonals."""
 MAX_JUMP = 0.009
 """A difference in inverse depth beyond this parts two surfaces, however steep [1/m]."""
 MIN_RISE = 0.015
 """Height over a neighbour's plane from which a depth step repels [m]; above staircases on steep faces."""
-GAP = 3
-"""Depth steps are looked for across this many samples without a reading [1]; sensors leave 2 px a side."""
-STEP_ATTRACTION = -1.0
-"""Attraction over a depth step, as strong as that over a flat surface."""
 
 
 def grid_edges(
@@ -55,17 +47,18 @@ def grid_edges(
     number = np.where(places, np.cumsum(places).reshape(places.shape) - 1, -1)
     offset = np.einsum("ij,ij->i", normals, points)
     planes = normals / np.where(offset == 0.0, np.inf, offset)[:, None]
-    ways = np.array([*TOUCHING, *(way for k in range(2, GAP + 1) for way in ((0, k), (k, 0)))])
-    edges = np.empty((len(TOUCHING) * len(points), 2), dtype=np.intp)
-    steps = np.empty((len(ways) * len(points), 2), dtype=np.intp)
-    counts = _find_pairs(number, points, normals, planes, ways, edge_jump, edges, steps)
-    return edges[: counts[0]], steps[: counts[1]]
+    # Rows down and columns right of a sample's later neighbours, and of those across a gap: sensors leave two
+    # pixels without readings on either side of a step.
+    ways = np.array([(0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0)])
+    return _find_pairs(number, points, normals, planes, ways, edge_jump)
 
 
 @njit(cache=True, error_model="numpy")
-def _find_pairs(number, points, normals, planes, ways, edge_jump, edges, steps):  # type: ignore[no-untyped-def]
-    """Write the pairs that `grid_edges` returns, and say how many there are of each."""
+def _find_pairs(number, points, normals, planes, ways, edge_jump):  # type: ignore[no-untyped-def]
+    """The pairs that `grid_edges` returns; the first four ways lead to neighbours, the others across gaps."""
     height, width = number.shape
+    edges = np.empty((4 * len(points), 2), dtype=np.intp)
+    steps = np.empty((len(ways) * len(points), 2), dtype=np.intp)
     edge_count = step_count = 0
     for place in range(height * width):
         row, col = place // width, place % width
@@ -92,13 +85,13 @@ def _find_pairs(number, points, normals, planes, ways, edge_jump, edges, steps):
             first, second = 1.0 / points[i, 2], 1.0 / points[j, 2]
             off = min(abs(from_i - 1.0) * second, abs(from_j - 1.0) * first)
             if abs(first - second) <= MAX_JUMP and off <= edge_jump:
-                if k < len(TOUCHING):
+                if k < 4:
                     edges[edge_count, 0], edges[edge_count, 1] = i, j
                     edge_count += 1
             elif max(rise_i, rise_j) > MIN_RISE:
                 steps[step_count, 0], steps[step_count, 1] = i, j
                 step_count += 1
-    return edge_count, step_count
+    return edges[:edge_count], steps[:step_count]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -141,17 +134,17 @@ def convex_parts(
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)
-    distances, turns = np.empty(len(edges)), np.empty(len(edges))
-    _measure_edges(points, normals, edges, distances, turns)
+    distances, turns = _measure_edges(points, normals, edges)
     costs = distances / config.surfel + config.crease * turns
-    surfels = gather_surfels(points, normals, edges, costs, thin(points, config.surfel))
+    surfels = _gather_surfels(points, normals, edges, costs, thin(points, config.surfel))
     count = len(surfels.sizes)
-    pairs, lengths = count_borders(surfels.owner, edges, count)
-    borders = pairs, border_attraction(surfels, pairs, config), lengths
+    pairs, lengths = _count_borders(surfels.owner, edges, count)
+    borders = pairs, _border_attraction(surfels, pairs, config), lengths
     if steps is not None:
-        borders = _with_steps(*borders, *count_borders(surfels.owner, steps, count), count)
+        borders = _with_steps(*borders, *_count_borders(surfels.owner, steps, count), count)
     cluster = cluster_by_mean(count, *borders)
-    min_width = config.min_width / _usual(distances)
+    apart = distances[distances > 0.0]
+    min_width = config.min_width / np.median(apart) if len(apart) else 0.0
     cluster = _absorb_slivers(cluster, surfels.sizes, pairs, lengths, config.min_size, min_width)
     part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
     large = np.bincount(part + 1)[1:] >= config.min_size
@@ -159,8 +152,9 @@ def convex_parts(
 
 
 @njit(cache=True)
-def _measure_edges(points, normals, edges, lengths, turns):  # type: ignore[no-untyped-def]
-    """Write how long each edge (E,) is [m] and how far the normal turns along it: 1 − cosine."""
+def _measure_edges(points, normals, edges):  # type: ignore[no-untyped-def]
+    """How long each edge (E,) is [m], and how far the normal turns along it: 1 − cosine."""
+    lengths, turns = np.empty(len(edges)), np.empty(len(edges))
     for e in range(len(edges)):
         i, j = edges[e]
         square, cosine = 0.0, 0.0
@@ -168,40 +162,32 @@ def _measure_edges(points, normals, edges, lengths, turns):  # type: ignore[no-u
             square += (points[i, axis] - points[j, axis]) ** 2
             cosine += normals[i, axis] * normals[j, axis]
         lengths[e], turns[e] = np.sqrt(square), 1.0 - cosine
+    return lengths, turns
 
 
-def gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, seeds: Index) -> Surfels:
-    """Give each sample (N, 3) to the seed (S,) nearest along the edges (E, 2) at their costs (E,).
-
-    Args:
-        points: Samples (N, 3) [m].
-        normals: Unit normals (N, 3).
-        edges: Both ends (E, 2) of each.
-        costs: What an edge takes (E,).
-        seeds: Samples that begin a surfel (S,).
-    """
-    owner = _nearest_seeds(len(points), edges, costs, seeds)
-    count = len(seeds)
+def _gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, seeds: Index) -> Surfels:
+    """Give each sample (N, 3) to the seed (S,), itself a sample, nearest along edges (E, 2) at costs (E,)."""
+    start = np.concatenate([[0], np.cumsum(np.bincount(edges.ravel(), minlength=len(points)))])
+    owner, count = _spread_seeds(edges, costs, start, seeds), len(seeds)
     sizes = np.bincount(owner + 1, minlength=count + 1)[1:]
-    centres = _sum_by(owner, points, count) / np.maximum(sizes, 1)[:, None]
-    return Surfels(owner, centres, transforms.unit(_sum_by(owner, normals, count)), sizes)
-
-
-def _nearest_seeds(count: int, edges: Index, costs: Array, seeds: Index) -> Index:
-    """For each of the nodes, the number of the seed (S,) nearest along the edges (E, 2), −1 = none."""
-    start = np.concatenate([[0], np.cumsum(np.bincount(edges.ravel(), minlength=count))])
-    distance, owner = np.full(count, np.inf), np.full(count, -1)
-    distance[seeds], owner[seeds] = 0.0, np.arange(len(seeds))
-    _spread_seeds(edges, costs, start, distance, owner)
-    return owner
+    centres, normals = (
+        np.stack([np.bincount(owner + 1, v, minlength=count + 1)[1:] for v in vectors.T], axis=-1)
+        for vectors in (points, normals)
+    )
+    return Surfels(owner, centres / np.maximum(sizes, 1)[:, None], transforms.unit(normals), sizes)
 
 
 @njit(cache=True)
-def _spread_seeds(edges, costs, start, distance, owner):  # type: ignore[no-untyped-def]
-    """Relax edges in sweeps back and forth until nothing changes (Bellman and Ford); faster than a heap here.
+def _spread_seeds(edges, costs, start, seeds):  # type: ignore[no-untyped-def]
+    """For each node (N,), the number of the seed (S,) nearest along the edges (E, 2), −1 = none.
 
-    The neighbours of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them.
+    Edges are relaxed in sweeps back and forth until nothing changes (Bellman and Ford); faster than a heap
+    here. The neighbours of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them.
     """
+    count = len(start) - 1
+    distance, owner = np.full(count, np.inf), np.full(count, -1)
+    for k in range(len(seeds)):
+        distance[seeds[k]], owner[seeds[k]] = 0.0, k
     neighbour, length = np.empty(2 * len(edges), dtype=np.intp), np.empty(2 * len(edges))
     free = start[:-1].copy()
     for e in range(len(edges)):
@@ -209,7 +195,6 @@ def _spread_seeds(edges, costs, start, distance, owner):  # type: ignore[no-unty
             at = free[edges[e, k]]
             free[edges[e, k]] += 1
             neighbour[at], length[at] = edges[e, 1 - k], costs[e]
-    count = len(distance)
     changed, forward = True, True
     while changed:
         changed = False
@@ -221,19 +206,11 @@ def _spread_seeds(edges, costs, start, distance, owner):  # type: ignore[no-unty
                     distance[node], owner[node] = through, owner[neighbour[at]]
                     changed = True
         forward = not forward
+    return owner
 
 
-def count_borders(owner: Index, edges: Index, owners: int) -> tuple[Index, Array]:
-    """Pairs of owners that edges lead across, and how many.
-
-    Args:
-        owner: Owner of each node (N,), −1 = none.
-        edges: Pairs of nodes (E, 2).
-        owners: Number of owners S.
-
-    Returns:
-        Pairs (B, 2), i < j, in ascending order, and the number of edges across each (B,).
-    """
+def _count_borders(owner: Index, edges: Index, owners: int) -> tuple[Index, Array]:
+    """Pairs (B, 2), ascending, of owners that edges (E, 2) lead across, and how many do; owner −1 = none."""
     first, second = owner[edges].T
     across = (first != second) & (first >= 0) & (second >= 0)
     first, second = first[across], second[across]
@@ -242,7 +219,7 @@ def count_borders(owner: Index, edges: Index, owners: int) -> tuple[Index, Array
     return np.stack(np.divmod(keys, owners), axis=-1), lengths.astype(np.float64)
 
 
-def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
+def _border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
     """Attraction (B,) of surfels over each border: 1 flat or convex, 0 at the limit, down to −2 beyond it."""
     i, j = pairs.T
     between = surfels.centres[j] - surfels.centres[i]
@@ -257,12 +234,12 @@ def border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig
 def _with_steps(
     pairs: Index, attraction: Array, lengths: Array, apart: Index, apart_lengths: Array, count: int
 ) -> tuple[Index, Array, Array]:
-    """Borders with their mean attraction and length once the depth steps along them repel."""
+    """Borders once depth steps along them repel, each as much as flat surface attracts."""
     if len(apart) == 0:
         return pairs, attraction, lengths
     keys = np.concatenate([pairs, apart]) @ np.array([count, 1])
     keys, inverse = np.unique(keys, return_inverse=True)
-    total = np.bincount(inverse, np.concatenate([attraction * lengths, STEP_ATTRACTION * apart_lengths]))
+    total = np.bincount(inverse, np.concatenate([attraction * lengths, -apart_lengths]))
     length = np.bincount(inverse, np.concatenate([lengths, apart_lengths])).astype(np.float64)
     return np.stack(np.divmod(keys, count), axis=-1), total / length, length
 
@@ -364,7 +341,8 @@ def _absorb_slivers(
             break
         border = np.bincount(inverse, weights=np.concatenate([lengths[outer], lengths[outer]]))
         small, large = np.divmod(keys, len(cluster))
-        narrow = total[small] * EDGES_ACROSS < min_width * border
+        # On a grid with diagonals, three edges cross a border for each sample along it.
+        narrow = 3.0 * total[small] < min_width * border
         absorbed = (total[small] < total[large]) & (narrow | (total[small] < min_size))
         small, large, border = small[absorbed], large[absorbed], border[absorbed]
         order = np.lexsort((large, border, small))
@@ -388,48 +366,52 @@ def wide_parts(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
     return wide
 
 
-def convex_together(first: Array, second: Array, share: float, config: SegmentationConfig) -> bool:
-    """Whether hardly a point of one patch rises above the tangent plane of a point of the other.
+def convex_together(
+    points: Array, normals: Array, first: Index, second: Index, share: float, config: SegmentationConfig
+) -> bool:
+    """Whether hardly a sample of one patch rises above the tangent plane of one of the other.
 
     Args:
-        first: Points [m] and unit normals (N, 6).
-        second: Points [m] and unit normals (M, 6).
-        share: Greatest share of the pairs of points of which one rises [1].
+        points: Samples (N, 3) [m].
+        normals: Unit normals (N, 3).
+        first: Samples of the one.
+        second: Samples of the other.
+        share: Greatest share of the pairs of which one rises [1].
         config: How far counts: a height, and an angle as normals err.
     """
-    between = second[None, :, :3] - first[:, None, :3]
-    over = np.einsum("nmi,ni->nm", between, first[:, 3:])
-    under = -np.einsum("nmi,mi->nm", between, second[:, 3:])
+    between = points[second] - points[first, None]
+    over = np.einsum("nmi,ni->nm", between, normals[first])
+    under = -np.einsum("nmi,mi->nm", between, normals[second])
     bend = np.sin(np.radians(config.concavity)) * np.linalg.norm(between, axis=-1)
     return float((np.maximum(over, under) > config.rise + bend).mean()) <= share
 
 
-def hollowness(patch: Array) -> float:
-    """How much a patch looks inwards: mean cosine between its normals and the way to its middle.
+def hollowness(points: Array, normals: Array, part: NDArray[np.integer]) -> Array:
+    """How much parts look inwards: mean cosine between their normals and the way to their middle.
 
     0 on a plane, positive on the inside of a bowl, negative on the outside.
 
     Args:
-        patch: Points [m] and unit normals (N, 6).
+        points: Samples (N, 3) [m].
+        normals: Unit normals (N, 3).
+        part: Part of each (N,), 0 … P − 1.
+
+    Returns:
+        Of each part (P,); 0 of one without samples.
     """
-    inwards = transforms.unit(patch[:, :3].mean(axis=0) - patch[:, :3])
-    return float(np.einsum("ij,ij->i", inwards, patch[:, 3:]).mean())
+    sizes = np.maximum(np.bincount(part), 1)
+    middles = np.stack([np.bincount(part, x) for x in points.T], axis=-1) / sizes[:, None]
+    inwards = transforms.unit(middles[part] - points)
+    return np.bincount(part, np.einsum("ij,ij->i", inwards, normals)) / sizes
 
 
 def number_by_appearance(part: NDArray[np.integer]) -> NDArray[np.int32]:
     """Number the parts (N,) of samples 1 … n in the order of their first ones; negative = 0."""
-    first = np.full(int(part.max(initial=-1)) + 2, len(part))
-    first[part[::-1] + 1] = np.arange(len(part))[::-1]
-    known = np.flatnonzero(first[1:] < len(part))
-    number = np.zeros(len(first), dtype=np.int32)
-    number[known[np.argsort(first[1:][known])] + 1] = np.arange(1, len(known) + 1)
-    return number[np.maximum(part, -1) + 1]
-
-
-def _usual(distances: Array) -> float:
-    """Usual distance between neighbouring samples [m] of all there are (E,)."""
-    distances = distances[distances > 0.0]
-    return float(np.median(distances)) if len(distances) else np.inf
+    known = part >= 0
+    names, first = np.unique(part[known], return_index=True)
+    number = np.zeros(int(part.max(initial=-1)) + 2, dtype=np.int32)
+    number[names[np.argsort(first)] + 1] = np.arange(1, len(names) + 1)
+    return number[np.where(known, part, -1) + 1]
 
 
 def _roots(parent: Index) -> Index:
@@ -438,9 +420,3 @@ def _roots(parent: Index) -> Index:
     while not np.array_equal(roots, roots[roots]):
         roots = roots[roots]
     return roots
-
-
-def _sum_by(owner: Index, vectors: Array, count: int) -> Array:
-    """Sums (count, 3) of the vectors (N, 3) of each owner; −1 = none."""
-    sums = [np.bincount(owner + 1, vectors[:, axis], minlength=count + 1)[1:] for axis in range(3)]
-    return np.stack(sums, axis=-1)

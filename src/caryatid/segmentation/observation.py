@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.config import Config, SegmentationMethod, SurfaceConfig
+from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
@@ -19,9 +19,7 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 UP = np.array([0.0, 0.0, 1.0])
 """The world's vertical (3,)."""
 MAX_POINTS = 20_000
-"""Points of a view the surface is looked for in [1]; spread evenly, they give its height to 0.1 mm."""
-MAX_POINTS_KNOWN = 5000
-"""The same once the table is known [1]: as many of a first view's are the table's, the rest is floor."""
+"""Points of a view the surface is looked for in, where it is not known [1]; or nearly twice as many."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -153,13 +151,18 @@ def _points(
 ) -> tuple[Cloud, NDArray[np.intp]]:
     """Oriented points of a view, and their pixels; of a cloud, all there are.
 
-    What is further below the known support surface than that may be sought is left out.
+    What is further below the known support surface than that may be sought is left out, unless labelled.
     """
     if isinstance(source, Cloud):
         if len(source) == 0:
             raise PerceptionError(f"{source.name}: holds no points")
         return source, np.arange(len(source), dtype=np.intp)
-    among = None if known is None else _not_below(source, known, config.surface.search)
+    among = None
+    if known is not None:
+        among = source.valid & (known.height_of_pixels(source) > -config.surface.search)
+        if source.labels is not None:
+            among |= source.labels > 0
+        among = among if among.any() else None
     points, normals, pixels = oriented_points(source, config.cloud, among=among)
     if len(points) == 0:
         limits = f"{config.cloud.min_depth:g}–{config.cloud.max_depth:g} m"
@@ -167,19 +170,6 @@ def _points(
     rgb = None if source.rgb is None else np.take(source.rgb.reshape(-1, 3), pixels, axis=0)
     eye = None if source.T_world_camera is None else source.T_world_camera[:3, 3]
     return Cloud(points, normals, None, rgb, eye, source.name), pixels
-
-
-def _not_below(view: View, surface: SupportSurface, depth: float) -> NDArray[np.bool_] | None:
-    """Pixels (H, W) that are labelled, or not this far [m] below a surface; None where there are none."""
-    x, y, z = transforms.rotate(transforms.invert(view.pose), surface.normal_world).astype(np.float32)
-    rows, columns = (np.arange(n, dtype=np.float32) for n in view.depth.shape)
-    across = x * (columns - np.float32(view.K[0, 2])) / np.float32(view.K[0, 0])
-    along = y * (rows - np.float32(view.K[1, 2])) / np.float32(view.K[1, 1]) + z
-    height = view.depth * (across + along[:, None])
-    among = (height > np.float32(-depth - surface.height(view.pose[:3, 3]))) & view.valid
-    if view.labels is not None:
-        among |= view.labels > 0
-    return among if among.any() else None
 
 
 def levelled(view: View, config: Config, rng: np.random.Generator, *, use_labels: bool = False) -> View:
@@ -215,25 +205,15 @@ def _surface(
             f"{cloud.name}: every point has the label of an object, none is left for the table; give the "
             "table label 0 (of a cloud --label-divisor may do so), or use --segmentation auto"
         )
-    if known is None:
-        return _found(_spread(cloud, loose, MAX_POINTS), up, config.surface, rng, PLANES)
-    near = np.abs(known.height(cloud.points_world)) < config.surface.search
+    if known is not None:
+        loose &= np.abs(known.height(cloud.points_world)) < config.surface.search
+    # Spread evenly, 20,000 points give its height to 0.1 mm. Once it is known a quarter will do: as many of a
+    # first view's are the table's, the rest is floor.
+    index, count, planes = np.flatnonzero(loose), *((MAX_POINTS, PLANES) if known is None else (5000, 1))
+    some = cloud.select(index[:: max(1, len(index) // count)])
     try:
-        return _found(_spread(cloud, loose & near, MAX_POINTS_KNOWN), up, config.surface, rng, 1)
-    except PerceptionError:
-        return known
-
-
-def _spread(cloud: Cloud, among: NDArray[np.bool_], count: int) -> Cloud:
-    """About this many, and less than twice as many, of some points (N,), spread evenly."""
-    index = np.flatnonzero(among)
-    return cloud.select(index[:: max(1, len(index) // count)])
-
-
-def _found(
-    cloud: Cloud, up: Array | None, config: SurfaceConfig, rng: np.random.Generator, planes: int
-) -> SupportSurface:
-    try:
-        return find_support_surface(cloud.points_world, cloud.normals_world, up, config, rng, planes)
+        return find_support_surface(some.points_world, some.normals_world, up, config.surface, rng, planes)
     except PerceptionError as error:
+        if known is not None:
+            return known
         raise PerceptionError(f"{cloud.name}: {error}") from None

@@ -5,37 +5,29 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import CloudConfig, SegmentationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import View
 
 Grid = tuple[slice, slice]
 Labels = NDArray[np.int32]
-Image = NDArray[np.float32]
 
 NORMAL_SIZE = 0.013
-"""Side of the narrow window of a sample's tangent plane, at the objects' median distance [m]."""
-NORMAL_RADIUS = (2, 6)
-"""Least and greatest radius of that window [px]: fewer leave the noise, more cost time."""
-WIDE = (5.0, 0.004, 0.0)
-"""The wide window the plane is refined over: radius [px], tolerance [1/m; 3σ of the sensor at 2 m], slope."""
-LEAST_SHARE = 0.25
-"""Share of a narrow window whose readings a first plane must have [1]; fewer are a corner, or flying."""
-LEAST_TAPS = 9.0
-"""Readings a plane is refined from at the least [1]; three determine it, three times as many even it out."""
-LEAST_SPREAD = 12.0
-"""Least determinant of their spread per reading [px⁴]; readings on a line determine no plane."""
-ON_A_LINE = 0.01
-"""The same below which readings lie on one line, from which no first plane is taken [px⁴]."""
-ROUNDS = 2
-"""How often a plane is refined over the wide window [1]; the readings that are its own then hardly change."""
+"""Side of the narrow window of a sample's tangent plane, at the objects' median distance [m]; of 5 px at
+least, as fewer leave the noise, and of 13 px at most, as more cost time."""
+WIDE_RADIUS, WIDE_TOLERANCE = 5, 0.004
+"""Radius [px] of the wide window the plane is refined over, and how near its readings lie to the plane [1/m];
+3σ of the sensor at 2 m."""
 MARGIN = 16
 """Pixels beyond the foreground that gaps may look at [px]."""
+SHARES = 16
+"""Shares of the samples that threads take [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -62,10 +54,6 @@ class Samples:
     rgb: NDArray[np.uint8] | None
     K: Array
 
-    def patch(self, own: NDArray[np.bool_] | NDArray[np.intp]) -> Array:
-        """Points [m] and unit normals (K, 6) of some of the samples."""
-        return np.concatenate([self.points_camera[own], self.normals_camera[own]], axis=1)
-
     def image(self, part: Labels) -> Labels:
         """Lay out the parts (N,) of the samples on the grid (H, W), 0 elsewhere."""
         image = np.zeros(self.places.shape, dtype=np.int32)
@@ -84,41 +72,17 @@ def find_foreground(
         config: Heights, and the margin around the surface's outline.
         clouds: Working range.
     """
-    T = np.eye(4) if view.T_world_camera is None else transforms.invert(view.T_world_camera)
-    surface = surface.moved(T)
-    up, corners = surface.normal_world, surface.outline_world
-    outward = np.cross(transforms.unit(np.roll(corners, -1, axis=0) - corners), up)
-    sides = np.column_stack([outward, -np.einsum("ij,ij->i", outward, corners)])
-    planes = np.concatenate([np.append(up, -up @ surface.point_world)[None], sides])
-    height, width = view.depth.shape
-    x, y = (np.arange(width) - view.K[0, 2]) / view.K[0, 0], (np.arange(height) - view.K[1, 2]) / view.K[1, 1]
-    limits = clouds.min_depth, clouds.max_depth, config.clearance, config.max_height, config.margin
+    height, rounding = surface.height_of_pixels(view), 1e-4
+    maybe = (height > config.clearance - rounding) & (height < config.max_height + rounding)
+    pixels = np.flatnonzero(maybe & (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth))
+    row, column = np.divmod(pixels, view.depth.shape[1])
+    points = _rays(view.K, row, column) * np.take(view.depth, pixels).astype(np.float64)[:, None]
+    T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
     foreground = np.zeros(view.depth.shape, dtype=np.bool_)
-    _find_over(view.depth, x, y, planes, np.array(limits), foreground)
+    foreground.ravel()[pixels] = surface.over(
+        transforms.transform(T, points), config.clearance, config.max_height, config.margin
+    )
     return foreground
-
-
-@njit(cache=True)
-def _find_over(depth, x, y, planes, limits, over):  # type: ignore[no-untyped-def]
-    """Mark pixels (H, W) over the first plane and not outside the other ones, n·p + d = 0 (M, 4).
-
-    Limits (5,) are least and greatest depth and height and the greatest distance outside; a pixel's ray has
-    the slopes x (W,) and y (H,).
-    """
-    low, high = np.float32(limits[0]), np.float32(limits[1])
-    for row in range(len(y)):
-        for col in range(len(x)):
-            z = depth[row, col]
-            if not low <= z <= high:
-                continue
-            height = z * (planes[0, 0] * x[col] + planes[0, 1] * y[row] + planes[0, 2]) + planes[0, 3]
-            if not limits[2] < height < limits[3]:
-                continue
-            inside = True
-            for k in range(1, len(planes)):
-                slope = planes[k, 0] * x[col] + planes[k, 1] * y[row] + planes[k, 2]
-                inside = inside and z * slope + planes[k, 3] <= limits[4]
-            over[row, col] = inside
 
 
 def take_samples(
@@ -140,10 +104,12 @@ def take_samples(
         config: The grid.
         clouds: How far readings count.
     """
-    grid = _around(foreground, config.stride)
+    rows, columns = np.flatnonzero(foreground.any(axis=1)), np.flatnonzero(foreground.any(axis=0))
+    corner = [max(0, int(i[0]) - MARGIN) // config.stride * config.stride for i in (rows, columns)]
+    ends = int(rows[-1]) + MARGIN + 1, int(columns[-1]) + MARGIN + 1
+    grid = slice(corner[0], ends[0], config.stride), slice(corner[1], ends[1], config.stride)
     places, depth = foreground[grid].copy(), view.depth[grid]
-    corner = np.array([side.start for side in grid])
-    row, column = np.argwhere(places).T * config.stride + corner[:, None]
+    row, column = np.argwhere(places).T * config.stride + np.array(corner)[:, None]
     rays = _rays(view.K, row, column)
     if view.normals_camera is None:
         scale = view.K[0, 0] / float(np.median(depth[places]))
@@ -192,76 +158,60 @@ def _tangent_planes(
     Returns:
         c, a, b (N, 3) [1/m, 1/m per px]; zero where readings are too few for a first plane.
     """
-    radius = int(np.clip(np.floor(NORMAL_SIZE * scale / 2.0), *NORMAL_RADIUS))
+    radius = int(np.clip(np.floor(NORMAL_SIZE * scale / 2.0), 2, 6))
     radius = min(radius, max(1, round((clouds.normal_size * scale - 1.0) / 2.0)))
-    windows = np.array([(radius, clouds.edge_jump, clouds.max_slope), WIDE])
     counts = (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     inverse_depth = np.zeros(view.depth.shape, dtype=np.float32)
     np.divide(np.float32(1.0), view.depth, out=inverse_depth, where=counts)
-    planes = np.zeros((len(row), 3))
-    _fit_planes(inverse_depth, np.column_stack([row, column]), windows, planes)
+    pixels, jump, slope = np.column_stack([row, column]), clouds.edge_jump, clouds.max_slope
+    shares = np.array_split(pixels, SHARES)
+    return np.concatenate(
+        on_threads(lambda k: _fit_planes(inverse_depth, shares[k], radius, jump, slope), SHARES)
+    )
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-def]
+    """Fit the planes (N, 3) of some pixels (N, 2) as `_tangent_planes` says."""
+    planes = np.zeros((len(pixels), 3))
+    side = 2.0 * radius + 1.0
+    for n in range(len(pixels)):
+        row, column, plane = pixels[n, 0], pixels[n, 1], planes[n]
+        own = float(image[row, column])
+        plane[0] = own
+        # A quarter of the window is needed, less is a corner, or flying; and more than readings on a line.
+        known = _refit(image, row, column, radius, jump, slope, 0.25 * side * side, 0.01, plane)
+        if not known or plane[0] <= 0.0:
+            plane[:] = 0.0
+            continue
+        plane[1] *= own / plane[0]
+        plane[2] *= own / plane[0]
+        plane[0] = own
+        for _ in range(2):
+            # Three times the readings that determine a plane even out their noise, if not on a line.
+            if not _refit(image, row, column, WIDE_RADIUS, WIDE_TOLERANCE, 0.0, 9.0, 12.0, plane):
+                break
     return planes
 
 
-def _around(mask: NDArray[np.bool_], stride: int) -> Grid:
-    """Rows and columns of a mask with a margin, every so many."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    top, left = (max(0, int(i[0]) - MARGIN) // stride * stride for i in (rows, columns))
-    return slice(top, int(rows[-1]) + MARGIN + 1, stride), slice(left, int(columns[-1]) + MARGIN + 1, stride)
+@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+def _refit(image, row, column, radius, tolerance, slope, least, spread, plane):  # type: ignore[no-untyped-def]
+    """Fit a plane (3,) to the readings of a window that lie near it, and say if they determine one.
 
-
-@njit(cache=True, parallel=True)
-def _fit_planes(image: Image, pixels: NDArray[np.intp], windows: Array, planes: Array) -> None:
-    """Do for each pixel as `_tangent_planes` says."""
-    for number in prange(len(pixels)):
-        _fit_plane(image, pixels[number, 0], pixels[number, 1], windows, planes[number])
-
-
-@njit(cache=True, error_model="numpy")
-def _fit_plane(image: Image, row: int, column: int, windows: Array, plane: Array) -> None:
-    """Fit one plane (3,); the windows (2, 3) are the narrow and the wide one."""
-    own, side = float(image[row, column]), 2.0 * windows[0, 0] + 1.0
-    plane[0], plane[1], plane[2] = own, 0.0, 0.0
-    known = _refit(image, row, column, windows[0], LEAST_SHARE * side * side, ON_A_LINE, plane)
-    if not known or plane[0] <= 0.0:
-        plane[0], plane[1], plane[2] = 0.0, 0.0, 0.0
-        return
-    plane[1] *= own / plane[0]
-    plane[2] *= own / plane[0]
-    plane[0] = own
-    for _ in range(ROUNDS):
-        if not _refit(image, row, column, windows[1], LEAST_TAPS, LEAST_SPREAD, plane):
-            return
-
-
-@njit(cache=True, error_model="numpy")
-def _refit(
-    image: Image,
-    row: int,
-    column: int,
-    window: Array,
-    least: float,
-    spread: float,
-    plane: Array,
-) -> bool:
-    """Fit a plane (3,) to the readings of a window (3,) that are its own, and say if they determine one."""
+    They do if there are at least so many, and the determinant of their spread a reading is no less [px⁴].
+    """
     height, width = image.shape
     c, a, b = plane[0], plane[1], plane[2]
-    radius, tolerance, slope = int(window[0]), window[1], window[2]
     n = su = sv = suu = suv = svv = sw = suw = svw = 0.0
-    for down in range(-radius, radius + 1):
-        if row + down < 0 or row + down >= height:
-            continue
+    left, right = max(-radius, -column), min(radius, width - 1 - column)
+    for down in range(max(-radius, -row), min(radius, height - 1 - row) + 1):
         dv = float(down)
         line_n = line_u = line_uu = line_w = line_uw = 0.0
-        for right in range(-radius, radius + 1):
-            if column + right < 0 or column + right >= width:
-                continue
-            du = float(right)
-            reading = image[row + down, column + right]
+        for across in range(left, right + 1):
+            du = float(across)
+            reading = image[row + down, column + across]
             off = reading - (c + a * du + b * dv)
-            distance = abs(du) if abs(du) > abs(dv) else abs(dv)
-            if reading > 0.0 and abs(off) <= tolerance + slope * distance:
+            if reading > 0.0 and abs(off) <= tolerance + slope * max(abs(du), abs(dv)):
                 line_n += 1.0
                 line_u += du
                 line_uu += du * du

@@ -9,8 +9,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
@@ -32,43 +30,11 @@ from caryatid.sensing.views import Cloud, View
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
-NEIGHBOURS = 10
-"""Nearest points a point of an unorganised cloud is joined to [1]."""
-PLAIN_COLOUR = 0.02
-"""Usual distance of the shares of red, green and blue from their mean up to which a piece is plain [1]."""
 OTHER_COLOUR = 0.08
-"""Distance between the mean shares beyond which two plain colours differ [1]; four times their spread."""
-PLAIN_SHARE = 0.9
-"""Least share of a part that its plain pieces make up where it is cut between them [1]."""
-BORDER_BEND = 0.25
-"""Greatest width over length of a border between colours that is straight [1]; round bodies bend it."""
-HOLLOW = 0.2
-"""Mean cosine between normals and the way inwards that makes a part the inside of something [1]; a bowl's
-has 0.6, flat faces and their noise 0.05."""
-RIM = 0.025
-"""Difference in height of the tops of an inside and of what it hangs in [m]; a rim's width and noise."""
+"""Distance between the mean shares of red, green and blue beyond which two plain colours differ [1]; a plain
+one spreads by a quarter of it."""
 MEETING = 5
 """Rows and columns of samples on which two parts must meet to be taken for one [1]; 3 cm at 1.5 m."""
-CONCAVE = 0.1
-"""Share of pairs of samples that may be concave where two parts are one [1]; creases are rounded."""
-COMPARED = 60
-"""Samples of a part, about, that are compared with another's [1]; bounds time."""
-HYPOTHESES = 40
-"""RANSAC hypotheses a shape when a merge is judged [1]; samples are evened out and hold few outliers."""
-FIT_POINTS = 300
-"""Points a merge is judged by [1]."""
-DISTANCE = 0.006
-"""Distance within which a sample lies at a shape [m]; 3σ of the evened out samples."""
-COSINE = 0.7
-"""Least cosine of the angle between the normals of a sample and of the shape it lies at [1]; 45°."""
-LOSS = 0.1
-"""Share of a part's samples that its own shape explains and the joint one need not [1]."""
-EMPTY = 0.1
-"""Share of a joint shape's visible faces that may lie where the camera saw through [1]; edges fray."""
-EDGE = 2
-"""Pixels at either end of a gap whose readings mix both sides and say nothing [px]."""
-TURNS = ((0, 1), (0, -1), (1, 0), (-1, 0))
-"""Rows down and columns right of the neighbours labels are taken from, one after the other."""
 
 
 def segment(
@@ -107,13 +73,8 @@ def segment(
     part = number_by_appearance(merge_occluded(samples, part, config, fit_config, rng) - 1)
     labels[samples.grid] = samples.image(part)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
-    labels[around] = spread_labels(
-        labels[around],
-        foreground[around],
-        view.depth[around],
-        2.0 * config.edge_jump,
-        2 * config.stride,
-    )
+    jump, rounds = np.float32(2.0 * config.edge_jump), 2 * config.stride
+    _spread_labels(labels[around], foreground[around], view.depth[around], jump, rounds)
     return labels
 
 
@@ -130,7 +91,7 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
     if len(index) < 2:
         return labels
     points = cloud.points_world[index]
-    count = min(NEIGHBOURS + 1, len(index))
+    count = min(11, len(index))  # Itself and ten neighbours.
     distance, neighbour = cKDTree(points).query(points, k=count)
     source = np.repeat(np.arange(len(index)), count - 1)
     target, near = neighbour[:, 1:].ravel(), distance[:, 1:].ravel() <= config.reach
@@ -142,33 +103,18 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
     return labels
 
 
-def spread_labels(
-    labels: Labels, foreground: Mask, depth: NDArray[np.float32], jump: float, rounds: int
-) -> Labels:
-    """Bring labels to the foreground pixels without one that lie no depth step from a labelled neighbour.
-
-    In each round a pixel takes the label to its right, then others to their left, below and above.
-
-    Args:
-        labels: Label image (H, W), 0 = none.
-        foreground: Pixels to label (H, W).
-        depth: Readings (H, W) [m].
-        jump: Difference in depth beyond which neighbours lie on two surfaces, at 1 m and times z² [m].
-        rounds: How often, each a pixel further.
-    """
-    labels = labels.copy()
-    waiting = np.flatnonzero(foreground & (labels == 0))
-    _spread(labels, waiting, np.ascontiguousarray(depth), np.float32(jump), np.array(TURNS), rounds)
-    return labels
-
-
 @njit(cache=True)
-def _spread(labels, waiting, depth, jump, turns, rounds):  # type: ignore[no-untyped-def]
-    """Label the waiting places (N,), which are in ascending order."""
+def _spread_labels(labels, foreground, depth, jump, rounds):  # type: ignore[no-untyped-def]
+    """Bring labels (H, W) to foreground pixels without one that lie no depth step from a labelled neighbour.
+
+    In each round a pixel takes the label to its right, then others to their left, below and above. There is a
+    step where depth differs by more than a jump at 1 m, times z² [m].
+    """
     height, width = labels.shape
+    waiting = np.flatnonzero(foreground & (labels == 0))
     left = len(waiting)
     for turn in range(4 * rounds):
-        down, right = turns[turn % 4]
+        down, right = ((0, 1), (0, -1), (1, 0), (-1, 0))[turn % 4]
         for step in range(left):
             # Against the direction labels are taken from, so that none moves on in the same turn.
             place = waiting[step] if down + right > 0 else waiting[left - 1 - step]
@@ -189,7 +135,7 @@ def _spread(labels, waiting, depth, jump, turns, rounds):  # type: ignore[no-unt
 
 
 def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labels:
-    """Cut parts that consist of plainly coloured pieces with straight borders, and of nothing else.
+    """Cut parts that consist of plainly coloured pieces with straight borders, and of hardly anything else.
 
     This tells flush boxes apart. A printed box has more colours, or borders all over; it stays whole.
 
@@ -205,36 +151,38 @@ def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labe
     shares: Array = rgb.astype(np.float64) + 1.0
     shares /= shares.sum(axis=-1, keepdims=True)  # Shading leaves the shares of the colours as they are.
     patch = _colour_patches(labels, shares)
+    sizes, part_of = np.bincount(patch.ravel()), np.zeros(int(patch.max()) + 1, dtype=np.int32)
+    part_of[patch] = labels
+    sizes[0] = 0
     for part in range(1, int(labels.max(initial=0)) + 1):
-        own = labels == part
-        patches, sizes = np.unique(patch[own], return_counts=True)
-        pieces, in_pieces = patches[sizes >= min_size], sizes[sizes >= min_size].sum()
-        if len(pieces) < 2 or in_pieces < PLAIN_SHARE * np.count_nonzero(own):
+        pieces = np.flatnonzero((part_of == part) & (sizes >= min_size))
+        if len(pieces) < 2 or sizes[pieces].sum() < 0.9 * sizes[part_of == part].sum():
             continue
-        colours = [shares[patch == piece] for piece in pieces]
-        if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours) > PLAIN_COLOUR:
+        colours = {k: shares[patch == k] for k in pieces.tolist()}
+        if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours.values()) > OTHER_COLOUR / 4.0:
             continue
         loose = ~np.isin(patch, pieces)
         nearest = ndimage.distance_transform_edt(loose, return_distances=False, return_indices=True)
-        piece_of = np.where(own, patch[tuple(nearest)], -1)
-        if _borders_are_clean(piece_of, {k: c.mean(axis=0) for k, c in zip(pieces, colours, strict=True)}):
+        piece_of = np.where(labels == part, patch[tuple(nearest)], -1)
+        if _borders_are_clean(piece_of, {k: c.mean(axis=0) for k, c in colours.items()}):
             for piece in pieces[1:]:
                 result[piece_of == piece] = result.max() + 1
     return result
 
 
 def _colour_patches(labels: Labels, shares: Array) -> NDArray[np.intp]:
-    """Connected patches (H, W) of one part (H, W) in which the colours (H, W, 3) of neighbours are alike."""
-    place = np.arange(labels.size).reshape(labels.shape)
-    pairs = []
-    for here, there in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
-        one = (labels[here] == labels[there]) & (labels[here] > 0)
-        step = np.linalg.norm(shares[here][one] - shares[there][one], axis=-1)
-        alike = step < OTHER_COLOUR / 2.0
-        pairs.append(np.stack([place[here][one][alike], place[there][one][alike]]))
-    ends = np.concatenate(pairs, axis=1)
-    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(labels.size, labels.size))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp).reshape(labels.shape)
+    """Connected patches (H, W), 1 … n, of one part in which neighbours' colours (H, W, 3) are alike."""
+    # Between each two pixels is a place that is set where they are connected.
+    height, width = labels.shape
+    connected = np.zeros((2 * height - 1, 2 * width - 1), dtype=np.bool_)
+    connected[::2, ::2] = labels > 0
+    down, right = np.s_[1:], np.s_[:, 1:]
+    up, left = np.s_[:-1], np.s_[:, :-1]
+    for here, there, between in ((down, up, np.s_[1::2, ::2]), (right, left, np.s_[::2, 1::2])):
+        step = shares[here] - shares[there]
+        alike = np.einsum("hwc,hwc->hw", step, step) < (OTHER_COLOUR / 2.0) ** 2
+        connected[between] = alike & (labels[here] == labels[there]) & (labels[here] > 0)
+    return np.asarray(ndimage.label(connected)[0][::2, ::2], dtype=np.intp)
 
 
 def _borders_are_clean(piece_of: NDArray[np.intp], colours: dict[int, Array]) -> bool:
@@ -244,9 +192,8 @@ def _borders_are_clean(piece_of: NDArray[np.intp], colours: dict[int, Array]) ->
         if len(border) < 3:
             continue
         bend, length = np.sqrt(np.linalg.eigvalsh(np.cov(border.T)))
-        if np.linalg.norm(colours[first] - colours[second]) <= OTHER_COLOUR:
-            return False
-        if bend > 1.0 + BORDER_BEND * length:
+        alike = np.linalg.norm(colours[first] - colours[second]) <= OTHER_COLOUR
+        if alike or bend > 1.0 + length / 4.0:  # Round bodies bend their borders more.
             return False
     return True
 
@@ -276,7 +223,8 @@ def merge_occluded(
     """
     part = _insides_merged(samples, part)
     inverse_depth = _inverse_depth(samples, part > 0)
-    quick = replace(fit_config, hypotheses=HYPOTHESES, polish=1, max_points=FIT_POINTS)
+    # Samples are evened out and hold few outliers.
+    quick = replace(fit_config, hypotheses=40, polish=1, max_points=300)
     refused: set[tuple[int, int]] = set()
     while True:
         pairs = [
@@ -286,7 +234,10 @@ def merge_occluded(
         ]
         asked = list(dict.fromkeys(key for a, b in pairs for key in ((a,), (b,), (a, b))))
         masks = [np.isin(part, key) for key in asked]
-        fits = dict(zip(asked, _fits(samples, masks, quick, rng), strict=True))
+        oriented = [Oriented(samples.points_camera[own], samples.normals_camera[own]) for own in masks]
+        rngs = [np.random.default_rng(seed) for seed in rng.integers(2**63, size=len(masks))]
+        found = candidates(oriented, config=quick, rngs=rngs)
+        fits = {key: fits[0] if fits else None for key, fits in zip(asked, found, strict=True)}
         for small, large in pairs:
             alone = [(part == number, fits[number,]) for number in (small, large)]
             if _is_one(fits[small, large], alone, samples):
@@ -301,9 +252,9 @@ def merge_occluded(
 def _insides_merged(samples: Samples, part: Labels) -> Labels:
     """Give each hollow part to the neighbour with the longest common border whose top is as high."""
     merged, count = part.copy(), int(part.max(initial=0)) + 1
-    hollow = np.zeros(count, dtype=bool)
-    for number in range(1, count):
-        hollow[number] = hollowness(samples.patch(part == number)) > HOLLOW
+    # The inside of a bowl has 0.6, flat faces and their noise 0.05.
+    hollow = hollowness(samples.points_camera, samples.normals_camera, part) > 0.2
+    hollow[0] = False
     if not hollow.any():
         return merged
     top = np.array([np.quantile(samples.height[part == k], 0.95) if k else 0.0 for k in range(count)])
@@ -311,7 +262,8 @@ def _insides_merged(samples: Samples, part: Labels) -> Labels:
         image = samples.image(merged)
         around = ndimage.binary_dilation(samples.image(part) == number, np.ones((3, 3)), iterations=2)
         border = np.bincount(image[around], minlength=count)
-        border[hollow | (np.abs(top - top[number]) >= RIM)] = 0
+        # Tops differ by a rim's width and noise at the most.
+        border[hollow | (np.abs(top - top[number]) >= 0.025)] = 0
         border[0] = 0
         if border.max() >= MEETING:
             merged[part == number] = np.argmax(border)
@@ -344,37 +296,27 @@ def _hidden_pairs(
 
 
 def _is_convex(samples: Samples, part: Labels, pair: tuple[int, int], config: SegmentationConfig) -> bool:
-    """Whether hardly a sample of one part rises above the planes of the other."""
+    """Whether hardly a sample of one part rises above the planes of the other; creases are rounded."""
     own = [np.flatnonzero(part == number) for number in pair]
-    first, second = (samples.patch(index[:: max(1, len(index) // COMPARED)]) for index in own)
-    return convex_together(first, second, CONCAVE, config)
-
-
-def _fits(
-    samples: Samples, masks: list[Mask], config: FitConfig, rng: np.random.Generator
-) -> list[Fit | None]:
-    """The best shape for each choice (N,) of samples, each from a generator of its own."""
-    parts = [Oriented(samples.points_camera[own], samples.normals_camera[own]) for own in masks]
-    rngs = [np.random.default_rng(seed) for seed in rng.integers(2**63, size=len(masks))]
-    return [found[0] if found else None for found in candidates(parts, config=config, rngs=rngs)]
+    first, second = (index[:: max(1, len(index) // 60)] for index in own)
+    return convex_together(samples.points_camera, samples.normals_camera, first, second, 0.1, config)
 
 
 def _is_one(joint: Fit | None, alone: list[tuple[Mask, Fit | None]], samples: Samples) -> bool:
     """Whether a shape explains about as many samples of each part as its own and fills nothing seen empty."""
-    if joint is None or _seen_empty(joint.shape, samples) > EMPTY:
+    if joint is None or _seen_empty(joint.shape, samples) > 0.1:  # Edges fray.
         return False
     return all(
-        fit is not None
-        and _explained(joint.shape, samples, own) >= _explained(fit.shape, samples, own) - LOSS
+        fit is not None and _explained(joint.shape, samples, own) >= _explained(fit.shape, samples, own) - 0.1
         for own, fit in alone
     )
 
 
 def _explained(shape: Shape, samples: Samples, own: Mask) -> float:
-    """Share of a part's samples that lie at a shape and face as it does."""
+    """Share of a part's evened out samples that lie within 3σ of a shape and face as it does."""
     distance, outward = Primitives.of([shape]).gradient(0, samples.points_camera[own])
     cosine = np.sum(outward * samples.normals_camera[own], axis=1)
-    return float(((np.abs(distance) < DISTANCE) & (cosine > COSINE)).mean())
+    return float(((np.abs(distance) < 0.006) & (cosine > 0.7)).mean())
 
 
 def _seen_empty(shape: Shape, samples: Samples) -> float:
@@ -414,6 +356,7 @@ def occlusion_gaps(labels: Labels, inverse_depth: Array, jump: float, longest: i
 
 @njit(cache=True)
 def _count_gaps(labels, inverse_depth, jump, longest, votes):  # type: ignore[no-untyped-def]
+    """Add one for each row and pair of parts; two pixels at either end of a gap mix both sides."""
     height, width = labels.shape
     for row in range(height):
         for i in range(width - 1):
@@ -430,7 +373,7 @@ def _count_gaps(labels, inverse_depth, jump, longest, votes):  # type: ignore[no
                     here = inverse_depth[row, k]
                     nearer = here > inverse_depth[row, i] + slope * (k - i) + jump
                     some = some or nearer
-                    if here > 0.0 and not nearer and k - i > EDGE and j - k > EDGE:
+                    if here > 0.0 and not nearer and k - i > 2 and j - k > 2:
                         hidden = False
                         break
                 if hidden and some:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -15,25 +16,12 @@ from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
+from caryatid.sensing.views import View
 
 Mask = NDArray[np.bool_]
 
-HYPOTHESES = 400
-"""RANSAC hypotheses a plane [1]; they find a plane of 20 % of the points with confidence 0.96."""
-SAMPLE = 4000
-"""Points the hypotheses are scored on [1]; spread evenly over the cloud."""
 PLANES = 6
 """Horizontal planes looked at where the table is not known [1]."""
-REFINEMENTS = 4
-"""Least-squares fits of a plane to its inliers, one after the other [1]."""
-CELL = 0.03
-"""Grid on a plane by which its area is measured [m]; above the points' spacing at 3 m."""
-MAX_CELLS = 1000
-"""Most cells along a plane's grid [1]; bounds memory where a cloud is not in metres."""
-STOREY_SHARE = 0.05
-"""Least share of a floor's points that the table above it has [1]; less is a shelf behind."""
-THICKNESS = 0.04
-"""Thickness of the box the table top is modelled by [m]; only its top counts."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -56,6 +44,20 @@ class SupportSurface:
         """Signed height (...,) [m] of points (..., 3) over the surface."""
         return (points_world - self.point_world) @ self.normal_world
 
+    def height_of_pixels(self, view: View) -> NDArray[np.float32]:
+        """Height (H, W) [m] over the surface of what each pixel of a view shows, in single precision.
+
+        Args:
+            view: The view; without a pose, the surface is in the camera frame. Without a reading a pixel has
+                the camera's height.
+        """
+        T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
+        x, y, z = (self.normal_world @ T[:3, :3]).astype(np.float32)
+        rows, columns = (np.arange(n, dtype=np.float32) for n in view.depth.shape)
+        across = x * (columns - np.float32(view.K[0, 2])) / np.float32(view.K[0, 0])
+        along = y * (rows - np.float32(view.K[1, 2])) / np.float32(view.K[1, 1]) + z
+        return view.depth * (across + along[:, None]) + np.float32(self.height(T[:3, 3]))
+
     def over(self, points_world: Array, low: float, high: float, margin: float) -> Mask:
         """Which points (N, 3) [m] are over the outline, or no further than the margin [m] outside it.
 
@@ -65,17 +67,13 @@ class SupportSurface:
             high: Greatest height [m].
             margin: Distance outside the lines of all sides within which points still count [m].
         """
-        axes = np.concatenate([_basis(self.normal_world), self.normal_world[None]])
-        points, over = np.ascontiguousarray(points_world), np.zeros(len(points_world), dtype=np.bool_)
-        _find_over(points, self.point_world, axes, self._sides(), low, high, margin, over)
-        return over
-
-    def _sides(self) -> Array:
-        """Outward unit normal, in the plane's coordinates, and offset [m] of each side (M, 3)."""
-        corners = (self.outline_world - self.point_world) @ _basis(self.normal_world).T
+        basis = _basis(self.normal_world)
+        corners = (self.outline_world - self.point_world) @ basis.T
         edges = transforms.unit(np.roll(corners, -1, axis=0) - corners)
         outward = np.stack([edges[:, 1], -edges[:, 0]], axis=-1)
-        return np.concatenate([outward, np.einsum("ij,ij->i", outward, corners)[:, None]], axis=-1)
+        sides = np.concatenate([outward, np.einsum("ij,ij->i", outward, corners)[:, None] + margin], axis=-1)
+        axes = np.concatenate([basis, self.normal_world[None]])
+        return _find_over(np.ascontiguousarray(points_world), self.point_world, axes, sides, low, high)
 
     def moved(self, T: Array) -> SupportSurface:
         """Return the surface moved by a rigid transform (4, 4) of the world."""
@@ -87,18 +85,13 @@ class SupportSurface:
         )
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Plane:
+class _Plane(NamedTuple):
     """A plane n·p = offset, the points on it, and how much of it is seen [m²]."""
 
     normal: Array
     offset: float
     inliers: Mask
     area: float
-
-    def height(self, up: Array) -> float:
-        """Where the plane cuts the line along `up` through the origin [m]."""
-        return float(self.offset / (self.normal @ up))
 
 
 def find_support_surface(
@@ -129,15 +122,21 @@ def find_support_surface(
     """
     points, normals = np.asarray(cloud_points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     if up is None:
-        everywhere = np.ones(len(points), dtype=bool)
-        largest = _largest_plane(points, normals, everywhere, None, config, rng)
-        if largest is None:
-            raise PerceptionError(_nothing_found(len(points), config))
-        up = largest.normal
-    candidates = _horizontal_planes(points, normals, transforms.unit(up), config, rng, max_planes)
-    if not candidates:
-        raise PerceptionError(_nothing_found(len(points), config))
-    return _surface(points, _choose_table(candidates, transforms.unit(up), config), config)
+        largest = _largest_plane(points, normals, np.ones(len(points), dtype=bool), None, config, rng)
+        up = None if largest is None else largest.normal
+    planes: list[_Plane] = []
+    if up is not None:
+        up = transforms.unit(up)
+        left = normals @ up > np.cos(np.radians(config.max_deviation))
+        while len(planes) < max_planes and (plane := _largest_plane(points, normals, left, up, config, rng)):
+            planes.append(plane)
+            left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
+    if up is None or not planes:
+        raise PerceptionError(
+            f"no support surface: no level plane holds {config.min_points} of the {len(points)} points; "
+            "the table top must be in view"
+        )
+    return _surface(points, _choose_table(planes, up, config))
 
 
 def refitted(
@@ -155,40 +154,25 @@ def refitted(
     normal = surface.normal_world
     offset = float(normal @ surface.point_world)
     plane = _refine(points, normals, np.ones(len(points), dtype=bool), normal, offset, up, config)
-    return None if plane is None else _surface(points, plane, config)
-
-
-def _horizontal_planes(
-    points: Array,
-    normals: Array,
-    up: Array,
-    config: SurfaceConfig,
-    rng: np.random.Generator,
-    max_planes: int,
-) -> list[_Plane]:
-    left = normals @ up > np.cos(np.radians(config.max_deviation))
-    planes: list[_Plane] = []
-    while len(planes) < max_planes:
-        plane = _largest_plane(points, normals, left, up, config, rng)
-        if plane is None:
-            break
-        planes.append(plane)
-        left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
-    return planes
+    return None if plane is None else _surface(points, plane)
 
 
 def _choose_table(planes: list[_Plane], up: Array, config: SurfaceConfig) -> _Plane:
-    def is_floor(plane: _Plane) -> bool:
-        return any(
-            other.area >= config.min_area
-            and other.height(up) > plane.height(up) + config.storey
-            and other.inliers.sum() >= STOREY_SHARE * plane.inliers.sum()
-            for other in planes
+    """The plane with most points among those that have no table a storey above them."""
+    # Where each cuts the line along `up` through the origin. A shelf behind has few points for a table.
+    heights = [plane.offset / (plane.normal @ up) for plane in planes]
+    counts = [np.count_nonzero(plane.inliers) for plane in planes]
+    sizeable = [plane.area >= config.min_area for plane in planes]
+    every = range(len(planes))
+    standing = [
+        k
+        for k in every
+        if not any(
+            sizeable[j] and heights[j] > heights[k] + config.storey and counts[j] >= 0.05 * counts[k]
+            for j in every
         )
-
-    standing = [plane for plane in planes if not is_floor(plane)]
-    sizeable = [plane for plane in standing if plane.area >= config.min_area]
-    return max(sizeable or standing, key=lambda plane: int(plane.inliers.sum()))
+    ]
+    return planes[max(standing, key=lambda k: (sizeable[k], counts[k]))]
 
 
 def _largest_plane(
@@ -199,28 +183,29 @@ def _largest_plane(
     config: SurfaceConfig,
     rng: np.random.Generator,
 ) -> _Plane | None:
-    """MSAC over three-point hypotheses, and with `up` also one-point ones; refined on all the points."""
+    """MSAC over three-point hypotheses, and with `up` also one-point ones; refined on all the points.
+
+    400 hypotheses find a plane of a fifth of the points with confidence 0.96; 4000 points will do to judge.
+    """
     index = np.flatnonzero(among)
     if len(index) < config.min_points:
         return None
-    sample = index[np.linspace(0, len(index) - 1, min(SAMPLE, len(index))).astype(np.intp)]
+    sample = index[np.linspace(0, len(index) - 1, min(4000, len(index))).astype(np.intp)]
     p, n = points[sample], normals[sample]
-    triples = p[rng.integers(0, len(p), size=(HYPOTHESES, 3))]
+    triples = p[rng.integers(0, len(p), size=(400, 3))]
     directions = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     proper = np.linalg.norm(directions, axis=-1) > 1e-9
     directions, anchors = transforms.unit(directions[proper]), triples[proper, 0]
+    down = np.einsum("ij,ij->i", directions, anchors) > 0.0 if up is None else directions @ up < 0.0
+    directions = np.where(down[:, None], -directions, directions)
     if up is None:
-        directions = np.where(
-            (np.einsum("ij,ij->i", directions, anchors) > 0)[:, None], -directions, directions
-        )
         upright = directions[:, 1] < np.sin(np.radians(config.max_tilt))
     else:
-        directions = np.where((directions @ up < 0)[:, None], -directions, directions)
         upright = directions @ up > np.cos(np.radians(config.max_tilt))
     directions, anchors = directions[upright], anchors[upright]
     if up is not None:
-        anchors = np.concatenate([anchors, p[rng.integers(0, len(p), size=HYPOTHESES // 4)]])
-        directions = np.concatenate([directions, np.tile(up, (len(anchors) - len(directions), 1))])
+        anchors = np.concatenate([anchors, p[rng.integers(0, len(p), size=100)]])
+        directions = np.concatenate([directions, np.tile(up, (100, 1))])
     if len(directions) == 0:
         return None
     offsets = np.einsum("ij,ij->i", directions, anchors)
@@ -241,7 +226,7 @@ def _refine(
     """Least squares on the inliers, a few times over; None if too few remain or the plane has tilted."""
     least_cosine = np.cos(np.radians(config.max_deviation))
     inliers = among
-    for _ in range(REFINEMENTS):
+    for _ in range(4):
         inliers = among & (np.abs(points @ normal - offset) <= config.tolerance)
         inliers &= normals @ normal > least_cosine
         if np.count_nonzero(inliers) < max(config.min_points, 3):
@@ -261,7 +246,9 @@ def _main_part(points: Array, normal: Array, inliers: Mask, config: SurfaceConfi
     """Keep the largest part of a plane that holds together over gaps, and say how much of it is seen [m²]."""
     index = np.flatnonzero(inliers)
     flat = _basis(normal) @ np.take(points, index, axis=0).T
-    cell = max(CELL, float((flat.max(axis=1) - flat.min(axis=1)).max()) / MAX_CELLS)
+    # Cells are wider than the points' spacing at 3 m; where a cloud is not in metres, they are no more
+    # than memory holds.
+    cell = max(0.03, float((flat.max(axis=1) - flat.min(axis=1)).max()) / 1000.0)
     cells = np.floor(flat / cell).astype(np.intp)
     cells -= cells.min(axis=1, keepdims=True)
     size = cells.max(axis=1) + 1
@@ -276,51 +263,32 @@ def _main_part(points: Array, normal: Array, inliers: Mask, config: SurfaceConfi
     return kept, float(np.count_nonzero((count > 0) & (part == main))) * cell**2
 
 
-def _surface(points: Array, plane: _Plane, config: SurfaceConfig) -> SupportSurface:
+def _surface(points: Array, plane: _Plane) -> SupportSurface:
+    """The surface of a plane: the hull of its points, and a box under the smallest rectangle around that."""
     on_plane = np.compress(plane.inliers, points, axis=0)
     centroid = np.array([x.mean() for x in on_plane.T])
     centroid = centroid - (plane.normal @ centroid - plane.offset) * plane.normal
-    basis = _basis(plane.normal)
-    flat = (on_plane - centroid) @ basis.T
-    corners = hull(np.ascontiguousarray(flat))
+    basis, thickness = _basis(plane.normal), 0.04
+    corners = hull(np.ascontiguousarray((on_plane - centroid) @ basis.T))
     if len(corners) < 3:
         raise PerceptionError("the points of the support surface lie on one line")
-    outline = centroid + corners @ basis
-    return SupportSurface(plane.normal, centroid, outline, _top_box(corners, centroid, basis, THICKNESS))
-
-
-def _top_box(corners: Array, origin: Array, basis: Array, thickness: float) -> Box:
-    """Box under the smallest rectangle around a convex polygon (M, 2) [m] in the plane's coordinates."""
     edges = transforms.unit(np.roll(corners, -1, axis=0) - corners)
-    along = corners @ edges.T
-    across = corners @ np.stack([-edges[:, 1], edges[:, 0]])
+    along, across = corners @ edges.T, corners @ np.stack([-edges[:, 1], edges[:, 0]])
     sizes = np.stack([np.ptp(along, axis=0), np.ptp(across, axis=0)])
     best = int(np.argmin(sizes[0] * sizes[1]))
     x, y = edges[best], np.array([-edges[best, 1], edges[best, 0]])
-    middle = np.array(
-        [
-            np.ptp(along[:, best]) / 2 + along[:, best].min(),
-            np.ptp(across[:, best]) / 2 + across[:, best].min(),
-        ]
-    )
-    centre_flat = middle[0] * x + middle[1] * y
+    middle = sizes[:, best] / 2 + (along[:, best].min(), across[:, best].min())
     normal = np.cross(basis[0], basis[1])
     R = np.stack([x @ basis, y @ basis, normal], axis=1)
-    centre = origin + centre_flat @ basis - thickness / 2.0 * normal
-    return Box(transforms.rigid(R, centre), np.array([sizes[0, best], sizes[1, best], thickness]))
+    centre = centroid + (middle[0] * x + middle[1] * y) @ basis - thickness / 2.0 * normal
+    box = Box(transforms.rigid(R, centre), np.array([*sizes[:, best], thickness]))
+    return SupportSurface(plane.normal, centroid, centroid + corners @ basis, box)
 
 
 def _basis(normal: Array) -> Array:
     """Two unit vectors (2, 3) that span the plane, right-handed with the normal."""
     x = transforms.perpendicular(normal)
     return np.stack([x, np.cross(normal, x)])
-
-
-def _nothing_found(count: int, config: SurfaceConfig) -> str:
-    return (
-        f"no support surface: no level plane holds {config.min_points} of the {count} points; "
-        "the table top must be in view"
-    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -344,8 +312,9 @@ def _plane_gains(points, normals, directions, offsets, tolerance, least_cosine, 
 
 
 @njit(cache=True)
-def _find_over(points, origin, axes, sides, low, high, margin, over):  # type: ignore[no-untyped-def]
-    """Mark the points (N,) that are within."""
+def _find_over(points, origin, axes, sides, low, high):  # type: ignore[no-untyped-def]
+    """Which points (N, 3) are between two heights, and inside the lines a·x + b·y = c of all sides (M, 3)."""
+    over = np.zeros(len(points), np.bool_)
     for i in range(len(points)):
         u, v, w = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
         z = axes[2, 0] * u + axes[2, 1] * v + axes[2, 2] * w
@@ -354,6 +323,7 @@ def _find_over(points, origin, axes, sides, low, high, margin, over):  # type: i
         x = axes[0, 0] * u + axes[0, 1] * v + axes[0, 2] * w
         y = axes[1, 0] * u + axes[1, 1] * v + axes[1, 2] * w
         k = 0
-        while k < len(sides) and sides[k, 0] * x + sides[k, 1] * y - sides[k, 2] <= margin:
+        while k < len(sides) and sides[k, 0] * x + sides[k, 1] * y <= sides[k, 2]:
             k += 1
         over[i] = k == len(sides)
+    return over
