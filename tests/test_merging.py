@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from synthetic import box, cylinder, hausdorff, random_motion, sphere, surface_points, thing
 
-from caryatid.config import FitConfig, FusionConfig
+from caryatid.config import FitConfig
 from caryatid.fitting.primitives import Fit, fit
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
@@ -17,10 +17,6 @@ from caryatid.objects.fusion import axes_rotation, merged_sightings
 ALL = (True,) * 6
 NONE = (False,) * 6
 LEVEL = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.radians(np.arange(0.0, 360.0, 5.0))])
-
-
-def merged_of(sightings):
-    return merged_sightings(sightings, FusionConfig())
 
 
 def renamed(shape, turn):
@@ -40,7 +36,7 @@ def fitted(shape, eye, seed) -> SceneObject:
 
 def test_one_sighting_is_kept_as_it_is():
     only = thing(4, box((0.1, 0.2, 0.3), (0.1, 0.2, 0.3)), seen=(True, False) * 3, residual=0.002)
-    merged = merged_of([only])
+    merged = merged_sightings([only])
     assert hausdorff(merged.shape, only.shape) == 0.0
     assert (merged.id, merged.seen, merged.residual) == ("o4", only.seen, 0.002)
 
@@ -50,7 +46,7 @@ def test_a_box_seen_from_two_sides_becomes_better_than_each(seed):
     truth = box((0.0, 0.0, 0.0), (0.08, 0.12, 0.1), turn_deg=10.0)
     one = fitted(truth, (-0.85, -0.7, 0.9), seed)
     two = fitted(truth, (0.7, 0.9, 0.9), seed + 10)
-    merged = merged_of([one, two])
+    merged = merged_sightings([one, two])
     errors = [hausdorff(o.shape, truth) for o in (one, two)]
     assert hausdorff(merged.shape, truth) < min(errors)
     # The bottom neither saw; around it each saw two of four walls, both together all of them.
@@ -62,7 +58,7 @@ def test_a_box_seen_from_two_sides_becomes_better_than_each(seed):
 def test_a_side_counts_from_those_that_saw_it():
     sees_low = thing(1, box((0.0, 0.0, 0.0), (0.1, 0.1, 0.10)), seen=(True, True, True, True, True, False))
     sees_high = thing(1, box((0.0, 0.0, 0.03), (0.1, 0.1, 0.12)), seen=(True, True, True, True, False, True))
-    merged = merged_of([sees_low, sees_high])
+    merged = merged_sightings([sees_low, sees_high])
     z, height = merged.centre_world[2], merged.shape.extents[2]
     assert z - height / 2.0 == pytest.approx(-0.05)
     assert z + height / 2.0 == pytest.approx(0.09)
@@ -72,7 +68,7 @@ def test_a_side_counts_from_those_that_saw_it():
 def test_a_side_nobody_saw_lies_farthest_out():
     short = thing(1, box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)), seen=(True, True, True, True, False, True))
     long = thing(1, box((0.0, 0.0, -0.02), (0.1, 0.1, 0.14)), seen=(True, True, True, True, False, True))
-    merged = merged_of([short, long])
+    merged = merged_sightings([short, long])
     assert merged.centre_world[2] - merged.shape.extents[2] / 2.0 == pytest.approx(-0.09)
     assert not merged.seen[4]
 
@@ -87,7 +83,7 @@ def test_sides_are_found_again_whatever_the_axes_are_called():
     axis = int(np.argmax(np.abs(up)))
     seen = [True] * 6
     seen[2 * axis + (up[axis] > 0.0)] = False
-    merged = merged_of([first, thing(1, turned, seen=tuple(seen))])
+    merged = merged_sightings([first, thing(1, turned, seen=tuple(seen))])
     assert hausdorff(turned, truth) < 1e-12
     assert hausdorff(merged.shape, truth) < 1e-9
     assert sum(merged.seen) == 5
@@ -102,24 +98,26 @@ def test_noise_of_many_sightings_averages_out():
         T = transforms.rigid(tilt, truth.T_world_object[:3, 3] + 0.004 * rng.normal(size=3))
         sightings.append(thing(1, Cylinder(T, 0.04 + 0.003 * rng.normal(), 0.1 + 0.005 * rng.normal())))
     errors = [hausdorff(o.shape, truth) for o in sightings]
-    assert hausdorff(merged_of(sightings).shape, truth) < 0.4 * np.mean(errors)
+    assert hausdorff(merged_sightings(sightings).shape, truth) < 0.4 * np.mean(errors)
 
 
 def test_spheres_are_averaged_too():
-    merged = merged_of([thing(1, sphere((0.0, 0.0, 0.0), 0.04)), thing(1, sphere((0.02, 0.0, 0.0), 0.05))])
+    merged = merged_sightings(
+        [thing(1, sphere((0.0, 0.0, 0.0), 0.04)), thing(1, sphere((0.02, 0.0, 0.0), 0.05))]
+    )
     assert hausdorff(merged.shape, sphere((0.01, 0.0, 0.0), 0.045)) < 1e-12
 
 
 def test_a_bad_fit_has_less_weight():
     good, bad = box((0.0, 0.0, 0.0), (0.1, 0.1, 0.1)), box((0.01, 0.0, 0.0), (0.1, 0.1, 0.1))
-    merged = merged_of([thing(1, good, residual=0.001), thing(1, bad, residual=0.03)])
+    merged = merged_sightings([thing(1, good, residual=0.001), thing(1, bad, residual=0.03)])
     assert 0.0 < merged.centre_world[0] < 0.002
 
 
 def test_the_kind_with_most_evidence_wins():
     ball, crate = sphere((0.0, 0.0, 0.0), 0.05), box((0.0, 0.0, 0.0), (0.09, 0.09, 0.09))
-    assert merged_of([thing(1, ball), thing(1, crate), thing(1, crate)]).shape.kind == "box"
-    assert merged_of([thing(1, ball), thing(1, crate, seen=NONE)]).shape.kind == "sphere"
+    assert merged_sightings([thing(1, ball), thing(1, crate), thing(1, crate)]).shape.kind == "box"
+    assert merged_sightings([thing(1, ball), thing(1, crate, seen=NONE)]).shape.kind == "sphere"
 
 
 def test_the_order_of_sightings_makes_no_difference_but_for_rounding():
@@ -134,9 +132,9 @@ def test_the_order_of_sightings_makes_no_difference_but_for_rounding():
         )
         for k, seen in enumerate([ALL, (True, False) * 3, (False, True) * 3], start=1)
     ]
-    merged = merged_of(sightings)
+    merged = merged_sightings(sightings)
     for order in permutations(sightings):
-        assert hausdorff(merged_of(list(order)).shape, merged.shape) < 1e-12
+        assert hausdorff(merged_sightings(list(order)).shape, merged.shape) < 1e-12
 
 
 def test_merging_commutes_with_any_motion():
@@ -147,7 +145,7 @@ def test_merging_commutes_with_any_motion():
         for k in range(3)
     ]
     there = [replace(o, shape=o.shape.moved(T)) for o in sightings]
-    assert hausdorff(merged_of(there).shape, merged_of(sightings).shape.moved(T)) < 1e-12
+    assert hausdorff(merged_sightings(there).shape, merged_sightings(sightings).shape.moved(T)) < 1e-12
 
 
 @pytest.mark.parametrize("degrees", [0.0, 7.0, 40.0])

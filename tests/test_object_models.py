@@ -11,7 +11,7 @@ from synthetic import box, cylinder, surface_points
 from caryatid.config import Config
 from caryatid.fitting.primitives import FitFailure
 from caryatid.geometry import transforms
-from caryatid.objects.models import ObjectModels, ObjectPoints, joined
+from caryatid.objects.models import ObjectModels, ObjectPoints
 from caryatid.segmentation.observation import Observation
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
@@ -126,7 +126,7 @@ def two_views():
     points = ObjectPoints()
     for view, at in enumerate((0.0, 100.0)):
         for label, count in ((1, 4), (3, 6), (SUPPORT_LABEL, 5)):
-            points.add(label, cloud(count, label, at), view)
+            points.add(cloud(count, label, at), view)
     return points
 
 
@@ -140,8 +140,6 @@ def test_views_add_up():
     assert len(points.everything()) == 30
     assert set(points.everything().labels) == {1, 3, SUPPORT_LABEL}
     assert len(points.of(7)) == 0
-    assert 3 in points
-    assert 7 not in points
 
 
 def test_merging_keeps_every_point_under_the_new_label():
@@ -168,7 +166,7 @@ def test_dividing_gives_each_group_its_points_and_new_labels_only():
 
 def test_a_move_moves_the_points_of_its_views_only():
     points = two_views()
-    points.add(9, cloud(3, 9, 7.0), 2)
+    points.add(cloud(3, 9, 7.0), 2)
     before = {k: points.of(k) for k in (1, 3, 9)}
     copied = points.copy()
     T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
@@ -198,7 +196,7 @@ def test_a_divided_objects_points_still_move_with_their_views():
 def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
     points = ObjectPoints()
     for view in range(9):
-        points.add(1, cloud(20, 1, 0.01 * view), view)
+        points.add(cloud(20, 1, 0.01 * view), view)
         points.bound(1, 0.5, 4)
         assert len(points.of(1)) == (20 * (view + 1) if view < 8 else 80)
     left = np.unique(np.round(points.of(1).points_world[:, 0] % 1.0, 9))
@@ -216,6 +214,10 @@ def test_a_label_given_up_is_not_given_again():
 def test_colours_stay_only_where_all_have_them():
     plain = cloud(2, 1)
     coloured = Cloud(plain.points_world, plain.normals_world, plain.labels, np.zeros((2, 3), dtype=np.uint8))
-    assert joined([coloured, coloured]).rgb is not None
-    assert joined([coloured, plain]).rgb is None
-    assert len(joined([])) == 0
+    points = ObjectPoints()
+    for view, (added, colours) in enumerate(
+        [(coloured, True), (coloured, True), (plain, False), (coloured, False)]
+    ):
+        points.add(added, view)
+        assert (points.everything().rgb is not None) == colours
+        assert len(points.everything()) == 2 * (view + 1)

@@ -13,11 +13,6 @@ from caryatid.geometry.points import most_central
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 
-DIVIDE_SHARE = 0.1
-"""A segment is divided among the known objects at which at least this share of its points lies [1]."""
-DENSITY = 4
-"""Points along the distance that counts as overlap [1]; the others are left out."""
-
 
 def associate(
     points_world: Array,
@@ -29,7 +24,8 @@ def associate(
 ) -> NDArray[np.int32]:
     """Give the points of each new segment the label of the object they belong to, or one never used before.
 
-    A segment that lies at several known objects is divided among them: each point goes to the nearest.
+    A segment that lies at several known objects, with a tenth of its points or more, is divided among them:
+    each point goes to the nearest.
 
     Args:
         points_world: (N, 3) [m].
@@ -43,7 +39,7 @@ def associate(
         Label of the object (N,) of each point; 0 where there was no segment.
     """
     names = np.array(sorted(known_points), dtype=np.int32)
-    spacing = config.overlap_reach / DENSITY
+    spacing = config.overlap_reach / 4.0
     owners = np.repeat(np.arange(len(names), dtype=np.int32), [len(known_points[k]) for k in names])
     points = np.concatenate([np.zeros((0, 3)), *(known_points[k] for k in names)])
     thinned = most_central(points, owners, np.full(len(names), spacing))
@@ -62,7 +58,7 @@ def associate(
             fresh += 1
             result[index] = fresh
             continue
-        among = np.flatnonzero(shares >= min(DIVIDE_SHARE, shares.max()))
+        among = np.flatnonzero(shares >= min(0.1, shares.max()))
         result[index] = names[among[0]]
         if len(among) > 1:
             theirs = np.isin(owners, among)

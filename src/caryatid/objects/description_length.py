@@ -10,16 +10,9 @@ from numpy.typing import NDArray
 
 from caryatid.config import ExplanationConfig, FitConfig
 from caryatid.fitting.primitives import Oriented, candidates, free_inside
-from caryatid.geometry.shapes import Primitives, Shape
+from caryatid.geometry.shapes import Box, Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.voxel_map import VoxelMap
-
-IRREGULAR = 9
-"""Parameters an irregular object is taken to have [1]: as many as a box."""
-INSET = 1.2
-"""How far inside a shape free space is looked for [voxels]; a surface voxel may be half free."""
-FIRST_HYPOTHESES, FIRST_STEPS, FIRST_POINTS = 10, 6, 150
-"""RANSAC hypotheses a shape, least-squares steps and points of a fit that is a first look."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -67,8 +60,8 @@ class Explanation:
 
 
 def price(shape: Shape | None, config: ExplanationConfig) -> float:
-    """Price [nats] of an object: of the parameters of its shape."""
-    return config.parameter_cost * (IRREGULAR if shape is None else shape.parameters)
+    """Price [nats] of an object: of the parameters of its shape; an irregular one has as many as a box."""
+    return config.parameter_cost * (Box if shape is None else shape).parameters
 
 
 def point_costs(shape: Shape | None, evidence: Evidence, config: ExplanationConfig) -> Array:
@@ -81,19 +74,20 @@ def point_costs(shape: Shape | None, evidence: Evidence, config: ExplanationConf
     return np.minimum(cost, config.outlier)
 
 
-def shape_cost(shape: Shape | None, evidence: Evidence, config: ExplanationConfig) -> float:
+def best_explanation(shapes: Sequence[Shape], evidence: Evidence, config: ExplanationConfig) -> Explanation:
+    """Explain points by one of some shapes, or as an irregular object, whichever costs least."""
+    found = [Explanation(shape, _cost(shape, evidence, config)) for shape in (None, *shapes)]
+    return min(found, key=lambda e: e.cost)
+
+
+def _cost(shape: Shape | None, evidence: Evidence, config: ExplanationConfig) -> float:
     """Cost [nats] of points as one object: of the points, the space seen free inside it, and its price."""
     cost = float(point_costs(shape, evidence, config).sum()) * evidence.weight
     if shape is not None and evidence.voxels is not None:
-        inset = max(INSET * evidence.voxels.config.size, 3.0 * evidence.noise)
+        # A surface voxel may be half free.
+        inset = max(1.2 * evidence.voxels.config.size, 3.0 * evidence.noise)
         cost += config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
     return cost + price(shape, config)
-
-
-def best_explanation(shapes: Sequence[Shape], evidence: Evidence, config: ExplanationConfig) -> Explanation:
-    """Explain points by one of some shapes, or as an irregular object, whichever costs least."""
-    found = [Explanation(shape, shape_cost(shape, evidence, config)) for shape in (None, *shapes)]
-    return min(found, key=lambda e: e.cost)
 
 
 def explain(
@@ -113,9 +107,7 @@ def explain(
         rngs: Source of the samples of each.
         first_look: A quick fit will do, which only tells what is worth a full one.
     """
-    quick = replace(
-        fit_config, hypotheses=FIRST_HYPOTHESES, polish=1, steps=FIRST_STEPS, max_points=FIRST_POINTS
-    )
+    quick = replace(fit_config, hypotheses=10, polish=1, steps=6, max_points=150)
     full = replace(fit_config, polish=1, search_points=fit_config.max_points)
     oriented = [Oriented(e.points, e.normals) for e in parts]
     fits = candidates(oriented, config=quick if first_look else full, rngs=rngs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations, product
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -26,14 +27,8 @@ _TURNS = np.array(
     ]
 )
 """The 24 rotations (24, 3, 3) of a cube: ways to name the axes of a box."""
-
-
 SIGMAS = 2.0
 """Standard deviations of centres and extents by which two sightings may differ beyond the tolerances [1]."""
-BLIND = 0.1
-"""Weight, in sides, of a sighting of which no side was seen (`sg`) [1]; small beside any other."""
-RESIDUAL = 0.01
-"""Mean distance of its points at which a sighting counts half in the merged shape (`sg`) [m]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -140,18 +135,13 @@ def fused_graph(
     for pair, found in evidence.supports.items():
         if pair[0] not in objects or pair[1] not in objects:
             continue
-        both = evidence.sightings[pair[0]].keys() & evidence.sightings[pair[1]].keys()
-        is_newest = newest in found
-        mostly = len(found) >= config.keep_share * len(both)
-        kept = {
-            "pc": is_newest,
-            "sg": mostly,
-            "pc+sg": is_newest or len(found) > config.keep_share * len(both),
-        }
-        if kept[config.method]:
+        views = evidence.sightings[pair[0]].keys() & evidence.sightings[pair[1]].keys()
+        least = config.keep_share * len(views)
+        mostly = len(found) >= least if config.method == "sg" else len(found) > least
+        if (mostly and config.method != "pc") or (newest in found and config.method != "sg"):
             last = found[max(found)]
             certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
-            supports.append(replace(last, certain=certain, occurrences=len(found), opportunities=len(both)))
+            supports.append(replace(last, certain=certain, occurrences=len(found), opportunities=len(views)))
     ordered = sorted(objects.values(), key=lambda o: (o.role != "support_surface", o.label))
     rank = {o.id: k for k, o in enumerate(ordered)}
     supports.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))
@@ -187,15 +177,20 @@ def match(
 
 def _distances(known: list[SceneObject], seen: list[SceneObject], config: FusionConfig) -> Array:
     """Distances (K, S) of the centres, as shares of what is tolerated; a table is only ever a table."""
-    centres = [np.array([o.centre_world for o in objects]) for objects in (known, seen)]
-    half = [np.array([o.shape.extents.min() / 2.0 for o in objects]) for objects in (known, seen)]
-    sigma = [np.array([np.linalg.norm(_position(o)) for o in objects]) for objects in (known, seen)]
-    table = [np.array([o.role == "support_surface" for o in objects]) for objects in (known, seen)]
-    reach = np.maximum(config.max_distance, np.minimum(half[0][:, None], half[1]))
-    reach += SIGMAS * np.hypot(sigma[0][:, None], sigma[1])
-    distances = np.linalg.norm(centres[0][:, None] - centres[1], axis=-1) / reach
-    distances[table[0][:, None] & table[1]] = 0.0
-    distances[table[0][:, None] != table[1]] = np.inf
+    (centres, half, sigma, table), other = (
+        (
+            np.array([o.centre_world for o in objects]),
+            np.array([o.shape.extents.min() / 2.0 for o in objects]),
+            np.array([np.linalg.norm(_deviations(o)[0]) for o in objects]),
+            np.array([o.role == "support_surface" for o in objects]),
+        )
+        for objects in (known, seen)
+    )
+    reach = np.maximum(config.max_distance, np.minimum(half[:, None], other[1]))
+    reach += SIGMAS * np.hypot(sigma[:, None], other[2])
+    distances = np.linalg.norm(centres[:, None] - other[0], axis=-1) / reach
+    distances[table[:, None] & other[3]] = 0.0
+    distances[table[:, None] != other[3]] = np.inf
     return distances
 
 
@@ -204,31 +199,21 @@ def _difference(known: SceneObject, seen: SceneObject, distance: float, config: 
     if known.role == "support_surface":
         return 0.0
     a, b = known.shape, seen.shape
-    ratio = _extent_ratio(known, seen, config)
+    # Largest ratio of the sorted extents, once what both fits' uncertainty explains is taken off.
+    first, second = np.argsort(a.extents, kind="stable"), np.argsort(b.extents, kind="stable")
+    unsure = SIGMAS * np.hypot(_deviations(known)[1][first], _deviations(seen)[1][second])
+    excess = np.maximum(np.abs(a.extents[first] - b.extents[second]) - unsure, 0.0)
+    ratio = np.max(1.0 + excess / np.minimum(a.extents[first], b.extents[second]))
     kind_differs = a.kind != b.kind
     angle = 0.0 if kind_differs or _is_round(a) else np.degrees(axes_rotation(b, a)[1]) / config.max_angle
-    size = np.log(ratio) / np.log(config.max_ratio)
+    size = float(np.log(ratio) / np.log(config.max_ratio))
     total = distance + size + angle + float(kind_differs)
     return total if max(distance, size, angle) <= 1.0 else np.inf
 
 
-def _extent_ratio(known: SceneObject, seen: SceneObject, config: FusionConfig) -> float:
-    """Largest ratio of the sorted extents, once what both fits' uncertainty explains is taken off."""
-    a, b = known.shape.extents, seen.shape.extents
-    first, second = np.argsort(a, kind="stable"), np.argsort(b, kind="stable")
-    unsure = SIGMAS * np.hypot(_sizes(known)[first], _sizes(seen)[second])
-    excess = np.maximum(np.abs(a[first] - b[second]) - unsure, 0.0)
-    return float(np.max(1.0 + excess / np.minimum(a[first], b[second])))
-
-
-def _position(o: SceneObject) -> Array:
-    """Standard deviations (3,) [m] of the centre; zero where they are not known."""
-    return np.zeros(3) if o.uncertainty is None else o.uncertainty.position
-
-
-def _sizes(o: SceneObject) -> Array:
-    """Standard deviations (3,) [m] of the extents; zero where they are not known."""
-    return np.zeros(3) if o.uncertainty is None else o.uncertainty.sizes
+def _deviations(o: SceneObject) -> tuple[Array, Array]:
+    """Standard deviations (3,) [m] of the centre and of the extents; zero where they are not known."""
+    return (np.zeros(3),) * 2 if o.uncertainty is None else (o.uncertainty.position, o.uncertainty.sizes)
 
 
 def _is_round(shape: Shape) -> bool:
@@ -238,9 +223,7 @@ def _is_round(shape: Shape) -> bool:
 
 
 def _vertex(seen: Mapping[int, SceneObject], config: FusionConfig) -> SceneObject:
-    return (
-        merged_sightings([seen[v] for v in sorted(seen)], config) if config.method == "sg" else _newest(seen)
-    )
+    return merged_sightings([seen[v] for v in sorted(seen)]) if config.method == "sg" else _newest(seen)
 
 
 def _newest(seen: Mapping[int, SceneObject]) -> SceneObject:
@@ -260,7 +243,7 @@ def _fresh_id(o: SceneObject, taken: set[str]) -> str:
     return object_id(label)
 
 
-def merged_sightings(sightings: Sequence[SceneObject], config: FusionConfig) -> SceneObject:
+def merged_sightings(sightings: Sequence[SceneObject]) -> SceneObject:
     """Merge sightings of one object into a vertex whose shape is better than each.
 
     The kind is the one with the most evidence. Poses and radii are averaged with the evidence as weight; each
@@ -269,20 +252,22 @@ def merged_sightings(sightings: Sequence[SceneObject], config: FusionConfig) -> 
 
     Args:
         sightings: At least one; the first lends id, label and role.
-        config: What a bad residual costs.
     """
-    weights = np.array([_evidence(o, config) for o in sightings])
-    kinds = sorted({o.shape.kind for o in sightings})
-    votes = [sum(w for w, o in zip(weights, sightings, strict=True) if o.shape.kind == k) for k in kinds]
-    kind = kinds[int(np.argmax(votes))]
+    # The sides seen, and little where none is; half of it where the residual is 1 cm.
+    weights = [(0.1 + sum(o.seen)) / (1.0 + (o.residual / 0.01) ** 2) for o in sightings]
+    votes = {o.shape.kind: 0.0 for o in sorted(sightings, key=lambda o: o.shape.kind)}
+    for weight, o in zip(weights, sightings, strict=True):
+        votes[o.shape.kind] += weight
+    kind = max(votes, key=lambda k: votes[k])
     same = [o for o in sightings if o.shape.kind == kind]
-    w = np.array([_evidence(o, config) for o in same])
+    w = np.array([weight for weight, o in zip(weights, sightings, strict=True) if o.shape.kind == kind])
     best = same[int(np.argmax(w))]
-    if len(same) == 1:
-        shape, seen = best.shape, best.seen
-    elif isinstance(best.shape, Sphere):
-        shape, seen = _merged_sphere([o.shape for o in same], w), best.seen
-    else:
+    shape, seen = best.shape, best.seen
+    if len(same) > 1 and isinstance(shape, Sphere):
+        centre = np.average([o.centre_world for o in same], axis=0, weights=w)
+        radius = float(np.average([o.shape.extents[0] / 2.0 for o in same], weights=w))
+        shape = Sphere(transforms.rigid(np.eye(3), centre), radius)
+    elif len(same) > 1:
         shape, seen = _merged_sides(same, w, best)
     return replace(
         sightings[0],
@@ -314,20 +299,9 @@ def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
     return turn, float(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
 
 
-def _evidence(o: SceneObject, config: FusionConfig) -> float:
-    """Weight of a sighting: the sides seen, less for a bad residual."""
-    return (BLIND + sum(o.seen)) / (1.0 + (o.residual / RESIDUAL) ** 2)
-
-
-def _merged_sphere(spheres: Sequence[Shape], weights: Array) -> Sphere:
-    centre = np.average([s.T_world_object[:3, 3] for s in spheres], axis=0, weights=weights)
-    radius = float(np.average([s.extents[0] / 2.0 for s in spheres], weights=weights))
-    return Sphere(transforms.rigid(np.eye(3), centre), radius)
-
-
 def _merged_sides(
     same: Sequence[SceneObject], weights: Array, best: SceneObject
-) -> tuple[Box | Cylinder, tuple[bool, bool, bool, bool, bool, bool]]:
+) -> tuple[Box | Cylinder, Any]:
     """Average axes, then each of the six sides along them."""
     T = np.array([o.shape.T_world_object for o in same])
     extents = np.array([o.shape.extents for o in same])
@@ -347,8 +321,7 @@ def _merged_sides(
     mean = (share * ends).sum(axis=0) / np.where(known, share.sum(axis=0), 1.0)
     widest = np.stack([ends[:, :, 0].min(axis=0), ends[:, :, 1].max(axis=0)], axis=1)
     low, high = np.where(known, mean, widest).T
-    sides = known.ravel().tolist()
-    flags = (sides[0], sides[1], sides[2], sides[3], sides[4], sides[5])
+    flags = tuple(known.ravel().tolist())
     if round_:
         centre = np.average(middles, axis=0, weights=weights)
         centre[2] = (low[2] + high[2]) / 2.0

@@ -17,10 +17,6 @@ from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 SPACING = 0.015
 """Spacing of the points tested on the moving side [m]."""
-INSET = 0.01
-"""How far inside the walls free space is looked for [m]; a voxel, so that a wall's noise says nothing."""
-FLAT = 0.02
-"""Extent below which a single side's points say nothing of the depth behind it [m]; their noise."""
 LEAST = 0.0005
 """Gaps below this are none [m]."""
 
@@ -134,9 +130,8 @@ def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, 
     axis, side = divmod(int(seen[0]), 2)
     if isinstance(candidate.shape, Cylinder) and axis != 2:
         return None
-    if candidate.shape.extents[axis] > FLAT:
-        return None
-    return axis, -1.0 if side else 1.0
+    # Their noise makes a single side's points up to 2 cm deep.
+    return (axis, -1.0 if side else 1.0) if candidate.shape.extents[axis] <= 0.02 else None
 
 
 def _way_to_others(face: _Face, limit: float, others: Sequence[Shape], config: CompletionConfig) -> float:
@@ -192,7 +187,8 @@ def _face(shape: Shape, axis: int, sign: float, config: CompletionConfig) -> _Fa
     else:
         outward = np.abs(points[:, across] / half[across]).max(axis=1)
     rim = points[outward > 0.99]
-    rim[:, across] *= np.maximum(1.0 - INSET / half[across], 0.0)
+    # A voxel inside the walls, so that their noise says nothing.
+    rim[:, across] *= np.maximum(1.0 - 0.01 / half[across], 0.0)
     T = shape.T_world_object
     return _Face(
         axis, sign, sign * T[:3, axis], transforms.transform(T, points), transforms.transform(T, rim)

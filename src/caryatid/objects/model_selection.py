@@ -29,23 +29,10 @@ from caryatid.objects.description_length import (
 Groups = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 Hints = Callable[[], Sequence[Mask]]
+Pair = tuple[int, int]
 
-NEIGHBOURS = 8
-"""Points the mean around a point is taken over [1]; 2 cm square of them."""
-CONNECTED = 0.02
-"""Points of one object further apart are not connected [m]; more than twice their spacing."""
-CRUMB = 8
-"""Fewer points off the rest of their side go to the other side [1]; 2 cm square of them."""
-PATCHES = 3
-"""Largest patches a single shape does not explain that are tried as objects of their own [1]."""
 LAYER = 0.009
 """Points within this of a surface may be of it [m]; a view that is off by 3σ leaves a layer of them."""
-LAYER_SHARE = 0.8
-"""Share of an object's points in such a layer, or inside the other, for it to be no object [1]."""
-FINALISTS = 2
-"""Best hypotheses that are settled with full fits [1]."""
-SMOOTH = 0.8
-"""Share of the border without a crease from which two may be one object without a shape [1]."""
 GROWTH = 1.3
 """What was found to be one object, or two, is looked at again when its points have grown by this [1]."""
 
@@ -132,7 +119,8 @@ def _best_two(
     starts = [h for h in starts if h.any() and not h.all()]
     starts += _hypotheses(evidence, bad, up, config)
     looks = _settled(evidence, starts, near, 0, config, rng, first_look=True)
-    tried = sorted((look.cost, k) for k, look in enumerate(looks) if look is not None)[:FINALISTS]
+    # The best two are settled with full fits.
+    tried = sorted((look.cost, k) for k, look in enumerate(looks) if look is not None)[:2]
     finalists = [starts[k] for _, k in tried]
     settled = _settled(evidence, finalists, near, config.split.rounds, config, rng)
     better = [two for two in settled if two is not None and two.cost < whole.cost]
@@ -144,7 +132,7 @@ def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
     """Whether one side is only a layer of points on the other's surface, left by a view that is off."""
     sides = evidence.points[two.second], evidence.points[~two.second]
     return any(
-        other.shape is not None and float((other.shape.signed_distance(side) < LAYER).mean()) >= LAYER_SHARE
+        other.shape is not None and float((other.shape.signed_distance(side) < LAYER).mean()) >= 0.8
         for side, other in zip(sides, two.explanations, strict=True)
     )
 
@@ -195,7 +183,7 @@ def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> It
     poor = bad > config.explanation.irregular
     if poor.any():
         part = _components(evidence.points[poor])
-        for number in np.argsort(-np.bincount(part))[:PATCHES]:
+        for number in np.argsort(-np.bincount(part))[:3]:
             start = np.zeros(len(bad), dtype=bool)
             start[np.flatnonzero(poor)[part == number]] = True
             yield start
@@ -220,24 +208,24 @@ def _directions(normals: Array, up: Array) -> list[Array]:
 
 
 def _components(points: Array) -> Groups:
-    """Connected part (N,) of each point, from 0."""
-    pairs = cKDTree(points).query_pairs(CONNECTED, output_type="ndarray")
+    """Connected part (N,) of each point, from 0; twice their spacing and more parts two."""
+    pairs = cKDTree(points).query_pairs(0.02, output_type="ndarray")
     graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
 
 
 def _connected(points: Array, second: Mask) -> Mask:
-    """Keep the largest connected part of the second side, and of the first all that is no crumb."""
+    """Keep the largest connected part of the second side, and of the first all that is no crumb (2 cm²)."""
     result = second.copy()
-    index = np.flatnonzero(second)
-    if len(index):
-        part = _components(points[index])
-        result[index[part != np.argmax(np.bincount(part))]] = False
-    index = np.flatnonzero(~result)
-    if len(index):
-        part = _components(points[index])
-        sizes = np.bincount(part)
-        result[index[(sizes < min(CRUMB, sizes.max()))[part]]] = True
+    for side, least in ((True, np.inf), (False, 8)):
+        index = np.flatnonzero(result == side)
+        if len(index):
+            part = _components(points[index])
+            sizes = np.bincount(part)
+            small = sizes < min(least, sizes.max())
+            if side:
+                small[np.flatnonzero(~small)[1:]] = True
+            result[index[small[part]]] = not side
     return result
 
 
@@ -245,11 +233,11 @@ def best_merge(
     evidence: Mapping[int, Evidence],
     alone: Mapping[int, Explanation],
     changed: set[int],
-    apart: MutableMapping[tuple[int, int], int],
+    apart: MutableMapping[Pair, int],
     *,
     config: Config,
     seed: int,
-) -> tuple[int, int] | None:
+) -> Pair | None:
     """Find the pair of neighbours that it is best to take for one.
 
     Args:
@@ -277,59 +265,54 @@ def best_merge(
     for (a, b), both in zip(pairs, joined, strict=True):
         second = np.arange(len(both)) >= len(evidence[a])
         twos.append(_two(both, second, (alone[a], alone[b]), _around(both.points), config))
-    best: tuple[float, tuple[int, int]] | None = None
+    best, most = None, 0.0
     for (a, b), gain in zip(pairs, _gains(joined, twos, pairs, config, seed), strict=True):
         if gain <= 0.0:
             apart[a, b] = len(evidence[a]) + len(evidence[b])
-        elif best is None or gain > best[0]:
-            best = gain, (a, b) if len(evidence[a]) >= len(evidence[b]) else (b, a)
-    return None if best is None else best[1]
+        elif gain > most:
+            best, most = ((a, b) if len(evidence[a]) >= len(evidence[b]) else (b, a)), gain
+    return best
 
 
 def _gains(
     joined: Sequence[Evidence],
     twos: Sequence[TwoObjects],
-    pairs: Sequence[tuple[int, int]],
+    pairs: Sequence[Pair],
     config: Config,
     seed: int,
 ) -> list[float]:
-    """How much less [nats] one object costs than two, by the shapes of both and by fits to all the points."""
+    """How much less [nats] one object costs than two, by the shapes of both and by fits to all the points.
+
+    Nothing where one shape leaves one of the two unexplained; without a shape two are one only where the
+    surface goes on from one to the other.
+    """
     costs = config.explanation
     rngs = [np.random.default_rng([seed, *pair]) for pair in pairs]
-    ones = []
-    for both, two in zip(joined, twos, strict=True):
-        shapes = [e.shape for e in two.explanations if e.shape is not None]
-        ones.append(best_explanation(shapes, both, costs))
+    ones = [
+        best_explanation([e.shape for e in two.explanations if e.shape is not None], both, costs)
+        for both, two in zip(joined, twos, strict=True)
+    ]
     worth = list(range(len(pairs)))
     for first_look in (True, False):
-        found = explain(
-            [joined[k] for k in worth],
-            costs,
-            config.fit,
-            [rngs[k] for k in worth],
-            first_look=first_look,
-        )
+        some, draws = [joined[k] for k in worth], [rngs[k] for k in worth]
+        found = explain(some, costs, config.fit, draws, first_look=first_look)
         for k, one in zip(worth, found, strict=True):
             ones[k] = min(ones[k], one, key=lambda e: e.cost)
         worth = [k for k in worth if ones[k].cost <= twos[k].cost + price(None, costs)]
-    return [_gain(*case, config) for case in zip(joined, twos, ones, strict=True)]
-
-
-def _gain(both: Evidence, two: TwoObjects, one: Explanation, config: Config) -> float:
-    """How much less [nats] one object costs; nothing where it leaves one of the two unexplained.
-
-    Without a shape two are one only where the surface goes on from one to the other.
-    """
-    if one.shape is None:
-        return two.cost - one.cost if two.smooth > SMOOTH else 0.0
-    cost = point_costs(one.shape, both, config.explanation)
-    unexplained = max(cost[two.second].mean(), cost[~two.second].mean()) > config.explanation.irregular
-    return 0.0 if unexplained else two.cost - one.cost
+    gains = []
+    for both, two, one in zip(joined, twos, ones, strict=True):
+        if one.shape is None:
+            is_one = two.smooth > 0.8
+        else:
+            cost = point_costs(one.shape, both, costs)
+            is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= costs.irregular
+        gains.append(two.cost - one.cost if is_one else 0.0)
+    return gains
 
 
 def _around(points: Array) -> Groups:
-    """Indices (N, K) of each point's nearest neighbours among points (N, 3), itself among them."""
-    count = min(NEIGHBOURS, len(points))
+    """Indices (N, 8) of the points (N, 3) nearest to each, itself among them: 2 cm square of them."""
+    count = min(8, len(points))
     return np.asarray(cKDTree(points).query(points, k=count)[1]).reshape(len(points), count)
 
 

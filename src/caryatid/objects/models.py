@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,43 +25,11 @@ from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 from caryatid.sensing.voxel_map import VoxelMap
 
-MEAN_TO_DEVIATION = 1.25
-"""Standard deviation of a normal distribution over its mean absolute value."""
-LEAST_NOISE = 0.002
-"""Least standard deviation of points from their surfaces [m]; what registration leaves."""
-SAME_PLACE = 0.02
-"""Points of two views within this are at the same place [m]; 2σ of registration error of both views."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class SeenPoints:
-    """Points of one object, those of later views behind those of earlier ones, and the view (N,) of each."""
-
-    cloud: Cloud
-    views: NDArray[np.intp]
-
-    def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> SeenPoints:
-        """Return some of the points, by a mask (N,) or indices (M,)."""
-        return SeenPoints(self.cloud.select(kept), self.views[kept])
-
-    def labelled(self, label: int) -> SeenPoints:
-        """Return the points with this label."""
-        return replace(self, cloud=labelled(self.cloud, label))
-
-    def moved(self, T: Mapping[int, Array]) -> SeenPoints:
-        """Return the points with those of some views moved, view → (4, 4)."""
-        poses = np.array([T.get(view, np.eye(4)) for view in range(int(self.views.max()) + 1)])
-        points = kernels.transform(poses, self.views, self.cloud.points_world)
-        normals = kernels.rotate(poses, self.views, self.cloud.normals_world)
-        return replace(self, cloud=replace(self.cloud, points_world=points, normals_world=normals))
-
-    def followed_by(self, other: SeenPoints) -> SeenPoints:
-        """Return these points and then the other ones."""
-        return SeenPoints(joined([self.cloud, other.cloud]), np.concatenate([self.views, other.views]))
-
 
 class ObjectPoints:
-    """What has been seen of each object so far; grows with every view.
+    """What has been seen of each object, and of the support surface, so far; grows with every view.
+
+    The points of one object are in the order of their views, those taken over from another one behind them.
 
     Attributes:
         labels_used: The highest label an object ever had; new ones are numbered from the next one.
@@ -69,52 +37,62 @@ class ObjectPoints:
 
     def __init__(self) -> None:
         self.labels_used = 0
-        self._seen: dict[int, SeenPoints] = {}
-        self._thinned: dict[tuple[int, float], tuple[Cloud, Cloud]] = {}
+        self._cloud = Cloud(np.zeros((0, 3)), np.zeros((0, 3)))
+        self._labels = np.zeros(0, dtype=np.int32)
+        self._views = np.zeros(0, dtype=np.intp)
+        self._selected: dict[tuple[int, float], Cloud] = {}
 
     def copy(self) -> ObjectPoints:
         """Return points that go on growing by themselves; the points so far are shared."""
-        other = ObjectPoints()
-        other.labels_used = self.labels_used
-        other._seen = self._seen.copy()
-        other._thinned = self._thinned.copy()
+        other = copy.copy(self)
+        other._selected = self._selected.copy()
         return other
 
-    def add(self, label: int, cloud: Cloud, view: int) -> None:
-        """Add a view's points of an object, or of the support surface."""
-        self._append(label, SeenPoints(joined([cloud]), np.full(len(cloud), view)))
-        if label != SUPPORT_LABEL:
-            self.labels_used = max(self.labels_used, label)
-
-    def __contains__(self, label: int) -> bool:
-        return label in self._seen
+    def add(self, cloud: Cloud, view: int) -> None:
+        """Add a view's points, which are labelled; colours stay where all points have them."""
+        if cloud.labels is None:
+            raise ValueError("the points of objects are labelled")
+        known = self._cloud
+        rgb = cloud.rgb
+        if len(known) and rgb is not None:
+            rgb = None if known.rgb is None else np.concatenate([known.rgb, rgb])
+        self._cloud = Cloud(
+            np.concatenate([known.points_world, cloud.points_world]),
+            np.concatenate([known.normals_world, cloud.normals_world]),
+            rgb=rgb,
+        )
+        self._views = np.concatenate([self._views, np.full(len(cloud), view)])
+        changed = set(np.unique(cloud.labels).tolist())
+        self._relabel(np.concatenate([self._labels, cloud.labels]), changed)
+        self.labels_used = max(self.labels_used, *(changed - {SUPPORT_LABEL}), 0)
 
     @property
     def objects(self) -> list[int]:
         """Labels of the objects, without the support surface."""
-        return sorted(k for k in self._seen if k != SUPPORT_LABEL)
+        labels: list[int] = np.flatnonzero(np.bincount(self._labels)).tolist()
+        return [k for k in labels if k != SUPPORT_LABEL]
 
     def of(self, label: int) -> Cloud:
         """All points of an object."""
-        return self._seen[label].cloud if label in self._seen else joined([])
+        if (label, 0.0) not in self._selected:
+            self._selected[label, 0.0] = self._select(np.flatnonzero(self._labels == label))
+        return self._selected[label, 0.0]
 
     def thinned(self, label: int, edge: float) -> Cloud:
         """Points of an object, of those in a voxel of this edge length [m] the one nearest to their mean."""
-        cloud = self.of(label)
-        before, result = self._thinned.get((label, edge), (None, None))
-        if result is None or before is not cloud:
-            result = cloud.select(thin(cloud.points_world, edge))
-            self._thinned[label, edge] = cloud, result
-        return result
+        if (label, edge) not in self._selected:
+            cloud = self.of(label)
+            self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
+        return self._selected[label, edge]
 
     def newest(self, label: int) -> Cloud:
         """Points of an object in the newest view that showed it."""
-        seen = self._seen[label]
-        return seen.cloud.select(seen.views == seen.views[-1])
+        rows = np.flatnonzero(self._labels == label)
+        return self._select(rows[self._views[rows] == self._views[rows[-1]]])
 
     def everything(self) -> Cloud:
         """All points of all objects and of the support surface, with labels."""
-        return joined(self._seen[label].cloud for label in sorted(self._seen))
+        return self._select(np.argsort(self._labels, kind="stable"))
 
     def bound(self, label: int, voxel: float, depth: int) -> None:
         """Leave an object the newest points in each voxel, once more than twice as many views have shown it.
@@ -124,20 +102,33 @@ class ObjectPoints:
             voxel: Edge length of a voxel [m].
             depth: Points left in each.
         """
-        seen = self._seen[label]
-        if np.count_nonzero(np.bincount(seen.views)) > 2 * depth:
-            self._seen[label] = seen.select(last_in_voxels(seen.cloud.points_world, voxel, depth))
+        if self._views.max(initial=0) < 2 * depth:
+            return
+        rows = np.flatnonzero(self._labels == label)
+        if np.count_nonzero(np.bincount(self._views[rows])) > 2 * depth:
+            kept = np.ones(len(self._labels), dtype=np.bool_)
+            kept[rows] = False
+            kept[rows[last_in_voxels(self._cloud.points_world[rows], voxel, depth)]] = True
+            self._reorder(np.flatnonzero(kept), self._labels, {label})
 
     def move(self, T: Mapping[int, Array]) -> set[int]:
         """Move the points of some views, view → (4, 4); returns the labels that have such points."""
-        moving = {k for k, seen in self._seen.items() if np.isin(seen.views, list(T)).any()} if T else set()
-        for label in moving:
-            self._seen[label] = self._seen[label].moved(T)
-        return moving
+        moving = np.isin(self._views, list(T))
+        if not moving.any():
+            return set()
+        poses = np.array([T.get(view, np.eye(4)) for view in range(int(self._views.max()) + 1)])
+        points = kernels.transform(poses, self._views, self._cloud.points_world)
+        normals = kernels.rotate(poses, self._views, self._cloud.normals_world)
+        self._cloud = replace(self._cloud, points_world=points, normals_world=normals)
+        changed = set(np.unique(self._labels[moving]).tolist())
+        self._relabel(self._labels, changed)
+        return changed
 
     def merge(self, old: int, new: int) -> None:
         """Give the points of one object to another."""
-        self._append(new, self._taken(old).labelled(new))
+        # Stable: of the two, the points of the new one come first.
+        order = np.argsort(np.where(self._labels == old, 2, self._labels == new), kind="stable")
+        self._reorder(order, np.where(self._labels == old, np.int32(new), self._labels), {old, new})
 
     def divide(self, label: int, groups: NDArray[np.intp]) -> list[int]:
         """Make several objects of one.
@@ -149,32 +140,25 @@ class ObjectPoints:
         Returns:
             Label of each group; the first keeps the old one.
         """
-        seen = self._taken(label)
         names = [label, *range(self.labels_used + 1, self.labels_used + 1 + int(groups.max()))]
-        for number, name in enumerate(names):
-            self._seen[name] = seen.select(groups == number).labelled(name)
+        labels = self._labels.copy()
+        labels[labels == label] = np.array(names)[groups]
+        self._relabel(labels, set(names))
         self.labels_used = max(self.labels_used, *names)
         return names
 
-    def _taken(self, label: int) -> SeenPoints:
-        self._thinned = {key: held for key, held in self._thinned.items() if key[0] != label}
-        return self._seen.pop(label)
+    def _select(self, rows: NDArray[np.intp]) -> Cloud:
+        return replace(self._cloud.select(rows), labels=self._labels[rows])
 
-    def _append(self, label: int, seen: SeenPoints) -> None:
-        self._seen[label] = self._seen[label].followed_by(seen) if label in self._seen else seen
+    def _reorder(self, rows: NDArray[np.intp], labels: NDArray[np.int32], changed: set[int]) -> None:
+        """Keep these rows, in this order, with the labels (N,) of all; forget what was selected of some."""
+        self._cloud, self._views = self._cloud.select(rows), self._views[rows]
+        self._relabel(labels[rows], changed)
 
-
-@dataclass(frozen=True, eq=False)
-class Segments:
-    """What segmentation found in one view: points (N, 3) [m] and the segment (N,) each is of."""
-
-    points: Array
-    labels: NDArray[np.int32]
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """Tree of the points."""
-        return cKDTree(self.points)
+    def _relabel(self, labels: NDArray[np.int32], changed: set[int]) -> None:
+        """Set all points' labels (N,), and forget what was selected of some."""
+        self._labels = labels
+        self._selected = {key: held for key, held in self._selected.items() if key[0] not in changed}
 
 
 class ObjectModels:
@@ -195,7 +179,7 @@ class ObjectModels:
         self._config = config
         self._seed = seed
         self._undivided: dict[int, int] = {}
-        self._segments: list[Segments] = []
+        self._segments: list[tuple[cKDTree, NDArray[np.int32]]] = []
         self._apart: dict[tuple[int, int], int] = {}
 
     def copy(self) -> ObjectModels:
@@ -214,7 +198,7 @@ class ObjectModels:
         segments = np.where(labels == SUPPORT_LABEL, 0, labels)
         kept = np.flatnonzero(segments)
         kept = kept[thin(points[kept], self._config.explanation.spacing)]
-        self._segments.append(Segments(points[kept], labels[kept]))
+        self._segments.append((cKDTree(points[kept]), labels[kept]))
         named = associate(
             points,
             segments,
@@ -233,9 +217,8 @@ class ObjectModels:
         voxels[0] = 0.0
         voxels[SUPPORT_LABEL:] = config.surface.spacing
         kept = most_central(observation.cloud.points_world, observation.labels, voxels)
-        labels = observation.labels[kept]
-        for label in sorted(shown):
-            self.points.add(label, observation.cloud.select(kept[labels == label]), view)
+        self.points.add(observation.cloud.select(kept), view)
+        for label in shown:
             self.points.bound(label, voxels[label], config.cloud.depth)
         return shown - {SUPPORT_LABEL}
 
@@ -342,9 +325,10 @@ class ObjectModels:
     def _hints(self, points: Array) -> Sequence[NDArray[np.bool_]]:
         """Points (N,) that segmentation took for a segment of its own in one of the views."""
         hints = []
-        for segments in self._segments:
-            gap, index = segments.tree.query(points, distance_upper_bound=SAME_PLACE)
-            owner = np.where(np.isfinite(gap), np.append(segments.labels, 0)[index], 0)
+        for tree, labels in self._segments:
+            # 2 cm: 2σ of the registration error of both views.
+            gap, index = tree.query(points, distance_upper_bound=0.02)
+            owner = np.where(np.isfinite(gap), np.append(labels, 0)[index], 0)
             for number in np.unique(owner[owner > 0]):
                 own = owner == number
                 if self._config.split.min_points <= own.sum() < 0.9 * (owner > 0).sum():
@@ -358,9 +342,10 @@ class ObjectModels:
 
     def _noise(self) -> float:
         """Standard deviation of points from their surfaces [m]: that of the object in the middle."""
+        # 1.25 mean absolute values of a normal distribution are one standard deviation; registration leaves
+        # 2 mm at the least.
         residuals = [o.residual for o in self.fits.values()]
-        spread = MEAN_TO_DEVIATION * float(np.median(residuals)) if residuals else 0.0
-        return max(spread, LEAST_NOISE)
+        return max(1.25 * float(np.median(residuals)), 0.002) if residuals else 0.002
 
     def _fit(self, clouds: Mapping[int, Cloud], voxels: VoxelMap | None = None) -> None:
         """Fit objects, by label, to these points."""
@@ -384,24 +369,3 @@ class ObjectModels:
                 seen=result.seen,
                 uncertainty=result.uncertainty,
             )
-
-
-def labelled(cloud: Cloud, label: int) -> Cloud:
-    """Return a cloud whose points all carry one label."""
-    return replace(cloud, labels=np.full(len(cloud), label, dtype=np.int32))
-
-
-def joined(clouds: Iterable[Cloud]) -> Cloud:
-    """Put clouds together; colours and labels stay where all of them have them."""
-    parts = list(clouds)
-    if not parts:
-        nothing: Array = np.zeros((0, 3))
-        return Cloud(nothing, nothing, np.zeros(0, dtype=np.int32))
-    rgb = [c.rgb for c in parts if c.rgb is not None]
-    labels = [c.labels for c in parts if c.labels is not None]
-    return Cloud(
-        np.concatenate([c.points_world for c in parts]),
-        np.concatenate([c.normals_world for c in parts]),
-        np.concatenate(labels) if len(labels) == len(parts) else None,
-        np.concatenate(rgb) if len(rgb) == len(parts) else None,
-    )

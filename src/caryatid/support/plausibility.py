@@ -16,21 +16,14 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
 from caryatid.support.contacts import Contact, find_contacts, local_frames
 
-REACH = 0.01
-"""Gap below an object that touches nothing below it that is closed [m]; as of contacts."""
-MAX_TILT = 25.0
-"""Separating planes steeper than this carry nothing for sure [deg]."""
-MIN_EXTENT = 0.008
-"""Shortest extent [m]; as of the fits."""
-
 
 def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> list[SceneObject]:
     """Move shapes, and their unsure sides, until they neither overlap nor float: within their uncertainty.
 
-    Each overlap is a measurement that the gap there is zero, and so is the smallest gap below an object that
-    touches nothing below it. All of them together correct poses, sizes and hidden extents at once, each in
-    proportion to its variance (the update of a Kalman filter). A gap beyond what the fits' uncertainty can
-    explain is left as it is and said of the objects: their shapes are doubtful.
+    Each overlap is a measurement that the gap there is zero, and so is the smallest gap, up to 1 cm, below
+    an object that touches nothing below it. All of them together correct poses, sizes and hidden extents at
+    once, each in proportion to its variance (the update of a Kalman filter). A gap beyond what the fits'
+    uncertainty can explain is left as it is and said of the objects: their shapes are doubtful.
 
     Args:
         objects: The support surface and the objects on it; without `uncertainty` they stay as they are.
@@ -44,7 +37,7 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
     variance = sigma**2
     doubts: dict[int, str] = {}
     for number in range(config.rounds):
-        contacts = find_contacts([o.shape for o in done], REACH)
+        contacts = find_contacts([o.shape for o in done], 0.01)
         wrong = [c for c in contacts if c.distance < -config.touch] + _floating(done, contacts, config)
         if not wrong:
             break
@@ -115,9 +108,9 @@ def _sigma(o: SceneObject) -> Array:
 def _floating(
     objects: Sequence[SceneObject], contacts: Sequence[Contact], config: PlausibilityConfig
 ) -> list[Contact]:
-    """The nearest contact below each object that touches nothing below it, among those with a small gap."""
+    """The nearest contact below each object that touches nothing below it; steep ones carry nothing."""
     nearest: dict[int, Contact] = {}
-    steep = np.cos(np.radians(MAX_TILT))
+    steep = np.cos(np.radians(25.0))
     for contact in contacts:
         upper = contact.b if contact.normal_world[2] > 0.0 else contact.a
         level = abs(contact.normal_world[2]) > steep and objects[upper].role != "support_surface"
@@ -164,7 +157,7 @@ def _changed(shape: Shape, change: Array) -> Shape:
     """Change a shape's independent variables (9,)."""
     change = _effect(shape.ties) @ change
     T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(change[3:6]), change[:3])
-    extents = np.maximum(shape.extents + 2.0 * change[6:9], MIN_EXTENT)
+    extents = np.maximum(shape.extents + 2.0 * change[6:9], 0.008)  # As of the fits.
     return shape.from_extents(T, extents)
 
 

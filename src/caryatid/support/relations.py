@@ -246,37 +246,31 @@ def _touching(
     objects: Sequence[SceneObject], contacts: Sequence[Contact], config: SupportConfig
 ) -> list[tuple[SceneObject, SceneObject, Touch]]:
     """Both objects of each contact, and the contact as the second of them feels it."""
-    pairs = [(objects[c.a], objects[c.b]) for c in contacts]
-    normals_world = [_plane_normal(a, b, c) for (a, b), c in zip(pairs, contacts, strict=True)]
-    tilts = np.degrees(transforms.angle_between(np.array(normals_world).reshape(-1, 3), (0.0, 0.0, 1.0)))
-    margins = _margins(objects, contacts, normals_world, config)
-    rows = zip(pairs, contacts, normals_world, tilts.tolist(), margins, strict=True)
-    return [
-        (a, b, Touch(a, normal_world, c.distance, tilt, c.points_world, c.point_world, margin))
-        for (a, b), c, normal_world, tilt, margin in rows
-    ]
-
-
-def _margins(
-    objects: Sequence[SceneObject],
-    contacts: Sequence[Contact],
-    normals_world: Sequence[Array],
-    config: SupportConfig,
-) -> list[float]:
-    """Gaps [m] up to which shapes touch: what their fits' uncertainty across each contact explains."""
+    normals_world = np.array([_plane_normal(objects[c.a], objects[c.b], c) for c in contacts]).reshape(-1, 3)
+    tilts = np.degrees(transforms.angle_between(normals_world, (0.0, 0.0, 1.0)))
+    # Shapes touch up to gaps that their fits' uncertainty across the contact explains.
     sides, rotation = np.zeros((len(objects), 3, 2)), np.zeros((len(objects), 3))
     for k, o in enumerate(objects):
         if o.uncertainty is not None:
             sides[k], rotation[k] = o.uncertainty.sides.reshape(3, 2), o.uncertainty.rotation
     pairs = np.array([(c.a, c.b) for c in contacts], dtype=np.intp).reshape(-1, 2)
     points_world = np.array([c.point_world for c in contacts]).reshape(-1, 3)
-    normals = np.array(normals_world).reshape(-1, 3)
-    points, outward = local_frames(Primitives.of([o.shape for o in objects]), pairs, points_world, normals)
+    shapes = Primitives.of([o.shape for o in objects])
+    points, outward = local_frames(shapes, pairs, points_world, normals_world)
     facing = np.where(outward > 0.0, sides[pairs, :, 1], sides[pairs, :, 0])
     spread = (outward * facing) ** 2 + (np.cross(points, outward) * rotation[pairs]) ** 2
     margins = config.margin_sigma * np.sqrt(spread.sum(axis=(1, 2)))
-    explained: list[float] = np.clip(margins, config.contact_margin, config.max_margin).tolist()
-    return explained
+    margins = np.clip(margins, config.contact_margin, config.max_margin)
+    return [
+        (
+            objects[c.a],
+            objects[c.b],
+            Touch(objects[c.a], normal_world, c.distance, tilt, c.points_world, c.point_world, margin),
+        )
+        for c, normal_world, tilt, margin in zip(
+            contacts, normals_world, tilts.tolist(), margins.tolist(), strict=True
+        )
+    ]
 
 
 def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:
@@ -360,23 +354,21 @@ def _weighed_down(
     """Top-down supports: what rests on an unstable object, all or only what weighs against its tipping."""
     if stability.stable:
         return []
-    head = _verdict(o.id, stability, config)
-    found = []
+    head, found = _verdict(o.id, stability, config), []
     for t in riders:
-        load_xy = centroid(_patch(t, o, config))
-        lever = float((tipping.pivot_xy - load_xy) @ tipping.direction_xy)
+        why = f"{head}; {t.other.id} rests on it"
+        lever = float((tipping.pivot_xy - centroid(_patch(t, o, config))) @ tipping.direction_xy)
         if config.top_down == "paper":
-            found.append(_support(t, o, "top-down", False, f"{head}; {t.other.id} rests on it."))
+            found.append(_support(t, o, "top-down", False, f"{why}."))
         elif stability.tips and lever > 0.0:
-            why = f"{head}; {t.other.id} rests on it {_mm(lever)} behind the edge it tips over."
+            why = f"{why} {_mm(lever)} behind the edge it tips over."
             found.append(_support(t, o, "top-down", False, why))
     return found
 
 
 def _support(t: Touch, o: SceneObject, kind: Kind, certain: bool, why: str) -> Support:
-    return Support(
-        t.other.id, o.id, kind, certain, contact_world=t.point_world, normal_world=t.normal_world, why=why
-    )
+    where = {"contact_world": t.point_world, "normal_world": t.normal_world}
+    return Support(t.other.id, o.id, kind, certain, **where, why=why)
 
 
 def _below_text(t: Touch, o: SceneObject) -> str:

@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from caryatid.config import SupportConfig
-from caryatid.geometry import polygons, transforms
-from caryatid.geometry.shapes import Primitives, Shape
+from caryatid.geometry import polygons
+from caryatid.geometry.shapes import Box, Primitives, Shape
 from caryatid.geometry.signed_distance import signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Stability
@@ -19,18 +18,19 @@ from caryatid.graph import Stability
 _UP = np.array([0.0, 0.0, 1.0])
 _NO_AREA = 1e-12
 """Contact areas below this are lines and points, blurred by rounding [m²]; a micrometre squared."""
-_CIRCLE = np.array([(math.cos(a), math.sin(a)) for a in 2.0 * np.pi * np.arange(48) / 48])
-"""Polygon (48, 2) that stands for the rim of a ball's cap; 0.2 % of its radius off."""
-_SIDES = 24
-"""Sides of the prism that stands for a cylinder; 1 % of its radius off."""
-_PATCH_TILT = 1.0
-"""Faces that a fit has turned against each other by this still touch all over [deg]; a ball has none."""
-_MARCH_POINTS = 16
-"""Surface points along the longest side of a shape that is let down."""
-_MARCH_STEPS = 40
-"""Steps by the signed distance: enough to come within a hair wherever the way is not along a wall."""
-_MARCH_HIT = 5e-4
+_HIT = 5e-4
 """A point this near to the other shape has met it [m]."""
+_RING = np.arange(24)
+_EDGES = {
+    "box": np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]),
+    "cylinder": np.concatenate(
+        [
+            np.stack(e, axis=-1)
+            for e in ((_RING, _RING + 24), (_RING, (_RING + 1) % 24), (_RING + 24, (_RING + 1) % 24 + 24))
+        ]
+    ),
+}
+"""Edges (E, 2) between the points of the outline of a box, and of the prism that stands for a cylinder."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -46,26 +46,6 @@ class Tipping:
     overhang: float
     pivot_xy: Array
     direction_xy: Array
-
-
-def _cube() -> tuple[Array, NDArray[np.int64]]:
-    """Corners (8, 3) and edges (12, 2) of a cube of half extent 1."""
-    corners = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    return corners, np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit])
-
-
-def _prism() -> tuple[Array, NDArray[np.int64]]:
-    """Corners (48, 3) and edges (72, 2) of a prism of radius and half height 1."""
-    angle = 2.0 * np.pi * np.arange(_SIDES) / _SIDES
-    ring = np.stack([np.cos(angle), np.sin(angle), np.ones(_SIDES)], axis=-1)
-    low, after = np.arange(_SIDES) + _SIDES, (np.arange(_SIDES) + 1) % _SIDES
-    ends = [(low - _SIDES, low), (low - _SIDES, after), (low, after + _SIDES)]
-    edges = np.concatenate([np.stack(e, axis=-1) for e in ends])
-    return np.concatenate([ring, ring * (1.0, 1.0, -1.0)]), edges
-
-
-_SOLIDS = {"box": _cube(), "cylinder": _prism()}
-"""Corners, in half extents, and edges of the solids that stand for shapes."""
 
 
 def ground_outline(shape: Shape) -> Array:
@@ -109,7 +89,7 @@ def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
 def beneath(shapes: Primitives, index: int, limit: float) -> list[int]:
     """Indices of the shapes that one could meet, by their boxes, when it falls down by a limit [m]."""
     low, high = shapes.bounds()
-    near = 2.0 * _MARCH_HIT
+    near = 2.0 * _HIT
     below = (low[index, 2] - limit <= high[:, 2] + near) & (high[index, 2] >= low[:, 2] - near)
     apart = np.maximum(low[:, :2] - high[index, :2], low[index, :2] - high[:, :2]).max(axis=1)
     return [int(k) for k in np.flatnonzero(below & (apart <= near)) if k != index]
@@ -150,39 +130,38 @@ def centroid(polygon: Array) -> Array:
 
 
 def _touching_depth(shape: Shape, config: SupportConfig) -> float:
-    if shape.kind == "sphere":
-        return config.patch_depth
-    turned = np.sin(np.radians(_PATCH_TILT)) * float(shape.extents.max()) / 2.0
+    """How deep [m] a shape touches: faces turned by a degree in a fit do so all over; a ball has none."""
+    turned = 0.0 if shape.kind == "sphere" else np.sin(np.radians(1.0)) * float(shape.extents.max()) / 2.0
     return config.patch_depth + float(turned)
 
 
 def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) -> float:
     """Way [m] until the first surface point meets the target; what touches at once lies beside it."""
     own, aim = zip(*Primitives.of([shape, target]), strict=True)
-    spacing = float(shape.extents.max()) / _MARCH_POINTS
+    spacing = float(shape.extents.max()) / 16.0
     corners_world = shape.outline() if shape.kind != "sphere" else np.empty((0, 3))
     points_world = np.concatenate([shape.surface(spacing)[0], corners_world])
-    in_front = signed_distances(*own, points_world + 2.0 * _MARCH_HIT * direction_world) > _MARCH_HIT
-    points_world = points_world[in_front & (signed_distances(*aim, points_world) > _MARCH_HIT)]
+    in_front = signed_distances(*own, points_world + 2.0 * _HIT * direction_world) > _HIT
+    points_world = points_world[in_front & (signed_distances(*aim, points_world) > _HIT)]
     travelled = np.zeros(len(points_world))
     step = np.full(len(points_world), np.inf)
-    for _ in range(_MARCH_STEPS):
+    for _ in range(40):  # Enough to come within a hair wherever the way is not along a wall.
         step = signed_distances(*aim, points_world + travelled[:, None] * direction_world)
-        on_its_way = (travelled + step <= limit) & (step > -_MARCH_HIT)
+        on_its_way = (travelled + step <= limit) & (step > -_HIT)
         points_world, step = points_world[on_its_way], step[on_its_way]
         travelled = travelled[on_its_way] + step
-        if not len(step) or step.max() < _MARCH_HIT:
+        if not len(step) or step.max() < _HIT:
             break
-    return float(travelled[step < _MARCH_HIT].min(initial=np.inf))
+    return float(travelled[step < _HIT].min(initial=np.inf))
 
 
 def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
     """Outline on the ground (M, 2) [m] of what lies within `depth` of a shape's extreme point that way."""
     if shape.kind == "sphere":
         return polygons.hull(_ball_cap(shape, direction_world, depth))
-    corners, edges = _SOLIDS.get(shape.kind, _SOLIDS["box"])
-    corners_world = transforms.transform(shape.T_world_object, corners * (shape.extents / 2.0))
-    return polygons.cap(corners_world, edges, direction_world, depth)
+    if shape.kind not in _EDGES:
+        shape = Box(shape.T_world_object, shape.extents)
+    return polygons.cap(shape.outline(), _EDGES[shape.kind], direction_world, depth)
 
 
 def _ball_cap(ball: Shape, direction_world: Array, depth: float) -> Array:
@@ -199,4 +178,5 @@ def _ball_cap(ball: Shape, direction_world: Array, depth: float) -> Array:
     v_xy = np.array([y * u[2] - z * u[1], z * u[0] - x * u[2]])
     wide = math.sqrt(depth * (2.0 * radius - depth))
     middle_xy = ball.T_world_object[:2, 3] + (radius - depth) * direction_world[:2]
-    return middle_xy + wide * (_CIRCLE @ np.stack([u[:2], v_xy]))
+    angle = 2.0 * np.pi * np.arange(48) / 48
+    return middle_xy + wide * (np.stack([np.cos(angle), np.sin(angle)], axis=-1) @ np.stack([u[:2], v_xy]))
