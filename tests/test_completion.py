@@ -146,16 +146,6 @@ def test_only_a_side_that_faces_down_is_one_to_rest_on(tilt_deg, extended):
     assert lowest(done.shape) >= TABLE_TOP - 0.001
 
 
-def test_the_table_is_where_it_was_found_not_where_it_is_in_the_examples():
-    hovering = box((0.0, 0.0, 0.3), (0.1, 0.1, 0.1))
-    (done,) = completed(thing(1, hovering, seen=SIDES_AND_TOP), surface=surface_at(0.2))
-    assert lowest(done.shape) == pytest.approx(0.2)
-
-
-def test_nothing_to_complete_is_no_error():
-    assert completed() == []
-
-
 def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():
     front = box((0.0, 0.0, TABLE_TOP + 0.05), (0.01, 0.08, 0.1))
     flat = thing(1, front, seen=(True, False, False, False, False, False))

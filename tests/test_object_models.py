@@ -183,16 +183,6 @@ def test_a_move_moves_the_points_of_its_views_only():
     np.testing.assert_array_equal(points.of(9).points_world, before[9].points_world)
 
 
-def test_a_divided_objects_points_still_move_with_their_views():
-    points = two_views()
-    names = points.divide(3, np.arange(12) % 2)
-    T = transforms.rigid(np.eye(3), (0.0, 0.0, 5.0))
-    heights = [points.of(k).points_world[:, 2] for k in names]
-    points.move({1: T})
-    for label, height in zip(names, heights, strict=True):
-        np.testing.assert_array_equal(points.of(label).points_world[:, 2] - height, [0, 0, 0, 5, 5, 5])
-
-
 def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
     points = ObjectPoints()
     for view in range(9):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from raycast import table_scene
 from synthetic import (
-    SENSOR,
     TABLE_TOP,
     box,
     config_for,
@@ -27,7 +26,6 @@ from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.truth import ground_truth
 
 METHODS = ("pc", "sg", "pc+sg")
@@ -80,14 +78,6 @@ def test_automatic_labels_are_those_of_the_vertices(without_labels):
         named = {o.label for o in graph.objects}
         # A part too small for a shape has a label and no vertex.
         assert len(shown & named) >= max(2, len(shown) - 1)
-
-
-def test_more_views_make_it_better():
-    f1 = []
-    scene = Scene(segmentation="labels")
-    for view in simulated_views("bridge"):
-        f1.append(f1_of(scene.update(view), "bridge"))
-    assert f1[0] < f1[-1]
 
 
 def test_the_shape_of_an_object_gets_better_and_is_not_merely_kept():
@@ -234,32 +224,20 @@ def test_inputs_are_not_changed():
         np.testing.assert_array_equal(before, after)
 
 
-def test_the_sensor_of_these_tests_is_the_carmine_made_smaller():
-    ratio = SENSOR.width / 640.0
-    assert SENSOR.focal == pytest.approx(525.0 * ratio, rel=0.01)
-    view = SimulatedCamera(simulated_scene("tower"), sensor=SENSOR).capture(look_from(0.0))
-    assert view.depth.shape == (180, 240)
-
-
 @pytest.mark.parametrize(("method", "segmentation"), [("pc+sg", "labels"), ("sg", "labels"), ("pc", "auto")])
 def test_what_a_copy_learns_the_original_does_not(method, segmentation):
     azimuths = (180.0, 60.0, 300.0, 0.0) if segmentation == "labels" else (180.0, 300.0, 0.0)
     *known, last, other = simulated_views("tower", azimuths=azimuths, noise="carmine")
     alone, copied = (model_of(known, config_for(method), segmentation=segmentation) for _ in range(2))
     graph, labels, points = graph_text(copied.graph), copied.labels, copied.cloud.points_world
-    copy = copied.copy()
+    copy, follower = copied.copy(), copied.copy()
     copy.update(other)
     assert (copy.views, copied.views) == (len(known) + 1, len(known))
     assert graph_text(copied.graph) == graph
     np.testing.assert_array_equal(copied.labels, labels)
     np.testing.assert_array_equal(copied.cloud.points_world, points)
-    assert graph_text(copied.update(last)) == graph_text(alone.update(last))
+    assert (
+        graph_text(copied.update(last)) == graph_text(alone.update(last)) == graph_text(follower.update(last))
+    )
     np.testing.assert_array_equal(copied.labels, alone.labels)
     np.testing.assert_array_equal(copied.cloud.points_world, alone.cloud.points_world)
-
-
-def test_a_copy_goes_on_as_the_original_would():
-    first, *rest = simulated_views("tower", noise="carmine")
-    scene = model_of([first])
-    copy = scene.copy()
-    assert [graph_text(copy.update(v)) for v in rest] == [graph_text(scene.update(v)) for v in rest]

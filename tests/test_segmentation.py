@@ -85,13 +85,6 @@ def test_without_a_pose_the_table_is_found_in_the_camera_frame():
     assert abs(transforms.transform(T, surface.point_world)[2] - TABLE) < 0.003
 
 
-def test_same_seed_same_surface():
-    view = table_scene(from_the_side(), STACK, sigma=0.001)
-    first, second = surface_of(view, seed=4), surface_of(view, seed=4)
-    np.testing.assert_array_equal(first.outline_world, second.outline_world)
-    np.testing.assert_array_equal(first.shape.T_world_object, second.shape.T_world_object)
-
-
 @pytest.mark.parametrize("up", [UP, None])
 def test_no_surface_is_an_error_that_says_so(up):
     rng = np.random.default_rng(0)

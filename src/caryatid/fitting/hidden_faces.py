@@ -16,7 +16,7 @@ from caryatid.fitting.uncertainty import Uncertainty, estimate
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import write_distances
+from caryatid.geometry.signed_distance import signed_distances
 from caryatid.geometry.transforms import Array, rigid
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
@@ -51,118 +51,76 @@ def close_hidden_faces(
     points = points[np.linspace(0, len(points) - 1, min(len(points), FINAL_POINTS)).astype(np.intp)]
     origin = points.mean(axis=0)
     kind, R, centre, half = Primitives.of([shape]).row(0)
-    sides = np.array(seen)
-    R, centre, half, hidden, information, sigma, residual, inliers = _close(
-        kind, R, centre - origin, half, sides, points - origin,
-        config.threshold, config.max_extent, config.min_extent, config.min_points, config.steps,
-        config.correlated, config.rim,
-    )  # fmt: skip
+    sides, centre, points = np.array(seen), centre - origin, points - origin
+    # Unseen sides are moved out of the way; a round side is seen as a whole, and a sphere stays.
+    unseen_mantle = kind == CYLINDER and not sides[:4].any()
+    flat = np.array([kind == BOX, kind == BOX, kind != SPHERE])
+    low, high = np.where(flat, OPENING * ~sides.reshape(3, 2).T, 0.0)
+    opened = half + (low + high) / 2.0
+    if unseen_mantle:
+        opened[:2] += OPENING
+    turned, middle = R.copy(), centre + np.einsum("ab,b->a", R, (high - low) / 2.0)
+    levenberg_marquardt(kind, turned, middle, opened, points, config.steps, config.min_extent, 0.0, CONVERGED)
+    distance = np.abs(signed_distances(kind, turned, middle, opened, points))
+    near = distance[distance < config.threshold]
+    sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) else config.threshold
+    information = np.empty((9, 9))
+    normal_equations(kind, turned, middle, opened, points, 2.5 * sigma, information, np.empty(9))
+    # Each unseen side is put where points end, or back where it was.
+    hidden, closed = np.full(6, config.max_extent / np.sqrt(12.0)), opened.copy()
+    own = np.ascontiguousarray(in_frame(turned, middle, points).T)
+    before = in_frame(turned, middle, centre[None])[0]
+    if unseen_mantle:
+        end, hidden[:4] = _end(kind, opened, own, 0, 1.0, sigma, config) or (half[0], hidden[0])
+        closed[:2] = end
+    for axis in np.flatnonzero(flat & ~sides.reshape(3, 2).all(axis=1)).tolist():
+        ends = [-opened[axis], opened[axis]]
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            if not sides[2 * axis + side]:
+                found = _end(kind, opened, own, axis, sign, sigma, config)
+                ends[side] = sign * found[0] if found else before[axis] + sign * half[axis]
+                hidden[2 * axis + side] = found[1] if found else hidden[2 * axis + side]
+        short = max(config.min_extent - (ends[1] - ends[0]), 0.0)
+        if sides[2 * axis + 1]:
+            ends[0] -= short
+        else:
+            ends[1] += short
+        closed[axis] = (ends[1] - ends[0]) / 2.0
+        middle += turned[:, axis] * (ends[1] + ends[0]) / 2.0
+    if 2.0 * closed.max() <= config.max_extent and len(near):
+        R, centre, half = turned, middle, closed
+    distance = np.abs(signed_distances(kind, R, centre, half, points))
+    residual = float(np.minimum(distance, config.threshold).mean())
+    inliers = float((distance < config.threshold).mean())
     uncertainty = estimate(kind, sides, hidden, information * len(points), sigma, config)
     return shape.from_extents(rigid(R, centre + origin), 2.0 * half), residual, inliers, uncertainty
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _close(  # type: ignore[no-untyped-def]
-    kind, R, centre, half, seen, points,
-    threshold, max_extent, min_extent, min_points, steps, correlated, rim,
-):  # fmt: skip
-    """Refine a shape with unseen sides out of the way, and put those where points about their origin end.
-
-    Returns:
-        Axes (3, 3), centre and half extents (3,) [m]; standard deviation (6,) [m] of where unseen sides are,
-        normal equations (9, 9) of the opened shape, robust standard deviation of the distances [m]; residual
-        [m] and inliers.
-    """
-    turned, middle, opened = R.copy(), centre.copy(), half.copy()
-    _open(kind, turned, middle, opened, seen)
-    levenberg_marquardt(kind, turned, middle, opened, points, steps, min_extent, 0.0, CONVERGED)
-    distance = np.empty(len(points))
-    write_distances(kind, turned, middle, opened, points, distance)
-    distance = np.abs(distance)
-    near = distance[distance < threshold]
-    sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) > 0 else threshold
-    information = np.empty((9, 9))
-    normal_equations(kind, turned, middle, opened, points, 2.5 * sigma, information, np.empty(9))
-    hidden = np.full(6, max_extent / np.sqrt(12.0))
-    closed = opened.copy()
-    if kind != SPHERE:
-        # Each unseen side lies where points end, or where it was.
-        own, before = in_frame(turned, middle, points), in_frame(turned, middle, centre.reshape(1, 3))[0]
-        if kind == CYLINDER and not seen[:4].any():
-            end, deviation = _end(kind, opened, own, 0, 1.0, sigma, min_points)
-            closed[0] = closed[1] = half[0] if np.isnan(end) else end
-            if not np.isnan(end):
-                hidden[:4] = np.sqrt(deviation * deviation * correlated + rim * rim)
-        for axis in range(2 if kind == CYLINDER else 0, 3):
-            if seen[2 * axis] and seen[2 * axis + 1]:
-                continue
-            ends = np.array([-opened[axis], opened[axis]])
-            for side in range(2):
-                if seen[2 * axis + side]:
-                    continue
-                sign = 2.0 * side - 1.0
-                end, deviation = _end(kind, opened, own, axis, sign, sigma, min_points)
-                ends[side] = before[axis] + sign * half[axis] if np.isnan(end) else sign * end
-                if not np.isnan(end):
-                    hidden[2 * axis + side] = np.sqrt(deviation * deviation * correlated + rim * rim)
-            short = max(min_extent - (ends[1] - ends[0]), 0.0)
-            if seen[2 * axis + 1]:
-                ends[0] -= short
-            else:
-                ends[1] += short
-            closed[axis] = (ends[1] - ends[0]) / 2.0
-            for a in range(3):
-                middle[a] += turned[a, axis] * (ends[1] + ends[0]) / 2.0
-    if 2.0 * closed.max() > max_extent or len(near) == 0:
-        turned, middle, closed = R, centre, half
-    write_distances(kind, turned, middle, closed, points, distance)
-    distance = np.abs(distance)
-    residual, inliers = np.minimum(distance, threshold).mean(), (distance < threshold).mean()
-    return turned, middle, closed, hidden, information, sigma, residual, inliers
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _open(kind, R, centre, half, seen):  # type: ignore[no-untyped-def]
-    """Move unseen sides out of the way; a round side is seen as a whole, and a sphere stays."""
-    if kind == CYLINDER and not seen[:4].any():
-        half[:2] += OPENING
-    shift = np.zeros(3)
-    for axis in range(3):
-        if kind == BOX or (kind == CYLINDER and axis == 2):
-            low, high = OPENING * (not seen[2 * axis]), OPENING * (not seen[2 * axis + 1])
-            half[axis] += (low + high) / 2.0
-            shift[axis] = (high - low) / 2.0
-    for a in range(3):
-        centre[a] += R[a, 0] * shift[0] + R[a, 2] * shift[2] + R[a, 1] * shift[1]
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _end(kind, half, own, axis, sign, sigma, min_points):  # type: ignore[no-untyped-def]
-    """Where points (N, 3) beside one side end along its direction, and its deviation [m]; NaN if few tell.
+def _end(
+    kind: int, half: Array, own: Array, axis: int, sign: float, sigma: float, config: FitConfig
+) -> tuple[float, float] | None:
+    """Where points (3, N) beside one side end along its direction, and its deviation [m]; None if few tell.
 
     Points of a cylinder's ends tell where its mantle is, those of a box's other faces where a face is.
     """
     round_ = kind == CYLINDER and axis != 2
-    coordinates = np.empty(len(own))
-    count = 0
-    for i in range(len(own)):
-        reach = np.sqrt(own[i, 0] ** 2 + own[i, 1] ** 2)
-        if round_:
-            off = abs(own[i, 2]) - half[2]
-        elif kind == CYLINDER:
-            off = reach - half[0]
-        else:
-            u, v = (axis + 1) % 3, (axis + 2) % 3
-            off = max(abs(own[i, u]) - half[u], abs(own[i, v]) - half[v])
-        if abs(off) < 3.0 * sigma:
-            coordinates[count] = reach if round_ else sign * own[i, axis]
-            count += 1
-    if count < min_points:
-        return np.nan, np.nan
-    found = coordinates[:count]
+    along = sign * own[axis]
+    if kind == CYLINDER:
+        reach = np.sqrt(own[0] ** 2 + own[1] ** 2)
+        off = np.abs(own[2]) - half[2] if round_ else reach - half[0]
+        along = reach if round_ else along
+    else:
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        off = np.maximum(np.abs(own[u]) - half[u], np.abs(own[v]) - half[v])
+    found = along[np.abs(off) < 3.0 * sigma]
+    if len(found) < config.min_points:
+        return None
     start = quantile(found, 1.0 - TRIM)
     span = start if round_ else start - quantile(found, TRIM)
-    return likeliest_end(found, start, sigma, max(4.0 * sigma, 0.1 * span), round_)
+    window = max(4.0 * sigma, 0.1 * span)
+    close = found[found > start - window - 12.0 * sigma]
+    end, deviation = likeliest_end(close, start, sigma, window, round_)
+    return end, math.sqrt(deviation * deviation * config.correlated + config.rim * config.rim)
 
 
 @njit(cache=True, error_model="numpy")
@@ -182,12 +140,11 @@ def likeliest_end(
         window: Length over which the density is measured [m].
         growing: The density grows with the coordinate, as on a disc along its radius.
     """
-    close = coordinates[coordinates > start - window - 12.0 * sigma]
-    end = start
-    density = 0.0
+    end, density = start, 0.0
     for _ in range(3):  # Both change by a hundredth of σ in the last round.
-        top = end - 2.0 * sigma
-        count = int(np.sum((close > top - window) & (close <= top)))
+        top, count = end - 2.0 * sigma, 0
+        for u in coordinates:
+            count += top - window < u <= top
         density = max(count, 1) / window
         if growing:
             density *= end / max(top - window / 2.0, 1e-6)
@@ -195,7 +152,7 @@ def likeliest_end(
         for _ in range(14):  # To 12 σ / 2¹⁴.
             middle = 0.5 * (low + high)
             slope = -density * sigma
-            for u in close:
+            for u in coordinates:
                 z = (middle - u) / sigma
                 if -6.0 < z < 4.5:
                     within = 0.5 * math.erfc(-z * 0.7071067811865476)

@@ -20,7 +20,7 @@ ROUGHLY = 1e-3
 """The same where another refinement follows."""
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def levenberg_marquardt(  # type: ignore[no-untyped-def]
     kind, R, centre, half, points, steps, min_extent, shrink, converged
 ):
@@ -49,7 +49,8 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
     distance, absolute = np.empty(len(points)), np.empty(len(points))
     write_distances(kind, R, centre, half, points, distance)
     for _ in range(steps):
-        absolute[:] = np.abs(distance)
+        for i in range(len(points)):
+            absolute[i] = abs(distance[i])
         # What is further off than 2.5 robust standard deviations loses most of its weight.
         scale = 2.5 * max(1.4826 * quantile(absolute, 0.5), NOISE_FLOOR)
         normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
@@ -68,7 +69,10 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
             trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half_trial)
             if trial_cost < cost:
                 improved = True
-                R[:], centre[:], half[:] = R_trial, centre_trial, half_trial
+                for a in range(3):
+                    centre[a], half[a] = centre_trial[a], half_trial[a]
+                    for b in range(3):
+                        R[a, b] = R_trial[a, b]
                 break
             damping *= 6.0
         if not improved:
@@ -78,7 +82,7 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
             break
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def normal_equations(kind, R, centre, half, points, scale, H, g):  # type: ignore[no-untyped-def]
     """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
 

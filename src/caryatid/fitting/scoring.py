@@ -16,7 +16,7 @@ BARE_SPACING = 0.008
 """Spacing of the samples that look for points near a side [m]; a point within twice that is near one."""
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
     """Coordinates (N, 3) of points (N, 3) in a frame with axes R (3, 3) at an origin (3,)."""
     own = np.empty((len(points), 3))
@@ -25,7 +25,7 @@ def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
     return own
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def judge(  # type: ignore[no-untyped-def]
     kind, R, centre, half, points, normals, threshold, least, min_extent, seen
 ):
@@ -47,21 +47,26 @@ def judge(  # type: ignore[no-untyped-def]
         Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, 1 at the most;
         share of the points within the threshold.
     """
-    own, facing, count = in_frame(R, centre, points), in_frame(R, np.zeros(3), normals), len(points)
-    counts, near = np.zeros(6, np.intp), np.zeros(count, np.bool_)
+    own, facing = in_frame(R, centre, points), in_frame(R, np.zeros(3), normals)
+    counts, near, count = np.zeros(6), np.empty((len(points), 3)), 0
     hx, hy, hz = half[0], half[1], half[2]
-    for i in range(count):
+    for i in range(len(points)):
         d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
-        near[i] = abs(d) < threshold
-        if near[i] and gx * facing[i, 0] + gy * facing[i, 1] + gz * facing[i, 2] > 0.5:
+        if not abs(d) < threshold:
+            continue
+        near[count, 0], near[count, 1], near[count, 2] = own[i, 0], own[i, 1], own[i, 2]
+        count += 1
+        if gx * facing[i, 0] + gy * facing[i, 1] + gz * facing[i, 2] > 0.5:
             for axis, g in enumerate((gx, gy, gz)):
                 counts[2 * axis] += g < -FACING
                 counts[2 * axis + 1] += g > FACING
-    seen[:] = counts >= least
+    for side in range(6):
+        seen[side] = counts[side] >= least
     if kind != SPHERE:
-        _draw_in(kind, R, centre, half, own, own[near] if near.any() else own, min_extent, seen)
+        _draw_in(kind, R, centre, half, own, near[:count] if count > 0 else own, min_extent, seen)
     away = turned = 0.0
     inliers = 0
+    count = len(points)
     hx, hy, hz = half[0], half[1], half[2]
     for i in range(count):
         d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
@@ -75,13 +80,15 @@ def judge(  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _draw_in(kind, R, centre, half, own, near, min_extent, seen):  # type: ignore[no-untyped-def]
     """Move sides that are not seen inwards to where the near points end; all points move with the centre."""
-    shift = np.zeros(3)
+    shift, reach = np.zeros(3), np.empty(len(near))
     for axis in range(2 if kind == CYLINDER else 0, 3):
         low, high = -half[axis], half[axis]
+        for i in range(len(near)):
+            reach[i] = near[i, axis]
         if not seen[2 * axis]:
-            low = min(max(low, quantile(near[:, axis].copy(), TRIM)), high - min_extent)
+            low = min(max(low, quantile(reach, TRIM)), high - min_extent)
         if not seen[2 * axis + 1]:
-            high = max(min(high, quantile(near[:, axis].copy(), 1.0 - TRIM)), low + min_extent)
+            high = max(min(high, quantile(reach, 1.0 - TRIM)), low + min_extent)
         half[axis], shift[axis] = (high - low) / 2.0, (high + low) / 2.0
     for a in range(3):
         centre[a] += R[a, 0] * shift[0] + R[a, 1] * shift[1] + R[a, 2] * shift[2]
@@ -89,17 +96,11 @@ def _draw_in(kind, R, centre, half, own, near, min_extent, seen):  # type: ignor
             own[i, a] -= shift[a]
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def bare_share(kind, R, centre, half, seen, points):  # type: ignore[no-untyped-def]
     """Share of the seen sides' area that has no point near it: a side that was seen should be seen whole.
 
-    Args:
-        kind: Code of the shape.
-        R: Axes (3, 3).
-        centre: (3,) [m].
-        half: Half extents (3,) [m].
-        seen: Which sides (6,) are seen.
-        points: (N, 3) [m].
+    The shape has axes R (3, 3), a centre (3,) and half extents (3,) [m]; points are (N, 3).
     """
     own = in_frame(R, centre, points)
     samples = bare = last = 0

@@ -1,15 +1,12 @@
-"""Compiled model search: shapes through two oriented points, the best of many by MSAC; and of one face.
-
-Axes R (3, 3), centre (3,) and half extents (3,) [m] of what is found are written to the arrays passed in.
-"""
+"""Compiled model search: shapes through two oriented points, the best of many by MSAC; and of one face."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
-from caryatid.geometry import BOX, CYLINDER
-from caryatid.geometry.points import quantile
+from caryatid.geometry import BOX, CYLINDER, SPHERE
+from caryatid.geometry.points import quantile, select
 from caryatid.geometry.signed_distance import local, signed_distance
 
 TRIM = 0.005
@@ -22,29 +19,29 @@ AGREEING = float(np.cos(np.radians(25.0)))
 """Least cosine between normals of one face [1]."""
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@njit(cache=True, error_model="numpy", nogil=True)
 def search(  # type: ignore[no-untyped-def]
-    kind, points, normals, samples, threshold, max_radius, max_extent, R, centre, half
+    kind, points, normals, samples, keep, threshold, max_radius, max_extent, min_extent
 ):
-    """Score hypotheses until a better one has become unlikely; keep the best, the best first (MSAC).
+    """Score hypotheses until a better one has become unlikely, and keep the best (MSAC).
 
     Args:
         kind: Code of the shape.
         points: (N, 3) [m].
         normals: Unit normals (N, 3).
         samples: Indices (B, 2) of the two points each hypothesis is made from, in the order they are tried.
+        keep: How many of the best are kept.
         threshold: Where distances are truncated [m].
         max_radius: [m].
         max_extent: [m].
-        R: Axes (K + 1, 3, 3) of the K best, columns = x, y, z; written to, the last one is for trials.
-        centre: (K + 1, 3) [m]; written to.
-        half: Half extents (K + 1, 3) [m]; written to.
+        min_extent: [m].
 
     Returns:
-        How many there are, at most K.
+        Axes (K, 3, 3), columns = x, y, z, centres (K, 3) and half extents (K, 3) [m] of the best, the best
+        first, and of a shape for points of one face behind them; none where nothing is within the limits.
     """
-    count, keep = len(points), len(R) - 1
-    cost = np.full(keep + 1, np.inf)
+    R, centre, half = np.empty((keep + 1, 3, 3)), np.empty((keep + 1, 3)), np.empty((keep + 1, 3))
+    count, cost = len(points), np.full(keep + 1, np.inf)
     most_inliers = found = 0
     for b in range(len(samples)):
         i, j = samples[b]
@@ -68,7 +65,11 @@ def search(  # type: ignore[no-untyped-def]
             hit = min(max((most_inliers / count) ** 2, 1e-9), 1.0 - 1e-9)
             if b + 1 >= keep * np.log(0.01) / np.log(1.0 - hit):
                 break
-    return found
+    if kind != SPHERE and _of_one_face(
+        kind, points, normals, min_extent, max_radius, max_extent, R[found], centre[found], half[found]
+    ):
+        found += 1
+    return R[:found], centre[:found], half[:found]
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
@@ -83,13 +84,13 @@ def _swap(k, R, centre, half, cost):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def of_one_face(  # type: ignore[no-untyped-def]
+def _of_one_face(  # type: ignore[no-untyped-def]
     kind, points, normals, min_extent, max_radius, max_extent, R, centre, half
 ):
     """Make a box or a cylinder for points of one face: their main normal, and what holds them along it.
 
-    A box has the least rectangle around them, a cylinder the circle that reaches as far. Returns whether it
-    is within the limits; arguments as of `search`.
+    A box has the least rectangle around them, a cylinder the circle that reaches as far. It is written to the
+    last three arguments. Returns whether it is within the limits.
     """
     (x, y, z), on_face = _main_normal(normals)
     if not x * x + y * y + z * z > 0.0:
@@ -221,23 +222,11 @@ def _turned(R, c, s):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _range(points, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Least and greatest coordinate [m] of points (N, 3) along a direction, a share at each end left out."""
-    beyond = min(int(TRIM * len(points)), (len(points) - 1) // 2)
-    least, greatest = np.full(beyond + 1, np.inf), np.full(beyond + 1, -np.inf)
+    along = np.empty(len(points))
     for i in range(len(points)):
-        c = points[i, 0] * dx + points[i, 1] * dy + points[i, 2] * dz
-        if c < least[beyond]:
-            k = beyond
-            while k > 0 and least[k - 1] > c:
-                least[k] = least[k - 1]
-                k -= 1
-            least[k] = c
-        if c > greatest[beyond]:
-            k = beyond
-            while k > 0 and greatest[k - 1] < c:
-                greatest[k] = greatest[k - 1]
-                k -= 1
-            greatest[k] = c
-    return least[beyond], greatest[beyond]
+        along[i] = points[i, 0] * dx + points[i, 1] * dy + points[i, 2] * dz
+    beyond = min(int(TRIM * len(points)), (len(points) - 1) // 2)
+    return select(along, beyond), select(along, len(points) - 1 - beyond)
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)

@@ -110,7 +110,7 @@ def explain(
     quick = replace(fit_config, hypotheses=10, polish=1, steps=6, max_points=150)
     full = replace(fit_config, polish=1, search_points=fit_config.max_points)
     oriented = [Oriented(e.points, e.normals) for e in parts]
-    fits = candidates(oriented, config=quick if first_look else full, rngs=rngs)
+    fits = candidates(oriented, config=quick if first_look else full, rngs=rngs, whole=False)
     return [
         best_explanation([f.shape for f in found], evidence, config)
         for evidence, found in zip(parts, fits, strict=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -94,23 +93,6 @@ def _find_pairs(number, points, normals, planes, ways, edge_jump):  # type: igno
     return edges[:edge_count], steps[:step_count]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Surfels:
-    """Patches of samples.
-
-    Attributes:
-        owner: Surfel of each sample (N,), −1 = none.
-        centres: Means of the samples (S, 3) [m].
-        normals: Unit means of the samples' normals (S, 3).
-        sizes: Samples of each surfel (S,).
-    """
-
-    owner: Index
-    centres: Array
-    normals: Array
-    sizes: Index
-
-
 def convex_parts(
     points: Array, normals: Array, edges: Index, config: SegmentationConfig, steps: Index | None = None
 ) -> NDArray[np.int32]:
@@ -136,17 +118,20 @@ def convex_parts(
         return np.zeros(0, dtype=np.int32)
     distances, turns = _measure_edges(points, normals, edges)
     costs = distances / config.surfel + config.crease * turns
-    surfels = _gather_surfels(points, normals, edges, costs, thin(points, config.surfel))
-    count = len(surfels.sizes)
-    pairs, lengths = _count_borders(surfels.owner, edges, count)
-    borders = pairs, _border_attraction(surfels, pairs, config), lengths
+    seeds = thin(points, config.surfel)
+    start = np.concatenate([[0], np.cumsum(np.bincount(edges.ravel(), minlength=len(points)))])
+    owner, count = _spread_seeds(edges, costs, start, seeds), len(seeds)
+    sizes = np.bincount(owner + 1, minlength=count + 1)[1:]
+    pairs, lengths = _count_borders(owner, edges, count)
+    attraction = _border_attraction(points, normals, owner, sizes, pairs, config)
+    borders = pairs, attraction, lengths
     if steps is not None:
-        borders = _with_steps(*borders, *_count_borders(surfels.owner, steps, count), count)
+        borders = _with_steps(*borders, *_count_borders(owner, steps, count), count)
     cluster = cluster_by_mean(count, *borders)
     apart = distances[distances > 0.0]
     min_width = config.min_width / np.median(apart) if len(apart) else 0.0
-    cluster = _absorb_slivers(cluster, surfels.sizes, pairs, lengths, config.min_size, min_width)
-    part = np.where(surfels.owner >= 0, cluster[surfels.owner], -1)
+    cluster = _absorb_slivers(cluster, sizes, pairs, lengths, config.min_size, min_width)
+    part = np.where(owner >= 0, cluster[owner], -1)
     large = np.bincount(part + 1)[1:] >= config.min_size
     return number_by_appearance(np.where((part >= 0) & np.append(large, False)[part], part, -1))
 
@@ -163,18 +148,6 @@ def _measure_edges(points, normals, edges):  # type: ignore[no-untyped-def]
             cosine += normals[i, axis] * normals[j, axis]
         lengths[e], turns[e] = np.sqrt(square), 1.0 - cosine
     return lengths, turns
-
-
-def _gather_surfels(points: Array, normals: Array, edges: Index, costs: Array, seeds: Index) -> Surfels:
-    """Give each sample (N, 3) to the seed (S,), itself a sample, nearest along edges (E, 2) at costs (E,)."""
-    start = np.concatenate([[0], np.cumsum(np.bincount(edges.ravel(), minlength=len(points)))])
-    owner, count = _spread_seeds(edges, costs, start, seeds), len(seeds)
-    sizes = np.bincount(owner + 1, minlength=count + 1)[1:]
-    centres, normals = (
-        np.stack([np.bincount(owner + 1, v, minlength=count + 1)[1:] for v in vectors.T], axis=-1)
-        for vectors in (points, normals)
-    )
-    return Surfels(owner, centres / np.maximum(sizes, 1)[:, None], transforms.unit(normals), sizes)
 
 
 @njit(cache=True)
@@ -219,12 +192,17 @@ def _count_borders(owner: Index, edges: Index, owners: int) -> tuple[Index, Arra
     return np.stack(np.divmod(keys, owners), axis=-1), lengths.astype(np.float64)
 
 
-def _border_attraction(surfels: Surfels, pairs: Index, config: SegmentationConfig) -> Array:
+def _border_attraction(
+    points: Array, normals: Array, owner: Index, sizes: Index, pairs: Index, config: SegmentationConfig
+) -> Array:
     """Attraction (B,) of surfels over each border: 1 flat or convex, 0 at the limit, down to −2 beyond it."""
+    sums = [np.bincount(owner + 1, v, minlength=len(sizes) + 1)[1:] for v in (*points.T, *normals.T)]
+    centres = np.stack(sums[:3], axis=-1) / np.maximum(sizes, 1)[:, None]
+    facing = transforms.unit(np.stack(sums[3:], axis=-1))
     i, j = pairs.T
-    between = surfels.centres[j] - surfels.centres[i]
-    rise_j = np.einsum("ij,ij->i", surfels.normals[i], between)
-    rise_i = -np.einsum("ij,ij->i", surfels.normals[j], between)
+    between = centres[j] - centres[i]
+    rise_j = np.einsum("ij,ij->i", facing[i], between)
+    rise_i = -np.einsum("ij,ij->i", facing[j], between)
     distance = np.maximum(np.linalg.norm(between, axis=-1), 1e-9)
     bend = 1.0 - np.maximum(rise_i + rise_j, 0.0) / distance / np.radians(config.concavity)
     step = 1.0 - np.maximum(rise_i, rise_j) / config.step
@@ -278,8 +256,7 @@ def _merge_all(count, node, attraction, total, length):  # type: ignore[no-untyp
     for e in range(len(total)):
         i, j = node[2 * e], node[2 * e + 1]
         if attraction[e] > 0.0:
-            heap.append((-attraction[e], min(i, j), max(i, j), e, length[e]))
-    heapq.heapify(heap)
+            heapq.heappush(heap, (-attraction[e], min(i, j), max(i, j), e, length[e]))
     while len(heap) > 0:
         _, i, j, e, known_length = heapq.heappop(heap)
         if parent[i] != i or parent[j] != j or length[e] != known_length:

@@ -159,7 +159,7 @@ def _points(
         return source, np.arange(len(source), dtype=np.intp)
     among = None
     if known is not None:
-        among = source.valid & (known.height_of_pixels(source) > -config.surface.search)
+        among = known.pixels_over(source, -config.surface.search, np.inf)
         if source.labels is not None:
             among |= source.labels > 0
         among = among if among.any() else None

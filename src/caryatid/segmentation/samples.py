@@ -61,30 +61,6 @@ class Samples:
         return image
 
 
-def find_foreground(
-    view: View, surface: SupportSurface, config: SegmentationConfig, clouds: CloudConfig
-) -> NDArray[np.bool_]:
-    """Which pixels (H, W) of a view show what stands on the support surface.
-
-    Args:
-        view: The view; without a pose, the surface is in the camera frame.
-        surface: The support surface.
-        config: Heights, and the margin around the surface's outline.
-        clouds: Working range.
-    """
-    height, rounding = surface.height_of_pixels(view), 1e-4
-    maybe = (height > config.clearance - rounding) & (height < config.max_height + rounding)
-    pixels = np.flatnonzero(maybe & (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth))
-    row, column = np.divmod(pixels, view.depth.shape[1])
-    points = _rays(view.K, row, column) * np.take(view.depth, pixels).astype(np.float64)[:, None]
-    T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
-    foreground = np.zeros(view.depth.shape, dtype=np.bool_)
-    foreground.ravel()[pixels] = surface.over(
-        transforms.transform(T, points), config.clearance, config.max_height, config.margin
-    )
-    return foreground
-
-
 def take_samples(
     view: View,
     foreground: NDArray[np.bool_],
@@ -163,15 +139,13 @@ def _tangent_planes(
     counts = (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     inverse_depth = np.zeros(view.depth.shape, dtype=np.float32)
     np.divide(np.float32(1.0), view.depth, out=inverse_depth, where=counts)
-    pixels, jump, slope = np.column_stack([row, column]), clouds.edge_jump, clouds.max_slope
-    shares = np.array_split(pixels, SHARES)
-    return np.concatenate(
-        on_threads(lambda k: _fit_planes(inverse_depth, shares[k], radius, jump, slope), SHARES)
-    )
+    shares = np.array_split(np.column_stack([row, column]), SHARES)
+    windows = radius, clouds.edge_jump, clouds.max_slope, WIDE_RADIUS, WIDE_TOLERANCE
+    return np.concatenate(on_threads(lambda k: _fit_planes(inverse_depth, shares[k], *windows), SHARES))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-def]
+def _fit_planes(image, pixels, radius, jump, slope, wide_radius, wide_tolerance):  # type: ignore[no-untyped-def]
     """Fit the planes (N, 3) of some pixels (N, 2) as `_tangent_planes` says."""
     planes = np.zeros((len(pixels), 3))
     side = 2.0 * radius + 1.0
@@ -189,7 +163,7 @@ def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-
         plane[0] = own
         for _ in range(2):
             # Three times the readings that determine a plane even out their noise, if not on a line.
-            if not _refit(image, row, column, WIDE_RADIUS, WIDE_TOLERANCE, 0.0, 9.0, 12.0, plane):
+            if not _refit(image, row, column, wide_radius, wide_tolerance, 0.0, 9.0, 12.0, plane):
                 break
     return planes
 
@@ -211,12 +185,13 @@ def _refit(image, row, column, radius, tolerance, slope, least, spread, plane): 
             du = float(across)
             reading = image[row + down, column + across]
             off = reading - (c + a * du + b * dv)
-            if reading > 0.0 and abs(off) <= tolerance + slope * max(abs(du), abs(dv)):
-                line_n += 1.0
-                line_u += du
-                line_uu += du * du
-                line_w += off
-                line_uw += du * off
+            near = abs(off) <= tolerance + slope * (abs(du) if abs(du) > abs(dv) else abs(dv))
+            weight = 1.0 if (reading > 0.0) & near else 0.0
+            line_n += weight
+            line_u += weight * du
+            line_uu += weight * (du * du)
+            line_w += weight * off
+            line_uw += weight * (du * off)
         n, su, sv = n + line_n, su + line_u, sv + dv * line_n
         suu, suv, svv = suu + line_uu, suv + dv * line_u, svv + dv * dv * line_n
         sw, suw, svw = sw + line_w, suw + line_uw, svw + dv * line_w

@@ -23,7 +23,7 @@ from caryatid.segmentation.lccp import (
     number_by_appearance,
     wide_parts,
 )
-from caryatid.segmentation.samples import Samples, find_foreground, take_samples
+from caryatid.segmentation.samples import Samples, take_samples
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
 
@@ -59,7 +59,8 @@ def segment(
         Label image (H, W): parts 1 … n, 0 = nothing and the surface itself.
     """
     labels = np.zeros(view.depth.shape, dtype=np.int32)
-    foreground = find_foreground(view, surface, config, clouds)
+    foreground = surface.pixels_over(view, config.clearance, config.max_height, config.margin)
+    foreground &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     if not foreground.any():
         return labels
     samples = take_samples(view, foreground, surface, config, clouds)
@@ -74,7 +75,8 @@ def segment(
     labels[samples.grid] = samples.image(part)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
     jump, rounds = np.float32(2.0 * config.edge_jump), 2 * config.stride
-    _spread_labels(labels[around], foreground[around], view.depth[around], jump, rounds)
+    waiting = np.flatnonzero(foreground[around] & (labels[around] == 0))
+    _spread_labels(labels[around], waiting, view.depth[around], jump, rounds)
     return labels
 
 
@@ -104,14 +106,13 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
 
 
 @njit(cache=True)
-def _spread_labels(labels, foreground, depth, jump, rounds):  # type: ignore[no-untyped-def]
-    """Bring labels (H, W) to foreground pixels without one that lie no depth step from a labelled neighbour.
+def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-untyped-def]
+    """Bring labels (H, W) to waiting pixels (N,), ascending, no depth step from a labelled neighbour.
 
     In each round a pixel takes the label to its right, then others to their left, below and above. There is a
     step where depth differs by more than a jump at 1 m, times z² [m].
     """
     height, width = labels.shape
-    waiting = np.flatnonzero(foreground & (labels == 0))
     left = len(waiting)
     for turn in range(4 * rounds):
         down, right = ((0, 1), (0, -1), (1, 0), (-1, 0))[turn % 4]

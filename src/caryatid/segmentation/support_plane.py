@@ -44,20 +44,6 @@ class SupportSurface:
         """Signed height (...,) [m] of points (..., 3) over the surface."""
         return (points_world - self.point_world) @ self.normal_world
 
-    def height_of_pixels(self, view: View) -> NDArray[np.float32]:
-        """Height (H, W) [m] over the surface of what each pixel of a view shows, in single precision.
-
-        Args:
-            view: The view; without a pose, the surface is in the camera frame. Without a reading a pixel has
-                the camera's height.
-        """
-        T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
-        x, y, z = (self.normal_world @ T[:3, :3]).astype(np.float32)
-        rows, columns = (np.arange(n, dtype=np.float32) for n in view.depth.shape)
-        across = x * (columns - np.float32(view.K[0, 2])) / np.float32(view.K[0, 0])
-        along = y * (rows - np.float32(view.K[1, 2])) / np.float32(view.K[1, 1]) + z
-        return view.depth * (across + along[:, None]) + np.float32(self.height(T[:3, 3]))
-
     def over(self, points_world: Array, low: float, high: float, margin: float) -> Mask:
         """Which points (N, 3) [m] are over the outline, or no further than the margin [m] outside it.
 
@@ -67,13 +53,30 @@ class SupportSurface:
             high: Greatest height [m].
             margin: Distance outside the lines of all sides within which points still count [m].
         """
-        basis = _basis(self.normal_world)
-        corners = (self.outline_world - self.point_world) @ basis.T
-        edges = transforms.unit(np.roll(corners, -1, axis=0) - corners)
-        outward = np.stack([edges[:, 1], -edges[:, 0]], axis=-1)
-        sides = np.concatenate([outward, np.einsum("ij,ij->i", outward, corners)[:, None] + margin], axis=-1)
-        axes = np.concatenate([basis, self.normal_world[None]])
-        return _find_over(np.ascontiguousarray(points_world), self.point_world, axes, sides, low, high)
+        return _points_over(np.ascontiguousarray(points_world), self._planes(margin), low, high)
+
+    def pixels_over(self, view: View, low: float, high: float, margin: float = np.inf) -> Mask:
+        """Which pixels (H, W) of a view show something over the surface.
+
+        Args:
+            view: The view; without a pose, the surface is in the camera frame.
+            low: Least height [m].
+            high: Greatest height [m].
+            margin: As of `over`; infinite: what is anywhere above or below counts.
+        """
+        surface = self if view.T_world_camera is None else self.moved(transforms.invert(view.T_world_camera))
+        x, y = ((np.arange(n) - view.K[k, 2]) / view.K[k, k] for k, n in enumerate(view.depth.shape[::-1]))
+        return _pixels_over(view.depth, x, y, surface._planes(margin), low, high)
+
+    def _planes(self, margin: float) -> Array:
+        """Planes n·p + d (M, 4): the surface's own, and those beyond which points are too far outside."""
+        up, corners = self.normal_world, self.outline_world
+        own = np.append(up, -up @ self.point_world)[None]
+        if margin == np.inf:
+            return own
+        outward = np.cross(transforms.unit(np.roll(corners, -1, axis=0) - corners), up)
+        offsets = -np.einsum("ij,ij->i", outward, corners) - margin
+        return np.concatenate([own, np.column_stack([outward, offsets])])
 
     def moved(self, T: Array) -> SupportSurface:
         """Return the surface moved by a rigid transform (4, 4) of the world."""
@@ -311,19 +314,30 @@ def _plane_gains(points, normals, directions, offsets, tolerance, least_cosine, 
     return gains
 
 
+@njit(cache=True, inline="always")
+def _is_over(planes, x, y, z, low, high):  # type: ignore[no-untyped-def]
+    """Whether a point lies between two heights over the first plane, and on the inner side of the others."""
+    over = low < planes[0, 0] * x + planes[0, 1] * y + planes[0, 2] * z + planes[0, 3] < high
+    k = 1
+    while over and k < len(planes):
+        over = planes[k, 0] * x + planes[k, 1] * y + planes[k, 2] * z + planes[k, 3] <= 0.0
+        k += 1
+    return over
+
+
 @njit(cache=True)
-def _find_over(points, origin, axes, sides, low, high):  # type: ignore[no-untyped-def]
-    """Which points (N, 3) are between two heights, and inside the lines a·x + b·y = c of all sides (M, 3)."""
-    over = np.zeros(len(points), np.bool_)
+def _points_over(points, planes, low, high):  # type: ignore[no-untyped-def]
+    over = np.empty(len(points), np.bool_)
     for i in range(len(points)):
-        u, v, w = points[i, 0] - origin[0], points[i, 1] - origin[1], points[i, 2] - origin[2]
-        z = axes[2, 0] * u + axes[2, 1] * v + axes[2, 2] * w
-        if not low < z < high:
-            continue
-        x = axes[0, 0] * u + axes[0, 1] * v + axes[0, 2] * w
-        y = axes[1, 0] * u + axes[1, 1] * v + axes[1, 2] * w
-        k = 0
-        while k < len(sides) and sides[k, 0] * x + sides[k, 1] * y <= sides[k, 2]:
-            k += 1
-        over[i] = k == len(sides)
+        over[i] = _is_over(planes, points[i, 0], points[i, 1], points[i, 2], low, high)
+    return over
+
+
+@njit(cache=True)
+def _pixels_over(depth, x, y, planes, low, high):  # type: ignore[no-untyped-def]
+    over = np.zeros(depth.shape, np.bool_)
+    for row in range(len(y)):
+        for col in range(len(x)):
+            z = float(depth[row, col])
+            over[row, col] = z > 0.0 and _is_over(planes, x[col] * z, y[row] * z, z, low, high)
     return over

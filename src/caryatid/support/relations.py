@@ -367,8 +367,9 @@ def _weighed_down(
 
 
 def _support(t: Touch, o: SceneObject, kind: Kind, certain: bool, why: str) -> Support:
-    where = {"contact_world": t.point_world, "normal_world": t.normal_world}
-    return Support(t.other.id, o.id, kind, certain, **where, why=why)
+    return Support(
+        t.other.id, o.id, kind, certain, contact_world=t.point_world, normal_world=t.normal_world, why=why
+    )
 
 
 def _below_text(t: Touch, o: SceneObject) -> str:
