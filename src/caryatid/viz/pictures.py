@@ -169,7 +169,7 @@ def _as_webp(href: str) -> str:
 def put_raster(
     axes: Axes, pixels: NDArray[np.uint8], left: float, top: float, width: float, height: float
 ) -> None:
-    """Put pixels (H, W, 3 or 4) into a picture's axes; the place is in pixels of the picture."""
+    """Put pixels (H, W, C) into a picture's axes; the place is in pixels of the picture."""
     axes.imshow(pixels, extent=(left, left + width, top + height, top), aspect="auto", clip_on=False)
 
 
