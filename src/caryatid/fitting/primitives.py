@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
@@ -180,11 +181,28 @@ def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]
         return 0, 0
     # A row of cubes begins at the surface; one that does not fit in lies in the middle.
     ticks = [np.arange(-h + size / 2.0, h, size) if h > size / 2.0 else np.zeros(1) for h in half]
-    inside = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     across = np.equal(shape.ties, shape.ties[0])
-    inside = inside[np.einsum("ij,ij->i", inside[:, across], inside[:, across]) <= half[0] ** 2]
-    free = voxels.state_at(transforms.transform(shape.T_world_object, inside)) == FREE
-    return len(inside), int(np.count_nonzero(free))
+    return _count_free(
+        voxels.states, voxels.origin_world, size, shape.T_world_object, *ticks, across, half[0] ** 2
+    )
+
+
+@njit(cache=True, nogil=True)
+def _count_free(states, origin, size, T, x, y, z, across, limit):  # type: ignore[no-untyped-def]
+    """Points of a grid that lie within a shape's round sides, and how many of them lie in free voxels."""
+    inside, free = 0, 0
+    for u in x:
+        for v in y:
+            for w in z:
+                if across[0] * u * u + across[1] * v * v + across[2] * w * w > limit:
+                    continue
+                inside += 1
+                i = math.floor((T[0, 0] * u + T[0, 1] * v + T[0, 2] * w + T[0, 3] - origin[0]) / size)
+                j = math.floor((T[1, 0] * u + T[1, 1] * v + T[1, 2] * w + T[1, 3] - origin[1]) / size)
+                k = math.floor((T[2, 0] * u + T[2, 1] * v + T[2, 2] * w + T[2, 3] - origin[2]) / size)
+                if 0 <= i < states.shape[0] and 0 <= j < states.shape[1] and 0 <= k < states.shape[2]:
+                    free += states[i, j, k] == FREE
+    return inside, free
 
 
 def _fit(

@@ -87,7 +87,9 @@ def _nearest_objects(
     """
     nearest, gap = np.full(len(points), -1, dtype=np.int32), np.full(len(points), reach)
     if len(known):
-        distance, index = cKDTree(known).query(points, distance_upper_bound=reach)
+        distance, index = cKDTree(known, compact_nodes=False, balanced_tree=False).query(
+            points, distance_upper_bound=reach
+        )
         found = np.isfinite(distance)
         nearest[found], gap[found] = owners[index[found]], distance[found]
     for number, shape in enumerate(shapes):

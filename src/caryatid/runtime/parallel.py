@@ -18,6 +18,9 @@ from numba import types
 
 Result = TypeVar("Result")
 
+SHARES = 16
+"""Shares into which threads divide points, pixels or hypotheses [1]: enough for usual numbers of cores."""
+
 
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
     """Call compiled work for each index from 0 to count − 1, on as many threads as numba uses.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from caryatid.config import CloudConfig, SegmentationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import on_threads
+from caryatid.runtime.parallel import SHARES, on_threads
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import View
 
@@ -26,8 +26,6 @@ WIDE_RADIUS, WIDE_TOLERANCE = 5, 0.004
 3σ of the sensor at 2 m."""
 MARGIN = 16
 """Pixels beyond the foreground that gaps may look at [px]."""
-SHARES = 16
-"""Shares of the samples that threads take [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

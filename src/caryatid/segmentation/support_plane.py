@@ -16,6 +16,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import SHARES, for_each
 from caryatid.sensing.views import View
 
 Mask = NDArray[np.bool_]
@@ -213,7 +214,9 @@ def _largest_plane(
         return None
     offsets = np.einsum("ij,ij->i", directions, anchors)
     agree, behind = np.cos(np.radians(config.max_deviation)), 0.0 if up is not None else 1.0
-    best = int(np.argmax(_plane_gains(p, n, directions, offsets, config.tolerance, agree, behind)))
+    gains = np.zeros(len(offsets))
+    for_each(_score_planes, SHARES, (p, n, directions, offsets, config.tolerance, agree, behind, gains))
+    best = int(np.argmax(gains))
     return _refine(points, normals, among, directions[best], float(offsets[best]), up, config)
 
 
@@ -295,13 +298,13 @@ def _basis(normal: Array) -> Array:
 
 
 @njit(cache=True, error_model="numpy")
-def _plane_gains(points, normals, directions, offsets, tolerance, least_cosine, penalty):  # type: ignore[no-untyped-def]
-    """Score (B,) planes n·p = offset by points: 1 − (distance/tolerance)² each where their normals agree.
+def _score_planes(share, data):  # type: ignore[no-untyped-def]
+    """Score a share of the planes n·p = offset by points: 1 − (distance/tolerance)² each if normals agree.
 
     A point further than three tolerances behind a plane costs it the penalty.
     """
-    gains = np.zeros(len(offsets))
-    for k in range(len(offsets)):
+    points, normals, directions, offsets, tolerance, least_cosine, penalty, gains = data
+    for k in range(share, len(offsets), SHARES):
         nx, ny, nz = directions[k]
         for i in range(len(points)):
             signed = nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - offsets[k]
@@ -311,7 +314,6 @@ def _plane_gains(points, normals, directions, offsets, tolerance, least_cosine, 
             cosine = nx * normals[i, 0] + ny * normals[i, 1] + nz * normals[i, 2]
             if abs(signed) < tolerance and cosine > least_cosine:
                 gains[k] += 1.0 - (signed / tolerance) ** 2
-    return gains
 
 
 @njit(cache=True, inline="always")

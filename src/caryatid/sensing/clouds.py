@@ -12,13 +12,11 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.points import most_central
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import for_each
+from caryatid.runtime.parallel import SHARES, for_each
 from caryatid.sensing.views import View
 
 Image = NDArray[np.float32]
 
-SHARES = 16
-"""Shares of the image's rows that threads take [1]: every 16th row, as the readings are amid the image."""
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
 """Numbers that leave sums in single precision."""
 
@@ -53,7 +51,7 @@ def oriented_points(
     pixels = np.flatnonzero(sampled)
     if given is None:
         points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
-        _orient(pixels, planes, np.ascontiguousarray(view.K), T, points, normals)
+        for_each(_orient, SHARES, (pixels, planes, np.ascontiguousarray(view.K), T, points, normals))
         return points, normals, pixels
     row, column = np.divmod(pixels, view.depth.shape[1])
     z = np.take(view.depth, pixels).astype(np.float64)
@@ -227,10 +225,11 @@ def _steadier(pixels, image, planes, radius, limit, trusted):  # type: ignore[no
 
 
 @njit(cache=True, error_model="numpy")
-def _orient(pixels, planes, K, T, points, normals):  # type: ignore[no-untyped-def]
-    """Write the points (N, 3) [m] and normals (N, 3) of these pixels, in the world."""
+def _orient(share, data):  # type: ignore[no-untyped-def]
+    """Write the points (N, 3) [m] and normals (N, 3) of a share of these pixels, in the world."""
+    pixels, planes, K, T, points, normals = data
     width = planes.shape[2]
-    for i in range(len(pixels)):
+    for i in range(share * len(pixels) // SHARES, (share + 1) * len(pixels) // SHARES):
         row = pixels[i] // width
         col = pixels[i] - row * width
         a, b, c = planes[0, row, col], planes[1, row, col], planes[2, row, col]
