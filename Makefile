@@ -21,7 +21,7 @@ demo: $(VENV)/.usable
 	$(BIN)/caryatid demo --out demo-run
 
 test: install
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest
 
 # What the viewer's tests look at it with. Elsewhere than on Debian and its like, install one and set CHROMIUM.
 chromium:

@@ -192,6 +192,7 @@ def test_a_run_is_scored_against_the_masks_of_its_recording(tmp_path, recording,
     assert [v["f1"] for v in json.loads(capsys.readouterr().out)["views"]] == [1.0, 1.0, 1.0]
 
 
+@pytest.mark.slow
 def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
     file = tmp_path / "settings.toml"
     file.write_text("[active]\nmax_views = 2\n")
@@ -340,6 +341,7 @@ def test_an_unknown_planner_is_answered_with_those_there_are(tmp_path, scene_fil
 # Interrupts and older runs
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", ["camera", "planner"])
 def test_an_interrupt_keeps_a_whole_run_of_the_views_done(tmp_path, scene_file, capsys, monkeypatch, at):
     owner, name = {"camera": (SimulatedCamera, "capture"), "planner": (SupportPlanner, "plan")}[at]
@@ -400,6 +402,7 @@ def shell(*arguments, **environment):
     )
 
 
+@pytest.mark.slow
 def test_the_command_runs_from_a_shell_without_escape_codes(tmp_path, scene_file):
     done = shell("explore", scene_file, "--out", tmp_path / "run", "--views", 1, *SMALL, "--json")
     assert done.returncode == 0

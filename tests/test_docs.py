@@ -257,7 +257,7 @@ def test_the_errors_the_questions_quote_are_what_the_code_says():
     assert len(quoted) > 15
     known = said_by_the_code()
     for line in quoted:
-        assert any(re.fullmatch(p, line) for p in known), line
+        assert any(re.fullmatch(rf"(?:[^:]+: )?{p}", line) for p in known), line
 
 
 def test_a_message_of_ros_becomes_a_view_as_the_page_does_it(workplace, views):

@@ -199,6 +199,7 @@ def test_nan_is_never_written():
         json_text({"a": float("nan")})
 
 
+@pytest.mark.slow
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers(-(10**9), 10**9) | st.floats(-1e6, 1e6) | st.text(),

@@ -31,6 +31,8 @@ CONFIG = Config(
 ELSEWHERE = """
 import json, pickle, sys, types
 
+pytestmark = pytest.mark.slow
+
 # The contacts of fitted shapes are computed by MuJoCo; importing them takes the names of its shapes only.
 shapes = types.SimpleNamespace(mjGEOM_BOX=0, mjGEOM_CYLINDER=1, mjGEOM_SPHERE=2)
 sys.modules["mujoco"] = types.SimpleNamespace(mjtGeom=shapes)

@@ -192,6 +192,7 @@ def words(tmp_path, kept, scene_file, recording):
     return spelled
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [command for command in WORDS if command in COMMANDS])
 def test_with_json_stdout_is_one_document_and_stderr_is_empty(command, words, capfd):
     capfd.readouterr()

@@ -95,6 +95,7 @@ def test_every_kind_that_shows_itself_is_tried_here(shown):
     assert kinds == {type(thing).__qualname__ for thing in shown.values()}
 
 
+@pytest.mark.slow
 def test_each_is_one_piece_of_markup_that_loads_and_runs_nothing(shown):
     for name, thing in shown.items():
         html = thing._repr_html_()

@@ -666,6 +666,7 @@ class TestVolumetric:
         assert decision.saliency == 1.0
         assert "100% of the most" in decision.why
 
+    @pytest.mark.slow
     @pytest.mark.parametrize("name", VOLUMETRIC)
     def test_its_score_is_the_utility(self, name):
         free, dear = (

@@ -238,6 +238,7 @@ def test_a_view_fused_with_itself_changes_no_vertex_and_no_edge(name, noise, met
     assert {s.occurrences for s in thrice.supports} == {3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bridge", "counterweight"])
 def test_with_sg_the_order_of_views_changes_no_vertex_and_no_edge(name):
     views = simulated_views(name)

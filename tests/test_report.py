@@ -121,6 +121,7 @@ def test_it_names_each_object_edge_figure_and_setting(report, html):
         assert said in page.text, said
 
 
+@pytest.mark.slow
 def test_the_pdf_says_what_the_page_says_and_has_the_same_bytes_each_time(report):
     content = render_pdf(report)
     assert content == render_pdf(report)
@@ -184,6 +185,7 @@ def test_charts_show_every_value_and_leave_gaps():
         assert f"<title>{note}</title>" in bars
 
 
+@pytest.mark.slow
 def test_any_step_is_drawn():
     """Without colour, decision, pose, view, objects or points."""
     step = make_step()
@@ -347,6 +349,7 @@ def test_drawing_is_reproducible_and_leaves_the_step_alone():
         assert np.array_equal(array, copy)
 
 
+@pytest.mark.slow
 def test_ten_views_stay_small():
     rng = np.random.default_rng(0)
     noisy = rng.integers(0, 255, (480, 640, 3)).astype(np.uint8)

@@ -169,6 +169,7 @@ def bent_sheet(angle: float):
     return points, normals, edges
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("angle", "parts"), [(-90.0, 1), (-20.0, 1), (0.0, 1), (40.0, 2), (90.0, 2)])
 def test_sheets_part_where_they_are_concave(angle, parts):
     points, normals, edges = bent_sheet(angle)

@@ -242,6 +242,7 @@ def test_a_session_that_another_process_writes_is_busy(tmp_path, views):
     assert served(talk, tmp_path).status_code == 201
 
 
+@pytest.mark.slow
 def test_sessions_that_are_closed_for_want_of_room_are_the_same_afterwards(tmp_path, views):
     names = ["a", "b", "c"]
 

@@ -110,6 +110,7 @@ def test_packed_objects_touch_one_another():
         assert -0.002 < min(gaps) < 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4", "packed-5-1"])
 def test_generated_names_repeat_byte_for_byte(name: str):
     a, b = load_scene(name), load_scene(name)

@@ -19,6 +19,8 @@ HEAVY = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx", "matplotlib
 IMPORTED = """
 import json, sys
 from caryatid.cli import main
+
+pytestmark = pytest.mark.slow
 try:
     main(sys.argv[2:])
 except SystemExit:
@@ -125,7 +127,6 @@ sys.exit(main(sys.argv[2:]))
 """
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("module", ["tyro", "caryatid.config", "numba", "scipy.spatial", "caryatid.scene"])
 @pytest.mark.parametrize("command", ["demo", "explore tower", "extract nowhere"])
 def test_an_interrupt_while_modules_are_imported_is_one_line(tmp_path, module, command):

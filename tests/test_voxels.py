@@ -54,6 +54,7 @@ sys.stdout.write(f"{numba.get_num_threads()} {hash(bytes_)} {voxels.passes.sum()
 """
 
 
+@pytest.mark.slow
 def test_the_number_of_threads_changes_no_bit():
     said = []
     for threads in ("1", "3"):

@@ -79,7 +79,7 @@ def compile_kernels(say: Callable[[str], None] = log.info) -> None:
         done = _read(stamp)
         if done == wanted:
             return
-        say("compiling kernels, once after installation: 10 to 20 s")
+        say("compiling kernels, once after installation: about 30 s")
         for module in wanted.keys() - {name for name, digest in done.items() if wanted.get(name) == digest}:
             # numba itself does not see that a kernel of another module, which this one calls, has changed.
             source = _source(module)
