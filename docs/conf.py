@@ -64,6 +64,7 @@ documented = set(
 nitpicky = True
 nitpick_ignore_regex = [
     ("py:.*", r"(?!caryatid\.).*"),  # other packages' names: nothing is fetched from their sites
+    ("py:.*", r"caryatid\.(\w+\.)*_\w+"),  # private names, in the annotations of settings
     ("py:.*", rf"({'|'.join(re.escape(m) for m in sorted(modules - documented))})\.\w+"),
 ]
 

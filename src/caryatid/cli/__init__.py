@@ -49,11 +49,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
+        if _interrupted(error):
+            sys.stderr.write("interrupted: nothing was written\n")
+            return INTERRUPTED
         if debug:
             raise
         sys.stderr.write(f"error: {in_one_line(error)}\n")
         return 1
     return 0
+
+
+def _interrupted(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is behind an error: libraries turn one that comes while they are imported into their own."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def run_from_shell() -> NoReturn:
