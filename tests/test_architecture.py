@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import grimp
@@ -65,7 +66,7 @@ def test_a_view_goes_through_the_files_that_the_page_lists():
         for caller, line in re.findall(r"^(\S+\.py) → (.+)$", PAGE.read_text(encoding="utf-8"), re.M)
         for called in line.split(", ")
     }
-    views = simulated_views("tower")
+    views = [replace(view) for view in simulated_views("tower")]  # without what other tests had them compute
     scene = model_of(views[:2], Config())
     assert files_called(lambda: scene.update(views[2])) == listed
     assert len(listed) <= 35

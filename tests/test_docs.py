@@ -111,8 +111,8 @@ def workplace(prepared, tmp_path, monkeypatch):
     """A copy of these files, in the current folder."""
     place = shutil.copytree(prepared, tmp_path / "here")
     monkeypatch.chdir(place)
-    monkeypatch.setattr("caryatid.benchmark.running.run_locally", lambda *arguments: iter(()))
-    monkeypatch.setattr("caryatid.benchmark.running.run_on_cluster", lambda *arguments: iter(()))
+    monkeypatch.setattr("caryatid.benchmark.running.run_locally", lambda *arguments: (row for row in ()))
+    monkeypatch.setattr("caryatid.benchmark.running.run_on_cluster", lambda *arguments: (row for row in ()))
     monkeypatch.setattr(
         "caryatid.benchmark.running.connect", lambda address: SimpleNamespace(close=lambda: None)
     )

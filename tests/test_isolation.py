@@ -21,6 +21,8 @@ from caryatid.planning.planners import BUILT_IN, make_planner
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
 
+pytestmark = pytest.mark.slow
+
 FORBIDDEN = ("mujoco", "caryatid.simulation", "caryatid.evaluation")
 """Packages whose objects know the truth."""
 
@@ -30,8 +32,6 @@ CONFIG = Config(
 
 ELSEWHERE = """
 import json, pickle, sys, types
-
-pytestmark = pytest.mark.slow
 
 # The contacts of fitted shapes are computed by MuJoCo; importing them takes the names of its shapes only.
 shapes = types.SimpleNamespace(mjGEOM_BOX=0, mjGEOM_CYLINDER=1, mjGEOM_SPHERE=2)

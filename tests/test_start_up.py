@@ -14,13 +14,13 @@ import pytest
 import caryatid
 import caryatid.io
 
+pytestmark = pytest.mark.slow
+
 HEAVY = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx", "matplotlib", "trimesh", "PIL", "jinja2")
 
 IMPORTED = """
 import json, sys
 from caryatid.cli import main
-
-pytestmark = pytest.mark.slow
 try:
     main(sys.argv[2:])
 except SystemExit:
