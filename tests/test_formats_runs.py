@@ -41,9 +41,8 @@ def write_run(folder, views=2, seed=7):
                 K=K,
                 record={"choice": {"saliency": 0.5, "why": "o2 is held by nothing"}},
             )
-        run.finish(
-            graph(views), {"seed": seed, "timings": [{"perceive": np.float64(0.25)}]}, "<html>σ</html>"
-        )
+        record = {"seed": seed, "timings": [{"perceive": np.float64(0.25)}]}
+        run.finish(graph(views), record, {"report.html": "<html>σ</html>".encode()})
 
 
 def test_a_run_is_read_back(tmp_path):

@@ -151,7 +151,7 @@ def told_views(views: Iterable[float]) -> list[float]:
 
 
 def _draw(name: str, title: str, caption: str, rows: int, plot: Callable[[Any], None]) -> Figure:
-    """Draw a figure with matplotlib, so many rows high."""
+    """Draw a figure with matplotlib, as high as its number of rows."""
     from matplotlib import style
     from matplotlib.figure import Figure as Drawing
 

@@ -99,7 +99,6 @@ class RunWriter(StagedFolder):
         self,
         graph: SupportGraph,
         record: Mapping[str, Any],
-        report: str | None = None,
         files: Mapping[str, bytes] | None = None,
     ) -> None:
         """Write the rest and put the folder in its place.
@@ -107,7 +106,6 @@ class RunWriter(StagedFolder):
         Args:
             graph: The final fused graph.
             record: For run.json: settings, seed, versions, source, timings [s], angle and path travelled.
-            report: Text of report.html.
             files: Further files by their paths in the folder.
 
         Raises:
@@ -118,8 +116,6 @@ class RunWriter(StagedFolder):
             raise CaryatidError(f"{self.folder}: no view was finished, so there is no run to keep")
         self.remove(_view_folder(self.views))
         self.write("graph.json", graph_text(graph).encode())
-        if report is not None:
-            self.write("report.html", report.encode())
         for path, content in (files or {}).items():
             self.write(path, content)
         document = {"format": FORMAT, "version": VERSION, "views": self.views} | dict(record)

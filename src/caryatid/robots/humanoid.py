@@ -70,7 +70,7 @@ class HumanoidRobot(SimulatedRobot):
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the views of the sphere that can be reached and see its centre past the furniture.
 
-        They are found anew for another sphere, or where other cells can be reached; else only their paths.
+        Another sphere, or other cells in reach, need new ones; otherwise only their paths change.
         """
         lengths = self._path_lengths.ravel()
         reached = np.isfinite(lengths)

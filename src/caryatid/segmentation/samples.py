@@ -170,7 +170,7 @@ def _fit_planes(image, pixels, radius, jump, slope, wide_radius, wide_tolerance)
 def _refit(image, row, column, radius, tolerance, slope, least, spread, plane):  # type: ignore[no-untyped-def]
     """Fit a plane (3,) to the readings of a window that lie near it, and say if they determine one.
 
-    They do if there are at least so many, and the determinant of their spread a reading is no less [px⁴].
+    They do if their number, and the determinant of their spread per reading [px⁴], are large enough.
     """
     height, width = image.shape
     c, a, b = plane[0], plane[1], plane[2]

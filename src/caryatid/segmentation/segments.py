@@ -263,7 +263,7 @@ def _insides_merged(samples: Samples, part: Labels) -> Labels:
         image = samples.image(merged)
         around = ndimage.binary_dilation(samples.image(part) == number, np.ones((3, 3)), iterations=2)
         border = np.bincount(image[around], minlength=count)
-        # Tops differ by a rim's width and noise at the most.
+        # Tops differ by no more than a rim's width and noise.
         border[hollow | (np.abs(top - top[number]) >= 0.025)] = 0
         border[0] = 0
         if border.max() >= MEETING:

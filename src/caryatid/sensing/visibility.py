@@ -62,7 +62,7 @@ def shown(
 
 @njit(cache=True, error_model="numpy")
 def _show(share, data):  # type: ignore[no-untyped-def]
-    """Write the worth of every so manieth piece of work: one point and 128 of the cameras."""
+    """Write the worth of a share of the work: each piece is one point and 128 of the cameras."""
     solid, worth = data[0], data[-1]
     found, count = room(solid.shape), worth.shape[1]
     across = (count + 127) // 128

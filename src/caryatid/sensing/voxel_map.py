@@ -227,7 +227,7 @@ def _log_odds(config: VoxelConfig) -> Array:
 
 @njit(cache=True, error_model="numpy")
 def _mark_rays(share, data):  # type: ignore[no-untyped-def]
-    """Mark the voxels that the rays of every so manieth tile of the image pass, and those in which they end.
+    """Mark the voxels that the rays of a share of the image's tiles pass, and those in which they end.
 
     A tile is 8 × 8 rays: neighbours meet the same voxels.
     """
@@ -273,7 +273,7 @@ def _ray(depth_image, K, R, u, v):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _count_marks(layer, data):  # type: ignore[no-untyped-def]
-    """Turn the marks in one layer of the map into counts, 255 at the most; no ray passes where one ends."""
+    """Turn the marks in one layer of the map into counts, at most 255; no ray passes where one ends."""
     hits, passes = data[0][layer].reshape(-1), data[1][layer].reshape(-1)
     new_hits, new_passes = data[2][layer].reshape(-1), data[3][layer].reshape(-1)
     for n in range(len(hits)):

@@ -1,4 +1,4 @@
-"""The scene after so many views, as a file: a cache, so that opening a session looks at no view again."""
+"""The scene after some views, as a file: a cache, so that opening a session processes no view again."""
 
 from __future__ import annotations
 

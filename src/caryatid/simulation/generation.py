@@ -154,7 +154,7 @@ def _set_down(
     Screens must not be upset; where there are none, no earlier object must be. Where nothing can be set down
     any more, the last solid is taken up again too; after 40 drops for each object the scene is given up.
     """
-    # An object that has not come to rest after two seconds is set down anew.
+    # An object that has not come to rest after two seconds is set down again.
     impatient = replace(physics, settle_time=2.0)
 
     def settled(solids: Sequence[Solid]) -> SimulatedScene | None:

@@ -74,7 +74,7 @@ class Projection:
 
 
 def _parallel(T_world_eye: Array, scale: float, centre: tuple[float, float]) -> Projection:
-    """A parallel projection of so many pixels a metre, in which nothing is hidden."""
+    """A parallel projection with a given number of pixels per metre, in which nothing is hidden."""
     K = np.array([[scale, 0.0, centre[0]], [0.0, scale, centre[1]], [0.0, 0.0, 1.0]])
     return Projection(T_world_eye, K, np.zeros((1, 1), dtype=np.float32), parallel=True)
 

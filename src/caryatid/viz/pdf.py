@@ -150,7 +150,7 @@ class _Sheets:
 
 
 def _wrapped(text: str, width: float, size: float) -> list[str]:
-    """Lines of a text that fit into so many inches."""
+    """Lines of a text that fit into a width in inches."""
     return textwrap.wrap(text, max(int(width / (GLYPH * size)), 4)) or [""]
 
 
