@@ -32,7 +32,7 @@ from caryatid.planning.expected_visibility import SURFACE_SAMPLES
 from caryatid.planning.planners import make_planner
 from caryatid.planning.points_of_interest import points_of_interest
 from caryatid.robots import Robot
-from caryatid.runtime.threads import one_blas_thread
+from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.observation import MAX_POINTS, UP
 from caryatid.segmentation.segments import segment
 from caryatid.segmentation.support_plane import find_support_surface

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import io
 import json
-import os
-import pty
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 
 import numpy as np
@@ -217,49 +215,48 @@ def test_with_json_an_error_is_one_line_and_no_document(command, words, capfd):
 # Colours, and what moves
 
 
-def said_on(words, *, out, err, **environment):
+class Stream(io.StringIO):
+    """A stream that is a terminal, or not."""
+
+    def __init__(self, terminal):
+        super().__init__()
+        self.isatty = lambda: terminal
+
+
+@pytest.fixture
+def said_on(monkeypatch):
     """What a command writes to stdout and stderr where these are terminals, or not."""
-    environment = {k: v for k, v in os.environ.items() if k not in {"NO_COLOR", "FORCE_COLOR"}} | {
-        "TERM": "xterm-256color", **environment,
-    }  # fmt: skip
-    masters, slaves = zip(*(pty.openpty() if terminal else os.pipe() for terminal in (out, err)), strict=True)
-    process = subprocess.Popen(
-        [sys.executable, "-m", "caryatid", *map(str, words)], stdin=subprocess.DEVNULL,
-        stdout=slaves[0], stderr=slaves[1], env=environment,
-    )  # fmt: skip
-    said = [b"", b""]
-    for k, (master, slave) in enumerate(zip(masters, slaves, strict=True)):
-        os.close(slave)
-        while True:
-            try:
-                chunk = os.read(master, 65536)
-            except OSError:  # Linux says so where the other end of a terminal is closed.
-                break
-            if not chunk:
-                break
-            said[k] += chunk
-        os.close(master)
-    process.wait()
-    return said[0].decode(), said[1].decode()
+
+    def said(words, *, out, err, **environment):
+        with monkeypatch.context() as patched:
+            for name in ("NO_COLOR", "FORCE_COLOR"):
+                patched.delenv(name, raising=False)
+            for name, value in ({"TERM": "xterm-256color"} | environment).items():
+                patched.setenv(name, value)
+            streams = Stream(out), Stream(err)
+            patched.setattr(sys, "stdout", streams[0])
+            patched.setattr(sys, "stderr", streams[1])
+            run_command(*words)
+        return streams[0].getvalue(), streams[1].getvalue()
+
+    return said
 
 
 COLOUR = re.compile(r"\x1b\[(?:\d+;)*[349]\d")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "words", ["explore nowhere --out run", "explore tower --out run --fusion k", "juggle"]
-)
-def test_errors_are_coloured_for_a_person_who_has_not_said_no(words):
-    assert COLOUR.search(said_on(words.split(), out=True, err=True)[1]) or "nowhere" in words
+@pytest.mark.parametrize("words", ["explore nowhere --out", "explore tower --fusion k --out", "juggle"])
+def test_errors_are_coloured_for_a_person_who_has_not_said_no(words, said_on, tmp_path):
+    spelled = [*words.split(), *([tmp_path / "run"] if words.endswith("--out") else [])]
+    assert COLOUR.search(said_on(spelled, out=True, err=True)[1]) or "nowhere" in words
     for quiet in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
-        assert not COLOUR.search(said_on(words.split(), out=True, err=True, **quiet)[1])
-    assert ESCAPE not in said_on(words.split(), out=True, err=False)[1]
-    assert ESCAPE not in said_on(words.split(), out=False, err=False)[1]
+        assert not COLOUR.search(said_on(spelled, out=True, err=True, **quiet)[1])
+    assert ESCAPE not in said_on(spelled, out=True, err=False)[1]
+    assert ESCAPE not in said_on(spelled, out=False, err=False)[1]
 
 
 @pytest.mark.slow
-def test_help_and_tables_are_plain_in_a_pipe(kept):
+def test_help_and_tables_are_plain_in_a_pipe(kept, said_on):
     for words in (["--help"], ["order", "--help"], ["order", kept / "run", *QUICK]):
         assert ESCAPE in "".join(said_on(words, out=True, err=True))
         out, err = said_on(words, out=False, err=False)
@@ -269,7 +266,7 @@ def test_help_and_tables_are_plain_in_a_pipe(kept):
 
 
 @pytest.mark.slow
-def test_a_spinner_turns_on_a_terminal_only(kept):
+def test_a_spinner_turns_on_a_terminal_only(kept, said_on):
     words = ["order", kept / "run", *QUICK]
     assert "rehearsing" in said_on(words, out=False, err=True)[1]
     assert said_on(words, out=True, err=False)[1] == ""

@@ -20,8 +20,8 @@ from caryatid.planning.planners import make_planner
 from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.robots.arm import ArmRobot
 from caryatid.runtime.display import Pictured
+from caryatid.runtime.parallel import one_blas_thread
 from caryatid.runtime.stopwatch import Stopwatch
-from caryatid.runtime.threads import one_blas_thread
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -74,6 +75,16 @@ class RunRecorder:
         if self.writer is not None:
             write_step(self.writer, step)
         return self.scores[-1] if self.scores else None
+
+    @contextmanager
+    def interruptible(self) -> Iterator[None]:
+        """Let Ctrl-C end the run after the views so far; before the first it leaves nothing."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            self.interrupted = True
+            if self.views == 0:
+                raise
 
     def finish(
         self, more: Mapping[str, object] | None = None, files: Mapping[str, bytes] | None = None

@@ -18,8 +18,8 @@ from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.display import Pictured, call
+from caryatid.runtime.parallel import one_blas_thread
 from caryatid.runtime.stopwatch import Stopwatch
-from caryatid.runtime.threads import one_blas_thread
 from caryatid.segmentation.observation import UP, Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
 from caryatid.sensing.registration import ViewRegistration

@@ -26,7 +26,7 @@ from caryatid.benchmark.episodes import Episode, Outcome, plugin_of, run_episode
 from caryatid.errors import CaryatidError, InputError
 from caryatid.runtime.fingerprint import fingerprint
 from caryatid.runtime.interrupts import interrupts_held
-from caryatid.runtime.threads import one_blas_thread
+from caryatid.runtime.parallel import one_blas_thread
 
 if TYPE_CHECKING:
     from distributed import Client

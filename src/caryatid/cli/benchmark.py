@@ -19,9 +19,9 @@ from caryatid.cli.options import (
     OptionalCount,
     OptionalPath,
     OptionalText,
+    PlannerName,
     defaults_to,
     one_of,
-    planner_name,
     shown_as,
 )
 from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
@@ -30,10 +30,6 @@ from caryatid.errors import InputError
 if TYPE_CHECKING:
     from caryatid.benchmark.store import ResultStore
     from caryatid.benchmark.suites import Suite
-    from caryatid.cli.output import Output
-
-CORES = os.cpu_count() or 1
-"""Default number of processes."""
 
 SUITES = (
     "smoke", "fig5", "planners", "path", "ablation", "ablation-attention", "poses", "noise", "dismantle",
@@ -49,7 +45,7 @@ class Benchmark(Command):
     """Compare methods over scenes and seeds, with figures.
 
     Every finished episode is kept: stop at any time and start again. Without --suite nothing is run, and the
-    figures of what the folder holds are made again.
+    figures of the results in the folder are drawn again.
 
     To try:
       caryatid benchmark --suite smoke --out bench
@@ -59,12 +55,12 @@ class Benchmark(Command):
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder of the results; earlier ones count."""
+    """Folder of the results; earlier ones are used."""
     suite: Annotated[str | None, one_of(SUITES), SAID] = None
     """What to compare."""
     scenes: Annotated[Words, shown_as("SCENE")] = ()
     """Scenes instead of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
-    planner: Annotated[tyro.conf.UseAppendAction[tuple[Annotated[str, planner_name()], ...]], SAID] = ()
+    planner: Annotated[tyro.conf.UseAppendAction[tuple[PlannerName, ...]], SAID] = ()
     """Planner instead of the suite's methods; may be repeated. The others are compared with the first."""
     fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], SAID] = ()
     """Fusion instead of the suite's; may be repeated."""
@@ -78,7 +74,7 @@ class Benchmark(Command):
     """Seeds 0…N−1 of every episode."""
     views: Annotated[OptionalCount, defaults_to("the suite's")] = None
     """Views of every episode, including the first."""
-    jobs: Annotated[OptionalCount, defaults_to(f"the cores of this machine, {CORES}")] = None
+    jobs: Annotated[OptionalCount, defaults_to(f"the cores of this machine, {os.cpu_count()}")] = None
     """Number of processes."""
     scheduler: Annotated[OptionalText, shown_as("ADDRESS")] = None
     """Run on the workers of this dask.distributed scheduler instead, such as tcp://10.0.0.5:8786."""
@@ -91,22 +87,21 @@ class Benchmark(Command):
 
     def __call__(self) -> None:
         from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
-        from caryatid.cli.output import Output
         from caryatid.runtime.fingerprint import fingerprint
 
         import_pandas()
-        out, path = Output(self.general), self.out / RESULTS
-        suite = None if self.suite is None else self._suite(self.suite)
+        path = self.out / RESULTS
         if self.scheduler is not None and self.jobs is not None:
             raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
+        suite = None if self.suite is None else self._suite(self.suite)
         if suite is not None:
             self._check(suite, path)
         code = None if suite is None else fingerprint()
         with ResultStore(path, code, collect_provenance()) as store:
             try:
                 if suite is not None:
-                    self._run(suite, store, out)
-                self._report(store, out)
+                    self._run(suite, store)
+                self._report(store)
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("what is done is kept, start again to continue") from None
 
@@ -123,9 +118,9 @@ class Benchmark(Command):
             noises=self.noise,
             settings=self.set,
         )
-        if self.scenes:
-            suite = replace(suite, scenes=tuple(find_scenes(self.scenes)))
-        return replace(suite, seeds=self.seeds or suite.seeds, views=self.views or suite.views)
+        scenes = tuple(find_scenes(self.scenes)) if self.scenes else suite.scenes
+        seeds, views = self.seeds or suite.seeds, self.views or suite.views
+        return replace(suite, scenes=scenes, seeds=seeds, views=views)
 
     def _check(self, suite: Suite, path: Path) -> None:
         """Refuse an unknown reference, or a cluster that does not answer, before anything is written."""
@@ -141,28 +136,26 @@ class Benchmark(Command):
             connect(self.scheduler).close()
         check_reference(self.reference, methods)
 
-    def _run(self, suite: Suite, store: ResultStore, out: Output) -> None:
-        """Run the missing episodes with a progress bar; where there is no terminal, print a line a minute."""
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    def _run(self, suite: Suite, store: ResultStore) -> None:
+        """Run the missing episodes with a progress bar; without a terminal, print a line every minute."""
+        from rich.progress import MofNCompleteColumn, Progress
 
         from caryatid.benchmark.episodes import short_name
         from caryatid.benchmark.running import run_locally, run_on_cluster
         from caryatid.runtime.compiling import compile_kernels
 
         missing = store.plan(suite.name, suite.members(), retry=self.retry)
-        total = len({member.episode for member in store.suites[suite.name]})
-        if self.scheduler is not None and missing:
-            episodes = run_on_cluster(missing, self.scheduler, out.say)
-        elif missing:
-            compile_kernels(out.say)
-            episodes = run_locally(missing, self.jobs or CORES)
-        else:
+        if not missing:
             return
-        columns = (
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-        )  # fmt: skip
-        console = out.progress
+        if self.scheduler is not None:
+            episodes = run_on_cluster(missing, self.scheduler, self.output.say)
+        else:
+            compile_kernels()
+            episodes = run_locally(missing, self.jobs or os.cpu_count() or 1)
+        total = len({member.episode for member in store.suites[suite.name]})
+        console = self.output.progress
         hidden = console.quiet or not console.is_interactive
+        columns = (*Progress.get_default_columns(), MofNCompleteColumn())
         bar = Progress(*columns, console=console, disable=hidden, speed_estimate_period=600.0)
         task = bar.add_task(suite.name, total=total, completed=total - len(missing))
         printed = time.monotonic()
@@ -172,32 +165,31 @@ class Benchmark(Command):
                 bar.advance(task)
                 if outcome.error is not None:
                     name = f"{short_name(episode.scene)}, {episode.planner}, seed {episode.seed}"
-                    out.say(f"failed: {name}: {outcome.error}")
+                    self.output.say(f"failed: {name}: {outcome.error}")
                 if hidden and time.monotonic() - printed >= 60.0:
                     printed = time.monotonic()
-                    out.say(f"{suite.name}: {done} of {total} episodes")
+                    self.output.say(f"{suite.name}: {done} of {total} episodes")
 
-    def _report(self, store: ResultStore, out: Output) -> None:
+    def _report(self, store: ResultStore) -> None:
         """Write tables, figures and pages, and print what there is."""
         from caryatid.benchmark import report
 
         results = report.summarise_store(store, self.reference)
         for result in results:
             failed = f", {len(result.failures)} failed" if result.failures else ""
-            line = f"{result.name}: {result.episodes} of {result.planned} episodes{failed}"
-            out.say(line)
+            self.output.say(f"{result.name}: {result.episodes} of {result.planned} episodes{failed}")
         for line in report.write_tables(store, self.out):
-            out.say(line)
+            self.output.say(line)
         if results:
             command = f"caryatid benchmark --out {self.out.name}"
             if self.reference is not None:
                 command += f" --reference {shlex.quote(self.reference)}"
             report.write_results(results, store.about, self.out / "summary.json.gz")
             page = report.write_page(results, store.about, self.out, command)
-            out.say(f"figures: {page}")
+            self.output.say(f"figures: {page}")
             if self.docs is not None:
                 report.write_document(results, store.about, self.docs, f"{command} --docs {self.docs.name}")
-        if self.general.json:
+        if self.output.json:
             suites = {
                 result.name: {
                     "planned": result.planned,
@@ -207,4 +199,4 @@ class Benchmark(Command):
                 }
                 for result in results
             }
-            out.result({"results": str(self.out), "suites": suites})
+            self.output.result({"results": str(self.out), "suites": suites})

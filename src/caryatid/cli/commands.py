@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, Union
 
 import tyro
 
-from caryatid.cli.options import Command, ModellingCommand
+from caryatid.cli.options import Command, Modelling
 
 DESCRIPTION = """Explore a cluttered table until it is known which object supports which.
 
@@ -93,19 +93,20 @@ def _any_command() -> Any:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShowConfig(ModellingCommand):
+class ShowConfig(Command):
     """Print all settings as TOML, to edit and pass back with --config.
 
     To try:
       caryatid config > settings.toml
     """
 
+    settings: Modelling = Modelling()
+
     def __call__(self) -> None:
-        from caryatid.cli.output import Output
         from caryatid.config.settings import write_settings
 
-        config = self.modelling.read()
-        Output(self.general).result(asdict(config), write_settings(config))
+        config = self.settings.read()
+        self.output.result(asdict(config), write_settings(config))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,10 +125,8 @@ class Completion(Command):
     """The shell."""
 
     def __call__(self) -> None:
-        from caryatid.cli.output import Output
-
         script = io.StringIO()
         words = ["--tyro-write-completion", self.shell, "-"]
         with redirect_stdout(script), suppress(SystemExit):
             tyro.cli(_any_command(), prog="caryatid", args=words, config=MARKERS)
-        Output(self.general).result({"shell": self.shell, "script": script.getvalue()}, script.getvalue())
+        self.output.result({"shell": self.shell, "script": script.getvalue()}, script.getvalue())

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -12,9 +13,10 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
-from caryatid.errors import InputError
+from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 
 if TYPE_CHECKING:
+    from caryatid.cli.output import Output
     from caryatid.config import Config
 
 SAID = tyro.conf.arg(help_behavior_hint="")
@@ -38,7 +40,7 @@ def shown_as(metavar: str) -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
-def one_of(choice: Any) -> PrimitiveConstructorSpec[str | None]:
+def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
     """One of a few words, or None when left out; anything else is a usage error that lists them.
 
     Args:
@@ -48,7 +50,7 @@ def one_of(choice: Any) -> PrimitiveConstructorSpec[str | None]:
     return _word("{" + ",".join(words) + "}", str, words)
 
 
-def whole_number(least: int) -> PrimitiveConstructorSpec[int | None]:
+def whole_number(least: int) -> PrimitiveConstructorSpec[Any]:
     """A whole number of at least `least`, or None when left out; anything else is a usage error."""
 
     def parse(word: str) -> int:
@@ -57,37 +59,6 @@ def whole_number(least: int) -> PrimitiveConstructorSpec[int | None]:
         return int(word)
 
     return _word("N", parse)
-
-
-def planner_name() -> PrimitiveConstructorSpec[str]:
-    """`oracle`, or a name `make_planner` knows, including planners of other packages."""
-    from caryatid.planning.planners import BUILT_IN, ORACLE, make_planner, offered
-
-    names = (*BUILT_IN, *sorted(offered()), ORACLE)
-    return _name(lambda name: name in {*BUILT_IN, ORACLE} or make_planner(name), names, names)
-
-
-def robot_name() -> PrimitiveConstructorSpec[str]:
-    """A name `find_robot` knows; files and modules are checked when they are opened."""
-    from caryatid.robots import ARM, HUMANOID, find_robot
-
-    shown = (HUMANOID, f"{ARM}FILE.npz", "module:callable", "…")
-    return _name(lambda name: ":" in name or find_robot(name), shown)
-
-
-def _name(
-    find: Callable[[str], object], shown: Iterable[str], choices: tuple[str, ...] | None = None
-) -> PrimitiveConstructorSpec[str]:
-    """A name that `find` accepts; where it raises InputError, that is a usage error."""
-
-    def parse(word: str) -> str:
-        try:
-            find(word)
-        except InputError as error:
-            raise ValueError(f"{error.reason}; {error.remedy}") from None
-        return word
-
-    return _word("{" + ",".join(shown) + "}", parse, choices)
 
 
 def _word(
@@ -112,28 +83,30 @@ OptionalPath = Annotated[Path | None, SAID]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="RUN")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
+PlannerName = Annotated[str, one_of((*BUILT_IN, *sorted(offered()), ORACLE))]
+RobotName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Segmentation = Annotated[SegmentationMethod | None, one_of(SegmentationMethod)]
 Assignments = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="STAGE.NAME=VALUE")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class General:
-    """Output."""
+    """What is printed."""
 
     json: Flag = False
     """Write the result to stdout as one JSON document, and nothing else."""
     quiet: Flag = False
-    """Print nothing while working."""
+    """Print no progress."""
     debug: Flag = False
     """Show the traceback of an error instead of one line."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """Settings."""
+    """Settings of the method and the simulation."""
 
     config: Annotated[OptionalPath, shown_as("FILE.toml")] = None
-    """Settings that replace the defaults; `caryatid config` writes a file with all of them."""
+    """File of settings that replace the defaults; `caryatid config` prints one with all of them."""
     set: Assignments = ()
     """Set one setting, such as `--set fit.hypotheses=200`; overrides the file."""
 
@@ -173,37 +146,30 @@ class Command:
 
     general: General = General()
 
+    @cached_property
+    def output(self) -> Output:
+        """Where it prints."""
+        from caryatid.cli.output import Output
 
-@dataclass(frozen=True, kw_only=True)
-class SettingsCommand(Command):
-    """A command with settings."""
-
-    settings: Settings = Settings()
-
-
-@dataclass(frozen=True, kw_only=True)
-class ModellingCommand(Command):
-    """A command that builds a scene model."""
-
-    modelling: Modelling = Modelling()
+        return Output(json=self.general.json, quiet=self.general.quiet)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExploringCommand(ModellingCommand):
+class ExploringCommand(Command):
     """A command that explores a scene."""
 
+    settings: Modelling = Modelling()
     views: Annotated[OptionalCount, default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
-    planner: Annotated[str, planner_name()] = "support"
-    """Planner of the next view; oracle knows the ground truth and works in simulation only."""
-    robot: Annotated[str, robot_name()] = "humanoid"
-    """Robot that carries the simulated camera: arm:FILE.npz is an arm with a reachability map,
-    module:callable one of your own."""
+    planner: PlannerName = "support"
+    """Planner of the next view; oracle knows the ground truth and needs a simulation."""
+    robot: RobotName = "humanoid"
+    """Robot that carries the simulated camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
     segmentation: Annotated[Segmentation, defaults_to("labels where the source has them")] = None
-    """Use the masks that are given, or segment automatically."""
+    """Use the masks of the source, or segment automatically."""
     noise: NoiseModel = "none"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 
-    def settings(self) -> Config:
-        """The configuration, as `Settings.read` returns it, with --views."""
-        return self.modelling.read({"active.max_views": self.views})
+    def config(self) -> Config:
+        """All settings."""
+        return self.settings.read({"active.max_views": self.views})

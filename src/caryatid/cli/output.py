@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from rich import box
@@ -13,37 +14,40 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from caryatid.runtime.stopwatch import by_stage
-
 if TYPE_CHECKING:
-    from caryatid.cli.options import General
     from caryatid.evaluation.scores import Score
     from caryatid.exploration import Step
     from caryatid.graph import SceneObject, SupportGraph
 
-WAITING = ("capture",)
-"""Stages that wait for the camera and are not part of a turn."""
 
-
-class Output:
-    """What a command prints.
+class Output(logging.Handler):
+    """What a command prints. It also prints what the package logs, such as that kernels are compiled.
 
     Nothing moves on stderr unless it is a terminal, not even with FORCE_COLOR.
 
     Args:
-        general: Whether progress is printed, and results as JSON.
+        json: Whether the result is one JSON document, and nothing else is printed.
+        quiet: Whether no progress is printed.
     """
 
-    def __init__(self, general: General) -> None:
-        self._json = general.json
+    def __init__(self, *, json: bool, quiet: bool) -> None:
+        super().__init__(logging.INFO)
+        self.json = json
         self.progress = Console(
             stderr=True,
-            quiet=general.quiet or general.json,
+            quiet=quiet or json,
             highlight=False,
             emoji=False,
             soft_wrap=True,
             force_interactive=None if sys.stderr.isatty() else False,
         )
+        logger = logging.getLogger("caryatid")
+        logger.handlers = [self]
+        logger.setLevel(logging.INFO)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print what was logged."""
+        self.say(record.getMessage())
 
     def say(self, text: str) -> None:
         """Print a line of progress."""
@@ -55,7 +59,7 @@ class Output:
 
     def result(self, document: Mapping[str, Any], *shown: RenderableType) -> None:
         """Print the result: as one JSON document, or else text as it is and tables."""
-        if self._json:
+        if self.json or not shown:
             from caryatid.io.json_files import json_text
 
             shown = (json_text(document),)
@@ -66,17 +70,10 @@ class Output:
                 Console(highlight=False).print(item)
         sys.stdout.flush()
 
-    def compile(self) -> None:
-        """Compile the kernels that are not compiled yet."""
-        from caryatid.runtime.compiling import compile_kernels
-
-        with self.working("compiling"):
-            compile_kernels(self.say)
-
     def step(self, step: Step, before: SupportGraph | None, score: Score | None) -> None:
         """Print what a view changed, its score where the ground truth is known, and what comes next."""
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
-        self.say(f"view {step.index:02d}: {summary(step.graph)}{f1} ({_turn(step.timings):.1f} s)")
+        self.say(f"view {step.index:02d}: {summary(step.graph)}{f1} ({turn(step.timings):.1f} s)")
         for line in changes(before, step.graph):
             self.say(f"  {line}")
         if step.decision is not None:
@@ -117,50 +114,40 @@ def _held(o: SceneObject, graph: SupportGraph) -> str:
     return f"held by {' and '.join(names)}" if names else "held by nothing seen yet"
 
 
-def numbered_table(title: str, *columns: str) -> Table:
-    """A table of numbered rows."""
-    table = Table(title=Text(title), title_justify="left")
-    table.add_column("", justify="right")
-    for column in columns:
-        table.add_column(column)
-    return table
-
-
-def figures_table(title: str, *columns: str) -> Table:
-    """A table of figures, aligned to the right."""
-    table = Table(title=Text(title), title_justify="left")
+def table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, figures: bool = False
+) -> Table:
+    """A table of text, or of figures aligned to the right."""
+    made = Table(title=Text(title), title_justify="left")
     for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
+        made.add_column(name, justify="right" if figures else "left", no_wrap=figures)
+    for row in rows:
+        made.add_row(*map(Text, row))
+    return made
 
 
-def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], list[Table]]:
-    """What `--profile` adds to the JSON document, in seconds, and two tables, by stage and by view [ms].
+def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], Table]:
+    """What `--profile` prints: the time of each stage of each view [s], and the same as a table [ms].
 
     Args:
         steps: Number and timings [s] of each view, as in run.json.
     """
-    stages = by_stage([step["timings"] for step in steps], beside=WAITING)
-    (turn,) = by_stage([{"turn": _turn(step["timings"])} for step in steps])
-    views = [{"view": step["view"]} | step["timings"] for step in steps]
-    record = {"stages": [asdict(s) for s in stages], "turn": asdict(turn), "views": views}
-    by_name = figures_table("time by stage [ms]", "stage", "median", "highest", "share")
-    by_name.columns[0].justify = "left"
-    for s in (*stages, turn):
-        share = "" if s is turn or s.share is None else f"{100.0 * s.share:.0f} %"
-        by_name.add_row(s.stage, _milliseconds(s.median), _milliseconds(s.highest), share)
-    by_view = figures_table("time by view [ms]", "view", *(s.stage for s in stages), turn.stage)
-    for step in steps:
-        times = [*(step["timings"].get(s.stage) for s in stages), _turn(step["timings"])]
-        by_view.add_row(f"{step['view']:02d}", *map(_milliseconds, times))
-    for table in (by_name, by_view):
-        table.box, table.padding, table.pad_edge = box.SIMPLE_HEAD, (0, 0, 0, 0), False
-    return {"profile": record}, [by_name, by_view]
+    stages = [*dict.fromkeys(stage for step in steps for stage in step["timings"]), "turn"]
+    times = [step["timings"] | {"turn": turn(step["timings"])} for step in steps]
+    names = [f"{step['view']:02d}" for step in steps]
+    rows = [
+        [name, *(_milliseconds(view.get(s)) for s in stages)] for name, view in zip(names, times, strict=True)
+    ]
+    medians = [median(view[s] for view in times if s in view) for s in stages]
+    rows.append(["median", *map(_milliseconds, medians)])
+    made = table("time by view [ms]", ["view", *stages], rows, figures=True)
+    made.box, made.padding, made.pad_edge = box.SIMPLE_HEAD, (0, 0, 0, 0), False
+    return [{"view": step["view"], **view} for step, view in zip(steps, times, strict=True)], made
 
 
-def _turn(laps: Mapping[str, float]) -> float:
-    """Time of a turn [s]."""
-    return sum(seconds for stage, seconds in laps.items() if stage not in WAITING)
+def turn(timings: Mapping[str, float]) -> float:
+    """Time of a turn of the loop [s]: all stages but waiting for the camera."""
+    return sum(seconds for stage, seconds in timings.items() if stage != "capture")
 
 
 def _milliseconds(seconds: float | None) -> str:

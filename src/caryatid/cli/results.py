@@ -11,12 +11,12 @@ import tyro
 from caryatid.cli.options import (
     Command,
     Flag,
-    ModellingCommand,
+    Modelling,
     OptionalCount,
     OptionalPath,
     OptionalText,
     RunPath,
-    SettingsCommand,
+    Settings,
     default_of,
     defaults_to,
     one_of,
@@ -28,7 +28,7 @@ Topic = Annotated[OptionalText, shown_as("TOPIC")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import(SettingsCommand):
+class Import(Command):
     """Turn a robot's recording into a scene folder of sharp views from different viewpoints.
 
     Reads bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), and folders of the
@@ -40,50 +40,48 @@ class Import(SettingsCommand):
       caryatid import rgbd_dataset_freiburg1_desk --out desk
     """
 
+    settings: Settings = Settings()
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Bag, or folder with depth.txt."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Scene folder to write, in the BOP format; must be new or empty."""
     depth: Topic = None
-    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. When left out, they are listed."""
+    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. When left out: topics are listed."""
     info: Topic = None
     """Camera of the depth images (CameraInfo)."""
     rgb: Topic = None
-    """Colour images that depth is registered to; they also tell how sharp a frame is."""
+    """Colour images that depth is registered to; they also show how sharp a frame is."""
     tf: Annotated[OptionalText, shown_as("FRAME")] = None
     """World frame, level with z up, such as map or base_link. When left out: one frame without a pose."""
     camera: Annotated[OptionalPath, shown_as("FILE.json")] = None
     """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. When left out: as published."""
     level: Flag = False
-    """Rotate the world so that the table is level, for poses whose z does not point up; most views must
-    show the table."""
+    """Rotate the world so that the table is level, for poses whose z is not up; most views must show it."""
     views: Annotated[OptionalCount, default_of("recording.max_views")] = None
     """Maximum number of views."""
 
     def __call__(self) -> None:
-        config = self.settings.read({"recording.max_views": self.views})
-        from caryatid.cli.output import Output
         from caryatid.io.datasets import Topics
         from caryatid.io.importing import import_recording, reasons
 
-        out = Output(self.general)
+        config, output = self.settings.read({"recording.max_views": self.views}), self.output
         topics = Topics(self.depth, self.info, self.rgb, self.tf)
-        with out.working(f"reading {self.source.name}"):
+        with output.working(f"reading {self.source.name}"):
             imported = import_recording(
                 self.source, self.out, topics, camera_file=self.camera, level=self.level, config=config
             )
-        if self.general.json:
+        if output.json:
             views = [
                 {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}
                 for n, f in enumerate(imported.chosen)
             ]
             document = {"recording": str(self.out), "frames": imported.read, "views": views}
-            out.result(document | {"skipped": imported.skipped, "notes": list(imported.notes)})
+            output.result(document | {"skipped": imported.skipped, "notes": list(imported.notes)})
         for note in imported.notes:
-            out.say(note)
+            output.say(note)
         skipped = f"; skipped: {reasons(imported.skipped)}" if imported.skipped else ""
-        out.say(f"{self.source.name}: {len(imported.chosen)} views of {imported.read} frames{skipped}")
-        out.say(f"recording: {self.out}, try `caryatid extract {self.out} --out run`")
+        output.say(f"{self.source.name}: {len(imported.chosen)} views of {imported.read} frames{skipped}")
+        output.say(f"recording: {self.out}, try `caryatid extract {self.out} --out run`")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,31 +98,30 @@ class Evaluate(Command):
     """Scene folder (scene.xml and gt.json), or recording with masks and gt.json."""
 
     def __call__(self) -> None:
-        from caryatid.cli.output import Output, figures_table
+        from caryatid.cli.output import table
         from caryatid.evaluation.truths import evaluate_run
 
-        scores = evaluate_run(self.run, self.truth)
+        views = [view.to_json() for view in evaluate_run(self.run, self.truth)]
+        names = ("precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou")
+        rows = [[f"{view['view']:02d}", *(f"{view[name]:.3f}" for name in names)] for view in views]
         columns = ("view", "precision", "recall", "F1", "edge precision", "edge recall", "mean IoU")
-        table = figures_table(f"{self.run} against {self.truth}", *columns)
-        for view in scores:
-            s = view.score
-            figures = (s.precision, s.recall, s.f1, s.edge_precision, s.edge_recall, s.mean_iou)
-            table.add_row(f"{view.view:02d}", *(f"{f:.3f}" for f in figures))
-        Output(self.general).result({"views": [s.to_json() for s in scores]}, table)
+        shown = table(f"{self.run} against {self.truth}", columns, rows, figures=True)
+        self.output.result({"views": views}, shown)
 
 
 @dataclass(frozen=True, kw_only=True)
-class OrderCommand(ModellingCommand):
+class OrderCommand(Command):
     """Find a safe order to take everything away, or to reach one object.
 
-    Each lift is rehearsed in physics on the extracted shapes, and on others as likely, before it is chosen.
-    Where no order is safe, the output names the objects in each other's way and gives the least risky order.
+    Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others as likely.
+    If no order is safe, the output gives the least risky one and names the objects in each other's way.
 
     To try:
       caryatid order run
       caryatid order run --goal o3
     """
 
+    settings: Modelling = Modelling()
     run: RunPath
     """Run folder."""
     goal: Annotated[OptionalText, shown_as("ID")] = None
@@ -133,25 +130,22 @@ class OrderCommand(ModellingCommand):
     """With 2, another hand may hold one object while the first lifts one."""
 
     def __call__(self) -> None:
-        config = self.modelling.read()
-        from rich.text import Text
-
-        from caryatid.cli.output import Output, numbered_table
+        from caryatid.cli.output import table
         from caryatid.io.runs import read_run
         from caryatid.manipulation.order import order_record, plan_order
-        from caryatid.runtime.threads import cores
+        from caryatid.runtime.parallel import cores
 
-        out = Output(self.general)
-        graph, seed = read_run(self.run).graph, self.modelling.seed
-        with out.working("rehearsing"):
+        config, seed, graph = self.settings.read(), self.settings.seed, read_run(self.run).graph
+        with self.output.working("rehearsing"):
             order = plan_order(graph, config, goal=self.goal, hands=self.hands, seed=seed, threads=cores())
         outcome = "a safe order" if order.safe else "no safe order"
         goal = f" to reach {self.goal}" if self.goal else ""
-        table = numbered_table(f"{self.run}: {outcome}{goal}", "take", "hold", "why")
-        for number, step in enumerate(order.steps, start=1):
-            why = Text(step.why if step.safe else f"! {step.why}")
-            table.add_row(str(number), step.object_id, ", ".join(step.hold), why)
-        out.result(order_record(order), table, *([Text(order.refusal)] if order.refusal else []))
+        rows = [
+            (str(number), step.object_id, ", ".join(step.hold), step.why if step.safe else f"! {step.why}")
+            for number, step in enumerate(order.steps, start=1)
+        ]
+        shown = table(f"{self.run}: {outcome}{goal}", ("", "take", "hold", "why"), rows)
+        self.output.result(order_record(order), shown, f"{order.refusal}\n" if order.refusal else "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,21 +160,19 @@ class ReportCommand(Command):
     run: RunPath
     """Run folder; its report.html is replaced."""
     pdf: Annotated[OptionalPath, shown_as("FILE.pdf")] = None
-    """Write a PDF as well, A4; replaces an earlier one."""
+    """PDF (A4) to write as well; replaces an earlier one."""
 
     def __call__(self) -> None:
-        from caryatid.cli.output import Output
         from caryatid.runs import write_report
 
-        out = Output(self.general)
         for path in write_report(self.run, self.pdf):
-            out.say(f"report: {path}")
-        if self.general.json:
-            out.result({"html": self.run / "report.html", "pdf": self.pdf})
+            self.output.say(f"report: {path}")
+        if self.output.json:
+            self.output.result({"html": self.run / "report.html", "pdf": self.pdf})
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(SettingsCommand):
+class Export(Command):
     """Write the scene model of a run for simulators, viewers and graph programs.
 
     To try:
@@ -188,6 +180,7 @@ class Export(SettingsCommand):
       caryatid export run --out scene.glb
     """
 
+    settings: Settings = Settings()
     run: RunPath
     """Run folder, or a graph.json."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
@@ -196,16 +189,14 @@ class Export(SettingsCommand):
     """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
 
     def __call__(self) -> None:
-        config = self.settings.read()
-        from caryatid.cli.output import Output, summary
+        from caryatid.cli.output import summary
         from caryatid.exports import export_graph, format_of
         from caryatid.io.graph_json import read_graph
         from caryatid.io.runs import read_run
 
-        out = Output(self.general)
-        format_ = self.format or format_of(self.out)
+        config, format_ = self.settings.read(), self.format or format_of(self.out)
         graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
         export_graph(graph, self.out, format_, config.export)
-        if self.general.json:
-            out.result({"file": str(self.out), "format": format_})
-        out.say(f"{self.out}: {format_}, {summary(graph)}")
+        if self.output.json:
+            self.output.result({"file": str(self.out), "format": format_})
+        self.output.say(f"{self.out}: {format_}, {summary(graph)}")

@@ -15,28 +15,37 @@ from caryatid.cli.options import (
     Command,
     Count,
     General,
-    ModellingCommand,
+    Modelling,
     OptionalPath,
     OptionalText,
+    PlannerName,
     Port,
+    RobotName,
     Segmentation,
-    SettingsCommand,
+    Settings,
     defaults_to,
-    planner_name,
-    robot_name,
     shown_as,
 )
 from caryatid.errors import InputError
-
-NEEDED = ("fastapi", "starlette", "uvicorn")
-"""Packages of the extra `serve`."""
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[OptionalPath, shown_as("FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class New(ModellingCommand):
+class SessionStep(Command):
+    """A command on a session."""
+
+    folder: Folder
+    """Folder of the session."""
+
+    def show(self, document: Mapping[str, Any], line: str) -> None:
+        """Print one JSON document, or a line unless --quiet."""
+        self.output.result(document, "" if self.general.quiet else f"{line}\n")
+
+
+@dataclass(frozen=True, kw_only=True)
+class New(SessionStep):
     """Begin a session in a new folder.
 
     To try:
@@ -45,43 +54,35 @@ class New(ModellingCommand):
       caryatid session new table --robot arm:arm.npz
     """
 
+    settings: Modelling = Modelling()
     folder: Folder
-    """Folder of the session; new or empty."""
+    """Folder of the session; must be new or empty."""
     segmentation: Annotated[Segmentation, defaults_to("labels where the first view has them")] = None
-    """Use the label images that are given, or segment automatically."""
-    planner: Annotated[str, planner_name()] = "support"
+    """Use the label images of the views, or segment automatically."""
+    planner: PlannerName = "support"
     """Planner of the next view."""
-    robot: Annotated[str, robot_name()] = "humanoid"
-    """Robot: arm:FILE.npz is an arm with a reachability map, module:callable one of your own."""
+    robot: RobotName = "humanoid"
+    """Robot that carries the camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
 
     def __call__(self) -> None:
-        config = self.modelling.read()
         from caryatid.robots import located
         from caryatid.sessions import Session
 
         session = Session.begin(
             self.folder,
-            config,
+            self.settings.read(),
             segmentation=self.segmentation,
-            seed=self.modelling.seed,
+            seed=self.settings.seed,
             planner=self.planner,
             robot=located(self.robot),
         )
         with session:
-            _print(self.general, {"session": self.folder, "views": 0}, f"session: {self.folder}")
+            self.show({"session": self.folder, "views": 0}, f"session: {self.folder}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Step(Command):
-    """A command on a session."""
-
-    folder: Folder
-    """Folder of the session."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Add(Step):
-    """Add a view; when the command ends with 0, the view is on the disk and stays.
+class Add(SessionStep):
+    """Add a view; once the command ends with status 0, the view is on disk and stays.
 
     camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm of one unit of depth, else 1}
 
@@ -99,7 +100,7 @@ class Add(Step):
     labels: ImagePath = None
     """Object number of each pixel: grey PNG or .npy; 0 = nothing, an object keeps its number."""
     number: Annotated[int | None, shown_as("N")] = None
-    """Expected number of the view, from 0: a view that is already there is not added again."""
+    """Expected number of the view, from 0; a view that is already there is not added again."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import summary
@@ -112,11 +113,11 @@ class Add(Step):
             added = session.add(capture, self.number)
         document = {"view": added.number, "changed": added.changed, "graph": graph_to_json(added.graph)}
         news = "" if added.changed else ", nothing new"
-        _print(self.general, document, f"view {added.number + 1}: {summary(added.graph)}{news}")
+        self.show(document, f"view {added.number + 1}: {summary(added.graph)}{news}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Next(Step):
+class Next(SessionStep):
     """Print where to look next: camera pose, platform, gaze, expected gain, and why; as JSON.
 
     candidates.json: {"T_world_camera": [4×4 …] that the robot reaches, "path_length": [m …], optional}
@@ -130,20 +131,20 @@ class Next(Step):
     """Poses to choose from, instead of those the session's robot reaches."""
 
     def __call__(self) -> None:
-        from caryatid.cli.output import Output
         from caryatid.sessions import Session
         from caryatid.sessions.next_view import Reachable
 
         with Session.open(self.folder, read_only=True) as session:
-            given = None if self.candidates is None else Reachable.read(self.candidates)
-            following = (
-                session.next() if given is None else session.next(given.T_world_camera, given.path_length)
-            )
-        Output(General(json=True)).result(following.to_json())
+            if self.candidates is None:
+                view = session.next()
+            else:
+                given = Reachable.read(self.candidates)
+                view = session.next(given.T_world_camera, given.path_length)
+        self.output.result(view.to_json())
 
 
 @dataclass(frozen=True, kw_only=True)
-class Graph(Step):
+class Graph(SessionStep):
     """Print the support graph so far, as graph.json.
 
     To try:
@@ -151,16 +152,15 @@ class Graph(Step):
     """
 
     def __call__(self) -> None:
-        from caryatid.cli.output import Output
         from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Session
 
         with Session.open(self.folder, read_only=True) as session:
-            Output(General(json=True)).result(graph_to_json(session.graph))
+            self.output.result(graph_to_json(session.graph))
 
 
 @dataclass(frozen=True, kw_only=True)
-class Undo(Step):
+class Undo(SessionStep):
     """Take the last view back.
 
     To try:
@@ -175,12 +175,12 @@ class Undo(Step):
         with _views_kept(), Session.open(self.folder) as session:
             left = session.undo()
             document = {"views": left, "graph": graph_to_json(session.graph)}
-            _print(self.general, document, f"{counted(left, 'view')} left: {summary(session.graph)}")
+            self.show(document, f"{counted(left, 'view')} left: {summary(session.graph)}")
 
 
 @dataclass(frozen=True)
 class SessionCommand:
-    """A scene model in a folder that grows as a robot's own software adds views.
+    """Keep a scene model in a folder, to which a robot's own software adds views.
 
     A view that was added stays, whatever happens to the process. One command writes at a time.
     """
@@ -197,29 +197,30 @@ class SessionCommand:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Serve(SettingsCommand):
+class Serve(SessionStep):
     """Serve sessions over HTTP to robot software in any language; /docs shows the OpenAPI page.
 
-    At 127.0.0.1 only programs of this machine can connect, and need no token. Any other --host demands one,
-    as `Authorization: Bearer TOKEN`; there is no encryption, so use it within a network you trust.
+    At 127.0.0.1 only programs on this machine can connect, and need no token. Any other --host requires one,
+    sent as `Authorization: Bearer TOKEN`; there is no encryption, so use it within a network you trust.
 
     To try:
       caryatid serve sessions
       CARYATID_TOKEN=$(openssl rand -hex 16) caryatid serve sessions --host 0.0.0.0
     """
 
+    settings: Settings = Settings()
     folder: Folder
-    """Folder of the sessions; made if missing."""
+    """Folder of the sessions; created if missing."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen at."""
     port: Port = 8765
-    """Port to listen at; 0 = any that is free."""
+    """Port to listen at; 0 = any free one."""
     token: Annotated[OptionalText, shown_as("TOKEN")] = None
     """Token that requests need; better given as CARYATID_TOKEN, where no process list shows it."""
     open_sessions: Count = 4
-    """Sessions kept open; others are opened from disk on request, in a tenth of a second."""
+    """Number of sessions kept open; others are opened from disk on request, in a tenth of a second."""
     waiting: Count = 16
-    """Maximum number of waiting requests; more are asked to try again."""
+    """Maximum number of waiting requests; further ones are asked to try again."""
     max_request: Count = 16
     """Maximum size of a request [MB]."""
 
@@ -229,21 +230,22 @@ class Serve(SettingsCommand):
             from caryatid.service.pool import SessionPool
             from caryatid.service.serving import check_token, run_service
         except ModuleNotFoundError as error:
-            if error.name not in NEEDED:
+            if error.name not in ("fastapi", "starlette", "uvicorn"):
                 raise
             raise InputError("serve", f"needs {error.name}", 'pip install "caryatid[serve]"') from None
-        from caryatid.cli.output import Output
         from caryatid.io.staging import write_errors
+        from caryatid.runtime.compiling import compile_kernels
 
         def listening(address: str) -> None:
             text = f"serving {self.folder} at {address}, its pages at {address}/docs; Ctrl-C stops"
-            _print(self.general, {"address": address, "folder": self.folder}, text)
+            self.show({"address": address, "folder": self.folder}, text)
 
         token = self.token or os.environ.get("CARYATID_TOKEN") or None
         check_token(self.host, token)
         with write_errors(self.folder):
             self.folder.mkdir(parents=True, exist_ok=True)
-        Output(self.general).compile()
+        with self.output.working("compiling"):
+            compile_kernels()
         run_service(
             SessionPool(self.folder, config, self.open_sessions, self.waiting),
             host=self.host,
@@ -260,10 +262,3 @@ def _views_kept() -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         raise KeyboardInterrupt("the session keeps every view that is in it") from None
-
-
-def _print(general: General, document: Mapping[str, Any], line: str) -> None:
-    """Print one JSON document, or a line unless --quiet."""
-    from caryatid.cli.output import Output
-
-    Output(general).result(document, *(() if general.quiet else (f"{line}\n",)))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 import webbrowser
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,25 +17,22 @@ import tyro
 from caryatid.cli.options import ExploringCommand, Flag, Port, SourceName
 
 if TYPE_CHECKING:
-    from contextlib import ExitStack
-
     from caryatid.cli.output import Output
     from caryatid.config import Config
     from caryatid.viewer.page import Page
     from caryatid.viewer.process import PageProcess
 
 PORT = 8770
-"""Where the page is, or at the next port that is free."""
+"""Port of the page, or else the next free one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class View(ExploringCommand):
-    """Look at a finished run in the browser, or work the loop there on a scene or a recording.
+    """Show a finished run in the browser, or control there the exploration of a scene or a recording.
 
     SOURCE is one of
-      a run folder, as explore, extract and dismantle write it; it is shown, and not changed
-      an MJCF scene, the name of a built-in one, or a recording, as of explore; the page takes view after
-      view when it is told to
+      a run folder, as explore, extract and dismantle write it; it is not changed
+      an MJCF scene, the name of a built-in one, or a recording, as for explore
 
     The page is served to this machine only, loads nothing from elsewhere, and stays until Ctrl-C.
 
@@ -45,28 +45,23 @@ class View(ExploringCommand):
     source: SourceName
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at; at any other than this one others can come, and nobody asks them who they are."""
+    """Address to listen at; at any other, programs on other machines can connect, without a password."""
     port: Port = PORT
-    """Port to listen at, or the next one that is free; 0 = any that is free."""
+    """Port to listen at, or else the next free one; 0 = any free one."""
     no_browser: Flag = False
-    """Say where the page is, and leave it to you to open it."""
+    """Print the address of the page without opening it."""
 
     def __call__(self) -> None:
-        import sys
-        from contextlib import ExitStack
-        from pathlib import Path
-
-        from caryatid.cli.output import Output
         from caryatid.io.runs import is_run
 
-        config, out = self.settings(), Output(self.general)
+        config, output = self.config(), self.output
         # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
         sys.setswitchinterval(0.0005)
         with ExitStack() as stack:
-            page = self._open_run(stack) if is_run(Path(self.source)) else self._open_loop(config, out, stack)
-            if self.general.json:
-                out.result({"address": page.url, "source": self.source})
-            out.say(f"{self.source} at {page.url}; Ctrl-C ends")
+            page = self._open_run(stack) if is_run(Path(self.source)) else self._open_loop(config, stack)
+            if output.json:
+                output.result({"address": page.url, "source": self.source})
+            output.say(f"{self.source} at {page.url}; Ctrl-C ends")
             if not self.no_browser:
                 webbrowser.open(page.url)
             wait_for_interrupt()
@@ -87,22 +82,19 @@ class View(ExploringCommand):
             page.add(Moment(step, scores[step.index] if scores else None))
         return page
 
-    def _open_loop(self, config: Config, out: Output, stack: ExitStack) -> Page:
-        from functools import partial
-
+    def _open_loop(self, config: Config, stack: ExitStack) -> Page:
         from caryatid.sources import open_source
         from caryatid.viewer.controls import Controls
         from caryatid.viewer.loop import Loop
         from caryatid.viewer.page import Page
 
-        shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.modelling.seed}
+        shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         opening = partial(open_source, self.source, noise=self.noise, robot=self.robot, **shared)
-        with out.working("opening"):
+        with self.output.working("opening"):
             loop = Loop(opening, config, planner=self.planner, **shared)
-        out.compile()
         page = Page(f"caryatid: {loop.source.name}", config.support, host=self.host, port=self.port)
         stack.callback(page.close)
-        controls = Controls(page, loop, seed=self.modelling.seed)
+        controls = Controls(page, loop, seed=self.settings.seed)
         stack.callback(controls.close)
         controls.start()
         return page
@@ -117,22 +109,16 @@ def wait_for_interrupt() -> None:
 
 
 @contextmanager
-def watched(name: str, config: Config, out: Output) -> Iterator[PageProcess]:
-    """Open a page for an exploration; where that comes to its end by itself, keep it open until Ctrl-C.
-
-    Args:
-        name: What is explored.
-        config: All settings.
-        out: Says where the page is.
-    """
+def watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]:
+    """Open a page for an exploration; when that ends by itself, keep the page until Ctrl-C."""
     from caryatid.viewer.process import PageProcess
 
     page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
-    out.say(f"{name} at {page.url}")
+    output.say(f"{name} at {page.url}")
     webbrowser.open(page.url)
     try:
         yield page
-        out.say(f"the page stays at {page.url}; Ctrl-C ends")
+        output.say(f"the page stays at {page.url}; Ctrl-C ends")
         wait_for_interrupt()
     finally:
         page.close()

@@ -18,7 +18,7 @@ from caryatid.graph import SupportGraph
 from caryatid.planning.candidates import Candidates, Looks
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.runtime.display import Pictured
-from caryatid.runtime.threads import one_blas_thread
+from caryatid.runtime.parallel import one_blas_thread
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.voxel_map import VoxelMap
 

@@ -18,7 +18,6 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +31,7 @@ from numba.core.caching import FunctionCache
 
 from caryatid.errors import InputError
 from caryatid.runtime.display import call
-from caryatid.runtime.threads import cores
+from caryatid.runtime.parallel import cores
 
 log = logging.getLogger(__name__)
 """Says that kernels are compiled, and why they cannot be."""
@@ -55,13 +54,10 @@ rehearse(sys.argv[2], int(sys.argv[3]))
 """What such a process runs; where it does not find caryatid otherwise, it looks where this process did."""
 
 
-def compile_kernels(say: Callable[[str], None] = log.info) -> None:
+def compile_kernels() -> None:
     """Compile all kernels that are not compiled yet: after installation, and where their sources changed.
 
     Several processes may call this at once: one compiles, the others wait.
-
-    Args:
-        say: Called with one line if there is something to compile.
 
     Raises:
         InputError: There is no folder that compiled kernels can be kept in.
@@ -79,7 +75,7 @@ def compile_kernels(say: Callable[[str], None] = log.info) -> None:
         done = _read(stamp)
         if done == wanted:
             return
-        say("compiling kernels, once after installation: about 30 s")
+        log.info("compiling kernels, once after installation: about 30 s")
         for module in wanted.keys() - {name for name, digest in done.items() if wanted.get(name) == digest}:
             # numba itself does not see that a kernel of another module, which this one calls, has changed.
             source = _source(module)

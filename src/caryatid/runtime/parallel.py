@@ -1,7 +1,8 @@
-"""Compiled work shared out among the cores: Python's threads call kernels that let go of its lock.
+"""Work on several cores: Python's threads call compiled kernels that release its lock.
 
-A parallel loop of numba's own compiles all that it calls once more, for many seconds where that is much. Here
-each piece of work is compiled once, and the loop needs no compiling.
+numba's own parallel loop compiles all that it calls once more, which takes many seconds where that is much.
+Here each piece of work is compiled once, and the loop needs no compiling. BLAS gets one thread: our matrices
+are small, and threads that wait for work cost more than they save.
 """
 
 from __future__ import annotations
@@ -9,17 +10,35 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from typing import Any, TypeVar
+from functools import cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 import numpy as np
 from numba import types
+from threadpoolctl import ThreadpoolController
 
+P = ParamSpec("P")
 Result = TypeVar("Result")
 
 SHARES = 16
 """Shares into which threads divide points, pixels or hypotheses [1]: enough for usual numbers of cores."""
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Let BLAS use one thread while a function runs; numba's kernels keep theirs."""
+
+    @wraps(function)
+    def limited(*args: P.args, **kwargs: P.kwargs) -> Result:
+        with _blas().limit(limits=1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return limited
 
 
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
@@ -88,3 +107,8 @@ def _layout(value: object) -> object:
 def _threads(process: int) -> ThreadPoolExecutor:
     """The threads of a process: one that was forked has none of its parent's."""
     return ThreadPoolExecutor(numba.config.NUMBA_NUM_THREADS, thread_name_prefix="caryatid")
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()

@@ -15,7 +15,7 @@ from caryatid.config import FusionMethod
 from caryatid.errors import CaryatidError, in_one_line
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered
-from caryatid.runtime.threads import cores
+from caryatid.runtime.parallel import cores
 from caryatid.viewer.loop import Loop, candidate_under, taken_apart
 from caryatid.viewer.page import Page
 
