@@ -7,7 +7,9 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
+import psutil
 import pytest
 from conftest import SMALL, run_command
 
@@ -54,7 +56,7 @@ def whole(folder, views):
     return run
 
 
-@pytest.mark.parametrize("moment", ["view 00", "next view", "view 02"])
+@pytest.mark.parametrize("moment", ["view 00", "view 02"])
 def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     folder = tmp_path / "runs" / "run"
     words = ["explore", scene_file, "--out", folder, "--no-early-stop", *SMALL]
@@ -89,21 +91,18 @@ def test_an_extraction_keeps_its_views(tmp_path, recording):
     assert len(whole(folder, 2).views) < 40
 
 
-@pytest.mark.parametrize("moment", ["view 01", "  done: ", "o"])
-def test_a_dismantling_keeps_its_views_and_lifts(tmp_path, moment):
+@pytest.mark.parametrize("moments", [["view 01"], ["view 01", "done: ", "o"]], ids=["views", "lifts"])
+def test_a_dismantling_keeps_its_views_and_lifts(tmp_path, moments):
     folder = tmp_path / "runs" / "run"
     folder.parent.mkdir()
     command = Command("dismantle", "tower", "--out", folder, "--views", 2, "--no-early-stop", *SMALL)
-    command.wait_for("view 01")
-    if moment != "view 01":
-        command.wait_for("done: ")
-    if moment == "o":
-        command.wait_for("o")
+    for moment in moments:
+        command.wait_for(moment)
     status, out, told = command.interrupt()
     assert (status, out) == (130, "")
     assert "views are kept in" in told
     record = whole(folder, 2).record["dismantling"]
-    assert len(record["steps"]) >= (moment == "o")
+    assert len(record["steps"]) >= (moments[-1] == "o")
     assert record["left"]
 
 
@@ -111,20 +110,16 @@ def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):
     assert run_command("explore", scene_file, "--out", tmp_path / "run", "--views", 1, *SMALL, "--quiet") == 0
     before = sorted(tmp_path.rglob("*"))
     command = Command("order", tmp_path / "run", "--set", "rehearsal.draws=20000")
-    with pytest.raises(subprocess.TimeoutExpired):
-        command._process.wait(6.0)  # by then it has imported everything, even on a busy machine
+    while not any("mujoco" in each.path for each in psutil.Process(command._process.pid).memory_maps()):
+        time.sleep(0.1)
+    time.sleep(1.0)
     assert command.interrupt() == (130, "", "interrupted: nothing was written")
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("option", ["--json", "--port=0"])
-def test_a_service_stops_as_soon_as_it_has_said_where_it_is(tmp_path, option):
-    command = Command("serve", tmp_path / "s", "--port", 0, option)
-    said = "".join(iter(command._process.stdout.readline, "}\n")) + "}" if option == "--json" else ""
-    if said:
-        assert json.loads(said)["address"].startswith("http://127.0.0.1:")
-    else:
-        assert command._process.stdout.readline().startswith("serving ")
+def test_a_service_stops_as_soon_as_it_has_said_where_it_is(tmp_path):
+    command = Command("serve", tmp_path / "s", "--port", 0)
+    assert command._process.stdout.readline().startswith("serving ")
     assert command.interrupt() == (0, "", "")
 
 

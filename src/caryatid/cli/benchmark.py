@@ -12,18 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from caryatid.cli.options import (
-    SAID,
-    Command,
-    Flag,
-    OptionalCount,
-    OptionalPath,
-    OptionalText,
-    PlannerName,
-    defaults_to,
-    one_of,
-    shown_as,
-)
+from caryatid.cli import options
 from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 
@@ -37,11 +26,11 @@ SUITES = (
 )  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
 
-Words = tyro.conf.UseAppendAction[tuple[str, ...]]
+options.Words = tyro.conf.UseAppendAction[tuple[str, ...]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Benchmark(Command):
+class Benchmark(options.Command):
     """Compare methods over scenes and seeds, with figures.
 
     Every finished episode is kept: stop at any time and start again. Without --suite nothing is run, and the
@@ -56,33 +45,33 @@ class Benchmark(Command):
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Folder of the results; earlier ones are used."""
-    suite: Annotated[str | None, one_of(SUITES), SAID] = None
+    suite: Annotated[str | None, options.one_of(SUITES), options.shown()] = None
     """What to compare."""
-    scenes: Annotated[Words, shown_as("SCENE")] = ()
+    scenes: Annotated[options.Words, options.shown("SCENE")] = ()
     """Scenes instead of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
-    planner: Annotated[tyro.conf.UseAppendAction[tuple[PlannerName, ...]], SAID] = ()
+    planner: Annotated[tyro.conf.UseAppendAction[tuple[options.PlannerName, ...]], options.shown()] = ()
     """Planner instead of the suite's methods; may be repeated. The others are compared with the first."""
-    fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], SAID] = ()
+    fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], options.shown()] = ()
     """Fusion instead of the suite's; may be repeated."""
-    segmentation: Annotated[tyro.conf.UseAppendAction[tuple[SegmentationMethod, ...]], SAID] = ()
+    segmentation: Annotated[tyro.conf.UseAppendAction[tuple[SegmentationMethod, ...]], options.shown()] = ()
     """Segmentation instead of the suite's conditions; may be repeated. Default: labels."""
-    noise: Annotated[tyro.conf.UseAppendAction[tuple[NoiseModel, ...]], SAID] = ()
+    noise: Annotated[tyro.conf.UseAppendAction[tuple[NoiseModel, ...]], options.shown()] = ()
     """Noise of the camera, instead of the suite's conditions; may be repeated. Default: carmine."""
-    set: Annotated[Words, shown_as("STAGE.NAME=VALUE")] = ()
+    set: Annotated[options.Words, options.shown("STAGE.NAME=VALUE")] = ()
     """One setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
-    seeds: Annotated[OptionalCount, defaults_to("the suite's")] = None
+    seeds: Annotated[options.OptionalCount, options.shown(default="the suite's")] = None
     """Seeds 0…N−1 of every episode."""
-    views: Annotated[OptionalCount, defaults_to("the suite's")] = None
+    views: Annotated[options.OptionalCount, options.shown(default="the suite's")] = None
     """Views of every episode, including the first."""
-    jobs: Annotated[OptionalCount, defaults_to(f"the cores of this machine, {os.cpu_count()}")] = None
+    jobs: Annotated[options.OptionalCount, options.shown(default="all cores")] = None
     """Number of processes."""
-    scheduler: Annotated[OptionalText, shown_as("ADDRESS")] = None
+    scheduler: Annotated[str | None, options.shown("ADDRESS")] = None
     """Run on the workers of this dask.distributed scheduler instead, such as tcp://10.0.0.5:8786."""
-    retry: Flag = False
+    retry: options.Flag = False
     """Run failed episodes again."""
-    reference: Annotated[OptionalText, shown_as("METHOD")] = None
+    reference: Annotated[str | None, options.shown("METHOD")] = None
     """Method the others are compared with in the figures, instead of the suite's."""
-    docs: Annotated[OptionalPath, shown_as("FILE.md")] = None
+    docs: Annotated[Path | None, options.shown("FILE.md")] = None
     """Write the figures as a Markdown document too."""
 
     def __call__(self) -> None:

@@ -5,39 +5,29 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
-    from caryatid.config import Config
 
-SAID = tyro.conf.arg(help_behavior_hint="")
-"""An option whose help text says everything, including what happens without it."""
+DEFAULTS = Config()
 
 
-def defaults_to(value: object) -> object:
-    """An option that is None when left out; the help names what applies then."""
-    return tyro.conf.arg(help_behavior_hint=f"(default: {value})")
+def shown(metavar: str | None = None, default: object = "") -> object:
+    """An option whose help text says everything, or else names the default that applies when it is left out.
 
-
-def default_of(setting: str) -> object:
-    """An option for a setting, such as `active.max_views`, whose default applies when it is left out."""
-    from caryatid.config import Config
-
-    return defaults_to(attrgetter(setting)(Config()))
-
-
-def shown_as(metavar: str) -> object:
-    """An option whose value has this name in the help, which says everything."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+    Args:
+        metavar: Name of its value in the help; None = that of its type.
+        default: What applies when it is left out.
+    """
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
 def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
@@ -74,19 +64,19 @@ def _word(
     )
 
 
+Flag = Annotated[bool, shown()]
 Count = Annotated[int, whole_number(1)]
 OptionalCount = Annotated[int | None, whole_number(1)]
 Port = Annotated[int, whole_number(0)]
-Flag = Annotated[bool, SAID]
-OptionalText = Annotated[str | None, SAID]
-OptionalPath = Annotated[Path | None, SAID]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="RUN")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
 PlannerName = Annotated[str, one_of((*BUILT_IN, *sorted(offered()), ORACLE))]
 RobotName = Annotated[str, tyro.conf.arg(metavar="NAME")]
-Segmentation = Annotated[SegmentationMethod | None, one_of(SegmentationMethod)]
-Assignments = Annotated[tyro.conf.UseAppendAction[tuple[str, ...]], tyro.conf.arg(metavar="STAGE.NAME=VALUE")]
+Segmentation = Annotated[
+    SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels where there are any")
+]
+Words = tyro.conf.UseAppendAction[tuple[str, ...]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,9 +95,9 @@ class General:
 class Settings:
     """Settings of the method and the simulation."""
 
-    config: Annotated[OptionalPath, shown_as("FILE.toml")] = None
+    config: Annotated[Path | None, shown("FILE.toml")] = None
     """File of settings that replace the defaults; `caryatid config` prints one with all of them."""
-    set: Assignments = ()
+    set: Annotated[Words, tyro.conf.arg(metavar="STAGE.NAME=VALUE")] = ()
     """Set one setting, such as `--set fit.hypotheses=200`; overrides the file."""
 
     def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
@@ -130,7 +120,7 @@ class Settings:
 class Modelling(Settings):
     """How views become a scene model."""
 
-    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
+    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), shown(default=DEFAULTS.fusion.method)] = None
     """What to fuse over views: points, graphs, or both."""
     seed: Annotated[int, whole_number(0)] = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""
@@ -159,13 +149,13 @@ class ExploringCommand(Command):
     """A command that explores a scene."""
 
     settings: Modelling = Modelling()
-    views: Annotated[OptionalCount, default_of("active.max_views")] = None
+    views: Annotated[OptionalCount, shown(default=DEFAULTS.active.max_views)] = None
     """Maximum number of views, including the first."""
     planner: PlannerName = "support"
     """Planner of the next view; oracle knows the ground truth and needs a simulation."""
     robot: RobotName = "humanoid"
     """Robot that carries the simulated camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
-    segmentation: Annotated[Segmentation, defaults_to("labels where the source has them")] = None
+    segmentation: Segmentation = None
     """Use the masks of the source, or segment automatically."""
     noise: NoiseModel = "none"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""

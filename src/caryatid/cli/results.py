@@ -8,27 +8,18 @@ from typing import Annotated, Literal
 
 import tyro
 
-from caryatid.cli.options import (
-    Command,
-    Flag,
-    Modelling,
-    OptionalCount,
-    OptionalPath,
-    OptionalText,
-    RunPath,
-    Settings,
-    default_of,
-    defaults_to,
-    one_of,
-    shown_as,
-)
+from caryatid.cli import options
+from caryatid.cli.options import DEFAULTS
 from caryatid.config.choices import ExportFormat
 
-Topic = Annotated[OptionalText, shown_as("TOPIC")]
+Topic = Annotated[str | None, options.shown("TOPIC")]
+Format = Annotated[
+    ExportFormat | None, options.one_of(ExportFormat), options.shown(default="that of FILE's ending")
+]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Import(Command):
+class Import(options.Command):
     """Turn a robot's recording into a scene folder of sharp views from different viewpoints.
 
     Reads bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), and folders of the
@@ -40,7 +31,7 @@ class Import(Command):
       caryatid import rgbd_dataset_freiburg1_desk --out desk
     """
 
-    settings: Settings = Settings()
+    settings: options.Settings = options.Settings()
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """Bag, or folder with depth.txt."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
@@ -51,13 +42,13 @@ class Import(Command):
     """Camera of the depth images (CameraInfo)."""
     rgb: Topic = None
     """Colour images that depth is registered to; they also show how sharp a frame is."""
-    tf: Annotated[OptionalText, shown_as("FRAME")] = None
+    tf: Annotated[str | None, options.shown("FRAME")] = None
     """World frame, level with z up, such as map or base_link. When left out: one frame without a pose."""
-    camera: Annotated[OptionalPath, shown_as("FILE.json")] = None
+    camera: Annotated[Path | None, options.shown("FILE.json")] = None
     """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. When left out: as published."""
-    level: Flag = False
+    level: options.Flag = False
     """Rotate the world so that the table is level, for poses whose z is not up; most views must show it."""
-    views: Annotated[OptionalCount, default_of("recording.max_views")] = None
+    views: Annotated[options.OptionalCount, options.shown(default=DEFAULTS.recording.max_views)] = None
     """Maximum number of views."""
 
     def __call__(self) -> None:
@@ -85,14 +76,14 @@ class Import(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Evaluate(Command):
+class Evaluate(options.Command):
     """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU.
 
     To try:
       caryatid evaluate run scenes/tower
     """
 
-    run: RunPath
+    run: options.RunPath
     """Run folder."""
     truth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GT")]
     """Scene folder (scene.xml and gt.json), or recording with masks and gt.json."""
@@ -110,7 +101,7 @@ class Evaluate(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OrderCommand(Command):
+class OrderCommand(options.Command):
     """Find a safe order to take everything away, or to reach one object.
 
     Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others as likely.
@@ -121,10 +112,10 @@ class OrderCommand(Command):
       caryatid order run --goal o3
     """
 
-    settings: Modelling = Modelling()
-    run: RunPath
+    settings: options.Modelling = options.Modelling()
+    run: options.RunPath
     """Run folder."""
-    goal: Annotated[OptionalText, shown_as("ID")] = None
+    goal: Annotated[str | None, options.shown("ID")] = None
     """Reach this object only, and take away no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
@@ -149,7 +140,7 @@ class OrderCommand(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportCommand(Command):
+class ReportCommand(options.Command):
     """Write the report of a run again, also as a PDF.
 
     To try:
@@ -157,9 +148,9 @@ class ReportCommand(Command):
       caryatid report run --pdf report.pdf
     """
 
-    run: RunPath
+    run: options.RunPath
     """Run folder; its report.html is replaced."""
-    pdf: Annotated[OptionalPath, shown_as("FILE.pdf")] = None
+    pdf: Annotated[Path | None, options.shown("FILE.pdf")] = None
     """PDF (A4) to write as well; replaces an earlier one."""
 
     def __call__(self) -> None:
@@ -172,7 +163,7 @@ class ReportCommand(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(Command):
+class Export(options.Command):
     """Write the scene model of a run for simulators, viewers and graph programs.
 
     To try:
@@ -180,12 +171,14 @@ class Export(Command):
       caryatid export run --out scene.glb
     """
 
-    settings: Settings = Settings()
-    run: RunPath
+    settings: options.Settings = options.Settings()
+    run: options.RunPath
     """Run folder, or a graph.json."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
     """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces an earlier one."""
-    format: Annotated[ExportFormat | None, one_of(ExportFormat), defaults_to("by the ending of FILE")] = None
+    format: Annotated[
+        ExportFormat | None, options.one_of(ExportFormat), options.shown(default="by the ending of FILE")
+    ] = None
     """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
 
     def __call__(self) -> None:

@@ -11,20 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from caryatid.cli.options import (
-    Command,
-    Count,
-    ExploringCommand,
-    Flag,
-    Modelling,
-    OptionalCount,
-    OptionalPath,
-    OutPath,
-    Segmentation,
-    SourceName,
-    defaults_to,
-    shown_as,
-)
+from caryatid.cli import options
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,7 +25,37 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explore(ExploringCommand):
+class RunCommand(options.Command):
+    """A command that writes a run folder."""
+
+    settings: options.Modelling = options.Modelling()
+    out: options.OutPath
+    """Run folder to write; replaces an earlier run."""
+    no_report: options.Flag = False
+    """Leave out report.html."""
+    profile: options.Flag = False
+    """Print the time of each stage at the end; with --json as part of the document."""
+
+    def conclude(self, recorder: RunRecorder, name: str) -> None:
+        """Write the report and print what came of the run."""
+        from caryatid.cli.output import counted, profile, summary
+        from caryatid.io.graph_json import graph_to_json
+
+        output, graph = self.output, recorder.graphs[-1]
+        if not self.no_report:
+            _draw_report(self.out, output)
+        output.say(f"{name}: {summary(graph)} after {counted(recorder.views, 'view')}")
+        output.say(f"run: {self.out}" + ("" if self.no_report else ", open its report.html"))
+        document: dict[str, Any] = {"run": str(self.out), "graph": graph_to_json(graph)}
+        if self.profile:
+            document["profile"], shown = profile(recorder.steps)
+            output.result(document, shown)
+        elif output.json:
+            output.result(document)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explore(RunCommand, options.ExploringCommand):
     """Explore a scene until it is known which object supports which.
 
     SOURCE is one of
@@ -53,18 +70,12 @@ class Explore(ExploringCommand):
       caryatid explore recording/ --segmentation auto --out run
     """
 
-    source: SourceName
+    source: options.SourceName
     """Scene or recording."""
-    out: OutPath
-    """Run folder to write; replaces an earlier run."""
-    no_early_stop: Flag = False
+    no_early_stop: options.Flag = False
     """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
-    no_report: Flag = False
-    """Leave out report.html."""
-    view: Flag = False
+    view: options.Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
-    profile: Flag = False
-    """Print the time of each stage at the end; with --json as part of the document."""
 
     def __call__(self) -> None:
         self.run(self.config())
@@ -80,28 +91,25 @@ class Explore(ExploringCommand):
                 with recorder.interruptible():
                     _record(recorder, steps, self.output, page)
                 recorder.finish()
-            _conclude(self, recorder, source.name)
+            self.conclude(recorder, source.name)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Demo(Command):
+class Demo(RunCommand):
     """Explore a built-in cluttered table in simulation and print what every view finds.
 
     To try:
       caryatid demo --out run
     """
 
-    settings: Modelling = Modelling()
-    out: OutPath = Path("demo-run")
+    out: options.OutPath = Path("demo-run")
     """Run folder to write; replaces an earlier run."""
     scene: Annotated[str, tyro.conf.arg(metavar="NAME")] = "clutter"
     """A built-in scene, such as tower, bridge or dense-12-0."""
-    views: Annotated[OptionalCount, defaults_to(5)] = None
+    views: Annotated[options.OptionalCount, options.shown(default=5)] = None
     """Maximum number of views, including the first."""
-    view: Flag = False
+    view: options.Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
-    profile: Flag = False
-    """Print the time of each stage at the end; with --json as part of the document."""
 
     def __call__(self) -> None:
         from caryatid.config import ActiveVisionConfig, Config
@@ -109,12 +117,13 @@ class Demo(Command):
         config = self.settings.read(
             {"active.max_views": self.views}, Config(active=ActiveVisionConfig(max_views=5))
         )
-        shared = {name: getattr(self, name) for name in ("out", "view", "profile", "settings", "general")}
+        names = ("out", "no_report", "view", "profile", "settings", "general")
+        shared = {name: getattr(self, name) for name in names}
         Explore(source=self.scene, noise="carmine", **shared).run(config)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract(Command):
+class Extract(RunCommand):
     """Extract shapes and support graph from all views of a recording, or from one cloud.
 
     To try:
@@ -122,19 +131,12 @@ class Extract(Command):
       caryatid extract table.pcd --segmentation auto --out run
     """
 
-    settings: Modelling = Modelling()
-    source: SourceName
+    source: options.SourceName
     """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
-    out: OutPath
-    """Run folder to write; replaces an earlier run."""
-    segmentation: Annotated[Segmentation, defaults_to("labels where the source has them")] = None
+    segmentation: options.Segmentation = None
     """Use the masks or labels of the source, or segment automatically."""
-    label_divisor: Count = 1
+    label_divisor: options.Count = 1
     """For clouds whose labels number parts of objects: object = label // N."""
-    no_report: Flag = False
-    """Leave out report.html."""
-    profile: Flag = False
-    """Print the time of each stage at the end; with --json as part of the document."""
 
     def __call__(self) -> None:
         from caryatid.io.runs import RunWriter
@@ -155,7 +157,7 @@ class Extract(Command):
             with recorder.interruptible():
                 _record(recorder, (self._of_cloud if is_cloud else self._of_recording)(config), self.output)
             recorder.finish()
-        _conclude(self, recorder, Path(self.source).name)
+        self.conclude(recorder, Path(self.source).name)
 
     def _of_recording(self, config: Config) -> Iterator[Step]:
         from caryatid.exploration import Explorer
@@ -192,7 +194,7 @@ class Extract(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dismantle(ExploringCommand):
+class Dismantle(options.ExploringCommand):
     """Explore a scene, find a safe order to take it apart, and try it in physics.
 
     Objects are lifted straight up, one by one. A step fails when any other object moves by more than 2 cm
@@ -205,11 +207,11 @@ class Dismantle(ExploringCommand):
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """An MJCF scene, or the name of a built-in one."""
-    out: Annotated[OptionalPath, shown_as("RUN")] = None
+    out: Annotated[Path | None, options.shown("RUN")] = None
     """Run folder to write, its report with pictures of every lift. When left out: nothing is written."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
-    no_early_stop: Flag = False
+    no_early_stop: options.Flag = False
     """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
 
     def __call__(self) -> None:
@@ -303,24 +305,6 @@ def _record(
         last = step
     assert last is not None, "the first view is always taken"
     return last
-
-
-def _conclude(command: Explore | Extract, recorder: RunRecorder, name: str) -> None:
-    """Write the report and print what came of the run."""
-    from caryatid.cli.output import counted, profile, summary
-    from caryatid.io.graph_json import graph_to_json
-
-    output, graph = command.output, recorder.graphs[-1]
-    if not command.no_report:
-        _draw_report(command.out, output)
-    output.say(f"{name}: {summary(graph)} after {counted(recorder.views, 'view')}")
-    output.say(f"run: {command.out}" + ("" if command.no_report else ", open its report.html"))
-    document: dict[str, Any] = {"run": str(command.out), "graph": graph_to_json(graph)}
-    if command.profile:
-        document["profile"], shown = profile(recorder.steps)
-        output.result(document, shown)
-    elif output.json:
-        output.result(document)
 
 
 def _draw_report(folder: Path, output: Output) -> None:

@@ -11,29 +11,15 @@ from typing import Annotated, Any
 
 import tyro
 
-from caryatid.cli.options import (
-    Command,
-    Count,
-    General,
-    Modelling,
-    OptionalPath,
-    OptionalText,
-    PlannerName,
-    Port,
-    RobotName,
-    Segmentation,
-    Settings,
-    defaults_to,
-    shown_as,
-)
+from caryatid.cli import options
 from caryatid.errors import InputError
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-ImagePath = Annotated[OptionalPath, shown_as("FILE")]
+ImagePath = Annotated[Path | None, options.shown("FILE")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SessionStep(Command):
+class SessionStep(options.Command):
     """A command on a session."""
 
     folder: Folder
@@ -54,14 +40,14 @@ class New(SessionStep):
       caryatid session new table --robot arm:arm.npz
     """
 
-    settings: Modelling = Modelling()
+    settings: options.Modelling = options.Modelling()
     folder: Folder
     """Folder of the session; must be new or empty."""
-    segmentation: Annotated[Segmentation, defaults_to("labels where the first view has them")] = None
+    segmentation: options.Segmentation = None
     """Use the label images of the views, or segment automatically."""
-    planner: PlannerName = "support"
+    planner: options.PlannerName = "support"
     """Planner of the next view."""
-    robot: RobotName = "humanoid"
+    robot: options.RobotName = "humanoid"
     """Robot that carries the camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
 
     def __call__(self) -> None:
@@ -99,7 +85,7 @@ class Add(SessionStep):
     """Colour image: PNG, JPEG or .npy."""
     labels: ImagePath = None
     """Object number of each pixel: grey PNG or .npy; 0 = nothing, an object keeps its number."""
-    number: Annotated[int | None, shown_as("N")] = None
+    number: Annotated[int | None, options.shown("N")] = None
     """Expected number of the view, from 0; a view that is already there is not added again."""
 
     def __call__(self) -> None:
@@ -127,7 +113,7 @@ class Next(SessionStep):
       caryatid session next table --candidates candidates.json
     """
 
-    candidates: Annotated[OptionalPath, shown_as("C.json")] = None
+    candidates: Annotated[Path | None, options.shown("C.json")] = None
     """Poses to choose from, instead of those the session's robot reaches."""
 
     def __call__(self) -> None:
@@ -188,7 +174,7 @@ class SessionCommand:
     step: New | Add | Next | Graph | Undo
 
     @property
-    def general(self) -> General:
+    def general(self) -> options.General:
         """Output options."""
         return self.step.general
 
@@ -208,20 +194,20 @@ class Serve(SessionStep):
       CARYATID_TOKEN=$(openssl rand -hex 16) caryatid serve sessions --host 0.0.0.0
     """
 
-    settings: Settings = Settings()
+    settings: options.Settings = options.Settings()
     folder: Folder
     """Folder of the sessions; created if missing."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen at."""
-    port: Port = 8765
+    port: options.Port = 8765
     """Port to listen at; 0 = any free one."""
-    token: Annotated[OptionalText, shown_as("TOKEN")] = None
+    token: Annotated[str | None, options.shown("TOKEN")] = None
     """Token that requests need; better given as CARYATID_TOKEN, where no process list shows it."""
-    open_sessions: Count = 4
+    open_sessions: options.Count = 4
     """Number of sessions kept open; others are opened from disk on request, in a tenth of a second."""
-    waiting: Count = 16
+    waiting: options.Count = 16
     """Maximum number of waiting requests; further ones are asked to try again."""
-    max_request: Count = 16
+    max_request: options.Count = 16
     """Maximum size of a request [MB]."""
 
     def __call__(self) -> None:

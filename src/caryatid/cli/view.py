@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from caryatid.cli.options import ExploringCommand, Flag, Port, SourceName
+from caryatid.cli import options
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
@@ -27,7 +27,7 @@ PORT = 8770
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(ExploringCommand):
+class View(options.ExploringCommand):
     """Show a finished run in the browser, or control there the exploration of a scene or a recording.
 
     SOURCE is one of
@@ -42,13 +42,13 @@ class View(ExploringCommand):
       caryatid view recording/ --segmentation auto --port 8080 --no-browser
     """
 
-    source: SourceName
+    source: options.SourceName
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """Address to listen at; at any other, programs on other machines can connect, without a password."""
-    port: Port = PORT
+    port: options.Port = PORT
     """Port to listen at, or else the next free one; 0 = any free one."""
-    no_browser: Flag = False
+    no_browser: options.Flag = False
     """Print the address of the page without opening it."""
 
     def __call__(self) -> None:
