@@ -70,11 +70,8 @@ def test_two_processes_compile_each_kernel_once(tmp_path):
     (tmp_path / "small.py").write_text(SMALL_REHEARSAL)
     (tmp_path / "sitecustomize.py").write_text(HOOKED)
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
-    environment = {
-        "PYTHONPATH": path,
-        "NUMBA_CACHE_DIR": str(tmp_path),
-        "COMPILED": str(tmp_path / "compiled"),
-    }
+    compiled = tmp_path / "compiled"
+    environment = {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(tmp_path), "COMPILED": str(compiled)}
     command = [sys.executable, "-c", REHEARSED]
     both = [
         subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
