@@ -33,7 +33,7 @@ from caryatid.planning.planners import make_planner
 from caryatid.planning.points_of_interest import points_of_interest
 from caryatid.robots import Robot
 from caryatid.runtime.parallel import one_blas_thread
-from caryatid.segmentation.observation import MAX_POINTS, UP
+from caryatid.segmentation.observation import UP
 from caryatid.segmentation.segments import segment
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points
@@ -218,7 +218,7 @@ def _stages(recording: Recording, later: dict[str, list[dict[str, float]]], effo
     points, normals, pixels = oriented_points(view, config.cloud)
     assert view.labels is not None
     loose = np.flatnonzero(view.labels.ravel()[pixels] == 0)
-    loose = loose[:: max(1, len(loose) // MAX_POINTS)]
+    loose = loose[:: max(1, len(loose) // 20_000)]
 
     def surface() -> object:
         return find_support_surface(

@@ -12,14 +12,12 @@ from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.segments import segment, segment_cloud
-from caryatid.segmentation.support_plane import PLANES, SupportSurface, find_support_surface
+from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 UP = np.array([0.0, 0.0, 1.0])
 """The world's vertical (3,)."""
-MAX_POINTS = 20_000
-"""Points of a view the surface is looked for in, where it is not known [1]; or nearly twice as many."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -209,7 +207,7 @@ def _surface(
         loose &= np.abs(known.height(cloud.points_world)) < config.surface.search
     # Spread evenly, 20,000 points give its height to 0.1 mm. Once it is known a quarter will do: as many of a
     # first view's are the table's, the rest is floor.
-    index, count, planes = np.flatnonzero(loose), *((MAX_POINTS, PLANES) if known is None else (5000, 1))
+    index, (count, planes) = np.flatnonzero(loose), (20_000, 6) if known is None else (5_000, 1)
     some = cloud.select(index[:: max(1, len(index) // count)])
     try:
         return find_support_surface(some.points_world, some.normals_world, up, config.surface, rng, planes)

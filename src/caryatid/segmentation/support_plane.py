@@ -21,9 +21,6 @@ from caryatid.sensing.views import View
 
 Mask = NDArray[np.bool_]
 
-PLANES = 6
-"""Horizontal planes looked at where the table is not known [1]."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SupportSurface:
@@ -104,7 +101,7 @@ def find_support_surface(
     up: Array | None,
     config: SurfaceConfig,
     rng: np.random.Generator,
-    max_planes: int = PLANES,
+    max_planes: int = 6,
 ) -> SupportSurface:
     """Find the table among the planes of a scene.
 
@@ -167,16 +164,12 @@ def _choose_table(planes: list[_Plane], up: Array, config: SurfaceConfig) -> _Pl
     heights = [plane.offset / (plane.normal @ up) for plane in planes]
     counts = [np.count_nonzero(plane.inliers) for plane in planes]
     sizeable = [plane.area >= config.min_area for plane in planes]
-    every = range(len(planes))
-    standing = [
-        k
-        for k in every
-        if not any(
-            sizeable[j] and heights[j] > heights[k] + config.storey and counts[j] >= 0.05 * counts[k]
-            for j in every
-        )
-    ]
-    return planes[max(standing, key=lambda k: (sizeable[k], counts[k]))]
+    tables = np.argwhere(sizeable)[:, 0]
+
+    def is_floor(k: int) -> bool:
+        return any(heights[j] > heights[k] + config.storey and counts[j] >= 0.05 * counts[k] for j in tables)
+
+    return planes[max(range(len(planes)), key=lambda k: (not is_floor(k), sizeable[k], counts[k]))]
 
 
 def _largest_plane(
@@ -213,9 +206,9 @@ def _largest_plane(
     if len(directions) == 0:
         return None
     offsets = np.einsum("ij,ij->i", directions, anchors)
+    planes, gains = np.ascontiguousarray(np.column_stack([directions, offsets]).T), np.zeros(len(offsets))
     agree, behind = np.cos(np.radians(config.max_deviation)), 0.0 if up is not None else 1.0
-    gains = np.zeros(len(offsets))
-    for_each(_score_planes, SHARES, (p, n, directions, offsets, config.tolerance, agree, behind, gains))
+    for_each(_score_planes, SHARES, (p, n, planes, config.tolerance, agree, behind, gains))
     best = int(np.argmax(gains))
     return _refine(points, normals, among, directions[best], float(offsets[best]), up, config)
 
@@ -231,12 +224,15 @@ def _refine(
 ) -> _Plane | None:
     """Least squares on the inliers, a few times over; None if too few remain or the plane has tilted."""
     least_cosine = np.cos(np.radians(config.max_deviation))
-    inliers = among
+    inliers = np.zeros_like(among)
     for _ in range(4):
+        before = inliers
         inliers = among & (np.abs(points @ normal - offset) <= config.tolerance)
         inliers &= normals @ normal > least_cosine
         if np.count_nonzero(inliers) < max(config.min_points, 3):
             return None
+        if np.array_equal(inliers, before):
+            break
         on_plane = np.compress(inliers, points, axis=0)
         centre = on_plane.mean(axis=0)
         refined = np.linalg.eigh(np.cov(on_plane.T))[1][:, 0]
@@ -299,21 +295,24 @@ def _basis(normal: Array) -> Array:
 
 @njit(cache=True, error_model="numpy")
 def _score_planes(share, data):  # type: ignore[no-untyped-def]
-    """Score a share of the planes n·p = offset by points: 1 − (distance/tolerance)² each if normals agree.
+    """Score a share of the planes (4, B), n·p = offset: 1 − (distance/tolerance)² for each point that agrees.
 
     A point further than three tolerances behind a plane costs it the penalty.
     """
-    points, normals, directions, offsets, tolerance, least_cosine, penalty, gains = data
-    for k in range(share, len(offsets), SHARES):
-        nx, ny, nz = directions[k]
-        for i in range(len(points)):
-            signed = nx * points[i, 0] + ny * points[i, 1] + nz * points[i, 2] - offsets[k]
-            if signed < -3.0 * tolerance:
-                gains[k] -= penalty
-                continue
-            cosine = nx * normals[i, 0] + ny * normals[i, 1] + nz * normals[i, 2]
-            if abs(signed) < tolerance and cosine > least_cosine:
-                gains[k] += 1.0 - (signed / tolerance) ** 2
+    points, normals, planes, tolerance, least_cosine, penalty, all_gains = data
+    mine = slice(share * len(all_gains) // SHARES, (share + 1) * len(all_gains) // SHARES)
+    nx, ny, nz, offset = planes[0, mine], planes[1, mine], planes[2, mine], planes[3, mine]
+    gains = all_gains[mine]
+    for i in range(len(points)):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        u, v, w = normals[i, 0], normals[i, 1], normals[i, 2]
+        # The innermost loop has no branch, so that several planes are scored at a time.
+        for k in range(len(gains)):
+            signed = nx[k] * x + ny[k] * y + nz[k] * z - offset[k]
+            gain = 1.0 - (signed / tolerance) ** 2
+            agrees = nx[k] * u + ny[k] * v + nz[k] * w > least_cosine and gain > 0.0
+            gains[k] += gain if agrees else 0.0
+            gains[k] -= penalty if signed < -3.0 * tolerance else 0.0
 
 
 @njit(cache=True, inline="always")

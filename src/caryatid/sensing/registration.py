@@ -7,8 +7,7 @@ distance, with the reported poses as priors.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -19,155 +18,394 @@ from caryatid.config import RegistrationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.points import solve_positive
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import for_each
-from caryatid.sensing.pose_graph import Index, PoseEdges
-from caryatid.sensing.surfels import MIN_COSINE, Surfels, even_sample, surfels_of
+from caryatid.runtime.parallel import on_threads
+from caryatid.sensing.pose_graph import EDGE, Edges, among, change, mean_misfit, partners, solve
+from caryatid.sensing.surfels import MIN_COSINE, even_sample, surfels_of
 from caryatid.sensing.views import Cloud
 
-COLUMNS = 8
-"""Of a patch: x, y, z [m], its unit normal, the variance of its distance from the surface [m²], its label."""
 BUCKETS = 4096
 """Lists a view's patches are kept in, by a hash of label and cell [1]; more patches make longer lists."""
-CHUNK = 50
-"""Patches one task looks for partners of [1]; who does which task changes no result."""
 OUTLIER = 0.3
 """Share of the reach beyond which distances lose their weight [1]."""
 INDEPENDENT = 0.1
 """Share of the partners that err independently [1]: neighbouring patches err alike."""
-ROUNDS = 3
-"""Rounds of matching at each reach, and of the joint solution [1]."""
-NORMAL_REACH = 0.05
-"""How far apart [m] directions at right angles count when partners are looked for, by 1/√2."""
+
+Outcome = Literal[
+    "reference", "fits as reported", "aligned", "too few partners", "beyond the limits", "no better"
+]
+"""What became of a view's alignment when it came; later views may move it whatever that was."""
+
+EXACT = ("reference", "fits as reported")
+"""Views that stay where they were reported, whatever comes later."""
 
 
-@njit(cache=True)
-def index_patches(patches: NDArray[np.float64], edge: float) -> tuple[Array, NDArray[np.int64]]:
-    """Sort patches such that those of one label and cell lie together.
+class ViewRegistration:
+    """Where the views are; the first one defines the world.
 
     Args:
-        patches: (P, 8), see `COLUMNS`.
-        edge: Edge of a cell [m].
+        pivot_world: What twists turn about (3,) [m]; best amid the points.
+        config: Expected errors and limits.
+
+    Attributes:
+        twists: Move (V, 6) of each view from where it was reported, 3 × m and 3 × rad about the pivot, as
+            `add` returned it.
+        outcomes: What became of the alignment of each.
+    """
+
+    def __init__(self, pivot_world: Array, config: RegistrationConfig) -> None:
+        self.twists = np.zeros((0, 6))
+        self.outcomes: list[Outcome] = []
+        self._pivot = pivot_world
+        self._config = config
+        self._views: dict[int, _View] = {}
+        self._now = np.zeros((0, 6))
+        self._edges: Edges = np.zeros(0, EDGE)
+
+    def copy(self) -> ViewRegistration:
+        """Return a registration that knows the same and goes on by itself; the views so far are shared."""
+        other = copy.copy(self)
+        other.outcomes, other._views = self.outcomes.copy(), self._views.copy()
+        return other
+
+    def add(self, cloud: Cloud, *, same_labels: bool) -> dict[int, Array]:
+        """Take in a view.
+
+        Args:
+            cloud: Its labelled points in the world as reported; 65535 = the support surface.
+            same_labels: Whether labels mean the same in every view.
+
+        Returns:
+            How the new view is to be moved and, on top of what they were moved before, earlier ones: view →
+            transform (4, 4) of the world.
+        """
+        new = len(self.outcomes)
+        self._views[new] = self._prepared(cloud, same_labels=same_labels)
+        self._now, self.twists = (np.concatenate([t, np.zeros((1, 6))]) for t in (self._now, self.twists))
+        views = self._views.copy()
+        outcome = self._lay()
+        self.outcomes.append(outcome)
+        if outcome == "beyond the limits":
+            self._let_go([new])
+        elif outcome not in EXACT:
+            self._refine()
+        moves = self._moves(views)
+        if len(self._views) > self._config.kept:
+            self._let_go([self._least_missed()])
+        return moves
+
+    def _prepared(self, cloud: Cloud, *, same_labels: bool) -> _View:
+        """What is kept of a view; errors of its orientation turn about the camera."""
+        config, arm = self._config, np.zeros(3)
+        if cloud.viewpoint_world is not None:
+            arm = cloud.viewpoint_world - self._pivot
+        at_camera = np.eye(6)
+        at_camera[:3, 3:] = -transforms.skew(arm)
+        sigma = np.repeat([config.translation, np.radians(config.rotation)], 3)
+        information = at_camera.T @ (at_camera / sigma[:, None] ** 2)
+        patches, side = surfels_of(cloud, config, same_labels=same_labels)
+        return _View(
+            *index_patches(patches, _edge(config)), patches[even_sample(side, config.sample)], information
+        )
+
+    def _lay(self) -> Outcome:
+        """Lay the newest view onto those that are kept, from where it was reported and coarse to fine."""
+        config, reach = self._config, self._config.reaches[-1]
+        outlier = OUTLIER * reach
+        *others, new = self._views
+        if not others:
+            return "reference"
+        exact = [v for v in others if self.outcomes[v] in EXACT]
+        right = self._matched((v, new) for v in exact)
+        found = float(right["found"].sum())
+        # Exact views leave a tenth of the noise, noisy ones all of it.
+        if found >= config.min_points and float(right["misfit"].sum()) < 0.3 * config.noise * found:
+            rest = self._matched((v, new) for v in others if v not in exact)
+            self._edges = np.concatenate([self._edges, right, rest])
+            return "fits as reported"
+
+        reported, twists = self._now, self._now.copy()
+        fine, misfit_before, misfit = self._descend(reported, reach)
+        best = fine
+        for wide in config.reaches[:-1]:
+            twists[new] = self._descend(twists, wide)[0]
+        if np.abs(twists[new] - fine).max() > outlier:
+            coarse, _, coarse_misfit = self._descend(twists, reach)
+            if coarse_misfit < misfit:
+                best, misfit = coarse, coarse_misfit
+        better = misfit < misfit_before
+        if better:
+            twists[new] = best
+            self._now = twists
+        edges = self._matched((v, new) for v in others)
+        outcome: Outcome = "aligned" if better else "no better"
+        if edges["found"].sum() < config.min_points:
+            outcome = "too few partners"
+        elif better and self._too_far(best):
+            outcome = "beyond the limits"
+        if better and outcome != "aligned":
+            self._now = reported
+            edges = self._matched((v, new) for v in others)
+        self._edges = np.concatenate([self._edges, edges])
+        return outcome
+
+    def _matched(self, pairs: Iterable[tuple[int, int]]) -> Edges:
+        """What pairs (still, moving) say of each other where they are, from the whole of their samples."""
+        pairs, reach = list(pairs), self._config.reaches[-1]
+        edges = np.zeros(len(pairs), EDGE)
+        upper, nowhere = np.triu_indices(6), np.zeros(6)
+        for edge, rows, (still, moving) in zip(
+            edges, self._correspondences(pairs, self._now, reach), pairs, strict=True
+        ):
+            sums = normal_equations(rows, nowhere, OUTLIER * reach)
+            edge["still"], edge["moving"], edge["asked"] = still, moving, len(rows)
+            edge["apart"] = self._now[moving] - self._now[still]
+            edge["found"], edge["misfit"] = sums[:2]
+            sums[2:] *= INDEPENDENT
+            edge["gradient"] = sums[2:8]
+            edge["information"][upper] = edge["information"].T[upper] = sums[8:]
+        return edges
+
+    def _descend(self, twists: Array, reach: float) -> tuple[Array, float, float]:
+        """Move the newest view such that partners come to lie in each other's planes; the others stay.
+
+        Gauss–Newton on the robust, symmetric point-to-plane distance, maximum a posteriori. It starts from
+        `twists` (V, 6).
+
+        Returns:
+            Its twist (6,), and the mean distance [m] over the patches that looked for a partner, those
+            without one being outliers, before and after.
+        """
+        *others, new = self._views
+        view, pairs = self._views[new], [(v, new) for v in others]
+        # 250 patches will do here; the fewer they are, the more of them err independently.
+        stride = max(1, len(view.sample) * len(others) // 250)
+        independent, outlier = min(1.0, stride * INDEPENDENT), OUTLIER * reach
+        # What a step this small leaves, the next reach or the joint solution takes.
+        settled = 0.1 * outlier
+        twists, misfits = twists.copy(), []
+        for _ in range(3):
+            rows = np.concatenate(self._correspondences(pairs, twists, reach, stride))
+            step, ends = step_down(rows, twists[new], view.information, independent, outlier, 4, settled)
+            twists[new] += step
+            misfits += [(far + (len(rows) - found) * outlier) / max(len(rows), 1) for found, far in ends]
+            if np.abs(step).max() < settled:
+                break
+        return twists[new], misfits[0], misfits[-1]
+
+    def _correspondences(
+        self, pairs: Sequence[tuple[int, int]], twists: Array, reach: float, stride: int = 1
+    ) -> list[Array]:
+        """Rows (S, 8) of `find_correspondences` of each pair (still, moving), for every stride-th patch."""
+        samples = [np.ascontiguousarray(self._views[moving].sample[::stride]) for _, moving in pairs]
+        # Who does which chunk changes no result.
+        chunks = [(pair, k) for pair, sample in enumerate(samples) for k in range(0, len(sample), 100)]
+
+        def work(chunk: int) -> Array:
+            pair, first = chunks[chunk]
+            still, moving = pairs[pair]
+            other, sample = self._views[still], samples[pair][first : first + 100]
+            return find_correspondences(
+                *(sample, twists[moving], other.patches, other.starts, twists[still]),
+                *(self._pivot, _edge(self._config), reach, self._config.noise),
+            )
+
+        rows = np.concatenate([np.zeros((0, 8)), *on_threads(work, len(chunks))])
+        return np.split(rows, np.cumsum([len(sample) for sample in samples])[:-1]) if pairs else []
+
+    def _too_far(self, twist: Array) -> bool:
+        turn, move = np.linalg.norm(twist[3:]), np.linalg.norm(twist[:3])
+        return bool(turn > np.radians(self._config.max_rotation) or move > self._config.max_translation)
+
+    def _refine(self) -> None:
+        """Move all kept views together that are not exact, unless that lays them worse.
+
+        Views that few partners tie to the others stay where they are.
+        """
+        config, outlier = self._config, OUTLIER * self._config.reaches[-1]
+        before, edges_before = self._now, self._edges
+        for _ in range(3):
+            if not self._solve():
+                return
+            # A quarter of the distance at which partners lose their weight.
+            moved = np.abs(change(self._edges, self._now)).max(axis=1, initial=0.0) > 2.0 * config.noise
+            if not moved.any():
+                break
+            stale = self._edges[moved]
+            anew = self._matched(zip(stale["still"].tolist(), stale["moving"].tolist(), strict=True))
+            self._edges = np.concatenate([self._edges[~moved], anew])
+        if mean_misfit(self._edges, outlier) > mean_misfit(edges_before, outlier) + 0.3 * config.noise:
+            self._now, self._edges = before, among(edges_before, list(self._views))
+
+    def _solve(self) -> bool:
+        """Move all views to where the pairs want them, if any is free; let go of what would go too far."""
+        while True:
+            enough = partners(self._edges, len(self._now)) >= self._config.min_points
+            free = [v for v in self._views if enough[v] and self.outcomes[v] not in EXACT]
+            informations = np.array([self._views[v].information for v in free]).reshape(-1, 6, 6)
+            now, _ = solve(self._edges, self._now, np.array(free, dtype=np.intp), informations)
+            far = [v for v in free if self._too_far(now[v])]
+            if not far:
+                self._now = now
+                return bool(free)
+            self._let_go(far)
+
+    def _moves(self, views: dict[int, _View]) -> dict[int, Array]:
+        """How views are to be moved now: the newest, and those whose points moved since they last were."""
+        numbers, moves, twists = list(views), {}, self.twists.copy()
+        T, T_told = (twist_transform(t[numbers], self._pivot) for t in (self._now, self.twists))
+        for v, now, told in zip(numbers, T, T_told, strict=True):
+            moved = views[v].sample[:, :3] @ (now - told)[:3, :3].T + (now - told)[:3, 3]
+            settled = (0.3 * self._config.noise) ** 2
+            if v == numbers[-1] or np.einsum("ni,ni->n", moved, moved).max() > settled:
+                moves[v] = now @ transforms.invert(told)
+                twists[v] = self._now[v]
+        self.twists = twists
+        return moves
+
+    def _let_go(self, views: Sequence[int]) -> None:
+        """Let views stay where they are from now on, and lay no others onto them."""
+        for v in views:
+            del self._views[v]
+        self._edges = among(self._edges, list(self._views))
+
+    def _least_missed(self) -> int:
+        """The kept view whose surfaces another one shows best; the first that nothing ties to any, if any."""
+        kept, edges = list(self._views), self._edges
+        number = partners(edges, len(self._now))
+        loose = [v for v in kept[1:] if number[v] < self._config.min_points]
+        if loose:
+            return loose[0]
+        shared = np.zeros((len(kept), len(kept)))
+        i, j = np.searchsorted(kept, edges["moving"]), np.searchsorted(kept, edges["still"])
+        shared[i, j] = shared[j, i] = edges["found"] / np.maximum(edges["asked"], 1)
+        pair = divmod(int(np.argmax(shared)), len(kept))
+        return kept[max((k for k in pair if k > 0), key=lambda k: shared[k].sum())]
+
+
+class _View(NamedTuple):
+    """A view as registration keeps it; patches are rows as of `surfels`.
+
+    Attributes:
+        patches: Its patches (P, 8), in the world as reported, sorted to be found.
+        starts: Where in them the list of each bucket begins (BUCKETS + 1,).
+        sample: Those (S, 8) that look for partners in other views.
+        information: Inverse covariance (6, 6) of the reported pose's error, as a twist about the pivot.
+    """
+
+    patches: Array
+    starts: NDArray[np.intp]
+    sample: Array
+    information: Array
+
+
+def twist_transform(twist: Array, pivot_world: Array) -> Array:
+    """The rigid transforms (..., 4, 4) that turn about a pivot (3,) [m] and move.
+
+    Args:
+        twist: Twists (..., 6): 3 × m, 3 × rad.
+        pivot_world: What is turned about (3,) [m].
+    """
+    x, y, z = np.moveaxis(twist[..., 3:], -1, 0)
+    angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
+    K = np.zeros((*twist.shape[:-1], 3, 3))
+    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -z, y, -x
+    K -= K.swapaxes(-1, -2)
+    # sin(a)/a and (1 - cos(a))/a²; numpy's sinc is sin(πx)/(πx).
+    half = np.sinc(angle / (2.0 * np.pi))
+    T = np.zeros((*twist.shape[:-1], 4, 4))
+    T[..., :3, :3] = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half * half * (K @ K)
+    T[..., :3, 3] = twist[..., :3] + pivot_world - T[..., :3, :3] @ pivot_world
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def _edge(config: RegistrationConfig) -> float:
+    """Edge of the cells partners are looked for in [m]: the widest search spans two on either side."""
+    return max(config.reaches) / 2.0
+
+
+def index_patches(patches: Array, edge: float) -> tuple[Array, NDArray[np.intp]]:
+    """Sort patches (P, 8) such that those of one label and cell of this edge [m] lie together.
 
     Returns:
         The patches in another order, and where the list of each bucket begins (BUCKETS + 1,).
     """
-    bucket = np.empty(len(patches), np.int64)
-    starts = np.zeros(BUCKETS + 2, np.int64)
-    for i in range(len(patches)):
-        x, y, z = patches[i, 0], patches[i, 1], patches[i, 2]
-        bucket[i] = _bucket(patches[i, 7], np.floor(x / edge), np.floor(y / edge), np.floor(z / edge))
-        starts[bucket[i] + 2] += 1
-    for b in range(1, len(starts)):
-        starts[b] += starts[b - 1]
-    ordered = np.empty_like(patches)
-    for i in range(len(patches)):
-        for c in range(COLUMNS):
-            ordered[starts[bucket[i] + 1], c] = patches[i, c]
-        starts[bucket[i] + 1] += 1
-    return ordered, starts[:-1]
+    cells = np.floor(patches[:, :3] / edge).astype(np.int64)
+    bucket = _bucket.py_func(patches[:, 7].astype(np.int64), *cells.T)
+    starts = np.cumsum(np.bincount(bucket + 1, minlength=BUCKETS + 1))
+    return patches[np.argsort(bucket, kind="stable")], starts
 
 
 @njit(cache=True, inline="always")
 def _bucket(label, x, y, z):  # type: ignore[no-untyped-def]
-    """Number of the bucket of a label and a cell, all given as floats."""
-    mixed = (np.int64(x) * 73856093) ^ (np.int64(y) * 19349663) ^ (np.int64(z) * 83492791)
-    mixed ^= np.int64(label) * 50331653
+    """Number of the bucket of a label and a cell, all integers."""
+    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791) ^ (label * 50331653)
     return (mixed ^ (mixed >> 15)) & (BUCKETS - 1)
 
 
-class Search(NamedTuple):
-    """Patches that look for partners in other views.
-
-    Attributes:
-        patches: Of all views (P, 8), view by view, each as `index_patches` sorts them, in the world as
-            reported; see `COLUMNS`.
-        starts: Where the list of each bucket of each view begins (V, BUCKETS + 1).
-        samples: Patches that may look for a partner (S, 8).
-        tasks: (R, 5): first and last sample, step from one to the next, view in which they look for a
-            partner, view they are of; at most `CHUNK` of them.
-        shares: Into how many shares the tasks go; every so many of them are one.
-        twists: Move (V, 6) of each view from where it was reported: 3 × m, 3 × rad, about the pivot.
-        pivot_world: (3,) [m].
-        edge: Edge of a cell [m], as the patches were sorted.
-        reach: How far away a partner may be [m].
-        min_cosine: Cosine of the angle between the normals of partners at least.
-        normal_reach: How far apart [m] directions at right angles count, by 1/√2.
-        noise: Standard deviation of the distance beside what the patches bring [m].
-        rows: (R, CHUNK, 8): derivative (6,) of the distance by the twist of the moving view, the other's
-            being the opposite; the distance [m]; its inverse variance [1/m²], 0 where there is no partner.
-            Written to where a sample looks for one, and zero elsewhere.
-    """
-
-    patches: NDArray[np.float64]
-    starts: NDArray[np.int64]
-    samples: NDArray[np.float64]
-    tasks: NDArray[np.int64]
-    shares: int
-    twists: NDArray[np.float64]
-    pivot_world: NDArray[np.float64]
-    edge: float
-    reach: float
-    min_cosine: float
-    normal_reach: float
-    noise: float
-    rows: NDArray[np.float64]
-
-
-@njit(cache=True, error_model="numpy")
-def find_correspondences(share: int, search: Search) -> None:
+@njit(cache=True, error_model="numpy", nogil=True)
+def find_correspondences(samples, twist, patches, starts, other_twist, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
     """Look for the patch of another view that is nearest in place and direction, and linearise the distance.
 
     Distance is along the mean of both normals, and its derivative by a move of either view that about the
     middle between the two patches: a move of both views together changes nothing. Coordinates are about the
-    pivot.
+    pivot (3,) [m].
+
+    Args:
+        samples: Patches (S, 8) that look for a partner.
+        twist: Where their view is, from where it was reported (6,).
+        patches: Those of the other view (P, 8), sorted by cells of this edge [m].
+        starts: Where the list of each bucket begins in them (BUCKETS + 1,).
+        other_twist: Where the other view is (6,).
+        pivot: What twists turn about (3,) [m].
+        edge: Edge of a cell [m].
+        reach: How far away a partner may be [m].
+        noise: Standard deviation of the distance beside what the patches bring [m].
+
+    Returns:
+        Rows (S, 8): derivative (6,) of the distance by the samples' twist, that by the other's being the
+        opposite; the distance [m]; its inverse variance [1/m²]; zero where there is no partner.
     """
-    twists, pivot, noise = search.twists, search.pivot_world, search.noise * search.noise
-    for task in range(share, len(search.tasks), search.shares):
-        stride, still, moving = search.tasks[task, 2], search.tasks[task, 3], search.tasks[task, 4]
-        R = _rotation(twists[moving, 3], twists[moving, 4], twists[moving, 5])
-        S = _rotation(twists[still, 3], twists[still, 4], twists[still, 5])
-        i = 0
-        for k in range(search.tasks[task, 0], search.tasks[task, 1], stride):
-            row, sample = search.rows[task, i], search.samples[k]
-            i += 1
-            px, py, pz = _turned(R, sample[0] - pivot[0], sample[1] - pivot[1], sample[2] - pivot[2])
-            px, py, pz = px + twists[moving, 0], py + twists[moving, 1], pz + twists[moving, 2]
-            nx, ny, nz = _turned(R, sample[3], sample[4], sample[5])
-            found = _partner(
-                search, still,
-                _turned_back(S, px - twists[still, 0], py - twists[still, 1], pz - twists[still, 2]),
-                _turned_back(S, nx, ny, nz), sample[7],
-            )  # fmt: skip
-            if found < 0:
-                for a in range(8):
-                    row[a] = 0.0
-                continue
-            other = search.patches[found]
-            qx, qy, qz = _turned(S, other[0] - pivot[0], other[1] - pivot[1], other[2] - pivot[2])
-            qx, qy, qz = qx + twists[still, 0], qy + twists[still, 1], qz + twists[still, 2]
-            mx, my, mz = _turned(S, other[3], other[4], other[5])
-            mx, my, mz = mx + nx, my + ny, mz + nz
-            length = np.sqrt(mx * mx + my * my + mz * mz)
-            mx, my, mz = mx / length, my / length, mz / length
-            row[0], row[1], row[2] = mx, my, mz
-            row[6] = (px - qx) * mx + (py - qy) * my + (pz - qz) * mz
-            qx, qy, qz = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
-            row[3], row[4], row[5] = qy * mz - qz * my, qz * mx - qx * mz, qx * my - qy * mx
-            row[7] = 1.0 / (sample[6] + other[6] + noise)
+    rows = np.zeros((len(samples), 8))
+    R = _rotation(twist[3], twist[4], twist[5])
+    S = _rotation(other_twist[3], other_twist[4], other_twist[5])
+    tx, ty, tz = twist[0], twist[1], twist[2]
+    sx, sy, sz = other_twist[0], other_twist[1], other_twist[2]
+    for i in range(len(samples)):
+        row, sample = rows[i], samples[i]
+        px, py, pz = _turned(R, sample[0] - pivot[0], sample[1] - pivot[1], sample[2] - pivot[2])
+        px, py, pz = px + tx, py + ty, pz + tz
+        nx, ny, nz = _turned(R, sample[3], sample[4], sample[5])
+        point, normal = _turned_back(S, px - sx, py - sy, pz - sz), _turned_back(S, nx, ny, nz)
+        found = _partner(patches, starts, pivot, edge, reach, point, normal, sample[7])
+        if found < 0:
+            continue
+        other = patches[found]
+        qx, qy, qz = _turned(S, other[0] - pivot[0], other[1] - pivot[1], other[2] - pivot[2])
+        qx, qy, qz = qx + sx, qy + sy, qz + sz
+        mx, my, mz = _turned(S, other[3], other[4], other[5])
+        mx, my, mz = mx + nx, my + ny, mz + nz
+        length = np.sqrt(mx * mx + my * my + mz * mz)
+        mx, my, mz = mx / length, my / length, mz / length
+        row[0], row[1], row[2] = mx, my, mz
+        row[6] = (px - qx) * mx + (py - qy) * my + (pz - qz) * mz
+        qx, qy, qz = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
+        row[3], row[4], row[5] = qy * mz - qz * my, qz * mx - qx * mz, qx * my - qy * mx
+        row[7] = 1.0 / (sample[6] + other[6] + noise * noise)
+    return rows
 
 
 @njit(cache=True, error_model="numpy")
-def _partner(search, view, point, normal, label):  # type: ignore[no-untyped-def]
-    """Number of the patch of a view nearest in place and direction, or −1; point [m] from the pivot."""
-    patches, starts, edge, reach = search.patches, search.starts[view], search.edge, search.reach
-    min_cosine, normal_reach, pivot = search.min_cosine, search.normal_reach, search.pivot_world
+def _partner(patches, starts, pivot, edge, reach, point, normal, label):  # type: ignore[no-untyped-def]
+    """Number of the patch nearest in place and direction, or −1; point [m] from the pivot."""
     x, y, z = point[0] + pivot[0], point[1] + pivot[1], point[2] + pivot[2]
     cx, cy, cz = np.floor(x / edge), np.floor(y / edge), np.floor(z / edge)
     fx, fy, fz = x - cx * edge, y - cy * edge, z - cz * edge
     inside = min(min(fx, edge - fx), min(fy, edge - fy), min(fz, edge - fz))
-    turned = 2.0 * normal_reach * normal_reach
+    # Directions at right angles count as √2 · 5 cm.
+    turned = 2.0 * 0.05 * 0.05
     widest = reach * reach
-    best = widest + turned * (1.0 - min_cosine)
+    best = widest + turned * (1.0 - MIN_COSINE)
     found = -1
     # Cell by cell in rings around its own; `gap` is how far away along an axis a cell begins.
     for ring in range(int(np.ceil(reach / edge)) + 1):
@@ -185,7 +423,7 @@ def _partner(search, view, point, normal, label):  # type: ignore[no-untyped-def
                     gap = k * edge - fz if k > 0 else (fz - (k + 1) * edge if k < 0 else 0.0)
                     if gap_xy + gap * gap >= min(best, widest):
                         continue
-                    bucket = _bucket(label, cx + i, cy + j, cz + k)
+                    bucket = _bucket(np.int64(label), np.int64(cx) + i, np.int64(cy) + j, np.int64(cz) + k)
                     for n in range(starts[bucket], starts[bucket + 1]):
                         u, v, w = patches[n, 0] - x, patches[n, 1] - y, patches[n, 2] - z
                         apart = u * u + v * v + w * w
@@ -194,7 +432,7 @@ def _partner(search, view, point, normal, label):  # type: ignore[no-untyped-def
                         cosine = patches[n, 3] * normal[0] + patches[n, 4] * normal[1]
                         cosine += patches[n, 5] * normal[2]
                         apart += turned * (1.0 - cosine)
-                        if cosine > min_cosine and apart < best:
+                        if cosine > MIN_COSINE and apart < best:
                             best = apart
                             found = n
     return found
@@ -226,48 +464,43 @@ def _turned_back(R, x, y, z):  # type: ignore[no-untyped-def]
     return R[0] * x + R[3] * y + R[6] * z, R[1] * x + R[4] * y + R[7] * z, R[2] * x + R[5] * y + R[8] * z
 
 
-SUMS = 29
-"""Of a group of partners: how many; the sum of their distances [m], none counting more than an outlier; the
-gradient (6,); the upper half of the matrix (6, 6), row by row."""
-
-
 @njit(cache=True, error_model="numpy")
-def normal_equations(
-    rows: NDArray[np.float64], groups: NDArray[np.int64], count: int, outlier: float
-) -> Array:
-    """Sum up the robust normal equations of groups of rows.
-
-    Args:
-        rows: (R, CHUNK, 8) as of `partners.Search`.
-        groups: Group (R,) of each task.
-        count: How many groups there are.
-        outlier: Distance beyond which partners lose their weight [m].
+def normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
+    """Sum up the robust normal equations of rows (N, 8) after a step (6,) of the moving view.
 
     Returns:
-        Sums (G, SUMS), G = `count`.
+        (29,): how many partners there are; the sum of their distances [m], none counting more than an
+        outlier [m], beyond which they lose their weight; the gradient (6,); the upper half of the matrix
+        (6, 6), row by row.
     """
-    sums, step = np.zeros((count, SUMS)), np.zeros(6)
-    for task in range(len(rows)):
-        _sum_up(rows[task], step, outlier, sums[groups[task]])
+    sums = np.zeros(29)
+    for i in range(len(rows)):
+        row = rows[i]
+        if row[7] == 0.0:
+            continue
+        distance = row[6]
+        for a in range(6):
+            distance += row[a] * step[a]
+        far = distance / outlier
+        weight = row[7] / ((1.0 + far * far) * (1.0 + far * far))
+        sums[0] += 1.0
+        sums[1] += min(abs(distance), outlier)
+        k = 8
+        for a in range(6):
+            weighted = weight * row[a]
+            sums[2 + a] += weighted * distance
+            for b in range(a, 6):
+                sums[k] += weighted * row[b]
+                k += 1
     return sums
 
 
 @njit(cache=True, error_model="numpy")
-def step_down(
-    rows: NDArray[np.float64],
-    twist: NDArray[np.float64],
-    information: NDArray[np.float64],
-    independent: float,
-    outlier: float,
-    steps: int,
-    settled: float,
-) -> Array:
-    """Move a view such that its partners come to lie in each other's planes; the partners stay the same.
-
-    Gauss–Newton on the robust distances and the view's pose as reported.
+def step_down(rows, twist, information, independent, outlier, steps, settled):  # type: ignore[no-untyped-def]
+    """Move a view by Gauss–Newton on the robust distances and its pose as reported; partners stay the same.
 
     Args:
-        rows: (R, CHUNK, 8) as of `partners.Search`, found with the view where it is.
+        rows: (N, 8) as of `find_correspondences`, found with the view where it is.
         twist: Where it is, from where it was reported (6,).
         information: Inverse covariance (6, 6) of the reported pose's twist.
         independent: Share of the partners that err independently.
@@ -276,19 +509,14 @@ def step_down(
         settled: A smaller step is the last [m, rad].
 
     Returns:
-        (10,): by how much the twist changes (6,); partners found and the sum of their distances [m], none
-        counting more than an outlier, before and after.
+        By how much the twist changes (6,); how many partners there are and the sum of their distances [m],
+        none counting more than an outlier, before and after (2, 2).
     """
-    result, step, gradient, hessian = np.zeros(10), np.zeros(6), np.zeros(6), np.zeros((6, 6))
-    sums = np.zeros(SUMS)
+    step, gradient, hessian, ends = np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((2, 2))
     largest = np.inf
     for number in range(steps + 1):
-        for k in range(SUMS):
-            sums[k] = 0.0
-        for task in range(len(rows)):
-            _sum_up(rows[task], step, outlier, sums)
-        if number == 0:
-            result[6], result[7] = sums[0], sums[1]
+        sums = normal_equations(rows, step, outlier)
+        ends[min(number, 1), 0], ends[min(number, 1), 1] = sums[0], sums[1]
         if number == steps or largest < settled:
             break
         k = 8
@@ -304,490 +532,4 @@ def step_down(
         for a in range(6):
             step[a] -= change[a]
             largest = max(largest, abs(change[a]))
-    for a in range(6):
-        result[a] = step[a]
-    result[8], result[9] = sums[0], sums[1]
-    return result
-
-
-@njit(cache=True, error_model="numpy")
-def _sum_up(rows, step, outlier, total):  # type: ignore[no-untyped-def]
-    """Add rows (N, 8), after a step (6,) of the moving view, to the total (SUMS,)."""
-    for i in range(len(rows)):
-        row = rows[i]
-        if row[7] == 0.0:
-            continue
-        distance = row[6]
-        for a in range(6):
-            distance += row[a] * step[a]
-        far = distance / outlier
-        weight = row[7] / ((1.0 + far * far) * (1.0 + far * far))
-        total[0] += 1.0
-        total[1] += min(abs(distance), outlier)
-        k = 8
-        for a in range(6):
-            weighted = weight * row[a]
-            total[2 + a] += weighted * distance
-            for b in range(a, 6):
-                total[k] += weighted * row[b]
-                k += 1
-
-
-UPPER = np.triu_indices(6)
-"""Rows and columns of the upper half of a matrix (6, 6), row by row."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class RegisteredView:
-    """One view as registration keeps it; patches are rows as `kernels.partners.COLUMNS` says.
-
-    Attributes:
-        patches: Its patches (P, 8), in the world as reported, sorted to be found.
-        starts: Where in them the list of each bucket begins (BUCKETS + 1,).
-        sample: Those (S, 8) that look for partners in other views.
-        information: Inverse covariance (6, 6) of the reported pose's error, as a twist about the pivot.
-    """
-
-    patches: Array
-    starts: NDArray[np.int64]
-    sample: Array
-    information: Array
-
-    @classmethod
-    def of(
-        cls, surfels: Surfels, viewpoint_world: Array | None, pivot_world: Array, config: RegistrationConfig
-    ) -> RegisteredView:
-        """Prepare a view.
-
-        Args:
-            surfels: Its patches.
-            viewpoint_world: Where the camera was (3,) [m], which errors of orientation turn about, or None.
-            pivot_world: What twists turn about (3,) [m].
-            config: Expected errors and the size of the sample.
-        """
-        arm = np.zeros(3) if viewpoint_world is None else viewpoint_world - pivot_world
-        at_camera = np.eye(6)
-        at_camera[:3, 3:] = -transforms.skew(arm)
-        sigma = np.repeat([config.translation, np.radians(config.rotation)], 3)
-        information = at_camera.T @ (at_camera / sigma[:, None] ** 2)
-        rows = np.column_stack(
-            [surfels.points_world, surfels.normals_world, surfels.variance, surfels.labels.astype(np.float64)]
-        )
-        patches, starts = index_patches(rows, _edge(config))
-        return cls(patches, starts, rows[even_sample(surfels, config.sample)], information)
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Refinement:
-    """Where a view came to lie.
-
-    Attributes:
-        twist: Its move (6,) from where it was reported.
-        misfit_before: Mean distance [m] over the patches that looked for a partner, those without one being
-            outliers, where it started.
-        misfit: The same where it came to lie.
-    """
-
-    twist: Array
-    misfit_before: float
-    misfit: float
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class ViewSet:
-    """Several views put together, to look for partners between them.
-
-    Attributes:
-        numbers: Their numbers (V,), ascending.
-        patches: Those of all views (P, 8), view by view.
-        starts: Where in them the list of each bucket of each view begins (V, BUCKETS + 1).
-        samples: Those of all views (S, 8) that look for partners.
-        first: Where in them those of each view begin (V + 1,).
-    """
-
-    numbers: Index
-    patches: Array
-    starts: NDArray[np.int64]
-    samples: Array
-    first: NDArray[np.int64]
-
-    @classmethod
-    def of(cls, views: Mapping[int, RegisteredView]) -> ViewSet:
-        """Put views together.
-
-        Args:
-            views: Number → view, ascending.
-        """
-        before = np.cumsum([0, *(len(v.patches) for v in views.values())])
-        return cls(
-            np.array(list(views), dtype=np.intp),
-            np.concatenate([v.patches for v in views.values()]),
-            np.stack([v.starts + n for v, n in zip(views.values(), before[:-1], strict=True)]),
-            np.concatenate([v.sample for v in views.values()]),
-            np.cumsum([0, *(len(v.sample) for v in views.values())]),
-        )
-
-    def sample(self, number: int) -> Array:
-        """Patches (S, 8) of a view that look for partners."""
-        slot = int(np.searchsorted(self.numbers, number))
-        return self.samples[self.first[slot] : self.first[slot + 1]]
-
-    def match(
-        self,
-        still: Index,
-        moving: Index,
-        twists: Array,
-        pivot_world: Array,
-        outlier: float,
-        config: RegistrationConfig,
-    ) -> PoseEdges:
-        """Find the partners of views' whole samples in other views, within the shortest reach.
-
-        Args:
-            still: Number (E,) of the view in which each pair's are looked for.
-            moving: Number (E,) of the one whose sample looks for them.
-            twists: Move of all views from where they were reported, whether here or not (M, 6), M ≥ V.
-            pivot_world: What twists turn about (3,) [m].
-            outlier: Distance beyond which partners lose their weight [m].
-            config: Noise, reach, and how much directions may differ.
-        """
-        tasks, pairs, asked = self._tasks(still, moving, 1)
-        search = self._search(tasks, len(tasks), twists, pivot_world, config.reaches[-1], config)
-        for_each(find_correspondences, search.shares, search)
-        sums = normal_equations(search.rows, pairs, len(still), outlier)
-        sums[:, 2:] *= INDEPENDENT
-        information = np.empty((len(sums), 6, 6))
-        information[:, UPPER[0], UPPER[1]] = sums[:, 8:]
-        information[:, UPPER[1], UPPER[0]] = sums[:, 8:]
-        apart = twists[moving] - twists[still]
-        return PoseEdges(still, moving, apart, asked, sums[:, 0], sums[:, 1], sums[:, 2:8], information)
-
-    def descend(
-        self, twists: Array, information: Array, pivot_world: Array, reach: float, config: RegistrationConfig
-    ) -> Refinement:
-        """Move the last view such that partners come to lie in each other's planes; the others stay.
-
-        Gauss–Newton on the robust, symmetric point-to-plane distance, maximum a posteriori.
-
-        Args:
-            twists: Move of all views from where they were reported, whether here or not (M, 6), M ≥ V.
-            information: Inverse covariance (6, 6) of the last one's reported pose.
-            pivot_world: What twists turn about (3,) [m].
-            reach: How far away a partner may be [m].
-            config: Noise, rounds, and how many patches look for partners; the fewer they are, the more of
-                them err independently.
-        """
-        others, new = self.numbers[:-1], self.numbers[-1:]
-        size = int(self.first[-1] - self.first[-2])
-        # 250 patches will do here; the pose is then made exact with the whole samples.
-        stride = max(1, size * len(others) // 250)
-        tasks, _, asked = self._tasks(others, np.repeat(new, len(others)), stride)
-        outlier = OUTLIER * reach
-        # What a step this small leaves, the next reach or the joint solution takes.
-        converged = 0.1 * outlier
-        search = self._search(tasks, 1, twists, pivot_world, reach, config)
-        twist, ends = search.twists[-1], []
-        for _ in range(ROUNDS):
-            for_each(find_correspondences, search.shares, search)
-            result = step_down(
-                *(search.rows, twist, information, min(1.0, stride * INDEPENDENT), outlier),
-                *(4, converged),
-            )
-            twist += result[:6]
-            ends += [result[6:8], result[8:]]
-            if np.abs(result[:6]).max() < converged:
-                break
-        total = max(int(asked.sum()), 1)
-        before, after = (float(far + (total - found) * outlier) / total for found, far in (ends[0], ends[-1]))
-        return Refinement(twist, before, after)
-
-    def _search(
-        self,
-        tasks: NDArray[np.int64],
-        shares: int,
-        twists: Array,
-        pivot_world: Array,
-        reach: float,
-        config: RegistrationConfig,
-    ) -> Search:
-        """Tasks (R, 5) in so many shares, and place for what they find; twists of all views (≥ V, 6)."""
-        return Search(
-            *(self.patches, self.starts, self.samples, tasks, shares, twists[self.numbers], pivot_world),
-            *(_edge(config), reach, MIN_COSINE, NORMAL_REACH, config.noise),
-            np.zeros((len(tasks), CHUNK, 8)),
-        )
-
-    def _tasks(
-        self, still: Index, moving: Index, stride: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Tasks (R, 5) of a search, the pair (R,) each is of, and how many patches (E,) they ask."""
-        still, moving = np.searchsorted(self.numbers, still), np.searchsorted(self.numbers, moving)
-        first, last = self.first[moving], self.first[moving + 1]
-        asked = -((first - last) // stride)
-        chunks = -(-asked // CHUNK)
-        pairs = np.repeat(np.arange(len(still)), chunks)
-        number = np.arange(len(pairs)) - np.repeat(np.cumsum(chunks) - chunks, chunks)
-        begin = first[pairs] + number * CHUNK * stride
-        end = np.minimum(begin + CHUNK * stride, last[pairs])
-        step = np.full(len(pairs), stride)
-        return np.stack([begin, end, step, still[pairs], moving[pairs]], axis=1), pairs, asked
-
-
-def twist_transform(twist: Array, pivot_world: Array) -> Array:
-    """The rigid transform that turns about a pivot (3,) [m] and moves; leading axes (..., 6) are kept.
-
-    Args:
-        twist: Twists (..., 6): 3 × m, 3 × rad.
-        pivot_world: What is turned about (3,) [m].
-
-    Returns:
-        (..., 4, 4).
-    """
-    x, y, z = np.moveaxis(twist[..., 3:], -1, 0)
-    angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
-    K = np.zeros((*twist.shape[:-1], 3, 3))
-    K[..., 0, 1], K[..., 0, 2], K[..., 1, 2] = -z, y, -x
-    K -= K.swapaxes(-1, -2)
-    # sin(a)/a and (1 - cos(a))/a²; numpy's sinc is sin(πx)/(πx).
-    half = np.sinc(angle / (2.0 * np.pi))
-    T = np.zeros((*twist.shape[:-1], 4, 4))
-    T[..., :3, :3] = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * half * half * (K @ K)
-    T[..., :3, 3] = twist[..., :3] + pivot_world - T[..., :3, :3] @ pivot_world
-    T[..., 3, 3] = 1.0
-    return T
-
-
-def _edge(config: RegistrationConfig) -> float:
-    """Edge of the cells partners are looked for in [m]: the widest search spans two on either side."""
-    return max(config.reaches) / 2.0
-
-
-Outcome = Literal[
-    "reference", "fits as reported", "aligned", "too few partners", "beyond the limits", "no better"
-]
-
-EXACT = ("reference", "fits as reported")
-"""Views that stay where they were reported, whatever comes later."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class PoseEstimate:
-    """Where a view is, better than it was reported.
-
-    Attributes:
-        twist: Move from where it was reported (6,): 3 × m, 3 × rad, about the pivot.
-        outcome: What became of its alignment when it came; later views may move it whatever that was.
-        covariance: Of the twist (6, 6) [m, rad]; zero where the view defines the world or is exact.
-        determined: Share (6,) of what is known of each of `directions` that comes from matching, ascending;
-            the rest is the report's. Near 0 = what the views share does not show it.
-        directions: Independent moves (6, 6), one a column, as twists in standard deviations of the report.
-    """
-
-    twist: Array
-    outcome: Outcome
-    covariance: Array
-    determined: Array
-    directions: Array
-
-
-class ViewRegistration:
-    """Where the views are; the first one defines the world.
-
-    Args:
-        pivot_world: What twists turn about (3,) [m]; best amid the points.
-        config: Expected errors and limits.
-
-    Attributes:
-        estimates: One for each view.
-    """
-
-    def __init__(self, pivot_world: Array, config: RegistrationConfig) -> None:
-        self.estimates: list[PoseEstimate] = []
-        self._pivot = pivot_world
-        self._config = config
-        self._views: dict[int, RegisteredView] = {}
-        self._twists = np.zeros((0, 6))
-        self._edges = PoseEdges.none()
-
-    def copy(self) -> ViewRegistration:
-        """Return a registration that knows the same and goes on by itself; the views so far are shared."""
-        other = copy.copy(self)
-        other.estimates = self.estimates.copy()
-        other._views = self._views.copy()
-        return other
-
-    def add(self, cloud: Cloud, *, same_labels: bool) -> dict[int, Array]:
-        """Take in a view.
-
-        Args:
-            cloud: Its labelled points in the world as reported; 65535 = the support surface.
-            same_labels: Whether labels mean the same in every view.
-
-        Returns:
-            How the new view is to be moved and, on top of what they were moved before, earlier ones: view →
-            transform (4, 4) of the world.
-        """
-        config, new = self._config, len(self.estimates)
-        surfels = surfels_of(cloud, config, same_labels=same_labels)
-        view = RegisteredView.of(surfels, cloud.viewpoint_world, self._pivot, config)
-        self._views[new] = view
-        self._twists = np.concatenate([self._twists, np.zeros((1, 6))])
-        view_set = ViewSet.of(self._views)
-        outcome = self._laid(view_set)
-        known: Array = np.zeros((6, 6))
-        if outcome not in EXACT:
-            known = np.asarray(np.linalg.inv(view.information), dtype=np.float64)
-        self.estimates.append(PoseEstimate(np.zeros(6), outcome, known, np.zeros(6), np.eye(6)))
-        if outcome == "beyond the limits":
-            self._let_go([new])
-        elif outcome not in EXACT:
-            self._refine(view_set)
-        moves = self._moves(view_set)
-        if len(self._views) > config.kept:
-            self._let_go([self._least_missed()])
-        return moves
-
-    def _laid(self, view_set: ViewSet) -> Outcome:
-        """Lay the newest view onto those that are kept, from where it was reported and coarse to fine."""
-        config, reach = self._config, self._config.reaches[-1]
-        outlier = OUTLIER * reach
-        *others, new = self._views
-        if not others:
-            return "reference"
-        exact = [v for v in others if self.estimates[v].outcome in EXACT]
-        right = self._matched(view_set, exact, [new], reach)
-        found = float(right.found.sum())
-        # Exact views leave a tenth of the noise, noisy ones all of it.
-        if found >= config.min_points and float(right.misfit.sum()) < 0.3 * config.noise * found:
-            rest = [v for v in others if v not in exact]
-            self._edges = self._edges.joined(right).joined(self._matched(view_set, rest, [new], outlier))
-            return "fits as reported"
-
-        reported, information = self._twists, self._views[new].information
-        best = fine = view_set.descend(reported, information, self._pivot, reach, config)
-        twists = reported.copy()
-        for wide in config.reaches[:-1]:
-            twists[new] = view_set.descend(twists, information, self._pivot, wide, config).twist
-        if np.abs(twists[new] - fine.twist).max() > outlier:
-            coarse = view_set.descend(twists, information, self._pivot, reach, config)
-            best = coarse if coarse.misfit < fine.misfit else fine
-        better = best.misfit < fine.misfit_before
-        outcome: Outcome = "aligned" if better else "no better"
-        if better:
-            twists[new] = best.twist
-            self._twists = twists
-        edges = self._matched(view_set, others, [new], outlier)
-        if edges.found.sum() < config.min_points:
-            outcome = "too few partners"
-        elif better and self._too_far(best.twist):
-            outcome = "beyond the limits"
-        if better and outcome != "aligned":
-            self._twists = reported
-            edges = self._matched(view_set, others, [new], outlier)
-        self._edges = self._edges.joined(edges)
-        return outcome
-
-    def _matched(
-        self,
-        view_set: ViewSet,
-        still: Sequence[int] | Index,
-        moving: Sequence[int] | Index,
-        outlier: float,
-    ) -> PoseEdges:
-        """What pairs of views say of each other where they are, from the whole of their samples."""
-        first, second = np.broadcast_arrays(np.asarray(still, np.intp), np.asarray(moving, np.intp))
-        return view_set.match(first, second, self._twists, self._pivot, outlier, self._config)
-
-    def _too_far(self, twist: Array) -> bool:
-        config = self._config
-        turn = np.linalg.norm(twist[3:]) > np.radians(config.max_rotation)
-        return bool(turn or np.linalg.norm(twist[:3]) > config.max_translation)
-
-    def _refine(self, view_set: ViewSet) -> None:
-        """Move all kept views together that are not exact, unless that lays them worse; note what is known.
-
-        Views that few partners tie to the others stay where they are.
-        """
-        config, outlier = self._config, OUTLIER * self._config.reaches[-1]
-        before = self._twists, self._edges
-        for _ in range(ROUNDS):
-            free, hessian = self._solve()
-            if len(free) == 0:
-                return
-            # A quarter of the distance at which partners lose their weight.
-            stale = self._edges.stale(self._twists, 2.0 * config.noise)
-            if not stale.any():
-                break
-            old = self._edges.select(stale)
-            anew = self._matched(view_set, old.still, old.moving, outlier)
-            self._edges = self._edges.select(~stale).joined(anew)
-        if self._edges.mean_misfit(outlier) > before[1].mean_misfit(outlier) + 0.3 * config.noise:
-            self._twists, self._edges = before[0], before[1].among(np.array(list(self._views)))
-        covariances, informations = _blocks(np.asarray(np.linalg.inv(hessian), np.float64)), _blocks(hessian)
-        reported = np.stack([self._views[v].information for v in free])
-        for v, covariance, determined, directions in zip(
-            free, covariances, *_determined(reported, informations), strict=True
-        ):
-            self.estimates[v] = replace(
-                self.estimates[v], covariance=covariance, determined=determined, directions=directions
-            )
-
-    def _solve(self) -> tuple[list[int], Array]:
-        """Move all views to where the pairs of them want them; one that would go too far is let go.
-
-        Returns:
-            The views that were free to move, and the inverse covariance of their twists.
-        """
-        while True:
-            enough = self._edges.partners(len(self._twists)) >= self._config.min_points
-            free = [v for v in self._views if enough[v] and self.estimates[v].outcome not in EXACT]
-            informations = np.array([self._views[v].information for v in free]).reshape(-1, 6, 6)
-            twists, hessian = self._edges.solve(self._twists, np.array(free, dtype=np.intp), informations)
-            far = [v for v in free if self._too_far(twists[v])]
-            if not far:
-                self._twists = twists
-                return free, hessian
-            self._let_go(far)
-
-    def _moves(self, view_set: ViewSet) -> dict[int, Array]:
-        """How views are to be moved now: the newest, and those whose points moved since they last were."""
-        numbers = view_set.numbers.tolist()
-        told = np.stack([self.estimates[v].twist for v in numbers])
-        T, T_told = (twist_transform(t, self._pivot) for t in (self._twists[numbers], told))
-        moves, settled = {}, 0.3 * self._config.noise
-        for v, now, then in zip(numbers, T, T_told, strict=True):
-            change = view_set.sample(v)[:, :3] @ (now - then)[:3, :3].T + (now - then)[:3, 3]
-            if v == numbers[-1] or np.einsum("ni,ni->n", change, change).max() > settled**2:
-                moves[v] = now @ transforms.invert(then)
-                self.estimates[v] = replace(self.estimates[v], twist=self._twists[v])
-        return moves
-
-    def _let_go(self, views: Sequence[int]) -> None:
-        """Let views stay where they are from now on, and lay no others onto them."""
-        for v in views:
-            del self._views[v]
-        self._edges = self._edges.among(np.array(list(self._views)))
-
-    def _least_missed(self) -> int:
-        """The kept view whose surfaces another one shows best; the first that nothing ties to any, if any."""
-        kept = list(self._views)
-        partners = self._edges.partners(len(self._twists))
-        loose = [v for v in kept[1:] if partners[v] < self._config.min_points]
-        if loose:
-            return loose[0]
-        shared = self._edges.shared(np.array(kept))
-        pair = divmod(int(np.argmax(shared)), len(kept))
-        return kept[max((k for k in pair if k > 0), key=lambda k: shared[k].sum())]
-
-
-def _blocks(matrix: Array) -> Array:
-    """Blocks (F, 6, 6) on the diagonal of a matrix (6·F, 6·F)."""
-    size = len(matrix) // 6
-    return np.asarray(matrix.reshape(size, 6, size, 6)[np.arange(size), :, np.arange(size)], dtype=np.float64)
-
-
-def _determined(information: Array, hessian: Array) -> tuple[Array, Array]:
-    """Share (F, 6) of what is known that is not the report's, ascending, and the directions (F, 6, 6)."""
-    half = np.linalg.inv(np.linalg.cholesky(information))
-    values, vectors = np.linalg.eigh(half @ hessian @ half.swapaxes(-1, -2))
-    return 1.0 - 1.0 / np.maximum(values, 1.0), half.swapaxes(-1, -2) @ vectors
+    return step, ends
