@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import pandas as pd
 from rich.console import Console
 
-from caryatid.benchmark.running import THREADS
 from caryatid.errors import CaryatidError
 
 T = TypeVar("T")
@@ -57,8 +56,8 @@ class Spread:
 
     def each(self, function: Callable[[T], R], tasks: Sequence[T], chunk: int = 1) -> list[R]:
         """What a function gives for each task, run in processes."""
-        for name in THREADS:
-            os.environ.setdefault(name, "1")
+        for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+            os.environ.setdefault(f"{library}_NUM_THREADS", "1")
         with ProcessPoolExecutor(self.jobs, get_context("spawn")) as pool:
             return list(pool.map(function, tasks, chunksize=chunk))
 

@@ -284,12 +284,9 @@ def test_workers_with_other_code_are_refused(cluster, tmp_path):
         told.append(text)
         cluster.add_worker(code=other.parent)
 
-    late, early = r"a worker runs other code \(\w+\) than", r"worker tcp://\S+ runs other code \(\w+\) than"
-    for who in (late, early):
-        with pytest.raises(CaryatidError, match=rf"^{who} this process .* install the same caryatid"):
-            list(run_on_cluster([Episode("tower", settings=QUICK, views=1)], cluster.address, tell, 1.0))
-    assert len(told) == 1
-    assert told[0] == f"no workers; waiting for some: dask worker {cluster.address} --nthreads 1 --nworkers N"
+    with pytest.raises(CaryatidError, match=r"^a worker runs other code .* install the same caryatid"):
+        list(run_on_cluster([Episode("tower", settings=QUICK, views=1)], cluster.address, tell, 1.0))
+    assert told == [f"no workers; waiting for some: dask worker {cluster.address} --nthreads 1 --nworkers N"]
 
 
 def test_a_worker_without_the_planner_is_refused():

@@ -157,8 +157,8 @@ def test_a_table_laid_on_its_side_axis_is_still_level():
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("<mujoco><worldbody>", "no MJCF"),
-        ("not xml at all", "no MJCF"),
+        ("<mujoco><worldbody>", "Not an MJCF file"),
+        ("not xml at all", "Not an MJCF file"),
         (mjcf(CUBE), "no body 'table'"),
         (mjcf(TABLE), "no objects"),
         (mjcf(TABLE.replace("<geom", "<freejoint/><geom") + CUBE), "body 'table' can move"),

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -19,7 +19,7 @@ from caryatid.config.settings import read_settings
 from caryatid.errors import InputError, in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, TrueScene, score
-from caryatid.evaluation.truths import SEED, true_scene_from_simulation
+from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
@@ -123,7 +123,21 @@ def find_scenes(sources: Iterable[str]) -> list[str]:
     """
     found: list[str] = []
     for source in sources:
-        found += [source] if is_builtin(source) else _scenes_in(Path(source))
+        folder = Path(source)
+        if is_builtin(source):
+            found.append(source)
+            continue
+        if not folder.is_dir():
+            remedy = f"give a folder of scenes, or one of {', '.join(list_scenes())}"
+            raise InputError(source, "Neither a built-in scene nor a folder", remedy)
+        scenes = sorted(
+            {f.parent for pattern in (SCENE_FILE, f"*/{SCENE_FILE}") for f in folder.glob(pattern)}
+        )
+        if not scenes:
+            raise InputError(source, f"No {SCENE_FILE} in it", "give a scene folder or a folder of them")
+        if missing := [scene for scene in scenes if not (scene / TRUTH_FILE).is_file()]:
+            raise InputError(missing[0], f"No {TRUTH_FILE} in it", "write the ground truth")
+        found += map(str, scenes)
     return list(dict.fromkeys(found))
 
 
@@ -132,16 +146,19 @@ def content_of(scene: str) -> str:
     return "" if is_builtin(scene) else _digest(sorted(p for p in Path(scene).rglob("*") if p.is_file()))
 
 
+@cache
 def plugin_of(planner: str) -> str:
     """Digest of the package that offers a planner; empty for built-in planners."""
     point = offered().get(planner)
     if point is None:
         return ""
     spec = find_spec(point.module.split(".")[0])
-    folders = [] if spec is None else [Path(folder) for folder in spec.submodule_search_locations or ()]
-    files = [f for folder in folders for f in sorted(folder.rglob("*.py"))]
-    if spec is not None and spec.origin and not folders:
-        files = [Path(spec.origin)]
+    places = [] if spec is None else spec.submodule_search_locations or [spec.origin or ""]
+    files = [
+        f
+        for place in map(Path, places)
+        for f in ([place] if place.is_file() else sorted(place.rglob("*.py")))
+    ]
     return hashlib.sha256((point.value + _digest(files)).encode()).hexdigest()[:16]
 
 
@@ -172,28 +189,29 @@ def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene
 
 def take_apart(
     scene: SimulatedScene, graph: SupportGraph, truth: TrueScene, order: OrderName, config: Config, seed: int
-) -> tuple[float, float]:
+) -> dict[str, float]:
     """Take a scene apart in physics; objects that were not extracted go last, the highest first.
 
     Returns:
-        1 where nothing was disturbed, else 0; and the share of the lifts that disturbed nothing.
+        `unharmed`, whether nothing was disturbed (1 or 0), and the share of `lifts` that disturbed nothing.
     """
     bodies = bodies_of(graph, truth)
     objects = [o for o in graph.objects if o.role == "object"]
-    ids = [o.id for o in sorted(objects, key=lambda o: (-o.centre_world[2], o.label))]
-    if order == "random":
-        ids = [objects[k].id for k in np.random.default_rng(seed).permutation(len(objects))]
-    elif order == "true graph":
-        ids = _by_graph(ids, truth.edges, bodies)
-    steps = [TakeStep(i, (), False, 1.0, "not rehearsed") for i in ids]
     if objects and order in ("one hand", "two hands"):
         steps = list(plan_order(graph, config, hands=1 if order == "one hand" else 2, seed=seed).steps)
+    else:
+        ids = [o.id for o in sorted(objects, key=lambda o: (-o.centre_world[2], o.label))]
+        if order == "random":
+            ids = [objects[k].id for k in np.random.default_rng(seed).permutation(len(objects))]
+        elif order == "true graph":
+            ids = _by_graph(ids, truth.edges, bodies)
+        steps = [TakeStep(i, (), False, 1.0, "not rehearsed") for i in ids]
     steps = [step for step in steps if step.object_id in bodies]
     height = dict(zip(scene.object_bodies.values(), poses_of(scene)[:, 2], strict=True))
     missed = sorted(set(height) - {bodies[s.object_id] for s in steps}, key=lambda b: -height[b])
     steps += [TakeStep(body, (), False, 1.0, "not extracted") for body in missed]
     ok = [taken.ok for taken in dismantle(scene, steps, bodies | {b: b for b in missed}, config)]
-    return float(all(ok)), float(np.mean(ok))
+    return {"unharmed": float(all(ok)), "lifts": float(np.mean(ok))}
 
 
 def figures_of(found: Score, graph: SupportGraph, true: int) -> Row:
@@ -209,26 +227,17 @@ def _rows(episode: Episode) -> list[Row]:
     known: dict[str, Any] = {"segmentation": episode.segmentation, "seed": episode.seed}
     planner, camera = planner_for(episode.planner, simulation.camera, truth, config, **known)
     rows: list[Row] = []
-    planning, taken = 0.0, (0.0, 0.0)
+    planning, removal = 0.0, {"unharmed": 0.0, "lifts": 0.0}
     for step in explore(camera, simulation.robot, planner=planner, config=config, early_stop=False, **known):
-        found = score(step.graph, truth, np.random.default_rng(SEED))
+        found = score(step.graph, truth)
         view = step.index + 1
         if episode.order and view in REMOVAL_VIEWS:
-            taken = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
-        rows.append(
-            {
-                "view": view,
-                **figures_of(found, step.graph, len(truth.objects)),
-                "angle": step.angle_travelled,
-                "path": step.path_travelled,
-                "planning_seconds": planning,
-                "perception_seconds": sum(
-                    s for stage, s in step.timings.items() if stage not in ("capture", "plan")
-                ),
-                "unharmed": taken[0],
-                "lifts": taken[1],
-            }
-        )
+            removal = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
+        perceiving = [s for stage, s in step.timings.items() if stage not in ("capture", "plan")]
+        travelled = {"angle": step.angle_travelled, "path": step.path_travelled}
+        times = dict(zip(TIMES, (planning, sum(perceiving)), strict=True))
+        figures = figures_of(found, step.graph, len(truth.objects))
+        rows.append({"view": view} | figures | travelled | times | removal)
         planning = step.timings.get("plan", 0.0)
     missing = range(int(rows[-1]["view"]) + 1, episode.views + 1)
     return rows + [rows[-1] | dict.fromkeys(TIMES, 0.0) | {"view": view} for view in missing]
@@ -249,24 +258,3 @@ def _digest(files: Iterable[Path]) -> str:
     for file in files:
         digest.update(file.name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
-
-
-def _scenes_in(folder: Path) -> list[str]:
-    if not folder.is_dir():
-        names = ", ".join(list_scenes())
-        raise InputError(
-            folder, "is neither a built-in scene nor a folder", f"give a folder of scenes, or of {names}"
-        )
-    folders = (
-        [folder]
-        if (folder / SCENE_FILE).is_file()
-        else sorted(p.parent for p in folder.glob(f"*/{SCENE_FILE}"))
-    )
-    if not folders:
-        raise InputError(
-            folder, f"holds no scene: no {SCENE_FILE}", "give a scene folder or a folder of them"
-        )
-    for scene in folders:
-        if not (scene / TRUTH_FILE).is_file():
-            raise InputError(scene, f"has no {TRUTH_FILE}", "write one: the benchmark needs the ground truth")
-    return [str(scene) for scene in folders]

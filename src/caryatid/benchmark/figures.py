@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,181 +22,133 @@ STYLE = {
     "lines.markersize": 5.0, "legend.frameon": False,
 }  # fmt: skip
 """matplotlib's settings that differ from its defaults; what users set for themselves has no effect."""
-OVER_VIEWS = {
-    "f1": ("F1", "vertices and edges together"),
-    "edge_f1": ("F1 of edges", "edges alone"),
-    "vertex_f1": ("F1 of vertices", "vertices alone, the table included"),
-    "mean_iou": ("Mean IoU", "of the matched objects"),
-}
-"""Measures drawn over views: what the axis says, what it is of."""
-REMOVAL = {
-    "unharmed": ("Scenes without harm", "share of those taken apart without any object being disturbed"),
-    "lifts": ("Lifts without harm", "share of all lifts"),
-}
-"""The same of scenes that are taken apart."""
 
-Looks = Mapping[str, dict[str, Any]]
-"""Label of a method → arguments of matplotlib's `plot`."""
 Curves = dict[str, "pd.DataFrame"]
-"""Label of a method → value, low and high by view or quantile."""
+"""Label of a method → value, low and high by view."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Figure:
-    """A figure: name of its file without an ending, heading, what is to be seen in it, and the drawing."""
+    """A figure: name of its file without an ending, what is to be seen in it, and what draws it."""
 
     name: str
-    title: str
     caption: str
-    drawing: Any
+    height: float
+    plot: Callable[[Any], None]
 
     def save(self, path: Path) -> None:
         """Write it as the ending says, SVG or PNG, with nothing of who drew it when."""
         from matplotlib import style
+        from matplotlib.figure import Figure as Drawing
 
         metadata = {"Date": None, "Creator": None} if path.suffix == ".svg" else {"Software": None}
         with style.context(["default", STYLE | {"svg.hashsalt": self.name}]):
-            self.drawing.savefig(path, dpi=160, metadata=metadata)
+            drawing = Drawing(figsize=(7.2, self.height), facecolor="white", layout="constrained")
+            self.plot(drawing)
+            drawing.savefig(path, dpi=160, metadata=metadata)
 
 
-def looks_of(methods: Sequence[str]) -> Looks:
-    """Give each method a colour, a marker and a line style of its own."""
-    looks = {}
-    for k, name in enumerate(methods):
-        turn, place = divmod(k, len(COLOURS))
-        shift, dash = divmod(turn, len(DASHES))
-        looks[name] = {
-            "color": COLOURS[place],
-            "marker": MARKERS[(place + shift) % len(MARKERS)],
-            "linestyle": DASHES[dash],
-            "markerfacecolor": "white" if dash else COLOURS[place],
-        }
-    return looks
-
-
-def draw_group(
-    summary: pd.DataFrame, label: str, scenes: str, reference: str, looks: Looks
-) -> Iterator[Figure]:
-    """Draw the figures of the methods under one condition, over all scenes or one family.
+def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) -> Iterator[Figure]:
+    """Draw the methods under one condition in all its scenes or those of one family.
 
     Args:
-        summary: Its rows of a suite's summary.
-        label: Told apart from other groups by this in names of files; may be empty.
-        scenes: How many of what kind, in words.
+        group: Its rows of a suite's summary.
+        measure: What is drawn, say `f1`.
+        heading: What the axis says of it.
         reference: Method differences are from.
-        looks: How each method is drawn.
     """
-    removal = is_removal(summary)
-    measures = REMOVAL if removal else OVER_VIEWS
-    mean = f"mean over {scenes}, with intervals"
-    for measure, (axis, what) in list(measures.items())[: 1 if label else None]:
-        if curves := curves_of(summary, measure):
-            title, caption = f"{axis} over views", f"{axis} ({what}) after each view: {mean}."
-            plot = partial(_draw_lines, looks=looks, curves=curves, label=axis)
-            yield _draw(f"{measure} over views {label}", title, caption, 14, plot)
-    f1, path = curves_of(summary, "f1"), curves_of(summary, "path")
-    if f1 and path and not removal:
-        caption = f"F1 over the path travelled, a mark for each view: {mean}."
-        plot = partial(_draw_lines, looks=looks, curves=f1, label="F1", path=path)
-        yield _draw(f"f1 over path {label}", "F1 over path", caption, 14, plot)
-    main, (name, _) = next(iter(measures.items()))
-    if differences := curves_of(summary, f"{main} difference"):
-        caption = (
-            f"{name} minus that of {reference} over the scenes and seeds both have: mean and interval; "
-            "to the right is better. Pale: the interval holds 0."
-        )
-        axis = f"{name} minus that of {reference}"
-        plot = partial(_draw_rows, looks=looks, curves=differences, label=axis, zero=True)
-        title = f"{name} compared with {reference}"
-        yield _draw(f"{main} differences {label}", title, caption, len(differences), plot)
-    times = curves_of(summary, "planning")
-    if times and not label and not removal:
-        for method, time in times.items():
-            middle = time.loc[[0.5]].assign(low=time["value"].min(), high=time["value"].max())
-            times[method] = middle.set_axis([1])
-        caption = "Time the choice of a view takes: median and the middle 95 %."
-        plot = partial(_draw_rows, looks=looks, curves=times, label="time of a choice [s]", scale="log")
-        yield _draw("planning time", "Planning time", caption, len(times), plot)
+    family = group["family"].iloc[0]
+    scenes = f"{family} scenes".strip()
+    curves, path = curves_of(group, measure), curves_of(group, "path")
+    if curves:
+        caption = f"{heading} after each view: mean over {scenes}, with intervals."
+        yield _figure(f"{measure} over views {family}", caption, 14, _lines(curves, heading))
+    if curves and path and measure == "f1":
+        caption = f"{heading} over the path travelled, a mark for each view: mean over {scenes}."
+        yield _figure(f"f1 over path {family}", caption, 14, _lines(curves, heading, path))
+    if differences := curves_of(group, f"{measure} difference"):
+        label = f"{heading} minus that of {reference}"
+        caption = f"{label} in {scenes}, paired: mean and interval. Pale: the interval holds 0."
+        rows = _rows(differences, label, zero=True)
+        yield _figure(f"{measure} differences {family}", caption, len(differences), rows)
 
 
-def draw_conditions(summary: pd.DataFrame, looks: Looks) -> Figure:
-    """Draw F1 under each condition after the later views, the methods below each other."""
-    rows = summary[(summary["family"] == "") & (summary["quantity"] == "f1")]
+def draw_conditions(summary: pd.DataFrame, measure: str, heading: str) -> Figure:
+    """Draw a measure under each condition, the methods below each other."""
+    whole = summary[summary["family"] == ""]
     curves = {
-        f"{condition}: {method}": own.set_index("at")
-        for (condition, method), own in rows.groupby(["condition", "method"], sort=False)
+        f"{condition}: {method}": curve
+        for condition, group in whole.groupby("condition", sort=False)
+        for method, curve in curves_of(group, measure).items()
     }
-    looks = {name: looks[name.rpartition(": ")[2]] for name in curves}
-    caption = "Mean F1 under each condition, with intervals over scenes."
-    plot = partial(_draw_rows, looks=looks, curves=curves, label="F1")
-    return _draw("f1 by condition", "F1 by condition", caption, len(curves), plot)
+    caption = f"{heading} under each condition: mean over scenes, with intervals."
+    return _figure(f"{measure} by condition", caption, len(curves), _rows(curves, heading))
 
 
-def is_removal(summary: pd.DataFrame) -> bool:
-    """Whether the scenes of a group were taken apart."""
-    return bool((summary["value"][summary["quantity"] == "lifts"] > 0.0).any())
-
-
-def curves_of(summary: pd.DataFrame, quantity: str) -> Curves:
+def curves_of(group: pd.DataFrame, quantity: str) -> Curves:
     """Value, low and high by view of each method that has this quantity."""
-    rows = summary[summary["quantity"] == quantity]
+    rows = group[group["quantity"] == quantity]
     return {str(method): own.set_index("at") for method, own in rows.groupby("method", sort=False)}
 
 
-def told_views(views: Iterable[float]) -> list[float]:
+def told_views(group: pd.DataFrame, quantity: str) -> list[float]:
     """Views that tables and figures tell of: 1, 2, 3, 5 and 10 as far as they exist, and the last."""
-    last = max(views, default=0)
+    last = max(group["at"][group["quantity"] == quantity], default=0)
     return sorted({v for v in (1, 2, 3, 5, 10, last) if 0 < v <= last})
 
 
-def _draw(name: str, title: str, caption: str, rows: int, plot: Callable[[Any], None]) -> Figure:
-    """Draw a figure with matplotlib, as high as its number of rows."""
-    from matplotlib import style
-    from matplotlib.figure import Figure as Drawing
-
+def _figure(name: str, caption: str, rows: int, plot: Callable[[Any], None]) -> Figure:
     name = re.sub(r"[^a-z0-9.]+", "-", name.lower()).strip("-")
-    with style.context(["default", STYLE]):
-        drawing = Drawing(figsize=(7.2, 0.9 + 0.22 * max(rows, 2)), facecolor="white", layout="constrained")
-        plot(drawing)
-    return Figure(name, title, caption, drawing)
+    return Figure(name, caption, 0.9 + 0.22 * max(rows, 2), plot)
 
 
-def _draw_lines(figure: Any, *, looks: Looks, curves: Curves, label: str, path: Curves | None = None) -> None:
-    """A line for each curve, over the views or over the path up to each."""
-    axes = figure.subplots()
-    for k, (method, curve) in enumerate(curves.items()):
-        at, errors = curve.index + 0.4 * ((k + 0.5) / len(curves) - 0.5), {"yerr": _interval(curve)}
-        if path is not None:
-            at, errors["xerr"] = path[method]["value"], _interval(path[method])
-        axes.errorbar(at, curve["value"], elinewidth=0.9, label=method, **errors, **looks[method])
-    axes.set(ylabel=label, xlabel="path over the floor [m]" if path else "views")
-    axes.set_ylim(None, min(1.0, axes.get_ylim()[1]))
-    axes.xaxis.get_major_locator().set_params(integer=path is None)
-    figure.legend(loc="outside right center")
+def _lines(curves: Curves, label: str, path: Curves | None = None) -> Callable[[Any], None]:
+    """Plots a line for each curve, over the views or over the path up to each."""
+
+    def plot(figure: Any) -> None:
+        axes = figure.subplots()
+        for index, (method, curve) in enumerate(curves.items()):
+            turn, place = divmod(index, len(COLOURS))
+            look = {
+                "color": COLOURS[place],
+                "marker": MARKERS[place],
+                "linestyle": DASHES[turn % len(DASHES)],
+            }
+            # Side by side, so that intervals at the same view do not hide each other.
+            at = curve.index + 0.4 * ((index + 0.5) / len(curves) - 0.5)
+            errors = {"yerr": _interval(curve)}
+            if path is not None:
+                at, errors["xerr"] = path[method]["value"], _interval(path[method])
+            axes.errorbar(at, curve["value"], elinewidth=0.9, label=method, **errors, **look)
+        axes.set(ylabel=label, xlabel="path over the floor [m]" if path else "views")
+        axes.set_ylim(None, min(1.0, axes.get_ylim()[1]))
+        axes.xaxis.get_major_locator().set_params(integer=path is None)
+        figure.legend(loc="outside right center")
+
+    return plot
 
 
-def _draw_rows(
-    figure: Any, *, looks: Looks, curves: Curves, label: str, zero: bool = False, scale: str = "linear"
-) -> None:
-    """A panel for each of the last views a table has, a row for each curve."""
-    views = told_views(view for curve in curves.values() for view in curve.index)
-    views = [view for view in views if view > 1][-4:] or [1]
-    panels = np.atleast_1d(figure.subplots(1, len(views), sharex=True, sharey=True))
-    for panel, view in zip(panels, views, strict=True):
-        for y, (name, curve) in enumerate(curves.items()):
-            row = curve[curve.index == view]
-            pale = zero and bool(((row["low"] <= 0.0) & (row["high"] >= 0.0)).any())
-            panel.errorbar(
-                row["value"], [y] * len(row), xerr=_interval(row), elinewidth=0.9, alpha=0.4 if pale else 1.0,
-                **looks[name],
-            )  # fmt: skip
-        if zero:
-            panel.axvline(0.0, color="#5d666f", linewidth=0.9, zorder=1)
-        if len(views) > 1:
+def _rows(curves: Curves, label: str, *, zero: bool = False) -> Callable[[Any], None]:
+    """Plots a panel for each of the last views a table has, a row for each curve."""
+
+    def plot(figure: Any) -> None:
+        last = max(curve.index.max() for curve in curves.values())
+        views = sorted({view for view in (2, 3, 5, 10, last) if view <= last})[-4:]
+        panels = figure.subplots(1, len(views), sharex=True, sharey=True, squeeze=False)[0]
+        for panel, view in zip(panels, views, strict=True):
+            for y, curve in enumerate(curves.values()):
+                row = curve[curve.index == view]
+                pale = zero and bool(((row["low"] <= 0.0) & (row["high"] >= 0.0)).any())
+                look = {"marker": "o", "elinewidth": 0.9, "alpha": 0.4 if pale else 1.0}
+                panel.errorbar(row["value"], [y] * len(row), xerr=_interval(row), color=COLOURS[0], **look)
+            if zero:
+                panel.axvline(0.0, color="#5d666f", linewidth=0.9, zorder=1)
             panel.set_title(f"view {view:.0f}", fontsize=9.0)
-    panels[0].set(xscale=scale, ylim=(len(curves) - 0.5, -0.5))
-    panels[0].set_yticks(range(len(curves)), list(curves))
-    figure.supxlabel(label, fontsize=9.0)
+        panels[0].set(ylim=(len(curves) - 0.5, -0.5))
+        panels[0].set_yticks(range(len(curves)), list(curves))
+        figure.supxlabel(label, fontsize=9.0)
+
+    return plot
 
 
 def _interval(curve: pd.DataFrame) -> Any:

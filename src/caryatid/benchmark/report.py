@@ -8,22 +8,12 @@ import io
 import json
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from caryatid.benchmark.figures import (
-    Figure,
-    curves_of,
-    draw_conditions,
-    draw_group,
-    is_removal,
-    looks_of,
-    told_views,
-)
+from caryatid.benchmark.figures import Figure, curves_of, draw_conditions, draw_group, told_views
 from caryatid.benchmark.statistics import CONFIG, summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES
@@ -32,23 +22,28 @@ from caryatid.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
 
-NONE = "–"
-"""Where there is no figure."""
+Column = tuple[str, float]
+"""A quantity of the summary and where it is taken."""
 BY_VIEW = {"f1": "F1", "edge_f1": "F1 of edges", "mean_iou": "Mean IoU", "path": "Path [m]"}
 REMOVAL = {"unharmed": "Scenes taken apart without harm", "lifts": "Lifts without harm"}
 """Measures with a column for each view, and their headings."""
+COUNTS = {("scenes", 0.0): "scenes", ("episodes", 0.0): "episodes", ("failed", 0.0): "failed"}
+PAIRED = {("paired scenes", 0.0): "scenes", ("paired episodes", 0.0): "episodes"}
 TO_THRESHOLD = {
     "share": "episodes that reach it",
     "median views": "median views",
     "median path": "median path [m]",
-    "mean views": "views, mean curve",
     "mean path": "path, mean curve [m]",
-    "path ratio": "… by that of {}",
+    "path ratio": "… by that of the reference",
 }
 """Quantities of a threshold of F1, and their headings."""
-DIGITS = {"median views": 0, "mean views": 0} | dict.fromkeys(
-    ("path", "median path", "mean path", "path ratio", "gap"), 2
-)
+TIMES = {
+    (kind, quantile): f"{kind}, {100.0 * quantile:g} %"
+    for kind in ("planning", "perception")
+    for quantile in (0.025, 0.5, 0.975)
+}
+DIGITS = dict.fromkeys(("path", "median path", "mean path", "path ratio", "gap"), 2)
+DIGITS |= dict.fromkeys(("median views", *(name for name, _ in (*COUNTS, *PAIRED))), 0)
 """Digits after the point of quantities that have not three."""
 NOTES = (
     "Means are over scenes; the seeds of a scene are averaged first. In brackets: the {confidence:g} % "
@@ -108,9 +103,7 @@ class SuiteResult:
         """Mean F1 after each view of each method under each condition."""
         whole = self.summary[self.summary["family"] == ""]
         return {
-            str(condition): {
-                method: curve["value"].tolist() for method, curve in curves_of(rows, "f1").items()
-            }
+            str(condition): {name: own["value"].tolist() for name, own in curves_of(rows, "f1").items()}
             for condition, rows in whole.groupby("condition", sort=False)
         }
 
@@ -129,16 +122,22 @@ def summarise_store(store: ResultStore, reference: str | None = None) -> list[Su
     check_reference(reference, {m: None for table in tables.values() for m in table["method"]})
     results = []
     for name, table in tables.items():
-        if not len(table):
+        if table.empty:
             continue
         known, methods = SUITES.get(name), set(table["method"])
         wanted = (reference, known.reference if known else None, table["method"].iloc[0])
         chosen = str(next(method for method in wanted if method in methods))
-        gap = known.gap if known and known.gap and methods.issuperset(known.gap) else None
         failed = table[table["error"].notna()]
-        short = failed["scene"].map(lambda scene: Path(scene).name)
-        error = [e.replace(s, n) for e, s, n in zip(failed["error"], failed["scene"], short, strict=True)]
-        failures = failed.assign(scene=short, error=error, seed=failed["seed"].astype(str))
+        failures = [
+            [
+                row.method,
+                row.condition,
+                Path(row.scene).name,
+                str(row.seed),
+                row.error.replace(row.scene, Path(row.scene).name),
+            ]
+            for row in failed.itertuples()
+        ]
         results.append(
             SuiteResult(
                 name,
@@ -147,8 +146,8 @@ def summarise_store(store: ResultStore, reference: str | None = None) -> list[Su
                 episodes=len(table[["method", "condition", "scene", "seed"]].drop_duplicates()),
                 scenes=table["scene"].nunique(),
                 seeds=table["seed"].nunique(),
-                failures=failures[["method", "condition", "scene", "seed", "error"]].to_numpy().tolist(),
-                summary=summarise(table, reference=chosen, gap=gap),
+                failures=failures,
+                summary=summarise(table, reference=chosen, gap=known.gap if known else None),
             )
         )
     return results
@@ -212,17 +211,16 @@ def write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: Pa
 
     def keep(suite: str, figure: Figure) -> str:
         (folder / suite).mkdir(exist_ok=True)
-        figure.save(folder / suite / f"{figure.name}.png")
-        figure.save(folder / suite / f"{figure.name}.svg")
-        return f"{suite}/{figure.name}.svg"
-
-    def inline(source: re.Match[str]) -> str:
-        return f"data:image/svg+xml;base64,{base64.b64encode((folder / source[0]).read_bytes()).decode()}"
+        file = folder / suite / f"{figure.name}.svg"
+        figure.save(file.with_name(f"{figure.name}.png"))
+        figure.save(file)
+        return f"data:image/svg+xml;base64,{base64.b64encode(file.read_bytes()).decode()}"
 
     reader = MarkdownIt("commonmark", {"html": False}).enable("table")
-    body = re.sub(r'(?<= src=")[^"]+', inline, reader.render(_markdown(results, about, command, keep)))
+    reader.validateLink = lambda url: url.startswith("data:image/svg+xml;")  # type: ignore[method-assign]
     page = folder / "index.html"
-    page.write_text(PAGE.format(body=body), encoding="utf-8")
+    text = reader.render(_markdown(results, about, command, keep))
+    page.write_text(PAGE.format(body=text), encoding="utf-8")
     return page
 
 
@@ -245,121 +243,95 @@ def _markdown(
     blocks = ["# Benchmark"]
     blocks.append(f"Run by {_plain(describe_provenance(about))}. This page is generated by `{command}`.")
     for result in results:
-        for block in _blocks(result):
+        for block in _suite(result):
             if isinstance(block, Figure):
-                file, caption = keep(result.name, block), _plain(block.caption)
-                block = f"![{_plain(block.title)}]({file})\n\n*{caption}*"
+                caption = _plain(block.caption)
+                block = f"![{caption}]({keep(result.name, block)})\n\n*{caption}*"
             blocks.append(block)
     blocks.append("## How to read it")
     blocks += [n.format(confidence=100.0 * CONFIG.confidence, resamples=CONFIG.resamples) for n in NOTES]
     return "\n\n".join(blocks) + "\n"
 
 
-@lru_cache(maxsize=16)
-def _blocks(result: SuiteResult) -> tuple[str | Figure, ...]:
-    """What the report shows of a suite, drawn once for the page and the document."""
-    return tuple(_suite(result))
-
-
 def _suite(result: SuiteResult) -> Iterator[str | Figure]:
     """What the report shows of a suite, from top to bottom."""
     known, summary = SUITES.get(result.name), result.summary
-    methods, conditions = list(summary["method"].unique()), list(summary["condition"].unique())
-    looks = looks_of(methods)
+    conditions = summary["condition"].nunique()
+    removal = bool((summary["value"][summary["quantity"] == "lifts"] > 0.0).any())
+    measures = REMOVAL if removal else BY_VIEW
+    main, heading = next(iter(measures.items()))
     yield f"## {_plain(result.name)}"
     failed = f"{len(result.failures)} failed" if result.failures else "none failed"
     yield _plain(
         f"{known.what if known else ''} {_count(result.episodes, 'episode')} of "
-        f"{_count(len(methods), 'method')} in {_count(result.scenes, 'scene')} with "
+        f"{_count(summary['method'].nunique(), 'method')} in {_count(result.scenes, 'scene')} with "
         f"{_count(result.seeds, 'seed')}; {failed}."
     )
     if result.planned > result.episodes:
         missing = _count(result.planned - result.episodes, "episode")
         yield f"Not finished: {missing} of {result.planned:,} to be run."
-    if len(conditions) > 1:
-        yield draw_conditions(summary, looks)
+    if conditions > 1:
+        yield draw_conditions(summary, main, heading)
     for (condition, family), group in summary.groupby(["condition", "family"], sort=False):
+        if family and conditions > 1:
+            continue
         only = f", {family} scenes only" if family else ""
         yield f"### {_plain(f'{result.name}: {condition}{only}')}"
-        if len(conditions) < 2:
-            scenes = max(group["value"][group["quantity"] == "scenes"], default=0)
-            counted = _count(int(scenes), f"{family} scene".strip())
-            yield from draw_group(group, family, counted, result.reference, looks)
-        if not family or len(conditions) < 2:
-            yield from _tables(group, result.reference, brief=bool(family) or len(conditions) > 1)
+        if conditions == 1:
+            yield from draw_group(group, main, heading, result.reference)
+        shown = {main: heading} if family or conditions > 1 else measures
+        yield from _tables(group, shown, result.reference)
     if result.failures:
-        head = ["method", "condition", "scene", "seed", "error"]
-        yield _table("Failed episodes", import_pandas().DataFrame(result.failures, columns=head))
+        yield _table("Failed episodes", ("method", "condition", "scene", "seed", "error"), result.failures)
 
 
-def _tables(group: pd.DataFrame, reference: str, *, brief: bool) -> Iterator[str]:
+def _tables(group: pd.DataFrame, measures: Mapping[str, str], reference: str) -> Iterator[str]:
     """Tables of the methods under one condition, each a part of the summary."""
-    figures = group[["quantity", "value", "low", "high"]].itertuples(index=False)
-    group = group.assign(text=[_text(*figure) for figure in figures])
-    measures = REMOVAL if is_removal(group) else {"f1": BY_VIEW["f1"]} if brief else BY_VIEW
-    for measure, heading in measures.items():
-        title = f"{heading}: mean and interval after so many views"
-        yield from _by_view(group, measure, title, ("scenes", "episodes", "failed"))
+    cells: dict[str, dict[Column, str]] = {}
+    for row in group.itertuples():
+        text = _text(row.quantity, row.value, row.low, row.high)
+        cells.setdefault(row.method, {})[row.quantity, row.at] = text
+
     main = next(iter(measures))
+
+    def by_view(quantity: str) -> dict[Column, str]:
+        return {(quantity, view): f"view {view:.0f}" for view in told_views(group, main)}
+
+    tables: dict[str, Mapping[Column, str]] = {
+        f"{heading}: mean and interval after so many views": by_view(measure) | COUNTS
+        for measure, heading in measures.items()
+    }
     title = f"{measures[main]} minus that of {reference}, paired"
-    yield from _by_view(group, f"{main} difference", title, ("paired scenes", "paired episodes"), least=2)
-    yield from _by_view(group, "gap", "Share of the gap that is closed")
-    methods = list(curves_of(group, "f1"))
-    if main not in BY_VIEW or not methods:
-        return
-    reached = group[group["quantity"].isin(TO_THRESHOLD)].pivot(
-        index=["at", "method"], columns="quantity", values="text"
-    )
-    if order := list(product(sorted(reached.index.unique("at"), reverse=True), methods)):
-        reached = reached.reindex(index=order, columns=list(TO_THRESHOLD))
-        reached = reached.rename(columns=lambda quantity: TO_THRESHOLD[quantity].format(reference))
-        reached.insert(0, "F1", [f"{at:.2f}" for at, _ in order])
-        yield _table("Until F1 reaches a threshold", reached.droplevel("at").reset_index())
-    kinds = ("planning", "perception")
-    parts = group[group["quantity"].isin(("area", *kinds))].pivot(
-        index="method", columns=["quantity", "at"], values="text"
-    )
-    wanted = [("area", 0.0), *product(kinds, (0.025, 0.5, 0.975))]
-    parts = parts.reindex(index=methods, columns=wanted).astype("string").fillna(NONE)
-    budget = max(group["value"][group["quantity"] == "budget"], default=0.0)
-    cells = {"method": methods, f"F1 along the path, over {budget:.2f} m": parts["area", 0.0]}
-    for kind in kinds:
-        cells[f"{kind}, median"] = parts[kind, 0.5]
-        cells[f"{kind}, middle 95 %"] = parts[kind, 0.025] + " – " + parts[kind, 0.975]
-    title = "F1 along the path, and time to choose a view (planning) and to see one (perception)"
-    yield _table(title, import_pandas().DataFrame(cells))
+    tables[title] = by_view(f"{main} difference") | PAIRED
+    tables["Share of the gap that is closed"] = by_view("gap")
+    if main == "f1":
+        for at in sorted(group["at"][group["quantity"] == "share"].unique(), reverse=True):
+            tables[f"Until F1 reaches {at:.2f}"] = {(name, at): text for name, text in TO_THRESHOLD.items()}
+        budget = max(group["value"][group["quantity"] == "budget"], default=0.0)
+        title = f"F1 along the path, over {budget:.2f} m; quantiles of the times to choose and to see a view"
+        tables[title] = {("area", 0.0): "F1 along the path"} | TIMES
+    for title, columns in tables.items():
+        first = next(iter(columns), None)
+        used = [column for column in columns if any(column in own for own in cells.values())]
+        lines = [
+            [method, *(own.get(column, "–") for column in used)]
+            for method, own in cells.items()
+            if first in own
+        ]
+        if lines:
+            yield _table(title, ("method", *(columns[column] for column in used)), lines)
 
 
-def _by_view(
-    group: pd.DataFrame, quantity: str, title: str, counted: Sequence[str] = (), least: int = 1
-) -> Iterator[str]:
-    """A table of a quantity with a column for each view from the least on, if any method has it."""
-    rows = group[group["quantity"] == quantity]
-    if rows.empty:
-        return
-    methods = list(rows["method"].unique())
-    views = [view for view in told_views(rows["at"]) if view >= least] or [1]
-    cells = rows.pivot(index="method", columns="at", values="text").reindex(index=methods, columns=views)
-    cells = cells.rename(columns=lambda view: f"view {view:.0f}")
-    if counted:
-        counts = group[group["quantity"].isin(counted)].pivot(
-            index="method", columns="quantity", values="value"
-        )
-        name = " / ".join(name.removeprefix("paired ") for name in counted)
-        cells[name] = [" / ".join(f"{n:.0f}" for n in counts.loc[m, list(counted)]) for m in methods]
-    yield _table(title, cells.reset_index())
-
-
-def _table(title: str, cells: pd.DataFrame) -> str:
-    lines = [cells.columns, ["---"] * cells.shape[1], *cells.astype("string").fillna(NONE).to_numpy()]
-    rows = ["| " + " | ".join(_plain(str(cell)) for cell in line) + " |" for line in lines]
+def _table(title: str, head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    rows = ["| " + " | ".join(_plain(cell) for cell in line) + " |" for line in (head, *lines)]
+    rows.insert(1, "| --- " * len(head) + "|")
     return "\n".join([f"**{_plain(title)}.**", "", *rows])
 
 
 def _text(quantity: str, value: float, low: float, high: float) -> str:
     """A figure with its interval, in the digits of its quantity; bold is a difference that is not 0."""
     if quantity in ("planning", "perception"):
-        return _time(value)
+        return f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"
     if quantity == "share":
         return f"{100.0 * value:.0f} %"
     digits, sign = DIGITS.get(quantity, 3), "+" if quantity.endswith(" difference") else ""
@@ -371,19 +343,11 @@ def _text(quantity: str, value: float, low: float, high: float) -> str:
         return text.replace("-", "−") if float(text) else text.lstrip("+-")
 
     if math.isnan(value):
-        return NONE
+        return "–"
     if math.isnan(low) or math.isinf(low):
         return number(value)
     text = f"{number(value)} [{number(low)}, {number(high)}]"
     return f"**{text}**" if sign and (low > 0.0 or high < 0.0) else text
-
-
-def _time(seconds: float) -> str:
-    """A time in the unit it is best read in, with three digits."""
-    for size, unit in ((1.0, "s"), (1e-3, "ms")):
-        if seconds >= 0.9995 * size:
-            return f"{seconds / size:#.3g} {unit}".replace(". ", " ")
-    return f"{1e6 * seconds:.0f} µs"
 
 
 def _count(number: int, one: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -16,7 +16,6 @@ from concurrent.futures import (
     as_completed,
     wait,
 )
-from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing import active_children, get_context, parent_process
 from threading import Lock, Thread
@@ -32,10 +31,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
 Outcomes = Generator[tuple[Episode, Outcome]]
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Set to 1 in the environment of the processes, unless set already: they share the cores."""
-PATIENCE = 10.0
-"""How long a scheduler may take to answer [s]."""
 
 _one_at_a_time = Lock()
 
@@ -46,51 +41,45 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
     Raises:
         CaryatidError: A process was killed.
     """
-    others, killed = set(active_children()), False
+    others = set(active_children())
     pool = ProcessPoolExecutor(min(jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent)
     try:
-        with _one_thread_each(), interrupts_held():
-            futures = {pool.submit(run_episode, e): e for e in episodes}
+        with interrupts_held():
+            futures = {pool.submit(run_on_worker, episode, fingerprint()): episode for episode in episodes}
         for future in as_completed(futures):
-            if isinstance(future.exception(), BrokenExecutor):
-                killed = True
-            else:
-                yield futures.pop(future), future.result()
+            yield futures.pop(future), future.result()
+    except BrokenExecutor:
+        raise CaryatidError(
+            "a process was killed, perhaps for want of memory; what is done is kept: "
+            "start again, with fewer --jobs"
+        ) from None
     except BaseException:
         for process in set(active_children()) - others:
             process.terminate()
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-    if killed:
-        raise CaryatidError(
-            "a process was killed, perhaps for want of memory; what is done is kept: "
-            "start again, with fewer --jobs"
-        )
 
 
 def run_on_cluster(
     episodes: Sequence[Episode],
     address: str,
     tell: Callable[[str], None] = lambda text: None,
-    patience: float = PATIENCE,
+    patience: float = 10.0,
 ) -> Outcomes:
-    """Run episodes on a cluster; those whose worker dies are run again on another.
+    """Run episodes on a scheduler's workers; yield each with its outcome as soon as it is done.
 
     Args:
-        episodes: What to run; scene folders must be readable on the workers.
-        address: Of the scheduler, say `tcp://10.0.0.5:8786`.
-        tell: Called with what the user should know while waiting.
+        episodes: What to run.
+        address: Of the scheduler.
+        tell: Is given a line when there is nobody to work.
         patience: How long the scheduler may take to answer [s].
 
     Raises:
-        InputError: dask.distributed is not installed, or no scheduler answers.
-        CaryatidError: A worker runs other code than this process, or the scheduler is gone.
+        InputError: No scheduler answers.
+        CaryatidError: It is gone, or a worker has other code.
     """
     with connect(address, patience) as client:
-        for worker, code in client.run(fingerprint, on_error="return").items():
-            if code != fingerprint() and not isinstance(code, OSError):
-                raise _other_code(f"worker {worker}", str(code))
         pool = client.get_executor(pure=False)
         futures = {pool.submit(run_on_worker, _absolute(e), fingerprint()): e for e in episodes}
         waiting, told = set(futures), False
@@ -102,8 +91,8 @@ def run_on_cluster(
                 tell(f"no workers; waiting for some: dask worker {address} --nthreads 1 --nworkers N")
 
 
-def connect(address: str, patience: float = PATIENCE) -> Client:
-    """Connect to a scheduler of dask.distributed.
+def connect(address: str, patience: float = 10.0) -> Client:
+    """Connect to a scheduler of dask.distributed that answers within a time [s].
 
     Raises:
         InputError: dask.distributed is not installed, or no scheduler answers.
@@ -136,7 +125,7 @@ def connect(address: str, patience: float = PATIENCE) -> Client:
 
 
 def run_on_worker(episode: Episode, code: str) -> Outcome:
-    """Run an episode on a worker, one at a time and on one thread, however many threads the worker has.
+    """Run an episode in a process of a pool or cluster, one at a time and on one thread.
 
     Args:
         episode: What to run; a scene folder must be readable here.
@@ -194,18 +183,6 @@ def _other_code(worker: str, found: str) -> CaryatidError:
 def _absolute(episode: Episode) -> Episode:
     """The episode with the full path of its scene folder: workers have other current folders."""
     return replace(episode, scene=os.path.abspath(episode.scene)) if episode.content else episode
-
-
-@contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Have processes started meanwhile compute on one thread; this process keeps its own."""
-    added = [name for name in THREADS if name not in os.environ]
-    os.environ.update(dict.fromkeys(added, "1"))
-    try:
-        yield
-    finally:
-        for name in added:
-            del os.environ[name]
 
 
 def _end_with_parent() -> None:

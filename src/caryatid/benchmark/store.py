@@ -9,7 +9,6 @@ import re
 import subprocess
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -19,6 +18,7 @@ from filelock import FileLock, Timeout
 
 from caryatid.benchmark.episodes import MEASURES, Episode, Outcome
 from caryatid.errors import InputError
+from caryatid.runtime.fingerprint import LIBRARIES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 RESULTS = "results.jsonl"
 """Name of the result file in the folder of a benchmark."""
 FORMAT = "3"
-LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx")
-"""Libraries whose versions figures may depend on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,17 +68,13 @@ class ResultStore:
             if fingerprint is not None:
                 self._begin({**(about or {}), "format": FORMAT, "fingerprint": fingerprint})
         except BaseException:
-            self.close()
+            self.__exit__()
             raise
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the file and let others write."""
         if self._file is not None:
             self._file.close()
         self._lock.release()
@@ -99,9 +93,9 @@ class ResultStore:
         if self.suites.get(suite) != list(members):
             self._append({"suite": suite, "members": [asdict(m) for m in members]})
             self.suites[suite] = list(members)
+        known = {key for key, outcome in self.outcomes.items() if outcome.error is None or not retry}
         wanted = {self._key(m.episode): m.episode for m in members}
-        failed = {key for key, outcome in self.outcomes.items() if retry and outcome.error is not None}
-        return [episode for key, episode in wanted.items() if key not in self.outcomes or key in failed]
+        return [episode for key, episode in wanted.items() if key not in known]
 
     def add(self, episode: Episode, outcome: Outcome) -> None:
         """Append what an episode gave; a success that is there already stays."""
@@ -115,18 +109,15 @@ class ResultStore:
         Raises:
             InputError: pandas is not installed.
         """
-        pandas = import_pandas()
         rows: list[dict[str, Any]] = []
         for member in self.suites.get(suite, ()):
-            outcome = self.outcomes.get(self._key(member.episode))
-            if outcome is None:
-                continue
-            known: dict[str, Any] = {n: getattr(member, n) for n in ("method", "condition", "family")}
-            known |= asdict(member.episode)
-            known["settings"] = json.dumps(member.episode.settings, ensure_ascii=False)
-            rows += [known | row | {"error": outcome.error} for row in outcome.rows or ({},)]
+            if outcome := self.outcomes.get(self._key(member.episode)):
+                known = asdict(member)
+                known |= known.pop("episode") | {"error": outcome.error}
+                known["settings"] = json.dumps(member.episode.settings, ensure_ascii=False)
+                rows += [known | row for row in outcome.rows or ({},)]
         columns = ["method", "condition", "family", *Episode.__slots__, "view", *MEASURES, "error"]
-        table = pandas.DataFrame(rows, columns=columns)
+        table = import_pandas().DataFrame(rows, columns=columns)
         return table.astype({"view": "Int64", "error": "string", **dict.fromkeys(MEASURES, "float64")})
 
     def _key(self, episode: Episode) -> str:
@@ -163,7 +154,7 @@ class ResultStore:
             if not whole and (self._file is None or not b'{"about"'.startswith(content[:8])):
                 raise ValueError
         except (ValueError, KeyError, TypeError):
-            raise InputError(self.path, "is no result file", "choose another folder") from None
+            raise InputError(self.path, "is not a result file", "choose another folder") from None
         if self._file is not None and len(whole) < len(content):
             self._file.truncate(len(whole))
 
@@ -205,13 +196,13 @@ def import_pandas() -> Any:
 def collect_provenance() -> dict[str, str]:
     """Which code on which machine: version, commit, libraries, processor; nothing of who ran it or where."""
     package = Path(__file__).parents[1]
-    commit = _git(package, "rev-parse", "HEAD") if _git(package, "ls-files", "__init__.py") else ""
+    tracked = _git(package, "ls-files", "__init__.py")
     processors = Path("/proc/cpuinfo")
     model = processors.is_file() and re.search(r"model name\s*:\s*(.*)", processors.read_text("utf-8"))
     return {
         "version": version("caryatid"),
-        "commit": commit or "unknown",
-        "dirty": str(bool(commit and _git(package, "status", "--porcelain", "--", "."))),
+        "commit": (tracked and _git(package, "rev-parse", "HEAD")) or "unknown",
+        "dirty": str(bool(tracked and _git(package, "status", "--porcelain", "--", "."))),
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
         "processor": " ".join(model[1].split()) if model else platform.processor() or "unknown",
@@ -236,9 +227,9 @@ def _member(episode: dict[str, Any], **about: str) -> Member:
 
 def _git(folder: Path, *arguments: str) -> str:
     """What git says; nothing where there is no git or it refuses."""
-    command = ["git", "-C", str(folder), *arguments]
-    with suppress(OSError, subprocess.SubprocessError):
+    try:
         return subprocess.run(
-            command, capture_output=True, text=True, timeout=30.0, check=True
+            ["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=30.0, check=True
         ).stdout.strip()
-    return ""
+    except (OSError, subprocess.SubprocessError):
+        return ""

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import CaryatidError, InputError
 from caryatid.evaluation.scores import TrueScene, score
-from caryatid.evaluation.truths import SEED
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text
@@ -24,9 +23,6 @@ from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.scene import Scene
 from caryatid.sensing.views import Camera, View
 from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
-
-EQUAL = 1e-9
-"""Scores nearer than this are the same [1]; they are ratios of small whole numbers."""
 
 SURFACE_CELL = 0.01
 """Edge of the cells ground-truth surface is counted in [m]; that of a voxel of the map."""
@@ -102,11 +98,12 @@ class OraclePlanner:
         # Best tie first: then the first of the highest F1 is the one to take, and nothing beats F1 = 1.
         order = np.lexsort((tried, candidates.path_length[tried], -unseen))
         best, reached = int(order[0]), -1.0
+        equal = 1e-9  # scores are ratios of small whole numbers
         for k in order:
             f1 = self._f1_after(candidates.T_world_camera[tried[k]])
-            if f1 > reached + EQUAL:
+            if f1 > reached + equal:
                 best, reached = int(k), f1
-            if reached > 1.0 - EQUAL:
+            if reached > 1.0 - equal:
                 break
         index = int(tried[best])
         cost = float(path_cost(state)[index])
@@ -139,7 +136,7 @@ class OraclePlanner:
         return self._f1(graph)
 
     def _f1(self, graph: SupportGraph) -> float:
-        return score(graph, self._truth, np.random.default_rng(SEED), self._config.evaluation).f1
+        return score(graph, self._truth, config=self._config.evaluation).f1
 
     def _unseen_surface(self, T_world_camera: Array) -> int:
         """Cells of true surface that come into sight from there."""

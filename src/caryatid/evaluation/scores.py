@@ -99,7 +99,7 @@ class Score:
 def score(
     found: SupportGraph | TrueScene,
     truth: TrueScene,
-    rng: np.random.Generator,
+    rng: np.random.Generator | None = None,
     config: EvaluationConfig | None = None,
 ) -> Score:
     """Score a graph of fitted shapes, or a scene of solids, against true solids; the truth itself scores 1.
@@ -110,12 +110,12 @@ def score(
     Args:
         found: The extracted graph, in the world frame of the truth.
         truth: The true scene.
-        rng: Draws the points volumes are measured with.
+        rng: Draws the points volumes are measured with; None draws the same ones every time.
         config: Least IoU, tolerance of the table's height, points a pair.
     """
     config = config or EvaluationConfig()
     found = as_scene(found) if isinstance(found, SupportGraph) else found
-    iou = volume_ious(found.objects, truth.objects, config.samples, rng)
+    iou = volume_ious(found.objects, truth.objects, config.samples, rng or np.random.default_rng(0))
     names, true_names = [o.name for o in found.objects], [o.name for o in truth.objects]
     matches, ious = _matched(iou, names, true_names, config.min_iou)
     tops = [t.table_top for t in (found, truth) if t.table_top is not None]

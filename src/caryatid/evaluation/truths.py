@@ -18,9 +18,6 @@ from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import GroundTruth, read_truth
 from caryatid.simulation.world import SimulatedScene
 
-SEED = 0
-"""Seed of the points volumes are measured with, the same for every evaluation so that it can be repeated."""
-
 
 @dataclass(frozen=True, slots=True)
 class ViewScore:
@@ -93,7 +90,7 @@ def evaluate_run(
         raise InputError(folder, "is no folder", "give a scene folder or a recording with gt.json")
     if (folder / "scene.xml").is_file():
         scene = read_true_scene(folder)
-        scores = [score(view.graph, scene, np.random.default_rng(SEED), config) for view in run.views]
+        scores = [score(view.graph, scene, config=config) for view in run.views]
     elif (folder / "scene_camera.json").is_file():
         truth, recording = read_truth(folder / "gt.json"), read_recording(folder)
         # A recording of one frame needs no names.

@@ -14,7 +14,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import View
-from caryatid.simulation.world import INVISIBLE_GROUP, SimulatedScene
+from caryatid.simulation.world import SimulatedScene
 
 
 def axial_sigma(depth: Array, config: NoiseConfig) -> Array:
@@ -182,8 +182,7 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
     geoms = np.empty(lengths.size, dtype=np.int32)
     depth = np.empty(lengths.size)
     normals_world = np.empty((lengths.size, 3))
-    visible = np.ones(6, dtype=np.uint8)  # MuJoCo has six groups of geoms
-    visible[INVISIBLE_GROUP] = 0
+    visible = np.array([1, 1, 1, 0, 1, 1], dtype=np.uint8)  # of MuJoCo's six groups, the fourth only collides
     mujoco.mj_multiRay(
         scene.model, scene.data, T_world_camera[:3, 3], rays_world.ravel(), visible, 1, -1, geoms, depth,
         normals_world.reshape(-1), lengths.size, sensor.far * float(lengths.max()),

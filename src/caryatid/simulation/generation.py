@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Literal
 
 import mujoco
 import numpy as np
@@ -34,29 +34,19 @@ SIZES: dict[GeneratedKind, tuple[int, int]] = {"pile": (1, 25), "dense": (10, 25
 """Kind of a scene → fewest and most objects, the screens of a dense one among them."""
 GAP = 0.002
 """Height over what is below from which an object is let go [m]."""
-PACKED_GAP = 0.0005
-"""Gap between objects of a packed scene before they settle [m]; far below what a camera can see."""
 TRIES = 10
-"""Times an object is set down anew while it falls off, rolls away or upsets others; then the one before
-it is taken up again as well."""
-DOWN = np.array([[0.0, 0.0, -1.0]])
-AXES = np.eye(3)
-"""Straight down (1, 3), and the world's axes (3, 3)."""
+"""Times an object is set down again while it falls off, rolls away or upsets others; then the one before it
+is taken up again as well."""
 
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Drop:
-    """A solid where it is let go, and whether it is meant to stay on another one."""
-
-    solid: Solid
-    stacked: bool = False
+_Drop = tuple[Solid, bool]
+"""A solid where it is let go, and whether it is meant to stay on another one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Plan:
-    """How a scene is set up: table [m] and walls, solids from the start, and what draws each further one."""
+    """How a scene is set up: what draws each object, solids from the start, size of the table [m], walls."""
 
-    draw: Callable[[np.random.Generator, SimulatedScene | None], _Drop]
+    draw: Callable[[SimulatedScene | None], _Drop]
     screens: tuple[Solid, ...] = ()
     table: tuple[float, float] = TABLE_SIZE
     walls: tuple[Side, ...] = ()
@@ -87,18 +77,18 @@ def generate(
         raise InputError(name, f"seed {seed} is negative", "give 0 or more")
     rng = np.random.default_rng([list(SIZES).index(kind), size, seed])
     plan = {"pile": _pile, "dense": _dense, "packed": _packed}[kind](rng, size)
-    return _set_down(name, size, plan, rng, physics or PhysicsConfig())
+    return _set_down(name, size, plan, physics or PhysicsConfig())
 
 
 def _pile(rng: np.random.Generator, size: int) -> _Plan:
     """Seven in ten objects are set down on another one, the others anywhere on the table."""
 
-    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
+    def draw(scene: SimulatedScene | None) -> _Drop:
         shape = _upright(rng)
         if scene is None or rng.random() >= 0.7:
             half = np.array(TABLE_SIZE) / 2.0 - 0.06
-            return _Drop(_let_go(shape, rng.uniform(-half, half), scene))
-        return _on_another(rng, shape, scene)
+            return _let_go(shape, rng.uniform(-half, half), scene), False
+        return _on_another(rng, shape, scene), True
 
     return _Plan(draw)
 
@@ -111,18 +101,14 @@ def _dense(rng: np.random.Generator, size: int) -> _Plan:
     count = int(rng.integers(1, 3))
     walls = tuple(sides[i] for i in sorted(rng.choice(3, size=count, replace=False)))
 
-    def somewhere(rng: np.random.Generator, shape: Shape, scene: SimulatedScene | None) -> Solid:
-        r, azimuth = radius * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
-        return _let_go(shape, np.array([r * np.cos(azimuth), r * np.sin(azimuth)]), scene)
-
-    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
+    def draw(scene: SimulatedScene | None) -> _Drop:
         shape = _shape(rng, transforms.random_rotation(rng)) if rng.random() < 0.3 else _upright(rng)
-        solid = somewhere(rng, shape, scene)
-        for _ in range(TRIES):
+        for _ in range(TRIES + 1):
+            r, azimuth = radius * np.sqrt(rng.random()), rng.uniform(-np.pi, np.pi)
+            solid = _let_go(shape, np.array([r * np.cos(azimuth), r * np.sin(azimuth)]), scene)
             if not any(_overlap(solid.shape, screen.shape) for screen in screens):
                 break
-            solid = somewhere(rng, shape, scene)
-        return _Drop(solid)
+        return solid, False
 
     return _Plan(draw, tuple(screens), (0.7, 1.0), walls)
 
@@ -131,56 +117,52 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
     """Half of the objects are parallel, so that faces touch; three in ten are set down on another one."""
     turn = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
 
-    def draw(rng: np.random.Generator, scene: SimulatedScene | None) -> _Drop:
+    def draw(scene: SimulatedScene | None) -> _Drop:
         shape = _upright(rng)
         if rng.random() < 0.5:
             shape = _turned(shape, turn)
         if scene is None:
-            return _Drop(_let_go(shape, np.zeros(2), scene))
+            return _let_go(shape, np.zeros(2), scene), False
         if rng.random() < 0.3:
-            return _on_another(rng, shape, scene)
+            return _on_another(rng, shape, scene), True
         azimuth = rng.uniform(-np.pi, np.pi)
         outward_world = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        return _Drop(Solid(_pushed(shape, outward_world, list(true_shapes(scene).values()))))
+        return Solid(_pushed(shape, outward_world, list(true_shapes(scene).values()))), False
 
     return _Plan(draw)
 
 
-def _set_down(
-    name: str, size: int, plan: _Plan, rng: np.random.Generator, physics: PhysicsConfig
-) -> SimulatedScene:
+def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> SimulatedScene:
     """Let solids go one after the other, each when all are at rest; what goes wrong is tried again.
 
     Screens must not be upset; where there are none, no earlier object must be. Where nothing can be set down
     any more, the last solid is taken up again too; after 40 drops for each object the scene is given up.
     """
+
+    def build(solids: Sequence[Solid], config: PhysicsConfig = physics, least: float = 0.0) -> SimulatedScene:
+        spec = build_spec(solids, name, plan.table, plan.walls)
+        return scene_from_spec(spec, name, name, config, least=least)
+
     # An object that has not come to rest after two seconds is set down again.
     impatient = replace(physics, settle_time=2.0)
-
-    def settled(solids: Sequence[Solid]) -> SimulatedScene | None:
-        return scene_from_spec(spec_of(solids), name, name, physics) if solids else None
-
-    def spec_of(solids: Sequence[Solid]) -> Any:
-        return build_spec(solids, name, plan.table, plan.walls)
-
     solids, failures = list(plan.screens), 0
     fixed = len(solids)
-    below = settled(solids)
+    below = build(solids) if solids else None
     for _ in range(40 * size):
         if len(solids) == size:
-            return scene_from_spec(spec_of(solids), name, name, physics)
-        drop = plan.draw(rng, below)
-        tried = scene_from_spec(spec_of([*solids, drop.solid]), name, name, impatient, least=0.3)
-        insist = drop.stacked and failures < TRIES // 2
+            return build(solids)
+        solid, stacked = plan.draw(below)
+        tried = build([*solids, solid], impatient, least=0.3)
+        insist = stacked and failures < TRIES // 2
         if _stands(tried, solids[:fixed] or solids, plan, physics) and (not insist or _is_raised(tried)):
             shapes = true_shapes(tried).values()
-            solids = [replace(s, shape=shape) for s, shape in zip([*solids, drop.solid], shapes, strict=True)]
+            solids = [replace(s, shape=shape) for s, shape in zip([*solids, solid], shapes, strict=True)]
             below, failures = tried, 0
             continue
         failures += 1
         if failures == TRIES and len(solids) > fixed:
             solids, failures = solids[:-1], 0
-            below = settled(solids)
+            below = build(solids) if solids else None
     raise InputError(name, f"object{len(solids)} would not stay on the table", "choose another seed")
 
 
@@ -225,22 +207,22 @@ def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Solid:
     if scene is not None:
         others = true_shapes(scene).items()
         tops += [float(bounds(scene, label)[1][2]) for label, other in others if _overlap(over, other)]
-    z = max(tops) + float(shape.support(DOWN)[0]) + GAP
+    z = max(tops) + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + GAP
     return Solid(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
 
 
-def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> _Drop:
+def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> Solid:
     """Put a shape at the origin over one of the scene's objects, off its middle by 0.3 of its half extent."""
     below = list(true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
-    reach = 0.3 * below.support(AXES)[:2]
+    reach = 0.3 * below.support(np.eye(3))[:2]
     xy = below.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
-    return _Drop(_let_go(shape, xy, scene), stacked=True)
+    return _let_go(shape, xy, scene)
 
 
 def _overlap(shape: Shape, other: Shape) -> bool:
     """Whether the level boxes around two shapes overlap seen from above."""
     apart = np.abs(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3])
-    return bool((apart < (shape.support(AXES) + other.support(AXES))[:2]).all())
+    return bool((apart < (shape.support(np.eye(3)) + other.support(np.eye(3)))[:2]).all())
 
 
 def _upright(rng: np.random.Generator) -> Shape:
@@ -287,15 +269,19 @@ def _turned(shape: Shape, turn: Array) -> Shape:
 
 
 def _pushed(shape: Shape, outward_world: Array, others: Sequence[Shape]) -> Shape:
-    """Push a shape over the table from outside towards the middle until it touches another."""
-    z = TABLE_HEIGHT + float(shape.support(DOWN)[0]) + PACKED_GAP
+    """Push a shape over the table from outside towards the middle until it touches another.
+
+    Before they settle, half a millimetre stays between them: far below what a camera can see.
+    """
+    close = 0.0005
+    z = TABLE_HEIGHT + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + close
     distance = float(np.hypot(*TABLE_SIZE))
     for _ in range(60):
         at = shape.moved(transforms.rigid(np.eye(3), distance * outward_world + (0.0, 0.0, z)))
         gap = min(_gap(at, other) for other in others)
-        if gap < PACKED_GAP or distance <= 0.0:
+        if gap < close or distance <= 0.0:
             break
-        distance = max(distance - gap + PACKED_GAP / 2.0, 0.0)
+        distance = max(distance - gap + close / 2.0, 0.0)
     return at
 
 

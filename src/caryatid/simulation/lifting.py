@@ -22,17 +22,9 @@ from caryatid.simulation.world import displacement, mujoco_warnings_ignored
 ASIDE = 50.0
 """How far up an object is put when it has been lifted [m]; nothing meets it there."""
 
-SEGMENT = 0.25
-"""Time simulated between two looks at the objects [s]; what falls is seen falling."""
-
 HAND = "caryatid-hand-"
 """Names of the bodies that grasp begin so."""
 
-_AT_THE_SAME_PLACE = np.zeros(12)
-"""A weld's anchor, relative position, relative quaternion and how much rotation counts [m]."""
-_AT_THE_SAME_PLACE[[6, 10]] = 1.0
-_STIFF = {"solref": [0.01, 1.0], "solimp": [0.95, 0.99, 0.001, 0.5, 2.0]}
-"""A grasp gives way by well under a millimetre, at time steps up to 5 ms."""
 _STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _GRASPS = int(
     mujoco.mjtState.mjSTATE_EQ_ACTIVE | mujoco.mjtState.mjSTATE_MOCAP_POS | mujoco.mjtState.mjSTATE_MOCAP_QUAT
@@ -48,7 +40,7 @@ class Lift:
         distance: Farthest (N,) [m] each object was from where it had been; 0 for what was lifted or gone.
         angle: The most (N,) [rad] each was turned.
         disturbed: Which objects (N,) were moved or turned beyond the limits.
-        film: States (T, N, 7) on the way, one each `SEGMENT`.
+        film: States (T, N, 7) on the way, one each quarter of a second.
     """
 
     state: Array
@@ -114,20 +106,20 @@ class Lifting:
         distance, angle = np.zeros(len(state)), np.zeros(len(state))
         film: list[Array] = []
         for speed, seconds in ((config.speed, lifted), (0.0, config.watch)):
-            segments = max(1, int(np.ceil(seconds / SEGMENT)))
+            segments = max(1, int(np.ceil(seconds / 0.25)))  # what falls is seen falling
             for _ in range(segments):
                 now = self._after(data, speed, seconds / segments, index)
                 moved, turned = displacement(state[watched], now[watched])
                 distance[watched] = np.maximum(distance[watched], moved)
                 angle[watched] = np.maximum(angle[watched], turned)
                 film.append(now)
-                if to_the_end:
-                    continue
-                if _beyond(distance, angle, config).any() or (speed == 0.0 and _at_rest(film)):
-                    return Lift(now, distance, angle, _beyond(distance, angle, config), np.array(film))
+                disturbed = _beyond(distance, angle, config)
+                done = disturbed.any() or (speed == 0.0 and _at_rest(film))
+                if done and not to_the_end:
+                    return Lift(now, distance, angle, disturbed, np.array(film))
             if speed > 0.0:
                 self._put_aside(data, index)
-        return Lift(now, distance, angle, _beyond(distance, angle, config), np.array(film))
+        return Lift(now, distance, angle, disturbed, np.array(film))
 
     def strayed(self, before: Array, after: Array, config: LiftConfig) -> NDArray[np.bool_]:
         """Which objects (N,) moved or turned beyond the limits between two states (N, 7)."""
@@ -191,15 +183,13 @@ def _with_hands(spec: Any, bodies: Sequence[str]) -> Any:
     for name in bodies:
         spec.worldbody.add_body(name=HAND + name, mocap=True)
         weld = spec.add_equality(
-            name=HAND + name,
-            type=mujoco.mjtEq.mjEQ_WELD,
+            name=HAND + name, name1=HAND + name, name2=name, active=False, type=mujoco.mjtEq.mjEQ_WELD,
             objtype=mujoco.mjtObj.mjOBJ_BODY,
-            name1=HAND + name,
-            name2=name,
-            active=False,
-            **_STIFF,
-        )
-        weld.data = _AT_THE_SAME_PLACE
+            # A grasp gives way by well under a millimetre, at time steps up to 5 ms.
+            solref=[0.01, 1.0], solimp=[0.95, 0.99, 0.001, 0.5, 2.0],
+        )  # fmt: skip
+        # Both at the same place: anchor, relative position and quaternion, and how much rotation counts [m].
+        weld.data = [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
     with mujoco_warnings_ignored():
         return spec.compile()
 

@@ -173,13 +173,13 @@ def _load_file(source: str, config: PhysicsConfig | None) -> SimulatedScene:
         remedy = f"give an MJCF file or one of the built-in scenes: {', '.join(list_scenes())}"
         raise InputError(path, "no such scene", remedy)
     if not path.is_file():
-        raise InputError(path, "is no file", "give an MJCF file")
+        raise InputError(path, "Not a file", "give an MJCF file")
     try:
         with mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(path, f"is no MJCF ({reason})", "mend the XML") from None
+        raise InputError(path, f"Not an MJCF file ({reason})", "mend the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     return scene_from_spec(spec, name or path.stem, str(path), config)
 

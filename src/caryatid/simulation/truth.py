@@ -177,10 +177,6 @@ def read_truth(path: Path) -> GroundTruth:
 def write_truth(truth: GroundTruth, path: Path) -> None:
     """Write a gt.json.
 
-    Args:
-        truth: What is true.
-        path: The file.
-
     Raises:
         InputError: The file cannot be written.
     """

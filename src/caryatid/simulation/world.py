@@ -23,9 +23,6 @@ from caryatid.sensing.views import SUPPORT_LABEL
 TABLE = "table"
 """Name of the body that is the support surface."""
 
-INVISIBLE_GROUP = 3
-"""Geoms of this group collide and are not seen."""
-
 _WARNING = mujoco.mjtWarning
 _BLOWN_UP = (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)
 
@@ -107,15 +104,13 @@ def scene_from_spec(
     if not np.isfinite(model.qpos0).all():
         raise InputError(source, "a body's pose holds NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
+    free = sorted(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
     if table < 0:
         raise InputError(source, f"has no body '{TABLE}'", f"name the static support surface '{TABLE}'")
     if model.body_weldid[table] != 0:
-        raise InputError(
-            source, f"body '{TABLE}' can move", "take its joints out: the support surface is static"
-        )
+        raise InputError(source, f"body '{TABLE}' can move", "take out its joints: the surface is static")
     if not np.isin(model.geom_bodyid, _subtree(model, table)).any():
         raise InputError(source, f"body '{TABLE}' has no geom", "give the table a top")
-    free = sorted(model.jnt_bodyid[model.jnt_type == mujoco.mjtJoint.mjJNT_FREE].tolist())
     if not free:
         raise InputError(source, "has no objects", "every object is a body with a free joint")
     if len(free) >= SUPPORT_LABEL:
@@ -425,17 +420,8 @@ def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[
 
 def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
     """Lowest and highest corner, (3,) each [m], of the world-aligned box around an object (0: the table)."""
-    low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for geom in solid_geoms(scene, label):
-        T_world_geom = _geom_pose(scene, geom)
-        if scene.model.geom_type[geom] == _GEOM.mjGEOM_MESH:
-            corners = transforms.transform(T_world_geom, _mesh_vertices(scene.model, geom))
-            low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
-        else:
-            reach = _reach(scene.model, geom, T_world_geom[:3, :3])
-            low = np.minimum(low, T_world_geom[:3, 3] - reach)
-            high = np.maximum(high, T_world_geom[:3, 3] + reach)
-    return low, high
+    lows, highs = zip(*(_span(scene, geom) for geom in solid_geoms(scene, label)), strict=True)
+    return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
@@ -527,21 +513,28 @@ def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:
     raise _unsupported(model, geom)
 
 
-def _reach(model: Any, geom: int, R_world_geom: Array) -> Array:
-    """How far (3,) [m] a primitive reaches from its centre along the world's axes."""
-    size, axis = model.geom_size[geom], np.abs(R_world_geom[:, 2])
+def _span(scene: SimulatedScene, geom: int) -> tuple[Array, Array]:
+    """Lowest and highest corner, (3,) each [m], of the world-aligned box around a geom."""
+    model, T_world_geom = scene.model, _geom_pose(scene, geom)
+    R, centre, size = T_world_geom[:3, :3], T_world_geom[:3, 3], model.geom_size[geom]
+    axis = np.abs(R[:, 2])
     match model.geom_type[geom]:
         case _GEOM.mjGEOM_BOX:
-            return np.abs(R_world_geom) @ size
+            reach = np.abs(R) @ size
         case _GEOM.mjGEOM_SPHERE:
-            return np.full(3, size[0])
+            reach = np.full(3, size[0])
         case _GEOM.mjGEOM_ELLIPSOID:
-            return np.linalg.norm(R_world_geom * size, axis=1)
+            reach = np.linalg.norm(R * size, axis=1)
         case _GEOM.mjGEOM_CYLINDER:
-            return size[1] * axis + size[0] * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
+            reach = size[1] * axis + size[0] * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
         case _GEOM.mjGEOM_CAPSULE:
-            return size[1] * axis + size[0]
-    raise _unsupported(model, geom)
+            reach = size[1] * axis + size[0]
+        case _GEOM.mjGEOM_MESH:
+            corners = transforms.transform(T_world_geom, _mesh_vertices(model, geom))
+            return corners.min(axis=0), corners.max(axis=0)
+        case _:
+            raise _unsupported(model, geom)
+    return centre - reach, centre + reach
 
 
 def _mesh_vertices(model: Any, geom: int) -> Array:
