@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
-import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -64,13 +62,3 @@ def test_a_service_that_is_told_to_stop_finishes_the_view_in_hand(tmp_path, arou
     with Session.open(tmp_path / "s/table") as session:
         assert session.views == 1
     assert "Traceback" not in (tmp_path / "said").read_text()
-
-
-def test_a_port_that_is_taken_is_said_in_one_line(tmp_path):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = str(taken.getsockname()[1])
-        command = [sys.executable, "-m", "caryatid", "serve", str(tmp_path), "--port", port]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == 1
-    assert done.stderr.startswith(f"error: 127.0.0.1:{port}: cannot be listened at (address already in use")
-    assert done.stderr.count("\n") == 1

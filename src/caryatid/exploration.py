@@ -13,7 +13,6 @@ from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.objects.fusion import changed
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import ATTEMPTS, Decision, Planner, PlanningState, path_cost
 from caryatid.planning.planners import make_planner
@@ -154,9 +153,8 @@ class Explorer:
         watch = Stopwatch()
         source = self._captured() if given is None else given
         watch.lap("capture")
-        graph_before = scene.graph
         graph = scene.update(source)
-        self.changed = changed(graph_before, graph, scene.config.fusion)
+        self.changed = scene.changed
         if scene.sphere is None or scene.labels is None:
             raise RuntimeError("an updated scene has a sphere and labels")
         view = source if isinstance(source, View) else None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from caryatid.config import Config, SegmentationMethod
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
-from caryatid.objects.fusion import Evidence, absorbed, fuse, fused_graph
+from caryatid.objects.fusion import Evidence, absorbed, changed, fuse, fused_graph
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.runtime.compiling import compile_kernels
@@ -52,6 +52,7 @@ class Scene(Pictured):
         sphere: The view sphere around the table top, or None before the first view.
         T_world_camera: Pose (4, 4) of the newest view after registration, or None for a cloud.
         views: How many views the model is made of.
+        changed: Whether the newest view changed the graph.
         timings: Seconds the stages of the newest update took.
     """
 
@@ -69,6 +70,7 @@ class Scene(Pictured):
         self.sphere: ViewSphere | None = None
         self.T_world_camera: Array | None = None
         self.views = 0
+        self.changed = False
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
         self._registration: ViewRegistration | None = None
@@ -243,5 +245,6 @@ class Scene(Pictured):
         fused = fused_graph(self._evidence, config, shown=self._shown, contradicted=self._contradicted)
         ids = {o.id for o in fused.objects}
         stability = {names[i]: verdict for i, verdict in newest.stability.items() if names[i] in ids}
-        self.graph = replace(fused, stability=stability)
+        before, self.graph = self.graph, replace(fused, stability=stability)
+        self.changed = changed(before, self.graph, config)
         return observation

@@ -90,16 +90,15 @@ class Add(SessionStep):
 
     def __call__(self) -> None:
         from caryatid.cli.output import summary
-        from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Capture, Session
 
         with _views_kept(), Session.open(self.folder) as session:
             limits = session.beginning.settings.session
-            capture = Capture.from_files(self.depth, self.camera, self.rgb, self.labels, limits)
+            images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
+            capture = Capture.from_files(images, self.camera, limits)
             added = session.add(capture, self.number)
-        document = {"view": added.number, "changed": added.changed, "graph": graph_to_json(added.graph)}
         news = "" if added.changed else ", nothing new"
-        self.show(document, f"view {added.number + 1}: {summary(added.graph)}{news}")
+        self.show(added.to_json(), f"view {added.number + 1}: {summary(added.graph)}{news}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,6 +116,7 @@ class Next(SessionStep):
     """Poses to choose from, instead of those the session's robot reaches."""
 
     def __call__(self) -> None:
+        from caryatid.io.json_files import parse_json, read_json
         from caryatid.sessions import Session
         from caryatid.sessions.next_view import Reachable
 
@@ -124,7 +124,7 @@ class Next(SessionStep):
             if self.candidates is None:
                 view = session.next()
             else:
-                given = Reachable.read(self.candidates)
+                given = parse_json(Reachable, read_json(self.candidates), self.candidates)
                 view = session.next(given.T_world_camera, given.path_length)
         self.output.result(view.to_json())
 
@@ -213,6 +213,7 @@ class Serve(SessionStep):
     def __call__(self) -> None:
         config = self.settings.read()
         try:
+            from caryatid.service.app import make_app
             from caryatid.service.pool import SessionPool
             from caryatid.service.serving import check_token, run_service
         except ModuleNotFoundError as error:
@@ -232,14 +233,9 @@ class Serve(SessionStep):
             self.folder.mkdir(parents=True, exist_ok=True)
         with self.output.working("compiling"):
             compile_kernels()
-        run_service(
-            SessionPool(self.folder, config, self.open_sessions, self.waiting),
-            host=self.host,
-            port=self.port,
-            token=token,
-            max_request=self.max_request * 1_000_000,
-            listening=listening,
-        )
+        pool = SessionPool(self.folder, config, self.open_sessions, self.waiting)
+        app = make_app(pool, token=token, max_request=self.max_request * 1_000_000, host=self.host)
+        run_service(app, self.host, self.port, listening)
 
 
 @contextmanager

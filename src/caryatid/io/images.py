@@ -73,7 +73,7 @@ def read_units(image: Path | bytes, name: str = "") -> NDArray[np.int32]:
 
 
 def decode_image(content: bytes, name: str, modes: tuple[str, ...], what: str, most: int) -> NDArray[Any]:
-    """Decode a PNG or JPEG that came from elsewhere: (H, W), or (H, W, C) where it is in colour.
+    """Decode a PNG or JPEG that came from elsewhere: (H, W), or (H, W, 3) where colour is allowed.
 
     Args:
         content: The file.
@@ -90,7 +90,7 @@ def decode_image(content: bytes, name: str, modes: tuple[str, ...], what: str, m
         if width * height > most:
             reason = f"has {width}×{height} pixels, {most} are allowed"
             raise InputError(name, reason, "give a smaller image")
-        return np.array(image)
+        return np.array(image.convert("RGB") if "RGB" in modes else image)
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:

@@ -38,6 +38,15 @@ class Numbers:
         """Read the field with `read`."""
         return core_schema.no_info_plain_validator_function(self.read)
 
+    def __get_pydantic_json_schema__(self, source: Any, handler: Any) -> dict[str, Any]:
+        """Describe the field as nested lists of these sizes."""
+        schema: dict[str, Any] = {"type": "number"}
+        for size in reversed(self.shape):
+            schema = {"type": "array", "items": schema}
+            if size >= 0:
+                schema |= {"minItems": size, "maxItems": size}
+        return schema
+
     def read(self, value: Any) -> Array:
         """Turn nested lists into an array (...) of this shape.
 

@@ -7,23 +7,15 @@ at once, so more threads would gain nothing.
 from __future__ import annotations
 
 import asyncio
-from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from math import prod
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, InputError
 from caryatid.sessions import Session
-
-T = TypeVar("T")
-
-MAX_VOXELS = 64_000_000
-"""Voxels of a session's map [1]; 128 MB, 25 times the default."""
-MAX_SPHERE_POINTS = 1_000_000
-"""Points of a session's view sphere [1]; 25 times the default."""
 
 
 class FullError(CaryatidError):
@@ -50,21 +42,18 @@ class SessionPool:
         self._max_open = open_sessions
         self._max_waiting = waiting
         self._waiting = 0
-        self._open: OrderedDict[str, Session] = OrderedDict()
+        self._open: dict[str, Session] = {}
 
-    def __enter__(self) -> None:
+    async def __aenter__(self) -> None:
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="sessions")
 
-    def __exit__(self, *error: object) -> None:
+    async def __aexit__(self, *error: object) -> None:
         """Finish what is waiting, and close the sessions."""
-        self._worker.submit(self._keep_open, 0).result()
         self._worker.shutdown()
+        self._close_all_but(0)
 
-    async def do(self, work: Callable[[], T]) -> T:
-        """Run some work on the sessions after everything that is waiting already.
-
-        Args:
-            work: Called in the thread of the pool; done to its end even if nobody waits for it any more.
+    async def do(self, work: Callable[[], Any]) -> Any:
+        """Run some work on the sessions, in the thread of the pool, after everything that is waiting already.
 
         Raises:
             FullError: Too many requests are waiting.
@@ -72,9 +61,10 @@ class SessionPool:
         if self._waiting >= self._max_waiting:
             raise FullError(f"{self._waiting} requests wait already; try again")
         self._waiting += 1
-        future = asyncio.get_running_loop().run_in_executor(self._worker, work)
-        future.add_done_callback(self._done)
-        return await asyncio.shield(future)
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._worker, work)
+        finally:
+            self._waiting -= 1
 
     def names(self) -> list[str]:
         """Names of all sessions."""
@@ -86,12 +76,11 @@ class SessionPool:
         Raises:
             InputError: There is one of that name, or a setting asks for more memory than a session may have.
         """
-        voxels = prod(length / config.voxels.size for length in config.voxels.extent)
-        if voxels > MAX_VOXELS:
-            raise InputError("voxels.size", f"makes {voxels:.3g} voxels", f"{MAX_VOXELS} are allowed")
-        if config.active.sphere_points > MAX_SPHERE_POINTS:
-            reason = f"{config.active.sphere_points} are too many"
-            raise InputError("active.sphere_points", reason, f"{MAX_SPHERE_POINTS} are allowed")
+        # 25 times the defaults: 128 MB of voxels.
+        if prod(length / config.voxels.size for length in config.voxels.extent) > 64e6:
+            raise InputError("voxels.size", "makes too many voxels", "64 million are allowed")
+        if config.active.sphere_points > 1_000_000:
+            raise InputError("active.sphere_points", "is too large", "1 million are allowed")
         return self._opened(name, Session.begin(self.folder / name, config, **options))
 
     def session(self, name: str) -> Session:
@@ -101,20 +90,18 @@ class SessionPool:
             MissingError: There is none of that name.
             SessionBusyError: Another process has it open.
         """
-        if name not in self._open and not (self.folder / name / "session.json").is_file():
+        if name in self._open:
+            return self._opened(name, self._open.pop(name))
+        if not (self.folder / name / "session.json").is_file():
             raise MissingError(f"there is no session '{name}'; begin it first")
-        return self._opened(name, self._open.get(name) or Session.open(self.folder / name))
+        return self._opened(name, Session.open(self.folder / name))
 
     def _opened(self, name: str, session: Session) -> Session:
         """Keep a session open, as the one used last."""
         self._open[name] = session
-        self._open.move_to_end(name)
-        self._keep_open(self._max_open)
+        self._close_all_but(self._max_open)
         return session
 
-    def _keep_open(self, most: int) -> None:
+    def _close_all_but(self, most: int) -> None:
         while len(self._open) > most:
-            self._open.popitem(last=False)[1].close()
-
-    def _done(self, future: asyncio.Future[Any]) -> None:
-        self._waiting -= 1
+            self._open.pop(next(iter(self._open))).close()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,10 +12,10 @@ from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import next_best_view
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.json_files import Numbers, parse_json, read_json
+from caryatid.io.json_files import Numbers
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
-from caryatid.robots import HUMANOID, Posture, Robot, Surroundings, find_robot, view_sphere_of
+from caryatid.robots import Posture, Robot, Surroundings, find_robot, view_sphere_of
 from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
@@ -56,58 +55,29 @@ class NextView:
         }
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, eq=False)
 class Reachable:
-    """Views that a robot says it reaches.
+    """Views that a robot says it reaches: candidates.json.
 
     Attributes:
-        T_world_camera: Camera poses (N, 4, 4).
-        path_length: Path length (N,) [m] to each, or None for straight lines.
+        T_world_camera: Camera poses (N, 4, 4) [m]; OpenCV camera frame, world z up.
+        path_length: Path length (N,) [m] to each, or null for straight lines.
     """
 
     T_world_camera: Annotated[Array, Numbers(-1, 4, 4)]
     path_length: Annotated[Array, Numbers(-1)] | None = None
 
-    @classmethod
-    def read(cls, path: Path) -> Reachable:
-        """Read candidates.json.
-
-        Raises:
-            InputError: A key is missing, or not a list of poses, or of lengths.
-        """
-        return parse_json(cls, read_json(path), path)
-
-    def candidates(self, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
-        """The views to choose from, as they are to a robot whose camera is at a pose (4, 4).
-
-        Raises:
-            InputError: One is no pose, or path lengths are not as many, or negative.
-        """
-        named = enumerate(self.T_world_camera)
-        poses = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
-        lengths = _straight(T_world_camera, poses) if self.path_length is None else self.path_length
-        if lengths.shape != (len(poses),) or not (lengths >= 0.0).all():
-            remedy = "give as many as candidates, 0 or more"
-            raise InputError("path_length", "is not one length a candidate", remedy)
-        return Candidates(poses, sphere.direction_of(poses), lengths, {})
-
 
 def plan_next(
-    scene: Scene,
-    T_world_cameras: Sequence[Array],
-    planner: str,
-    reachable: Reachable | None,
-    stop: str | None,
-    robot_name: str = HUMANOID,
-) -> NextView:
-    """Choose the next view.
+    scene: Scene, T_world_cameras: Sequence[Array], reachable: Reachable | None, planner: str, robot_name: str
+) -> tuple[Decision, Posture | None]:
+    """Choose the next view, and say how the robot would stand there where it is not one of those given.
 
     Args:
-        scene: What is known, of at least one view.
+        scene: What is known.
         T_world_cameras: Where the views so far were taken (4, 4), the last one last.
+        reachable: What a robot says it reaches; None = what the robot of this name reaches.
         planner: Name of the planner.
-        reachable: What the robot reaches; None = what the robot of this name reaches, which knows the table.
-        stop: Why another view may not pay, or None.
         robot_name: As `find_robot` knows it.
 
     Raises:
@@ -116,26 +86,21 @@ def plan_next(
     """
     if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; add a first view")
-    robot: Robot | None = None
+    sphere, robot = scene.sphere, None
     if reachable is not None:
-        sphere = scene.sphere
-        candidates = reachable.candidates(T_world_cameras[-1], sphere)
+        candidates = _given(reachable, T_world_cameras[-1], sphere)
     else:
-        floor = table_floor(scene)
-        robot = find_robot(robot_name)(Surroundings(scene.sphere.centre_world, floor, scene.config))
-        sphere = view_sphere_of(robot, scene.sphere)
+        robot = find_robot(robot_name)(Surroundings(sphere.centre_world, table_floor(scene), scene.config))
+        sphere = view_sphere_of(robot, sphere)
         candidates = _reached(robot, T_world_cameras[-1], sphere, scene.sphere.centre_world)
-    visited = np.stack([sphere.direction_of(T) for T in T_world_cameras])
+    visited = sphere.direction_of(np.stack(T_world_cameras))
     decision = next_best_view(scene, robot, visited, candidates=candidates, planner=planner, seed=scene.seed)
     posture = None if robot is None else robot.solve(decision.T_world_camera)
-    return NextView(len(T_world_cameras), decision, posture if isinstance(posture, Posture) else None, stop)
+    return decision, posture if isinstance(posture, Posture) else None
 
 
 def table_floor(scene: Scene) -> FloorGrid:
     """The floor around the table: under its top, and everything on it, nobody can stand.
-
-    Args:
-        scene: What is known, of at least one view.
 
     Raises:
         PlanningError: No view is known yet.
@@ -144,11 +109,23 @@ def table_floor(scene: Scene) -> FloorGrid:
         raise PlanningError("nothing has been seen yet; add a first view")
     shape = scene.surface.shape
     top = float(scene.surface.point_world[2])
-    half = shape.extents / 2.0
     centre = np.array([*shape.T_world_object[:2, 3], top / 2.0])
-    sides = np.array([half[0], half[1], max(abs(top) / 2.0, STEP)])
+    half = np.array([*shape.extents[:2] / 2.0, max(abs(top) / 2.0, STEP)])
     R = shape.T_world_object[:3, :3]
-    return FloorGrid.from_boxes([centre], [sides], [R], scene.config.robot, scene.sphere.centre_world[:2])
+    return FloorGrid.from_boxes([centre], [half], [R], scene.config.robot, scene.sphere.centre_world[:2])
+
+
+def _given(reachable: Reachable, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
+    """What a robot whose camera is at a pose (4, 4) says it reaches, checked."""
+    named = enumerate(reachable.T_world_camera)
+    poses = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
+    lengths = reachable.path_length
+    if lengths is None:
+        lengths = _straight(T_world_camera, poses)
+    if lengths.shape != (len(poses),) or not (lengths >= 0.0).all():
+        remedy = "give as many as candidates, 0 or more"
+        raise InputError("path_length", "is not one length a candidate", remedy)
+    return Candidates(poses, sphere.direction_of(poses), lengths, {})
 
 
 def _reached(robot: Robot, T_world_camera: Array, sphere: ViewSphere, centre_world: Array) -> Candidates:

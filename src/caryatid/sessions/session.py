@@ -27,7 +27,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError
 from caryatid.exploration import reason_to_stop
 from caryatid.graph import SupportGraph
-from caryatid.io.graph_json import graph_text
+from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
 from caryatid.planning.planners import make_planner
@@ -37,23 +37,18 @@ from caryatid.sensing.views import View
 from caryatid.sessions.captures import CameraRecord, Capture
 from caryatid.sessions.checks import check_view
 from caryatid.sessions.next_view import NextView, Reachable, plan_next
-from caryatid.sessions.snapshots import Snapshots, State
+from caryatid.sessions.snapshots import read_snapshot, write_snapshot
 
-FORMAT: Final = "caryatid/session"
-VERSION: Final = 1
-"""Format of session.json."""
-
-
-class TakenError(InputError):
-    """The folder of a new session holds something already."""
+FORMAT: Final = {"format": "caryatid/session", "version": 1}
+"""How session.json begins."""
 
 
-class SessionBusyError(InputError):
+class SessionConflictError(InputError):
+    """The session is not in the state the request expects: its folder is taken, or it has other views."""
+
+
+class SessionBusyError(SessionConflictError):
     """Another process writes to the session."""
-
-
-class WrongNumberError(InputError):
-    """A view has another number than the next one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +69,6 @@ class Beginning:
     robot: str
     settings: Config
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of session.json."""
-        return {"format": FORMAT, "version": VERSION, "caryatid": version("caryatid")} | asdict(self)
-
     @classmethod
     def read(cls, path: Path) -> Beginning:
         """Read session.json.
@@ -89,10 +80,9 @@ class Beginning:
             raise InputError(path.parent, "holds no session", "begin one with `caryatid session new`")
         document = read_json(path)
         release = document.get("caryatid", "0.1.0")  # the first release did not say which it was
-        if document.get("format") != FORMAT or document.get("version") != VERSION:
-            reason = f"is no '{FORMAT}' of version {VERSION}; caryatid {release} wrote it"
-            raise InputError(path, reason, "use the release that wrote it")
         try:
+            if not FORMAT.items() <= document.items():
+                raise InputError(path, f"is not in format {FORMAT}")
             return parse_json(cls, document, path)
         except InputError as error:
             reason = f"was begun with caryatid {release} and does not fit this release ({error.reason})"
@@ -114,12 +104,21 @@ class Added:
     graph: SupportGraph
     changed: bool
 
+    def to_json(self) -> dict[str, Any]:
+        """Return the answer of `caryatid session add` and of the service."""
+        return {"view": self.number, "changed": self.changed, "graph": graph_to_json(self.graph)}
+
 
 class Session:
     """A scene model in a folder; `begin` or `open` one.
 
     A view that has been added stays, whatever happens to this process, the machine or its power: it is on
     the disk before `add` returns. There is one writer at a time; others may read meanwhile.
+
+    Attributes:
+        path: The folder.
+        beginning: What it was begun with.
+        scene: What is known; not to be updated.
     """
 
     def __init__(self, path: Path, beginning: Beginning, lock: FileLock | None) -> None:
@@ -129,10 +128,9 @@ class Session:
         if lock is not None:
             for folder in (path, path / "views", path / "state"):
                 clear_partials(folder)
-        self._snapshots = Snapshots(path / "state", json.dumps(asdict(beginning)))
-        self._views = self._kept()
-        self._first = self._decoded(0) if self._views else None
-        self._state = self._restored(self._views)
+        self._records = self._kept()
+        self._first = self._decoded(0) if self._records else None
+        self.scene = self._after(self._records)
 
     @classmethod
     def begin(
@@ -166,16 +164,13 @@ class Session:
         folder = Path(path)
         with write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            if (folder / "session.json").exists():
-                raise TakenError(folder, "holds a session already", "use that one, or give another folder")
-            others = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
-            if others - {"views", "state", "lock"}:
-                raise TakenError(folder, "already exists and holds other files", "give a new folder")
-            for name in ("views", "state"):
-                (folder / name).mkdir(exist_ok=True)
+            if any(p.name != "views" and not p.name.startswith(".") for p in folder.iterdir()):
+                reason = "already holds a session or other files"
+                raise SessionConflictError(folder, reason, "use that session, or give a new folder")
+            (folder / "views").mkdir(exist_ok=True)
         beginning = Beginning(segmentation, seed, planner, robot, config or Config())
-        text = json.dumps(beginning.to_json(), indent=1) + "\n"
-        write_file(folder / "session.json", text.encode(), durable=True)
+        document = FORMAT | {"caryatid": version("caryatid")} | asdict(beginning)
+        write_file(folder / "session.json", f"{json.dumps(document, indent=1)}\n".encode(), durable=True)
         sync(folder.resolve().parent)
         return cls.open(folder)
 
@@ -216,17 +211,12 @@ class Session:
     @property
     def views(self) -> int:
         """Number of views."""
-        return len(self._views)
-
-    @property
-    def scene(self) -> Scene:
-        """What is known; not to be updated."""
-        return self._state.scene
+        return len(self._records)
 
     @property
     def graph(self) -> SupportGraph:
         """The fused support graph."""
-        return self._state.scene.graph
+        return self.scene.graph
 
     def add(self, view: View | Capture, number: int | None = None) -> Added:
         """Add a view; when this returns, it is on the disk.
@@ -237,31 +227,32 @@ class Session:
                 so a client that missed the answer can send it again. None = the next one.
 
         Raises:
-            WrongNumberError: It would have another number.
+            SessionConflictError: It would have another number.
             InputError: The view cannot be used; the session is as it was.
             PerceptionError: Nothing can be perceived in it; the session is as it was.
         """
         self._check_writable()
         capture = Capture.of(view) if isinstance(view, View) else view
+        record = capture.record
         if number is not None and number != self.views:
-            if number == self.views - 1 and capture.record.digest == self._views[-1].digest:
-                return Added(number, self.graph, self._state.changed)
-            raise WrongNumberError(
-                capture.camera.name, f"is to be view {number}, the next one is view {self.views}"
-            )
+            if number != self.views - 1 or record.digest != self._records[-1].digest:
+                raise SessionConflictError(
+                    record.name, f"is to be view {number}, the next one is view {self.views}"
+                )
+            return Added(number, self.graph, self.scene.changed)
         decoded = capture.decode(self.beginning.settings.session)
         check_view(decoded, self.scene, self._first)
-        state = self._state.after(decoded)
-        graph_text(state.scene.graph)  # a view whose graph cannot be written is refused, and not kept
+        scene = self.scene.copy()
+        graph_text(scene.update(decoded))  # a view whose graph cannot be written is refused, and not kept
         folder = StagedFolder(self._folder(self.views), durable=True)
         for name, content in capture.files().items():
             folder.write(name, content)
         folder.publish()
-        self._views.append(capture.record)
+        self._records.append(record)
         self._first = self._first or decoded
-        self._state = state
-        self._snapshots.write(state, [v.digest for v in self._views])
-        return Added(self.views - 1, state.scene.graph, state.changed)
+        self.scene = scene
+        write_snapshot(self.path / "state", self._history(self._records), scene)
+        return Added(self.views - 1, self.graph, scene.changed)
 
     def next(self, candidates: ArrayLike | None = None, path_length: ArrayLike | None = None) -> NextView:
         """Choose where to look next.
@@ -275,13 +266,16 @@ class Session:
             PlanningError: There is no view yet, or none can be reached.
             InputError: Candidates are no poses.
         """
-        beginning, reachable = self.beginning, None
+        reachable = None
         if candidates is not None:
             lengths = None if path_length is None else np.asarray(path_length, dtype=np.float64)
             reachable = Reachable(np.asarray(candidates, dtype=np.float64).reshape(-1, 4, 4), lengths)
-        stop = reason_to_stop(self.views, self._state.changed, beginning.settings.active)
-        poses = [v.T_world_camera for v in self._views]
-        return plan_next(self.scene, poses, beginning.planner, reachable, stop, beginning.robot)
+        poses = [record.T_world_camera for record in self._records]
+        decision, posture = plan_next(
+            self.scene, poses, reachable, self.beginning.planner, self.beginning.robot
+        )
+        stop = reason_to_stop(self.views, self.scene.changed, self.beginning.settings.active)
+        return NextView(self.views, decision, posture, stop)
 
     def undo(self) -> int:
         """Remove the last view.
@@ -293,12 +287,12 @@ class Session:
             InputError: There is none, or an earlier one is broken; the session is as it was.
         """
         self._check_writable()
-        if not self._views:
-            raise InputError(self.path, "has no views to take back", "add one first")
-        left = self._views[:-1]
-        state = self._restored(left)
+        if not self._records:
+            raise SessionConflictError(self.path, "has no views to take back", "add one first")
+        left = self._records[:-1]
+        scene = self._after(left)
         remove_folder(self._folder(len(left)))
-        self._views, self._state = left, state
+        self._records, self.scene = left, scene
         self._first = self._first if left else None
         return len(left)
 
@@ -310,7 +304,6 @@ class Session:
         return self.path / "views" / f"{number:06d}"
 
     def _kept(self) -> list[CameraRecord]:
-        """The cameras of the views that are kept, in order."""
         folders = sorted((self.path / "views").glob("[0-9]*"))
         for number, folder in enumerate(folders):
             if folder != self._folder(number):
@@ -321,29 +314,28 @@ class Session:
     def _decoded(self, number: int) -> View:
         return Capture.read(self._folder(number)).decode(self.beginning.settings.session)
 
-    def _restored(self, views: Sequence[CameraRecord]) -> State:
-        """The state after some views, from the newest usable snapshot and the views after it."""
-        digests = [view.digest for view in views]
-        state = next(self._snapshots.read(digests), None)
-        if state is None:
-            b = self.beginning
-            state = State(Scene(b.settings, segmentation=b.segmentation, seed=b.seed))
-        for number in range(state.scene.views, len(views)):
-            state = state.after(self._decoded(number))
-            if self._lock is not None and number + 2 >= len(views):
-                self._snapshots.write(state, digests[: number + 1])
-        return state
+    def _after(self, records: Sequence[CameraRecord]) -> Scene:
+        """The scene after some views, from the newest usable snapshot and the views after it."""
+        folder, b = self.path / "state", self.beginning
+        scene = read_snapshot(folder, self._history(records))
+        scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        while scene.views < len(records):
+            scene.update(self._decoded(scene.views))
+            if self._lock is not None:
+                write_snapshot(folder, self._history(records[: scene.views]), scene)
+        return scene
+
+    def _history(self, records: Sequence[CameraRecord]) -> list[str]:
+        return [json.dumps(asdict(self.beginning)), *(record.digest for record in records)]
 
 
 def _locked(path: Path) -> FileLock:
     """Become the only writer, until the lock is released or this process ends."""
     lock = FileLock(path, timeout=0, thread_local=False)
-    try:
-        lock.acquire()
-    except Timeout:
-        remedy = "wait until it is done, or stop it"
-        raise SessionBusyError(path.parent, "another writer has this session open", remedy) from None
-    except OSError as error:
-        reason = f"cannot be locked ({error.strerror or error})"
-        raise InputError(path, reason, "give a folder you may write to") from None
+    with write_errors(path):
+        try:
+            lock.acquire()
+        except Timeout:
+            remedy = "wait until it is done, or stop it"
+            raise SessionBusyError(path.parent, "another writer has this session open", remedy) from None
     return lock

@@ -5,22 +5,15 @@ from __future__ import annotations
 import hashlib
 import io
 import pickle
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from caryatid.io.staging import write_file
-from caryatid.objects.fusion import changed
 from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
-from caryatid.sensing.views import View
 
-FORMAT: Final = "3"
-"""Part of every snapshot's digest; to be raised when this module stores something else."""
-STEPS: Final = (1, 8, 64)
-"""The newest snapshot after a multiple of each of these numbers of views is kept [1], for undo."""
 KNOWN: Final = {
     ("builtins", "set"),
     ("collections", "Counter"),
@@ -33,70 +26,42 @@ KNOWN: Final = {
 """What a snapshot may name besides classes of caryatid: a session that came from elsewhere runs no code."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class State:
-    """The scene after some views, and whether the last of them changed the graph."""
-
-    scene: Scene
-    changed: bool = False
-
-    def after(self, view: View) -> State:
-        """Return the state with one more view; this one stays as it is."""
-        scene = self.scene.copy()
-        before = scene.graph
-        return State(scene, changed(before, scene.update(view), scene.config.fusion))
-
-
-class Snapshots:
-    """Snapshots in a folder.
+def read_snapshot(folder: Path, history: Sequence[str]) -> Scene | None:
+    """Return the newest scene in a folder that this code made of the first views of a session.
 
     Args:
-        folder: Where they are.
-        beginning: What the session was begun with, as text: snapshots of another one do not count.
+        folder: Holds the snapshots.
+        history: What the session was begun with, and the digest of each view.
     """
+    for views in range(len(history) - 1, 0, -1):
+        with suppress(Exception):  # whatever a damaged file leads to: the views are still there
+            content = _path(folder, views).read_bytes()
+            if content[:32] == _seal(history[: views + 1], content[32:]):
+                scene = _Unpickler(io.BytesIO(content[32:])).load()
+                if isinstance(scene, Scene) and scene.views == views:
+                    return scene
+    return None
 
-    def __init__(self, folder: Path, beginning: str) -> None:
-        self._folder = folder
-        self._beginning = beginning
 
-    def read(self, views: Sequence[str]) -> Iterator[State]:
-        """Snapshots that this code made of the first of some views, the newest first.
+def write_snapshot(folder: Path, history: Sequence[str], scene: Scene) -> None:
+    """Keep the scene of all views, and those of the seven views before; a failure costs only time."""
+    with suppress(Exception):
+        folder.mkdir(exist_ok=True)
+        payload = pickle.dumps(scene, protocol=5)
+        write_file(_path(folder, scene.views), _seal(history, payload) + payload)
+        kept = {_path(folder, scene.views - back) for back in range(8)}
+        for path in set(folder.iterdir()) - kept:
+            path.unlink()
 
-        Args:
-            views: Digests of the views.
-        """
-        numbers = [int(path.stem) for path in self._folder.glob("*.pickle") if path.stem.isdecimal()]
-        for number in sorted((n for n in numbers if n <= len(views)), reverse=True):
-            with suppress(Exception):  # whatever a damaged file leads to: the views are still there
-                content = self._path(number).read_bytes()
-                seal, payload = content[:32], content[32:]
-                if seal == self._seal(views[:number], payload):
-                    state = _Unpickler(io.BytesIO(payload)).load()
-                    if isinstance(state, State) and state.scene.views == number:
-                        yield state
 
-    def write(self, state: State, views: Sequence[str]) -> None:
-        """Keep a state, and remove snapshots that are not needed any more; a failure costs only time.
+def _path(folder: Path, views: int) -> Path:
+    return folder / f"{views:06d}.pickle"
 
-        Args:
-            state: The state after the views.
-            views: Digests of the views.
-        """
-        with suppress(Exception):
-            payload = pickle.dumps(state, protocol=5)
-            write_file(self._path(len(views)), self._seal(views, payload) + payload)
-            kept = {self._path(n - n % step) for n in (len(views), len(views) - 1) for step in STEPS}
-            for path in self._folder.iterdir():
-                if path not in kept:
-                    path.unlink()
 
-    def _path(self, views: int) -> Path:
-        return self._folder / f"{views:06d}.pickle"
-
-    def _seal(self, views: Sequence[str], payload: bytes) -> bytes:
-        """Digest of the code, the settings and the views that made a snapshot, and of the snapshot itself."""
-        made_of = " ".join((FORMAT, fingerprint(), self._beginning, *views))
-        return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
+def _seal(history: Sequence[str], payload: bytes) -> bytes:
+    """Digest of the code and the views that made a snapshot, and of the snapshot itself."""
+    made_of = " ".join((fingerprint(), *history))
+    return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
 
 
 class _Unpickler(pickle.Unpickler):
