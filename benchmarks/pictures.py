@@ -174,12 +174,12 @@ def concepts() -> dict[str, Image.Image]:
             ], 560, 2,
         ),
         "fusion": ([(draw_graph(steps[k].graph), f"after view {k + 1}") for k in (0, 1, 3)], 420, 3),
-        "interest": ([(draw_sphere(paper), "points of interest and their saliency")], 880, 1),
+        "interest": ([(draw_sphere(paper), "points of interest and their saliency")], 560, 1),
         "next": (
             [
                 (draw_sphere(first), "what each view would show, less the way there"),
                 (plain(views[1]), "the view that was chosen"),
-            ], 620, 2,
+            ], 520, 2,
         ),
         "order": ([(f.picture, f.heading) for f in lifts], 280, 4),
     }  # fmt: skip

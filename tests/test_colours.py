@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.viz.colours import PALETTE, PLAIN, SALIENCY_STOPS, SERIES, object_colour, object_stripes, rgb
+from caryatid.viz.colours import PALETTE, SALIENCY_STOPS, object_colour, object_stripes, rgb
 
 VISIONS = {
     "full": np.eye(3),
@@ -61,14 +61,9 @@ def test_colours_too_near_to_tell_have_other_stripes(vision):
 
 
 def test_28_objects_differ_in_colour_or_stripes():
-    looks = [(object_colour(k), object_stripes(k)) for k in range(1, 4 * PLAIN + 1)]
+    looks = [(object_colour(k), object_stripes(k)) for k in range(1, 2 * len(PALETTE) + 1)]
     assert len(set(looks)) == len(looks)
     assert object_stripes(1) == object_stripes(SUPPORT_LABEL) == ()
-
-
-@pytest.mark.parametrize("vision", VISIONS)
-def test_parts_of_bars_that_touch_are_told_apart(vision):
-    assert np.diag(differences(SERIES, vision), 1).min() >= 30.0
 
 
 @pytest.mark.parametrize("vision", VISIONS)

@@ -19,7 +19,6 @@ from caryatid.geometry.transforms import Array
 from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
 from caryatid.manipulation.order import TakeStep
 from caryatid.planning.decision import Decision, Planner
-from caryatid.planning.planners import ORACLE
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.world import SimulatedScene
@@ -45,8 +44,6 @@ class Loop:
 
     Attributes:
         source: What is explored.
-        config: All settings.
-        planner: Name of who chooses the next view.
         planned: What the planner chose, also where a person has chosen otherwise.
         moments: What came of each view.
         ended: Why no further view can be taken, or None.
@@ -65,24 +62,22 @@ class Loop:
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
     ) -> None:
-        self._open_source, self._segmentation, self._seed = open_source, segmentation, seed
-        self._began_with = self.planner = planner
-        self.config = config
+        self._open_source, self._began_with = open_source, planner
+        self._options: dict[str, Any] = {"segmentation": segmentation, "seed": seed}
+        self.config, self.planner = config, planner
         self._begin()
 
     def _begin(self) -> None:
         self.source = source = self._open_source(self.config)
-        how: dict[str, Any] = {"segmentation": self._segmentation, "seed": self._seed}
-        self._first, camera = planner_for(self._began_with, source.camera, source.truth, self.config, **how)
-        self._explorer = Explorer(camera, source.robot, planner=self._planner(), config=self.config, **how)
+        options = self._options | {"config": self.config}
+        first, camera = planner_for(self._began_with, source.camera, source.truth, **options)
+        self._planners: dict[str, Planner] = {self._began_with: first}
+        chooser = self._planners.get(self.planner, self.planner)
+        self._explorer = Explorer(camera, source.robot, planner=chooser, **options)
         self.moments: list[Moment] = []
         self.planned: Decision | None = None
         self.ended: str | None = None
         self.pause: str | None = None
-
-    def _planner(self) -> Planner | str:
-        """The planner in charge; there is an oracle only if the loop began with it."""
-        return self._first if self.planner in (self._began_with, ORACLE) else self.planner
 
     @property
     def fusion(self) -> FusionMethod:
@@ -115,8 +110,8 @@ class Loop:
         Raises:
             CaryatidError: There is no such planner, or it can choose no view.
         """
+        self._explorer.use_planner(self._planners.get(name, name))
         self.planner = name
-        self._explorer.use_planner(self._planner())
         if not self.moments or self.ended is not None:
             return None
         step = self._explorer.plan()
@@ -139,16 +134,9 @@ class Loop:
             moment = self.turn()
             if moment is None:
                 return
-            own, taken = moment.step.decision, before.step.decision
-            same = (
-                own is not None
-                and taken is not None
-                and np.array_equal(own.T_world_camera, taken.T_world_camera)
-            )
-            if taken is None or same or before is earlier[-1]:
-                yield moment
-            else:
-                yield self._go_to(taken, by_hand=before.by_hand)
+            if before is not earlier[-1] and before.step.decision is not None:
+                moment = self._go_to(before.step.decision, by_hand=before.by_hand)
+            yield moment
 
     def choose(self, index: int) -> Moment:
         """Go to this candidate next, whatever the planner says.
@@ -203,17 +191,16 @@ def taken_apart(
         Several pictures of each lift, with what came of it where it is done, else an empty text.
     """
     gone: set[str] = set()
-    camera = source.camera
-    lifts = _lifts_as_ordered(steps)
+    camera, lifts = source.camera, _lifts_as_ordered(steps)
     if isinstance(camera, SimulatedCamera) and source.truth is not None:
         lifts = _lifts_in_physics(camera.scene, steps, bodies_of(step.graph, source.truth), config)
-    for number, (taken, pictures, disturbed) in enumerate(lifts, start=1):
-        for T_world_world in pictures:
+    for number, (taken, moves, disturbed) in enumerate(lifts, start=1):
+        for T_world_world in moves:
             yield _without(step, gone, taken.object_id, T_world_world), ""
         gone.add(taken.object_id)
         harm = f", {', '.join(disturbed)} disturbed" if disturbed else ""
         text = f"{number} of {len(steps)} taken: {taken.object_id}{harm}"
-        yield _without(step, gone, taken.object_id, pictures[-1] if pictures else {}), text
+        yield _without(step, gone, taken.object_id, moves[-1] if moves else {}), text
 
 
 Lift = tuple[TakeStep, list[dict[str, Array]], tuple[str, ...]]
@@ -227,12 +214,11 @@ def _lifts_in_physics(
     names = list(scene.object_bodies.values())
     began = transforms.invert(_transforms(poses_of(scene)))
     for taken in dismantle(scene, steps, bodies, config):
-        pictures = []
-        for state in taken.film:
-            if taken.body is not None and state[names.index(taken.body), 2] < ASIDE / 2.0:
-                now = _transforms(state) @ began
-                pictures.append({i: now[names.index(body)] for i, body in bodies.items()})
-        yield taken.step, pictures, taken.disturbed
+        film = taken.film
+        if taken.body is not None:
+            film = film[film[:, names.index(taken.body), 2] < ASIDE / 2.0]
+        moves = (_transforms(state) @ began for state in film)
+        yield taken.step, [{i: T[names.index(b)] for i, b in bodies.items()} for T in moves], taken.disturbed
 
 
 def _lifts_as_ordered(steps: Sequence[TakeStep]) -> Iterator[Lift]:

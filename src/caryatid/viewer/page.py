@@ -18,7 +18,7 @@ from caryatid.scene import Scene
 from caryatid.support.relations import predict_removal
 from caryatid.viewer import panels
 from caryatid.viewer.drawing import LAYERS, NEXT, Moment, SceneDrawing, moment_of_scene
-from caryatid.viz.colours import SERIES
+from caryatid.viz.colours import PALETTE
 from caryatid.viz.notebook import cell_html
 from caryatid.viz.report import Section
 
@@ -161,7 +161,7 @@ class Page:
             self._no_chart = gui.add_html(cell_html(Section("", "The ground truth is not known here.")))
             self._chart = gui.add_uplot(
                 (np.zeros(1), np.zeros(1)),
-                ({"label": "view"}, {"label": "F1", "stroke": SERIES[0], "width": 2, "points": {"size": 7}}),
+                ({"label": "view"}, {"label": "F1", "stroke": PALETTE[0], "width": 2, "points": {"size": 7}}),
                 title="F1 after each view",
                 scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
                 aspect=1.6,

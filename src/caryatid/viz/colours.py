@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,12 +16,9 @@ PALETTE = (
 )  # fmt: skip
 """Colours for objects 1, 2, …: first the seven of Okabe and Ito, then seven of Tol's muted set, each in the
 order in which neighbours stay furthest apart also for the colour-blind."""
-PLAIN = 7
-"""So many colours are told apart by everyone; the next so many are striped as well."""
 STRIPES = ((), (1,), (-1,), (1, -1))
-"""Directions of the stripes on objects of the first, second, … such turn: 1 rises to the right, −1 falls."""
-SERIES = ("#0072b2", "#d55e00", "#56b4e9", "#882255", "#e69f00", "#8a8f96", "#f0e442", "#009e73")
-"""Colours of a chart's lines and of its bars' parts, on light and dark; none of them means an object."""
+"""Directions of the stripes on the first half of the palette, all of whose colours can be told apart, on the
+second, on the first again, …: 1 rises to the right, −1 falls."""
 SURFACE_COLOUR = "#9c9184"
 """The support surface."""
 NOTHING_COLOUR = "#b9bec4"
@@ -39,30 +34,30 @@ DEPTH_STOPS = ((0.0, "#ffe945"), (0.33, "#bcae6c"), (0.66, "#4b6579"), (1.0, "#0
 
 def rgb(colour: str) -> Colour:
     """Return red, green and blue 0…255 of `#rrggbb`."""
-    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+    red, green, blue = bytes.fromhex(colour[1:])
+    return red, green, blue
 
 
-def _css(colour: Iterable[float]) -> str:
-    return "#" + "".join(f"{round(c):02x}" for c in colour)
+def _css(colour: Array | NDArray[np.uint8]) -> str:
+    return f"#{bytes(np.rint(colour).astype(np.uint8)).hex()}"
 
 
 def object_colour(label: int) -> str:
     """Return `#rrggbb` of the object with this label; it depends on nothing but the label.
 
-    The palette starts anew, darker, after its last colour.
+    After its last colour the palette begins again, darker.
     """
     if label in (0, SUPPORT_LABEL):
         return SURFACE_COLOUR
     turn, position = divmod(label - 1, len(PALETTE))
-    shade = (1.0, 0.72, 0.5)[turn % 3]
-    return _css(shade * c for c in rgb(PALETTE[position]))
+    return _css((1.0, 0.72, 0.5)[turn % 3] * np.array(rgb(PALETTE[position])))
 
 
 def object_stripes(label: int) -> tuple[int, ...]:
     """Return the directions of the stripes on the object with this label, which tell like colours apart."""
     if label in (0, SUPPORT_LABEL):
         return ()
-    return STRIPES[(label - 1) // PLAIN % len(STRIPES)]
+    return STRIPES[2 * (label - 1) // len(PALETTE) % len(STRIPES)]
 
 
 def striped_colours(labels: NDArray[np.int32], u: Array, v: Array, pitch: float) -> Array:
@@ -98,9 +93,9 @@ def ink_on(colour: str) -> str:
 
 def scale(values: Array, stops: tuple[tuple[float, str], ...]) -> NDArray[np.uint8]:
     """Map values (...) to colours (..., 3) between the stops; beyond the ends the ends' colours."""
-    positions = [position for position, _ in stops]
-    channels = np.array([rgb(colour) for _, colour in stops], dtype=np.float64)
-    mapped = [np.interp(values, positions, channels[:, c]) for c in range(3)]
+    positions, colours = zip(*stops, strict=True)
+    channels = np.array([rgb(colour) for colour in colours]).T
+    mapped = [np.interp(values, positions, channel) for channel in channels]
     return np.stack(mapped, axis=-1).round().astype(np.uint8)
 
 

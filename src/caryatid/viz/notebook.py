@@ -6,13 +6,11 @@ is small, loads nothing, runs no script, and takes its colours from the page aro
 
 from __future__ import annotations
 
-from functools import singledispatch
-
 import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.exploration import Step
-from caryatid.geometry.shapes import Cylinder, Shape, Sphere
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.manipulation.order import Order
@@ -53,124 +51,85 @@ def cell_html(section: Section) -> str:
     return template("cell.html.jinja").render(cell=section, svg=picture_svg)
 
 
-@singledispatch
 def _cell_of(shown: object) -> Section:
+    match shown:
+        case Scene(views=0):
+            return Section("Scene", "nothing has been seen yet; update(view) takes in a first view.")
+        case Scene(graph=graph, cloud=cloud):
+            lead = f"{count_of(shown.views, 'view')}, {len(cloud):,} points, {census(graph)}"
+            return _graph_cell("Scene", lead, graph, _cloud(cloud, graph, shown.T_world_camera))
+        case Step(view=view, graph=graph):
+            images = [] if view is None else [_image(view, shown.labels, graph, "segments and fitted shapes")]
+            travelled = f"{np.degrees(shown.angle_travelled):.0f}° and {shown.path_travelled:.1f} m travelled"
+            cell = _graph_cell(f"View {shown.index}", f"{census(graph)}; {travelled}", graph, *images)
+            following = ("stopped", f"{shown.stop}")
+            if shown.decision is not None:
+                following = ("next", shown.decision.why)
+            tables = (*cell.tables, point_table(shown.decision))
+            return Section(cell.title, cell.text, cell.figures, [following], tables)
+        case SupportGraph():
+            return _graph_cell("SupportGraph", census(shown), shown)
+        case SceneObject():
+            residual = f"{1e3 * shown.residual:.1f} mm{', a poor fit' * shown.poor_fit}"
+            views = f"{shown.occurrences} of {shown.opportunities} views"
+            facts = [*_size(shown.shape), ("found in", views), ("residual", residual)]
+            facts += [(name, said) for name, said in (("why", shown.why), ("doubtful", shown.doubt)) if said]
+            lead = "support surface" if shown.role == "support_surface" else shown.shape.kind
+            solid, colour = Figure("", draw_solid(shown.shape, shown.label)), object_colour(shown.label)
+            return Section(shown.id, lead, [solid], facts, colour=colour)
+        case Shape():
+            return Section(type(shown).__name__, "", [Figure("", draw_solid(shown))], _size(shown))
+        case View():
+            return _view_cell(shown)
+        case Cloud():
+            figures = [_cloud(shown, SupportGraph(), None)] if len(shown) else []
+            return Section("Cloud", f"{shown.name}, {len(shown):,} points", figures)
+        case Decision():
+            scores = {"saliency": shown.saliency, "path cost": shown.cost, "score": shown.score}
+            facts = [("camera", _pose(shown.T_world_camera))]
+            facts += [(name, f"{score:.3f}") for name, score in scores.items()]
+            return Section("Decision", shown.why, facts=facts, tables=[point_table(shown)])
+        case Order():
+            lead = f"{count_of(len(shown.steps), 'object')} to take, {'safe' if shown.safe else 'not safe'}"
+            facts = [("refused", shown.refusal)] * bool(shown.refusal)
+            return Section("Order", lead, facts=facts, tables=[order_table(shown)])
     raise TypeError(f"a {type(shown).__name__} has no cell of its own")
 
 
-@_cell_of.register
-def _of_scene(scene: Scene) -> Section:
-    if scene.views == 0:
-        return Section("Scene", "nothing has been seen yet; update(view) takes in a first view.")
-    lead = f"{count_of(scene.views, 'view')}, {len(scene.cloud):,} points, {census(scene.graph)}"
-    figures = (_graph(scene.graph), _cloud(scene.cloud, scene.graph, scene.T_world_camera))
-    return Section(
-        "Scene", lead, figures=figures, tables=(object_table(scene.graph), support_table(scene.graph))
-    )
+def _graph_cell(title: str, lead: str, graph: SupportGraph, *others: Figure) -> Section:
+    """A graph and its tables, with other pictures beside it."""
+    drawn = Figure("", draw_graph(graph), "supporter → supported; dashed: uncertain")
+    figures = [drawn, *others] if graph.objects else others
+    return Section(title, lead, figures, tables=[object_table(graph), support_table(graph)])
 
 
-@_cell_of.register
-def _of_step(step: Step) -> Section:
-    figures = [_graph(step.graph)]
-    if step.view is not None:
-        figures.insert(0, _image(step.view, step.labels, step.graph, "segments and fitted shapes"))
-    travelled = f"{np.degrees(step.angle_travelled):.0f}° and {step.path_travelled:.1f} m travelled"
-    return Section(
-        f"View {step.index}",
-        f"{census(step.graph)}; {travelled}",
-        figures,
-        [("next", step.decision.why) if step.decision is not None else ("stopped", f"{step.stop}")],
-        tables=(object_table(step.graph), support_table(step.graph), point_table(step.decision)),
-    )
-
-
-@_cell_of.register
-def _of_graph(graph: SupportGraph) -> Section:
-    figures = (_graph(graph),) if graph.objects else ()
-    return Section(
-        "SupportGraph", census(graph), figures=figures, tables=(object_table(graph), support_table(graph))
-    )
-
-
-@_cell_of.register
-def _of_object(item: SceneObject) -> Section:
-    residual = f"{1e3 * item.residual:.1f} mm{', a poor fit' if item.poor_fit else ''}"
-    facts = [("found in", f"{item.occurrences} of {item.opportunities} views"), ("residual", residual)]
-    facts += [(name, said) for name, said in (("why", item.why), ("doubtful", item.doubt)) if said]
-    lead = "support surface" if item.role == "support_surface" else item.shape.kind
-    figures = (Figure("", draw_solid(item.shape, item.label)),)
-    return Section(item.id, lead, figures, (*_size(item.shape), *facts), colour=object_colour(item.label))
-
-
-@_cell_of.register(Shape)
-def _of_shape(shape: Shape) -> Section:
-    return Section(type(shape).__name__, facts=_size(shape), figures=(Figure("", draw_solid(shape)),))
-
-
-def _size(shape: Shape) -> tuple[tuple[str, str], ...]:
+def _size(shape: Shape) -> list[tuple[str, str]]:
     x, y, z = shape.T_world_object[:3, 3]
-    facts = [("size", f"{size_of(shape)} mm"), ("centre", f"{x:.3f}, {y:.3f}, {z:.3f} m")]
-    if not isinstance(shape, Sphere):
-        vertical = np.abs(shape.T_world_object[2, :3])
-        upright = vertical[2] if isinstance(shape, Cylinder) else vertical.max()
-        facts.append(("leans", f"{np.degrees(np.arccos(min(upright, 1.0))):.0f}° off the vertical"))
-    return (*facts, ("volume", f"{1e6 * shape.volume:,.0f} cm³"))
+    place, volume = f"{x:.3f}, {y:.3f}, {z:.3f} m", f"{1e6 * shape.volume:,.0f} cm³"
+    return [("size", f"{size_of(shape)} mm"), ("centre", place), ("volume", volume)]
 
 
-@_cell_of.register
-def _of_view(view: View) -> Section:
+def _view_cell(view: View) -> Section:
     height, width = view.depth.shape
     labels = np.zeros(view.depth.shape, dtype=np.int32) if view.labels is None else view.labels
     readings = "none"
     if view.valid.any():
         near, far = np.percentile(view.depth[view.valid], (1.0, 99.0))
         readings = f"{view.valid.mean():.0%} of the pixels, {near:.2f} to {far:.2f} m"
-    facts = (
+    facts = [
         ("size", f"{width} × {height} px"),
         ("readings", readings),
-        ("colour", "yes" if view.rgb is not None else "none"),
-        ("labels", "none" if view.labels is None else f"{len(np.unique(labels[labels > 0]))} objects"),
+        ("labels", "none" if view.labels is None else count_of(len(np.unique(labels[labels > 0])), "object")),
         ("camera", _pose(view.T_world_camera)),
         ("focal length", f"{view.K[0, 0]:.1f} px"),
-    )
+    ]
     caption = "segments" if view.rgb is not None else "depth: near is bright"
-    return Section("View", view.name, facts=facts, figures=(_image(view, labels, SupportGraph(), caption),))
-
-
-@_cell_of.register
-def _of_cloud(cloud: Cloud) -> Section:
-    figures = (_cloud(cloud, SupportGraph(), None),) if len(cloud) else ()
-    return Section("Cloud", f"{cloud.name}, {len(cloud):,} points", figures=figures)
-
-
-@_cell_of.register
-def _of_decision(decision: Decision) -> Section:
-    facts = (
-        ("camera", _pose(decision.T_world_camera)),
-        ("saliency", f"{decision.saliency:.3f}"),
-        ("path cost", f"{decision.cost:.3f}"),
-        ("score", f"{decision.score:.3f}"),
-    )
-    return Section("Decision", decision.why, facts=facts, tables=(point_table(decision),))
-
-
-@_cell_of.register
-def _of_order(order: Order) -> Section:
-    lead = f"{count_of(len(order.steps), 'object')} to take, {'safe' if order.safe else 'not safe'}"
-    return Section(
-        "Order", lead, facts=[("refused", order.refusal)] * bool(order.refusal), tables=(order_table(order),)
-    )
-
-
-def _graph(graph: SupportGraph) -> Figure:
-    return Figure("", draw_graph(graph), "supporter → supported; dashed: uncertain")
+    return Section("View", view.name, [_image(view, labels, SupportGraph(), caption)], facts)
 
 
 def _cloud(cloud: Cloud, graph: SupportGraph, T_world_camera: Array | None) -> Figure:
     picture = draw_cloud(cloud, graph, sensor_azimuth(cloud, T_world_camera))
-    return Figure(
-        "", picture, "the points, with the shapes fitted to them" if graph.objects else "the points"
-    )
+    return Figure("", picture, f"the points{', with the shapes fitted to them' * bool(graph.objects)}")
 
 
 def _image(view: View, labels: NDArray[np.int32], graph: SupportGraph, caption: str) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Sequence
+from itertools import groupby
 from typing import Any
 
 from caryatid.viz.pictures import DOUBT, INK, SOFT, own_style
@@ -13,8 +14,6 @@ from caryatid.viz.tables import Entry, Table
 
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.55
 """Size of a page and its free border [in]."""
-GLYPH = 0.58 / 72.0
-"""Mean width of a letter [in] per point of its size."""
 
 
 def render_pdf(report: Report) -> bytes:
@@ -62,15 +61,16 @@ class _Sheets:
         self._sheet.text(left / WIDTH, at / HEIGHT, text, fontsize=size, va="top", linespacing=1.3, **look)
 
     def section(self, section: Section) -> None:
-        """Write a section; one with tables begins on a new page."""
-        self._room(HEIGHT if section.tables else 3.0)
+        """Write a section; one with pictures and tables begins on a new page, others where there is room."""
+        self._room(HEIGHT if section.figures and section.tables else 2.2)
         self._chapters.append((section.title, self._number - 1))
         self.text(section.title, 13.0, bold=True)
         if section.text:
             self.text(section.text, 8.0)
-        narrow = [figure for figure in section.figures if not figure.wide]
-        self._pictures(narrow, 2 if len(narrow) == 4 else min(section.columns, 3))
-        self._pictures([figure for figure in section.figures if figure.wide], 1)
+        for share, group in groupby(section.figures, lambda figure: figure.share):
+            figures = list(group)
+            for start in range(0, len(figures), share):
+                self._pictures(figures[start : start + share])
         for lead, remark in section.facts:
             self.text(f"{lead}: {remark}", 8.5, bold=True)
         for table in section.tables:
@@ -84,38 +84,32 @@ class _Sheets:
         self._write("\n".join(lines), MARGIN, size, fontweight="bold" if bold else "normal")
         self._top -= height + 0.04
 
-    def _pictures(self, figures: Sequence[Figure], columns: int) -> None:
-        """Put pictures side by side, with headings above and captions below them."""
+    def _pictures(self, figures: Sequence[Figure]) -> None:
+        """Put pictures of one size side by side, with headings above and captions below them."""
         gap = 0.2
-        width = (WIDTH - 2.0 * MARGIN + gap) / columns - gap
-        for start in range(0, len(figures), columns):
-            row = figures[start : start + columns]
-            heights = [min(width * f.picture.height / f.picture.width, 4.6) for f in row]
-            captions = [_wrapped(f.caption, width, 6.5) for f in row]
-            below = max(len(lines) for lines in captions) * 9.5 / 72.0 + 0.12
-            left_over = self._top - MARGIN - 0.2 - below
-            if left_over > 0.7 * max(heights):
-                heights = [min(height, left_over) for height in heights]
-            self._room(0.2 + max(heights) + below)
-            for k, (figure, height, lines) in enumerate(zip(row, heights, captions, strict=True)):
-                left, bottom = MARGIN + k * (width + gap), self._top - 0.2 - height
-                self._write(figure.heading, left, 8.5, fontweight="bold")
-                drawn = height * figure.picture.width / figure.picture.height
-                inset = left + (width - drawn) / 2.0
-                where = (inset / WIDTH, bottom / HEIGHT, drawn / WIDTH, height / HEIGHT)
-                figure.picture.put(self._sheet, where)
-                self._write("\n".join(lines), left, 6.5, bottom - 0.04, color=SOFT)
-            self._top -= 0.2 + max(heights) + below
+        width = (WIDTH - 2.0 * MARGIN + gap) / figures[0].share - gap
+        heights = [min(width * f.picture.height / f.picture.width, 4.6) for f in figures]
+        captions = [_wrapped(f.caption, width, 6.5) for f in figures]
+        below = max(len(lines) for lines in captions) * 9.0 / 72.0 + 0.12
+        self._room(0.2 + max(heights) + below)
+        for k, (figure, height, lines) in enumerate(zip(figures, heights, captions, strict=True)):
+            left, bottom = MARGIN + k * (width + gap), self._top - 0.2 - height
+            drawn = height * figure.picture.width / figure.picture.height
+            where = ((left + (width - drawn) / 2.0) / WIDTH, bottom / HEIGHT, drawn / WIDTH, height / HEIGHT)
+            self._write(figure.heading, left, 8.5, fontweight="bold")
+            figure.picture.put(self._sheet, where)
+            self._write("\n".join(lines), left, 6.5, bottom - 0.04, color=SOFT)
+        self._top -= 0.2 + max(heights) + below
 
     def _table(self, table: Table) -> None:
         """Write a table, over as many pages as it takes."""
+        size = 6.5
         self._room(0.6)
         self.text(table.heading, 9.5, bold=True)
         if not table.rows:
             self.text("None.", 7.5)
             return
-        size, widths = 6.5, _column_widths(table, 6.5)
-        heading = tuple(Entry(name) for name in table.columns)
+        heading, widths = tuple(Entry(name) for name in table.columns), _column_widths(table, size)
         for row in (heading, *table.rows):
             cells = [_wrapped(e.text, width - 0.06, size) for e, width in zip(row, widths, strict=True)]
             height = max(len(lines) for lines in cells) * 8.5 / 72.0 + 0.03
@@ -123,8 +117,7 @@ class _Sheets:
             left = MARGIN
             for entry, lines, width in zip(row, cells, widths, strict=True):
                 if entry.colour:
-                    chip = {"facecolor": entry.colour, "edgecolor": "none", "boxstyle": "square,pad=0.15"}
-                    self._write(" ", left, size, bbox=chip)
+                    self._write("■", left, size, color=entry.colour)
                 colour = SOFT if row is heading else DOUBT if entry.doubt else INK
                 self._write("\n".join(lines), left + 0.1 * bool(entry.colour), size, color=colour)
                 left += width
@@ -149,16 +142,21 @@ class _Sheets:
         file.writeObject(file.rootObject, root)
 
 
+def _letter(size: float) -> float:
+    """Mean width of a letter of a size in points [in]."""
+    return 0.56 * size / 72.0
+
+
 def _wrapped(text: str, width: float, size: float) -> list[str]:
     """Lines of a text that fit into a width in inches."""
-    return textwrap.wrap(text, max(int(width / (GLYPH * size)), 4)) or [""]
+    return textwrap.wrap(text, max(int(width / _letter(size)), 4)) or [""]
 
 
 def _column_widths(table: Table, size: float) -> list[float]:
     """Widths of the columns [in]: each as wide as its entries, but for the last, which takes what is left."""
     widths = []
-    for k, name in enumerate(table.columns[:-1]):
-        longest = max(len(row[k].text) + 2 * bool(row[k].colour) for row in table.rows)
+    for name, *entries in zip(table.columns, *table.rows, strict=True):
+        longest = max(len(e.text) + 2 * bool(e.colour) for e in entries)
         words = max(map(len, name.split()), default=2)
-        widths.append((min(max(longest, words), 20) + 1.6) * GLYPH * size)
-    return [*widths, WIDTH - 2.0 * MARGIN - sum(widths)]
+        widths.append((min(max(longest, words), 20) + 1.6) * _letter(size))
+    return [*widths[:-1], WIDTH - 2.0 * MARGIN - sum(widths[:-1])]

@@ -12,8 +12,9 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from html import escape
+from itertools import count
 from typing import TYPE_CHECKING, Any, NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,6 @@ THEME = {
 """Colours that a page may replace by its own, so that drawings can be read on light and dark."""
 INK, SOFT, LINE, DOUBT, PANEL = THEME.values()
 STYLE = {
-    "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "text.color": INK,
     "text.parse_math": False,
@@ -44,10 +44,8 @@ STYLE = {
     "ytick.major.size": 0.0,
     "legend.frameon": False,
     "legend.labelcolor": SOFT,
-    "legend.handlelength": 1.5,
-    "legend.handletextpad": 0.4,
-    "legend.columnspacing": 1.0,
     "path.simplify_threshold": 0.4,
+    "lines.solid_capstyle": "round",
     "image.interpolation": "none",
     "image.composite_image": False,
     "svg.fonttype": "none",
@@ -82,11 +80,9 @@ class Picture:
         axes.set(xlim=(0.0, self.width), ylim=(self.height, 0.0), autoscale_on=False)
         self.draw(axes)
         unit = where[2] * figure.get_size_inches()[0] * 72.0 / self.width
-        if unit == 1.0:
-            return
         artists = [*axes.texts, *axes.lines, *axes.patches]
-        for artist in (*artists, *(a for inset in axes.child_axes for a in inset.findobj())):
-            for size in ("fontsize", "linewidth", "markersize", "markeredgewidth"):
+        for artist in (*artists, *(part for inset in axes.child_axes for part in inset.findobj())):
+            for size in ("fontsize", "linewidth", "markersize", "markeredgewidth", "mutation_scale"):
                 if hasattr(artist, f"set_{size}"):
                     getattr(artist, f"set_{size}")(unit * getattr(artist, f"get_{size}")())
 
@@ -106,40 +102,29 @@ def picture_svg(picture: Picture) -> str:
     The colours of `THEME` become `var(--ink, …)` and so on. Groups drawn with a gid `class|title` get that
     class and that tooltip; rasters get the classes `raster0`, `raster1`, …
     """
-    root = ElementTree.fromstring(
-        _saved(picture, "svg", picture.name, transparent=True, metadata={"Date": None})
-    )
-    for child in list(root):
-        if child.tag.endswith("metadata") or child.find(".//{*}style") is not None:
-            root.remove(child)
-    size = root.attrib["viewBox"]
-    root.attrib.clear()
-    root.attrib |= {"viewBox": size, "role": "img", "aria-label": picture.name}
-    rasters = 0
-    for node in root.iter():
-        node.tag = node.tag.rpartition("}")[2]
-        node.attrib = {key.rpartition("}")[2]: " ".join(text.split()) for key, text in node.attrib.items()}
-        node.tail = None
-        if node.tag == "image":
-            del node.attrib["id"]
-            node.attrib |= {"href": _as_webp(node.attrib["href"]), "class": f"raster{rasters}"}
-            node.set("preserveAspectRatio", "none")
-            rasters += 1
-        elif node.tag == "path":
-            node.set("d", re.sub(r"(\.\d)\d+", r"\1", node.attrib["d"]))
-        elif node.tag == "g":
-            node.text = None
-            kind, found, title = node.attrib.pop("id", "").partition("|")
-            if found and kind:
-                node.set("class", kind)
-            if title:
-                element = ElementTree.Element("title")
-                element.text = title
-                node.insert(0, element)
-    text = ElementTree.tostring(root, encoding="unicode")
+    numbers = count()
+
+    def raster(found: re.Match[str]) -> str:
+        """An image element with its PNG as WebP, several times smaller."""
+        content = io.BytesIO()
+        Image.open(io.BytesIO(base64.b64decode(found[1]))).save(content, "WEBP", quality=65, method=2)
+        data = base64.b64encode(content.getvalue()).decode("ascii")
+        form = f'class="raster{next(numbers)}" preserveAspectRatio="none"'
+        return f'<image {form} href="data:image/webp;base64,{data}"'
+
+    saved = _saved(picture, "svg", picture.name, transparent=True, metadata={"Date": None}).decode()
+    size = f"{picture.width:g} {picture.height:g}"
+    text = f'<svg viewBox="0 0 {size}" role="img" aria-label="{escape(picture.name)}">'
+    text += saved[saved.index("</metadata>") + len("</metadata>") :]
+    text = re.sub(r"<defs>\s*<style.*?</defs>", "", text, count=1, flags=re.DOTALL)
+    text = re.sub(r'<image xlink:href="data:image/png;base64,\s*([^"]*)" id="[^"]*"', raster, text)
+    text = re.sub(r"""<g id=(["'])([^|>]*?)\|(.*?)\1>""", r"<g class=\1\2\1><title>\3</title>", text)
+    text = re.sub(r'<g id="[^"]*"', "<g", text).replace("<title></title>", "")
+    text = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d)\d+", r"\1", path[0]), text)
+    text = re.sub(r">\s+<", "><", text.replace("xlink:href", "href"))
     for variable, colour in THEME.items():
         text = text.replace(colour, f"var(--{variable}, {colour})")
-    return text
+    return text.strip()
 
 
 def picture_png(picture: Picture) -> bytes:
@@ -156,14 +141,6 @@ def _saved(picture: Picture, kind: str, salt: str = "caryatid", **options: Any) 
         content = io.BytesIO()
         figure.savefig(content, format=kind, **options)
     return content.getvalue()
-
-
-def _as_webp(href: str) -> str:
-    """The PNG of an image element, several times smaller."""
-    buffer = io.BytesIO()
-    data = base64.b64decode(href.partition(",")[2])
-    Image.open(io.BytesIO(data)).save(buffer, "WEBP", quality=80, method=2)
-    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
 def put_raster(
@@ -185,19 +162,17 @@ class Tag(NamedTuple):
 
 def put_tags(axes: Axes, tags: Sequence[Tag], size: float) -> None:
     """Write tags, letters `size` [px] high, moved until they cover neither each other nor the edge."""
-    if not tags:
-        return
-    anchors = np.array([[tag.x, tag.y] for tag in tags])
-    plates = np.array([[(0.62 * len(tag.text) + 0.7) * size, 1.45 * size] for tag in tags])
+    anchors = np.array([[tag.x, tag.y] for tag in tags]).reshape(-1, 2)
+    plates = np.array([[(0.62 * len(tag.text) + 0.7) * size, 1.45 * size] for tag in tags]).reshape(-1, 2)
     centres = keep_apart(anchors, plates + 2.0, (axes.get_xlim()[1], axes.get_ylim()[0]))
-    for tag, anchor, (x, y) in zip(tags, anchors, centres, strict=True):
-        if np.hypot(*(anchor - (x, y))) > plates[0, 1]:
-            axes.plot(*np.array([anchor, (x, y)]).T, color="white", linewidth=1.4, zorder=7.0, gid="shapes|")
-        alpha = 0.6 if tag.faint else 1.0
-        plate = {"boxstyle": "round,pad=0.22", "facecolor": tag.colour, "edgecolor": "white", "alpha": alpha}
+    for tag, anchor, centre in zip(tags, anchors, centres, strict=True):
+        if np.hypot(*(anchor - centre)) > 1.45 * size:
+            axes.plot(*np.array([anchor, centre]).T, color="white", linewidth=1.4, zorder=7.0, gid="shapes|")
+        look: dict[str, Any] = {"alpha": 0.6 if tag.faint else 1.0, "gid": "shapes|"}
+        plate = {"boxstyle": "round,pad=0.22", "facecolor": tag.colour, "edgecolor": "white"} | look
         axes.text(
-            x, y, tag.text, color=ink_on(tag.colour), fontsize=size, fontweight="bold", ha="center",
-            va="center_baseline", bbox=plate | {"gid": "shapes|"}, alpha=alpha, zorder=8.0, gid="shapes|",
+            centre[0], centre[1], tag.text, color=ink_on(tag.colour), fontsize=size, fontweight="bold",
+            ha="center", va="center_baseline", bbox=plate, zorder=8.0, **look,
         )  # fmt: skip
 
 

@@ -5,26 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import resources
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from caryatid.config import ReportConfig
-from caryatid.graph import SupportGraph
+from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import Cloud
-from caryatid.viz.drawings import bar_chart, draw_cloud, draw_image, draw_sphere, line_chart
-from caryatid.viz.graph_drawing import BESIDE, draw_graph
+from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_sphere
+from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, picture_svg
 from caryatid.viz.tables import (
     Table,
+    census,
     changes,
     count_of,
     object_table,
     point_table,
-    settings_table,
     support_table,
+    uncertain_supports,
 )
 
 if TYPE_CHECKING:
@@ -41,14 +40,14 @@ class Figure:
         heading: Its heading, or empty.
         picture: What is drawn.
         caption: What is to be seen in it, or empty.
-        wide: It takes the whole width of the page.
+        share: One divided by this is its share of the page's width.
         link: Anchor of the section it leads to, or empty.
     """
 
     heading: str
     picture: Picture
     caption: str = ""
-    wide: bool = False
+    share: int = 2
     link: str = ""
 
 
@@ -59,12 +58,10 @@ class Section:
     Attributes:
         title: Its heading.
         text: What stands below or beside it.
-        figures: Pictures side by side.
+        figures: Pictures, as many side by side as there is room for.
         facts: Names and what is said under them.
         tables: Tables, one below the other.
         colour: Colour of the chip before the title, `#rrggbb`, or empty.
-        anchor: Its id on the page.
-        columns: How many pictures stand side by side.
     """
 
     title: str
@@ -73,8 +70,11 @@ class Section:
     facts: Sequence[tuple[str, str]] = ()
     tables: Sequence[Table] = ()
     colour: str = ""
-    anchor: str = ""
-    columns: int = 2
+
+    @property
+    def anchor(self) -> str:
+        """Its id on the page."""
+        return self.title.lower().replace(" ", "")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -106,7 +106,7 @@ def make_report(
     Args:
         title: Heading of the report.
         steps: What `explore` yields, or `extract` takes from a recording or a cloud; at least one.
-        settings: Names and values of the run's settings; mappings and dataclasses in it are flattened.
+        settings: Names and values of the run's settings.
         scores: F1, precision and recall after each view by name; empty where there is no ground truth.
         strip: Pictures of the objects being taken away, in order.
         config: Sizes of the pictures.
@@ -117,40 +117,44 @@ def make_report(
     width = (config or ReportConfig()).image_width
     seen: list[Step] = []
     views: list[Section] = []
-    thumbnails = []
+    contacts = []
     for number, step in enumerate(steps):
         f1 = f"F1 {scores[number]['f1']:.3f}" if number < len(scores) else ""
         before = seen[-1] if seen else None
         views.append(_view(step, before, f1, width))
         if step.view is not None:
             picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
-            why = "The first view" if before is None or before.decision is None else before.decision.why
+            why = "the first view" if before is None or before.decision is None else before.decision.why
             heading = " · ".join(filter(None, (views[-1].title, f1)))
-            caption = f"{why[:1].upper()}{why[1:]}"
-            thumbnails.append(Figure(heading, picture, caption, link=views[-1].anchor))
+            contacts.append(Figure(heading, picture, _sentence(why), 3, views[-1].anchor))
         nothing = step.cloud.select(np.zeros(0, dtype=np.intp))
         seen.append(replace(step, view=None, labels=step.labels[:0], cloud=nothing, candidates=None))
     if not seen:
         raise ValueError("a report needs at least one view")
     if scores and len(scores) != len(seen):
         raise ValueError(f"{len(scores)} scores for {len(seen)} views")
-    sections = [Section("Summary", figures=_charts(seen, scores), anchor="summary", columns=4)]
-    if len(thumbnails) > 1:
+    sections = [Section("Summary", figures=_charts(seen, scores))]
+    if len(contacts) > 1:
         text = "Every view with the segments found in it, and why it was taken."
-        sections.append(Section("Contact sheet", text, thumbnails, anchor="contacts", columns=4))
+        sections.append(Section("Contact sheet", text, contacts))
     sections += views
     if strip:
         text = "Each object lifted straight up in physics, in the order found."
-        sections.append(Section("Taken apart", text, strip, anchor="taken", columns=3))
-    sections.append(Section("Settings", tables=(settings_table(settings or {}),), anchor="settings"))
+        sections.append(Section("Taken apart", text, strip))
+    named = ((name, str(value)) for name, value in (settings or {}).items())
+    sections.append(Section("Settings", tables=[Table.of("Settings", ("name", "value"), named)]))
     return Report(title, _cards(seen, scores), sections)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
 
 
 def _cards(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[tuple[str, str, str]]:
     last = steps[-1]
     kinds = [o.shape.kind for o in last.graph.objects if o.role == "object"]
     counts = ", ".join(count_of(kinds.count(kind), kind) for kind in sorted(set(kinds)))
-    supports, uncertain = len(last.graph.supports), _uncertain(last.graph)
+    supports, uncertain = len(last.graph.supports), uncertain_supports(last.graph)
     seconds = [sum(step.timings.values()) for step in steps]
     cards = [
         ("objects", str(len(kinds)), counts or "none found"),
@@ -168,69 +172,41 @@ def _cards(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list
 
 
 def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[Figure]:
-    """Scores over views and path, what was found, time."""
-    number, charts = [float(step.index) for step in steps], []
+    """Scores and what was found, over views."""
+    charts = []
     if scores:
         lines = {name: [s[name.lower()] for s in scores] for name in ("F1", "precision", "recall")}
-        charts.append(line_chart("F1 over views", "view", number, lines, "share"))
-        path, unit = [step.path_travelled for step in steps], "path [m]"
-        if path[-1] == 0.0:
-            path = [float(np.rad2deg(step.angle_travelled)) for step in steps]
-            unit = "angle around the scene [°]"
-        if path[-1] > path[0]:
-            charts.append(line_chart("F1 over path length", unit, path, {"F1": lines["F1"]}, "F1"))
+        charts.append(draw_chart("F1 over views", "share", lines))
     if len(steps) > 1:
+        graphs = [step.graph for step in steps]
         found = {
-            "objects": [_objects(step.graph) for step in steps],
-            "supports": [len(step.graph.supports) for step in steps],
-            "uncertain supports": [_uncertain(step.graph) for step in steps],
+            "objects": [sum(o.role == "object" for o in graph.objects) for graph in graphs],
+            "supports": [len(graph.supports) for graph in graphs],
+            "uncertain supports": [uncertain_supports(graph) for graph in graphs],
         }
-        charts.append(line_chart("Found so far", "view", number, found, "number"))
-    times = [step.timings for step in steps]
-    if any(times):
-        charts.append(bar_chart("Time of each stage", "view", times, "time [s]"))
+        charts.append(draw_chart("Found so far", "number", found))
     return [Figure("", chart) for chart in charts]
-
-
-def _objects(graph: SupportGraph) -> int:
-    return sum(o.role == "object" for o in graph.objects)
-
-
-def _uncertain(graph: SupportGraph) -> int:
-    return sum(not s.certain for s in graph.supports)
 
 
 def _view(step: Step, before: Step | None, f1: str, width: int) -> Section:
     """A view: its counts, its score and what it changed, pictures, what comes next, tables."""
     graph, decision = step.graph, step.decision
-    parts = [step.name, count_of(_objects(graph), "object"), count_of(len(graph.supports), "support"), f1]
-    parts += [] if before is None else [changes(before.graph, graph)]
-    facts = []
+    parts = [step.name, census(graph), f1, "" if before is None else changes(before.graph, graph)]
+    facts, tables = [], [object_table(graph), support_table(graph)]
     if decision is not None:
-        numbers = (
+        scores = (
             f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
         )
-        facts.append(("Next view", f"{decision.why.rstrip('.')} ({numbers})."))
+        facts.append(("Next view", f"{decision.why.rstrip('.')} ({scores})."))
+        tables += [point_table(decision)] * bool(decision.points_of_interest)
     if step.stop:
-        facts.append(("Stopped", step.stop))
-    tables = [object_table(graph), support_table(graph)]
-    if decision is not None and decision.points_of_interest:
-        tables.append(point_table(decision))
-    figures, number = _figures(step, width), f"{step.index:02d}"
-    return Section(
-        f"View {number}",
-        " · ".join(filter(None, parts)),
-        figures,
-        facts,
-        tables,
-        anchor=f"view{number}",
-        columns=3 if len(figures) == 3 else 2,
-    )
+        facts.append(("Stopped", _sentence(step.stop)))
+    text = " · ".join(filter(None, parts))
+    return Section(f"View {step.index:02d}", text, _figures(step, width), facts, tables)
 
 
 def _figures(step: Step, width: int) -> list[Figure]:
-    graph, cloud, view = step.graph, step.cloud, step.view
-    figures = []
+    graph, cloud, view, figures = step.graph, step.cloud, step.view, []
     if view is not None:
         kind = "colour image" if view.rgb is not None else "depth image, near bright and far dark"
         caption = (
@@ -246,7 +222,8 @@ def _figures(step: Step, width: int) -> list[Figure]:
         "supporter."
     )
     picture = draw_graph(graph)
-    figures.append(Figure("What supports what", picture, caption, picture.width > BESIDE))
+    # A graph of more than eight vertices beside each other cannot be read in half the width.
+    figures.append(Figure("What supports what", picture, caption, share=1 if picture.width > 680.0 else 2))
     azimuth = sensor_azimuth(cloud, None if view is None else view.T_world_camera)
     if len(step.visited):
         azimuth = float(np.arctan2(step.visited[0, 1], step.visited[0, 0]))
@@ -255,13 +232,13 @@ def _figures(step: Step, width: int) -> list[Figure]:
         "inside of a surface whose other side has not been seen."
     )
     for turn, side in ((0.0, "from the first view's side"), (np.pi, "from the opposite side")):
-        figures.append(Figure(f"The cloud {side}", draw_cloud(cloud, graph, azimuth + turn), caption))
+        figures.append(Figure(f"The cloud {side}", draw_cloud(cloud, graph, azimuth + turn), caption, 3))
     if step.candidates is not None or step.decision is not None:
-        figures.append(Figure("Where to look next", draw_sphere(step), _sphere_caption(step), wide=True))
+        figures.append(Figure("Where to look next", draw_sphere(step), _sphere_caption(step), 3))
     return figures
 
 
-def sensor_azimuth(cloud: Cloud, T_world_camera: NDArray[np.float64] | None) -> float:
+def sensor_azimuth(cloud: Cloud, T_world_camera: Array | None) -> float:
     """Direction [rad] from the scene to the sensor at a pose (4, 4); where unknown, the world's −x."""
     backward = np.array([-1.0, 0.0, 0.0])
     if T_world_camera is not None:
@@ -273,8 +250,8 @@ def sensor_azimuth(cloud: Cloud, T_world_camera: NDArray[np.float64] | None) -> 
 
 def _sphere_caption(step: Step) -> str:
     text = (
-        "The view sphere, coloured by saliency; washed out where the robot cannot bring its camera. Rays "
-        "lead from points of interest to where they are best seen. Numbers: views made; next: the choice."
+        "The view sphere from above, coloured by saliency; pale where the robot cannot bring its camera. "
+        "Rays lead from points of interest to where they are best seen. Numbers: the views so far."
     )
     if step.candidates is not None:
         refused = ", ".join(f"{count:,} {reason}" for reason, count in step.candidates.rejected.items())
@@ -287,13 +264,12 @@ def template(name: str) -> jinja2.Template:
     """One of the HTML templates of this package; everything put into it is escaped."""
     import jinja2
 
-    folder = resources.files("caryatid.viz")
     environment = jinja2.Environment(
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
-        loader=jinja2.FunctionLoader(lambda file: folder.joinpath(file).read_text(encoding="utf-8")),
+        loader=jinja2.PackageLoader("caryatid", "viz"),
     )
     return environment.get_template(name)
 

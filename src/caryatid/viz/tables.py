@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, is_dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -16,78 +15,61 @@ if TYPE_CHECKING:
     from caryatid.manipulation.order import Order
     from caryatid.planning.decision import Decision
 
-FACES = ("−x", "+x", "−y", "+y", "−z", "+z")
-"""Names of an object's sides, in the order of `SceneObject.seen`."""
 
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One place of a table.
-
-    Attributes:
-        text: What it says.
-        colour: Colour of the chip before it, `#rrggbb`, or empty.
-        doubt: It says something doubtful.
-    """
+class Entry(NamedTuple):
+    """One place of a table: what it says, the colour `#rrggbb` of the chip before it, whether in doubt."""
 
     text: str
     colour: str = ""
     doubt: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A table, ready to print.
-
-    Attributes:
-        heading: What it is of.
-        columns: Their headings; the last column is the widest.
-        rows: As many entries in each.
-    """
+class Table(NamedTuple):
+    """A table, ready to print: what it is of, its columns' headings, its rows; the last column is widest."""
 
     heading: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Entry, ...], ...]
 
-
-def _table(heading: str, columns: tuple[str, ...], rows: Any) -> Table:
-    """A table of rows whose entries may be plain texts."""
-    entries = (tuple(e if isinstance(e, Entry) else Entry(e) for e in row) for row in rows)
-    return Table(heading, columns, tuple(entries))
+    @classmethod
+    def of(cls, heading: str, columns: Iterable[str], rows: Iterable[Iterable[str | Entry]]) -> Table:
+        """Make a table of rows in which plain texts may stand for entries."""
+        entries = (tuple(e if isinstance(e, Entry) else Entry(e) for e in row) for row in rows)
+        return cls(heading, tuple(columns), tuple(entries))
 
 
 def object_table(graph: SupportGraph) -> Table:
     """Say of each object what it is, how well it is known and whether it stands."""
-    columns = (
-        "id", "shape", "size [mm]", "in views", "sides unseen", "residual [mm]", "supported by", "stability",
-        "r_s", "overhang [mm]", "how it came about",
-    )  # fmt: skip
-    return _table("Objects", columns, (_object_row(item, graph) for item in graph.objects))
+    rows = [_object_row(item, graph) for item in graph.objects]
+    return Table.of("Objects", rows[0] if rows else (), (row.values() for row in rows))
 
 
-def _object_row(item: SceneObject, graph: SupportGraph) -> tuple[str | Entry, ...]:
+def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry]:
     surface, stability = item.role == "support_surface", graph.stability.get(item.id)
-    unseen = " ".join(face for face, seen in zip(FACES, item.seen, strict=True) if not seen)
+    faces = ("−x", "+x", "−y", "+y", "−z", "+z")
+    unseen = " ".join(face for face, seen in zip(faces, item.seen, strict=True) if not seen)
     supporters = ", ".join(s.supporter if s.certain else f"{s.supporter}?" for s in graph.supporters(item.id))
     verdict, ratio, overhang = "–" if surface else "not tested", "–", "–"
     if stability is not None:
-        fired = (("small area", stability.small_area), ("tips", stability.tips))
-        verdict, ratio = ", ".join(name for name, yes in fired if yes) or "stable", f"{stability.ratio:.2f}"
+        found = ["small area"] * stability.small_area + ["tips"] * stability.tips
+        verdict, ratio = ", ".join(found) or "stable", f"{stability.ratio:.2f}"
         if np.isfinite(stability.overhang):
             overhang = f"{1e3 * stability.overhang:.0f}".replace("-", "−")
-    return (
-        Entry(item.id, object_colour(item.label)),
-        item.shape.kind,
-        size_of(item.shape),
-        f"{item.occurrences} of {item.opportunities}",
-        "all" if not any(item.seen) else unseen or "none",
-        Entry(f"{item.residual * 1e3:.1f}{' poor fit' if item.poor_fit else ''}", doubt=item.poor_fit),
-        "–" if surface else supporters or "nothing known",
-        Entry(verdict, doubt=stability is not None and not stability.stable),
-        ratio,
-        overhang,
-        f"{item.why}; doubtful: {item.doubt}" if item.doubt else item.why,
-    )
+    return {
+        "id": Entry(item.id, object_colour(item.label)),
+        "shape": item.shape.kind,
+        "size [mm]": size_of(item.shape),
+        "in views": f"{item.occurrences} of {item.opportunities}",
+        "sides unseen": (unseen or "none") if any(item.seen) else "all",
+        "residual [mm]": Entry(
+            f"{item.residual * 1e3:.1f}{' poor fit' * item.poor_fit}", doubt=item.poor_fit
+        ),
+        "supported by": "–" if surface else supporters or "nothing known",
+        "stability": Entry(verdict, doubt=stability is not None and not stability.stable),
+        "r_s": ratio,
+        "overhang [mm]": overhang,
+        "origin": f"{item.why}; doubtful: {item.doubt}" if item.doubt else item.why,
+    }
 
 
 def support_table(graph: SupportGraph) -> Table:
@@ -104,8 +86,8 @@ def support_table(graph: SupportGraph) -> Table:
         )
         for s in graph.supports
     )
-    columns = ("supporter", "supported", "kind", "certain", "found in views", "why it is there")
-    return _table("Supports", columns, rows)
+    columns = ("supporter", "supported", "kind", "certain", "found in views", "evidence")
+    return Table.of("Supports", columns, rows)
 
 
 def point_table(decision: Decision | None) -> Table:
@@ -115,7 +97,7 @@ def point_table(decision: Decision | None) -> Table:
         (" – ".join(p.subject) or "–", Entry(f"{p.saliency:.2f}", saliency_colour(p.saliency)), p.why)
         for p in points
     )
-    return _table("Points of interest", ("about", "saliency", "why"), rows)
+    return Table.of("Points of interest", ("about", "saliency", "why"), rows)
 
 
 def order_table(order: Order) -> Table:
@@ -130,24 +112,7 @@ def order_table(order: Order) -> Table:
         )
         for number, step in enumerate(order.steps, 1)
     )
-    return _table("Steps", ("", "take", "hold", "safe", "why"), rows)
-
-
-def settings_table(settings: Mapping[str, object]) -> Table:
-    """Flatten settings, dataclasses and mappings inside them, to `stage.name` and value."""
-
-    def flat(inner: Mapping[str, object], prefix: str) -> list[tuple[str, str]]:
-        rows = []
-        for name, value in inner.items():
-            if is_dataclass(value) and not isinstance(value, type):
-                value = asdict(value)
-            if isinstance(value, Mapping):
-                rows += flat(value, f"{prefix}{name}.")
-            else:
-                rows.append((f"{prefix}{name}", f"{value:g}" if isinstance(value, float) else str(value)))
-        return rows
-
-    return _table("Settings", ("name", "value"), flat(settings, ""))
+    return Table.of("Steps", ("", "take", "hold", "safe", "why"), rows)
 
 
 def size_of(shape: Shape) -> str:
@@ -168,29 +133,30 @@ def count_of(number: int, name: str) -> str:
 
 def census(graph: SupportGraph) -> str:
     """Count the objects and supports of a graph."""
-    objects = sum(o.role == "object" for o in graph.objects)
-    uncertain = sum(not s.certain for s in graph.supports)
+    objects, uncertain = sum(o.role == "object" for o in graph.objects), uncertain_supports(graph)
     text = f"{count_of(objects, 'object')}, {count_of(len(graph.supports), 'support')}"
     return f"{text}, {uncertain} of them uncertain" if uncertain else text
+
+
+def uncertain_supports(graph: SupportGraph) -> int:
+    """Number of uncertain supports."""
+    return sum(not s.certain for s in graph.supports)
 
 
 def changes(before: SupportGraph, after: SupportGraph) -> str:
     """Say what a view added to and took from the graph."""
     old, new = ({o.id: o.shape.kind for o in graph.objects} for graph in (before, after))
-    old_edges, new_edges = ({s.pair: s.certain for s in graph.supports} for graph in (before, after))
-    both = [pair for pair in new_edges if pair in old_edges]
-    parts: dict[str, list[Any]] = {
+    old_edges, new_edges = (
+        {f"{s.supporter} → {s.supported}": s.certain for s in graph.supports} for graph in (before, after)
+    )
+    parts: dict[str, Iterable[Any]] = {
         "new objects": [n for n in new if n not in old],
         "objects gone": [n for n in old if n not in new],
         "new supports": [p for p in new_edges if p not in old_edges],
         "supports gone": [p for p in old_edges if p not in new_edges],
-        "now certain": [p for p in both if new_edges[p] and not old_edges[p]],
-        "now in doubt": [p for p in both if old_edges[p] and not new_edges[p]],
-        "other shape": [n for n in new if n in old and old[n] != new[n]],
+        "now certain": [p for p, certain in new_edges.items() if certain and not old_edges.get(p, True)],
+        "now uncertain": [p for p, certain in new_edges.items() if not certain and old_edges.get(p, False)],
+        "other shape": [n for n in new if old.get(n, new[n]) != new[n]],
     }
-    said = (
-        f"{name}: {', '.join(i if isinstance(i, str) else ' → '.join(i) for i in items)}"
-        for name, items in parts.items()
-        if items
-    )
+    said = (f"{name}: {', '.join(items)}" for name, items in parts.items() if items)
     return "; ".join(said) or "nothing new"
