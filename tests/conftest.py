@@ -14,9 +14,12 @@ import pytest
 
 from caryatid import cli
 from caryatid.config import Config, SensorConfig
+from caryatid.exploration import Step
 from caryatid.geometry import transforms
 from caryatid.io import write_recording
 from caryatid.runtime.compiling import compile_kernels
+from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.sensing.views import Cloud
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth, write_truth
@@ -80,6 +83,13 @@ def without_poses(views):
 
 def without_labels(views):
     return [replace(view, labels=None) for view in views]
+
+
+def step_of(graph, labels, name="a") -> Step:
+    """A step of which only the graph and the labels matter."""
+    none = np.zeros((0, 3))
+    sphere, cloud = ViewSphere(np.zeros(3), 1.0, none), Cloud(none, none)
+    return Step(0, name, None, labels, graph, cloud, sphere, none, None, None, {}, 0.0, 0.0, None)
 
 
 def run_command(*arguments: object) -> int:

@@ -17,7 +17,8 @@ from PIL import Image
 
 import caryatid as ct
 from caryatid.errors import InputError
-from caryatid.io import read_run, write_recording
+from caryatid.io import write_recording
+from caryatid.steps import read_run
 
 
 @pytest.fixture
@@ -240,8 +241,8 @@ def test_a_name_of_two_lines_is_said_in_one(tmp_path, capsys):
 def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     assert run_command("extract", recording, "--out", tmp_path / "run", "--no-report", "--quiet") == 0
     for run, truth, says in (
-        (tmp_path / "nowhere", scene_file.parent, "is no folder"),
-        (tmp_path / "run", tmp_path / "nowhere", "is no folder"),
+        (tmp_path / "nowhere", scene_file.parent, "is not a folder"),
+        (tmp_path / "run", tmp_path / "nowhere", "is not a folder"),
         (recording, scene_file.parent, "run.json: the file is missing"),
         (tmp_path / "run", recording, "gt.json: the file is missing"),
         (tmp_path / "run", tmp_path, "has neither scene.xml nor scene_camera.json"),

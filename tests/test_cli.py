@@ -17,7 +17,6 @@ from conftest import SMALL, SMALL_SENSOR, run_command
 from PIL import Image
 
 from caryatid.config import Config
-from caryatid.io import read_run
 from caryatid.io.bop import read_recording
 from caryatid.planning.planners import BUILT_IN
 from caryatid.planning.planners.hidden_surface import SupportPlanner
@@ -25,6 +24,7 @@ from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth
+from caryatid.steps import read_run
 
 ESCAPE = "\x1b"
 
@@ -80,7 +80,7 @@ def test_every_view_has_its_graph_labels_pose_and_choice(kept_run):
     run = read_run(kept_run)
     assert (kept_run / "graph.json").read_bytes() == (kept_run / "views/01/graph.json").read_bytes()
     for view in run.views:
-        with Image.open(view.labels_path) as image:
+        with Image.open(view.folder / "labels.png") as image:
             assert image.mode == "I;16"
         labels = view.load_labels()
         assert labels.shape == (SMALL_SENSOR.height, SMALL_SENSOR.width)
@@ -149,7 +149,7 @@ def test_a_cloud_with_labels_is_extracted(tmp_path, points, write_pcd):
     assert run_command("extract", cloud, "--out", tmp_path / "run") == 0
     run = read_run(tmp_path / "run")
     labels = run.views[0].load_labels()
-    assert run.views[0].labels_path.suffix == ".npy"
+    assert (run.views[0].folder / "labels.npy").is_file()
     assert labels.shape == points[1].shape
     assert (labels[points[1] > 0] == points[1][points[1] > 0]).all()
     assert (labels == SUPPORT_LABEL).sum() > 1000

@@ -9,7 +9,8 @@ import pytest
 from conftest import run_command
 
 from caryatid.errors import InputError
-from caryatid.io import open_dataset, read_recording, read_run
+from caryatid.io import open_dataset, read_recording
+from caryatid.steps import read_run
 
 FORMAT = """
 from functools import partial

@@ -13,12 +13,11 @@ from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import Explorer, Step, explore, next_best_view
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
-from caryatid.io.runs import RunWriter, read_run
 from caryatid.planning.planners.baselines import RandomPlanner
 from caryatid.robots.recording import RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.steps import read_steps, write_step
+from caryatid.steps import RunWriter, read_run, read_steps
 
 CONFIG = Config(
     sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
@@ -231,7 +230,7 @@ def test_views_may_be_handed_in_without_camera_or_robot():
 def written(folder, steps):
     with RunWriter(folder) as writer:
         for step in steps:
-            write_step(writer, step)
+            writer.add(step)
         writer.finish(steps[-1].graph, {"versions": {"caryatid": "0.2.0"}})
     return read_run(folder)
 

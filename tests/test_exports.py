@@ -220,7 +220,7 @@ def test_a_graph_file_alone_can_be_exported_and_settings_count(tmp_path, graph):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--out", "model.step"], "does not say which format"),
+        (["--out", "model.step"], "does not end as any format does"),
         (["--format", "mjcf", "--out", "graph.json"], "does not end as mjcf does"),
         (["--out", "folder.urdf"], "is a folder"),
     ],
@@ -239,7 +239,7 @@ def test_a_file_that_is_no_export_is_never_touched(tmp_path, extracted, monkeypa
 
 def test_what_cannot_be_exported_is_said(tmp_path, graph, capsys):
     assert run_command("export", tmp_path / "no-run", "--out", tmp_path / "s.xml") == 1
-    assert "is no folder" in capsys.readouterr().err
+    assert "is not a folder" in capsys.readouterr().err
     assert run_command("export", tmp_path, "--format", "step", "--out", tmp_path / "s.step") == 2
     with pytest.raises(InputError, match="holds no objects"):
         export_graph(SupportGraph(), tmp_path / "s.glb")

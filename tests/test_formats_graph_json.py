@@ -123,7 +123,7 @@ def change(document, *path_and_value):
     ("where", "said"),
     [
         (("format", "other"), "caryatid/graph"),
-        (("version", 2), "version 2"),
+        (("version", 2), "'version' is 2: must be 1"),
         (("objects", ...), "'objects' is missing"),
         (("objects", 1, "id", "o0"), "two objects are called 'o0'"),
         (("objects", 1, "id", ...), "'id' is missing"),

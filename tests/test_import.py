@@ -24,7 +24,7 @@ from bag_files import (
     write_bag,
     write_tum,
 )
-from conftest import run_command, without_labels
+from conftest import run_command
 from hypothesis import given
 from hypothesis import settings as limits
 from hypothesis import strategies as st
@@ -38,12 +38,17 @@ from caryatid.io.importing import apart, choose_views
 
 TOPICS = ("--depth", DEPTH, "--info", INFO)
 ALL = (*TOPICS, "--rgb", RGB, "--tf", WORLD)
-KINDS = [("one.bag", ""), ("two", "sqlite3"), ("three", "mcap")]
+KINDS = [("one.bag", "sqlite3"), ("two", "sqlite3"), ("three", "mcap")]
 
 
 def bag_of(tmp_path, views, kind=KINDS[0], **options):
+    """A bag of some views, or an empty one."""
     name, storage = kind
-    write_bag(tmp_path / name, views, storage or "sqlite3", **options)
+    if views is None:
+        with BagFile(tmp_path / name, storage):
+            pass
+    else:
+        write_bag(tmp_path / name, views, storage, **options)
     return tmp_path / name
 
 
@@ -122,8 +127,7 @@ def one_frame(tmp_path, views, depth=None, colour=None, **camera):
     view = views[0]
     millimetres = np.rint(view.depth * 1000.0).astype(np.uint16)
     with BagFile(tmp_path / "one.bag") as bag:
-        size = view.depth.shape[::-1]
-        bag.write(INFO, bag.camera(START, view.K, size, **camera), START)
+        bag.write(INFO, bag.camera(START, **{"K": view.K, "size": (160, 120)} | camera), START)
         made = depth(bag, START) if depth else bag.image(START, millimetres, "16UC1")
         bag.write(DEPTH, made, START)
         if colour:
@@ -131,22 +135,22 @@ def one_frame(tmp_path, views, depth=None, colour=None, **camera):
     return tmp_path / "one.bag"
 
 
-@pytest.mark.parametrize(("encoding", "big", "padding"), [("16UC1", False, 0), ("mono16", True, 6)])
-def test_depth_in_millimetres(tmp_path, views, encoding, big, padding):
-    millimetres = np.rint(views[0].depth * 1000.0).astype(np.uint16)
-    bag = one_frame(tmp_path, views, lambda b, t: b.image(t, millimetres, encoding, padding=padding, big=big))
-    (view,) = imported(tmp_path, bag, *TOPICS)
-    assert np.array_equal(np.rint(view.depth * 1000.0), millimetres)
-
-
-@pytest.mark.parametrize("big", [False, True])
-def test_depth_in_metres_without_what_is_no_reading(tmp_path, views, big):
-    metres = views[0].depth.astype(np.float32)
-    metres[:2], metres[2:4], metres[4:6], metres[6:8] = np.nan, np.inf, -1.0, 30.0
-    bag = one_frame(tmp_path, views, lambda b, t: b.image(t, metres, "32FC1", padding=8, big=big))
+@pytest.mark.parametrize(
+    ("encoding", "big", "padding"),
+    [("16UC1", False, 0), ("mono16", True, 6), ("32FC1", False, 8), ("32FC1", True, 0)],
+)
+def test_raw_depth_without_what_is_no_reading(tmp_path, views, encoding, big, padding):
+    pixels = views[0].depth.astype(np.float32)
+    if encoding == "32FC1":
+        pixels[:2], pixels[2:4], pixels[4:6], pixels[6:8] = np.nan, np.inf, -1.0, 30.0
+    else:
+        pixels[:8] = 0.0
+        pixels = np.rint(pixels * 1000.0).astype(np.uint16)
+    bag = one_frame(tmp_path, views, lambda b, t: b.image(t, pixels, encoding, padding=padding, big=big))
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert not view.depth[:8].any()
-    assert np.allclose(view.depth[8:], views[0].depth[8:], atol=0.00011)
+    metres = views[0].depth if encoding == "32FC1" else pixels * 0.001
+    assert np.allclose(view.depth[8:], metres[8:], atol=0.00006)
 
 
 @pytest.mark.parametrize(
@@ -167,29 +171,28 @@ def rgba(rgb):
     return np.dstack([rgb, np.full(rgb.shape[:2], 9, dtype=np.uint8)])
 
 
-COLOURS = {
-    "rgb8": lambda rgb: rgb,
-    "bgr8": lambda rgb: rgb[:, :, ::-1],
-    "rgba8": rgba,
-    "bgra8": lambda rgb: rgba(rgb[:, :, ::-1]),
-}
-
-
-@pytest.mark.parametrize("encoding", COLOURS)
-def test_colour(tmp_path, views, encoding):
+@pytest.mark.parametrize(
+    ("pack", "encoding"),
+    [
+        (lambda rgb: rgb, "rgb8"),
+        (lambda rgb: rgb[:, :, ::-1], "bgr8"),
+        (rgba, "rgba8"),
+        (lambda rgb: rgba(rgb[:, :, ::-1]), "bgra8"),
+        (png, "rgb8; png compressed bgr8"),
+        (jpeg, "jpeg"),
+    ],
+)
+def test_colour(tmp_path, views, pack, encoding):
     rgb = views[0].rgb
-    pixels = np.ascontiguousarray(COLOURS[encoding](rgb))
-    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, pixels, encoding, padding=5))
-    (view,) = imported(tmp_path, bag, *TOPICS, "--rgb", RGB)
-    assert np.array_equal(view.rgb, rgb)
+    packed = pack(rgb)
 
+    def message(bag, time):
+        if isinstance(packed, bytes):
+            return bag.compressed(time, packed, encoding)
+        return bag.image(time, np.ascontiguousarray(packed), encoding, padding=5)
 
-@pytest.mark.parametrize(("pack", "form"), [(png, "rgb8; png compressed bgr8"), (jpeg, "jpeg")])
-def test_compressed_colour(tmp_path, views, pack, form):
-    rgb = views[0].rgb
-    bag = one_frame(tmp_path, views, colour=lambda b, t: b.compressed(t, pack(rgb), form))
-    (view,) = imported(tmp_path, bag, *TOPICS, "--rgb", RGB)
-    assert np.abs(view.rgb.astype(int) - rgb).mean() < (3.0 if form == "jpeg" else 1e-9)
+    (view,) = imported(tmp_path, one_frame(tmp_path, views, colour=message), *TOPICS, "--rgb", RGB)
+    assert np.abs(view.rgb.astype(int) - rgb).mean() < (3.0 if encoding == "jpeg" else 1e-9)
 
 
 def test_a_lens_that_distorts_is_told_of(tmp_path, views, capsys):
@@ -268,62 +271,51 @@ def test_what_does_not_fit_the_bag_is_said(tmp_path, views, capsys, leftovers, o
     assert leftovers() == {"one.bag"}
 
 
-def test_a_bag_of_a_later_version_is_not_called_damaged(tmp_path, views, capsys):
-    bag = bag_of(tmp_path, views, KINDS[2])
-    path = bag / "metadata.yaml"
-    path.write_text(path.read_text().replace("version: 9", "version: 99"))
-    told = refused(capsys, bag, *ALL, "--out", tmp_path / "out")
-    assert "is of a kind rosbags does not read (Rosbag2 version 99 not supported" in told
-
-
-def test_depth_that_is_not_registered(tmp_path, views, capsys):
-    rgb = views[0].rgb
-    large = np.repeat(rgb, 2, axis=1)
-    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, large, "rgb8"))
-    told = refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
-    assert "depth (160×120, frame 'optical') is not registered to colour (320×120, frame 'optical')" in told
-    bag.unlink()
-    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, rgb, "rgb8", frame="other"))
-    told = refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
-    assert "frame 'other') ; give" in told.replace(");", ") ;")
+@pytest.mark.parametrize(
+    ("columns", "frame", "said"),
+    [
+        (
+            2,
+            LENS,
+            "(160×120 pixels, frame 'optical') is not registered to colour (320×120 pixels, frame 'optical')",
+        ),
+        (1, "other", "is not registered to colour (160×120 pixels, frame 'other')"),
+    ],
+)
+def test_depth_that_is_not_registered(tmp_path, views, capsys, columns, frame, said):
+    rgb = np.repeat(views[0].rgb, columns, axis=1)
+    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, rgb, "rgb8", frame=frame))
+    assert said in refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
     ("camera", "said"),
     [
-        ({"K": np.zeros((3, 3))}, "the camera is not calibrated"),
-        ({"binning": 2}, "cropped or binned"),
-        ({"size": (320, 240)}, "is the camera of 320×240 pixel images, the depth has 160×120"),
-        ({"frame": "infra"}, "is the camera 'infra', the depth is of 'optical'"),
+        ({"K": np.zeros((3, 3))}, "K has focal lengths 0, 0"),
+        (
+            {"size": (320, 240)},
+            "its images (320×240 pixels, frame 'optical') are not the depth images (160×120",
+        ),
+        ({"frame": "infra"}, "its images (160×120 pixels, frame 'infra') are not the depth images (160×120"),
     ],
 )
 def test_a_camera_that_is_not_the_depth_images(tmp_path, views, capsys, camera, said):
-    with BagFile(tmp_path / "one.bag") as bag:
-        given = {"K": views[0].K, "size": (160, 120)} | camera
-        bag.write(INFO, bag.camera(START, **given), START)
-        depth = np.rint(views[0].depth * 1000.0).astype(np.uint16)
-        bag.write(DEPTH, bag.image(START, depth, "16UC1"), START)
-    assert said in refused(capsys, tmp_path / "one.bag", *TOPICS, "--out", tmp_path / "out")
+    bag = one_frame(tmp_path, views, **camera)
+    assert said in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda b, t, d: b.image(t, d.astype(np.uint8), "mono8"), "encoding 'mono8' is none of depth"),
-        (
-            lambda b, t, d: b.compressed(t, jpeg(d.astype(np.uint8)), "jpeg"),
-            "its depth is compressed as 'jpeg'",
-        ),
+        (lambda b, t, d: b.image(t, d, "mono8"), "encoding 'mono8' is not supported"),
+        (lambda b, t, d: b.compressed(t, jpeg(d), "jpeg"), "its depth is compressed as 'jpeg'"),
         (lambda b, t, d: b.compressed(t, b"\0" * 99, "16UC1; compressedDepth rvl"), "compressedDepth rvl"),
-        (
-            lambda b, t, d: b.compressed(t, b"\0" * 5, "16UC1; compressedDepth png"),
-            "images is usable: 1 broken",
-        ),
-        (lambda b, t, d: b.compressed(t, jpeg(d.astype(np.uint8)), "16UC1"), "images is usable: 1 broken"),
+        (lambda b, t, d: b.compressed(t, b"\0" * 5, "16UC1; compressedDepth png"), "is usable: 1 broken"),
+        (lambda b, t, d: b.compressed(t, jpeg(d), "16UC1"), "images is usable: 1 broken"),
     ],
 )
 def test_depth_that_cannot_be_decoded(tmp_path, views, capsys, leftovers, make, said):
-    bag = one_frame(tmp_path, views, lambda b, t: make(b, t, np.rint(views[0].depth * 1000.0)))
+    bag = one_frame(tmp_path, views, lambda b, t: make(b, t, views[0].depth.astype(np.uint8)))
     assert said in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
     assert leftovers() == {"one.bag"}
 
@@ -337,7 +329,7 @@ def test_a_bag_that_was_cut_off_or_has_wrong_bytes_is_read_or_refused_in_one_lin
     whole, there = file.read_bytes(), leftovers()
     for share in (0.001, 0.3, 0.99):
         file.write_bytes(whole[: int(share * len(whole))])
-        assert "is damaged or was cut off" in refused(capsys, bag, *ALL, "--out", tmp_path / "out")
+        assert "rosbags cannot read it (" in refused(capsys, bag, *ALL, "--out", tmp_path / "out")
         assert leftovers() == there
     rng = np.random.default_rng(0)
     for _ in range(15):
@@ -358,17 +350,8 @@ def test_a_bag_that_was_cut_off_or_has_wrong_bytes_is_read_or_refused_in_one_lin
 
 @pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
 def test_an_empty_bag(tmp_path, kind, capsys):
-    name, storage = kind
-    with BagFile(tmp_path / name, storage or "sqlite3"):
-        pass
-    assert "the bag is empty" in refused(capsys, tmp_path / name, *TOPICS, "--out", tmp_path / "out")
-
-
-def test_what_is_no_recording(tmp_path, capsys):
-    (tmp_path / "x.zip").write_bytes(b"PK")
-    told = refused(capsys, tmp_path / "x.zip", *TOPICS, "--out", tmp_path / "out")
-    assert "is of no known format" in told
-    assert "there is no such file" in refused(capsys, tmp_path / "no.bag", "--out", tmp_path / "out")
+    bag = bag_of(tmp_path, None, kind)
+    assert "the bag is empty" in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
 
 
 def test_without_the_library_the_extra_is_named(tmp_path, views, capsys, monkeypatch):
@@ -399,18 +382,13 @@ def test_a_folder_of_the_benchmark_becomes_the_views_it_holds(tmp_path, views):
     same_views(recording, views, atol=0.00011)
 
 
-@pytest.mark.parametrize(
-    ("name", "fx"),
-    [("rgbd_dataset_freiburg1_xyz", 517.3), ("x-freiburg2-y", 520.9), ("rgbd_dataset_freiburg3_z", 535.4)],
-)
-def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, name, fx):
-    large = [
-        replace(v, depth=np.kron(v.depth, np.ones((4, 4))), rgb=np.kron(v.rgb, np.ones((4, 4, 1), np.uint8)))
-        for v in without_labels(views[:1])
-    ]
-    (view,) = imported(tmp_path, tum_folder(tmp_path, large, name))
-    assert view.K[0, 0] == fx
-    number = name.partition("freiburg")[2][0]
+@pytest.mark.parametrize(("number", "fx"), [(1, 517.3), (2, 520.9), (3, 535.4)])
+def test_the_name_of_the_folder_says_which_camera(tmp_path, views, capsys, number, fx):
+    view = views[0]
+    depth, rgb = np.kron(view.depth, np.ones((4, 4))), np.kron(view.rgb, np.ones((4, 4, 1), np.uint8))
+    large = replace(view, depth=depth, rgb=rgb, labels=None)
+    (read,) = imported(tmp_path, tum_folder(tmp_path, [large], f"rgbd_dataset_freiburg{number}_xyz"))
+    assert read.K[0, 0] == fx
     assert f"camera: as published for freiburg{number}, fx {fx:g}" in capsys.readouterr().err
 
 
@@ -426,8 +404,8 @@ def spoil(name, text):
         (spoil("depth.txt", "1.0\n"), "'1.0' has 1 columns, not 2"),
         (spoil("depth.txt", "nan depth/x.png\n"), "a row does not begin with a time in seconds"),
         (spoil("groundtruth.txt", "1.0 0 0 0\n"), "has 4 columns, not 8"),
-        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 0\n"), "is no pose"),
-        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 one\n"), "is no pose"),
+        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 0\n"), "is not a pose"),
+        (spoil("groundtruth.txt", "1.0 0 0 0 0 0 0 one\n"), "is not a pose"),
         (spoil("groundtruth.txt", "# none\n"), "none of its 3 depth images is usable: 3 no pose"),
         (spoil("rgb.txt", "# none\n"), "3 no colour image of that time"),
         (lambda folder: shutil.rmtree(folder / "depth"), "3 broken"),
@@ -445,48 +423,36 @@ def test_a_folder_that_is_broken(tmp_path, views, capsys, change, said):
 def test_a_camera_that_is_not_known_or_does_not_fit(tmp_path, views, capsys):
     folder = tum_folder(tmp_path, views)
     out = ("--out", tmp_path / "out")
-    assert "its name holds none of freiburg1, freiburg2, freiburg3" in refused(capsys, folder, *out)
+    assert "name holds none of freiburg1, freiburg2, freiburg3" in refused(capsys, folder, *out)
     (tmp_path / "camera.json").write_text('{"fx": 500, "fy": 500, "cx": 320}')
     told = refused(capsys, folder, "--camera", tmp_path / "camera.json", *out)
     assert "the key 'cy' is missing" in told
     other = tum_folder(tmp_path, views, "freiburg1")
-    assert "is 160×120 pixels, the published camera has 640×480" in refused(capsys, other, *out)
+    assert "(640×480 pixels, frame 'camera') are not the depth images (160×120" in refused(
+        capsys, other, *out
+    )
     assert "are for bags" in refused(capsys, folder, *TOPICS, *out)
 
 
-def lying(views):
-    """The same pictures in a world that lies on its side."""
-    T = transforms.rigid(transforms.rotation_from_vector((1.4, 0.5, 0.0)), (0.3, -0.2, 1.0))
-    return [replace(view, T_world_camera=T @ view.pose) for view in views]
-
-
-def up_from(view, upright):
-    """Angle [deg] between up in a view and up in the same view of an upright world."""
-    up, right = view.pose[2, :3], upright.pose[2, :3]
-    return np.rad2deg(transforms.angle_between(up, right))
-
-
 def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views, capsys):
-    folder = tum_folder(tmp_path, lying(views))
+    T = transforms.rigid(transforms.rotation_from_vector((1.4, 0.5, 0.0)), (0.3, -0.2, 1.0))
+    folder = tum_folder(tmp_path, [replace(view, T_world_camera=T @ view.pose) for view in views])
     options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
     levelled = list(imported(tmp_path, folder, *options))
     assert "so that the table is level" in capsys.readouterr().err
-    assert max(up_from(view, upright) for view, upright in zip(levelled, views, strict=True)) < 0.5
+    for view, upright in zip(levelled, views, strict=True):
+        assert np.rad2deg(transforms.angle_between(view.pose[2, :3], upright.pose[2, :3])) < 0.5
     before, after = (transforms.invert(a.pose) @ b.pose for a, b in (views[:2], levelled[:2]))
     assert np.allclose(before, after, atol=1e-5)
 
 
 def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, capsys):
-    turns = [
-        transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
-        for n in range(3)
-    ]
-    folder = tum_folder(
-        tmp_path, [replace(v, T_world_camera=T @ v.pose) for v, T in zip(views, turns, strict=True)]
-    )
-    camera = camera_file(tmp_path, views[0].K)
-    told = refused(capsys, folder, "--camera", camera, "--level", "--out", tmp_path / "out")
-    assert "1 of 3 views agree on where up is" in told
+    turned = []
+    for n, view in enumerate(views):
+        T = transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
+        turned.append(replace(view, T_world_camera=T @ view.pose))
+    options = ("--camera", camera_file(tmp_path, views[0].K), "--level", "--out", tmp_path / "out")
+    assert "1 of 3 views agree on where up is" in refused(capsys, tum_folder(tmp_path, turned), *options)
     assert not (tmp_path / "out").exists()
 
 
@@ -531,7 +497,7 @@ def test_of_too_many_those_farthest_apart_stay():
     assert chosen == ([0, 11, 12], {"more than are wanted": 10})
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(0, 60), st.integers(1, 12))
+@given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 12))
 @limits(max_examples=50, deadline=None)
 def test_views_are_few_apart_and_every_frame_is_accounted_for(seed, count, most):
     rng = np.random.default_rng(seed)
@@ -543,8 +509,7 @@ def test_views_are_few_apart_and_every_frame_is_accounted_for(seed, count, most)
     config = RecordingConfig(max_views=most)
     kept, others = choose_views(times, rng.uniform(0.5, 1.0, count), poses, config)
     assert len(kept) + sum(others.values()) == count
-    assert (count == 0) == (len(kept) == 0)
-    assert len(kept) <= most
+    assert 1 <= len(kept) <= most
     assert kept == sorted(set(kept))
     for k in kept:
         rest = [j for j in kept if j != k]

@@ -13,7 +13,7 @@ import psutil
 import pytest
 from conftest import SMALL, run_command
 
-from caryatid.io import read_run
+from caryatid.steps import read_run
 
 pytestmark = pytest.mark.slow
 

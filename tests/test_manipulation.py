@@ -16,13 +16,13 @@ from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.graph import Support, SupportGraph
-from caryatid.io.runs import read_run
 from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses_of
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.manipulation.rehearsal import Rehearsal
 from caryatid.simulation.lifting import ASIDE, Lifting
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import TABLE_HEIGHT, Solid, build_spec, scene_from_spec
+from caryatid.steps import read_run
 from caryatid.support.relations import infer
 
 CONFIG = replace(Config(), rehearsal=RehearsalConfig(draws=2), lift=LiftConfig(watch=1.0))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import step_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -25,8 +26,9 @@ from caryatid.evaluation.scores import (
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.io import RunWriter, write_recording
+from caryatid.io import write_recording
 from caryatid.sensing.views import SUPPORT_LABEL, View
+from caryatid.steps import RunWriter
 
 SHARED = Path(__file__).parents[2] / "shared"
 
@@ -214,7 +216,7 @@ def write_run(folder, graphs, labels=None, names=None):
     with RunWriter(folder) as run:
         for index, graph in enumerate(graphs):
             image = np.zeros((4, 4), np.int32) if labels is None else labels[index]
-            run.add_view(graph, image, name=f"view {index}" if names is None else names[index])
+            run.add(step_of(graph, image, f"view {index}" if names is None else names[index]))
         run.finish(graphs[-1], {})
 
 
@@ -288,10 +290,10 @@ def test_a_bad_truth_is_refused(tmp_path, scene_folder, name, content, said):
 
 
 def test_missing_folders_are_refused(tmp_path, scene_folder):
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         evaluate_run(tmp_path / "nowhere", scene_folder)
     write_run(tmp_path / "RUN", [scene_graph(2)])
-    with pytest.raises(InputError, match="is no folder"):
+    with pytest.raises(InputError, match="is not a folder"):
         evaluate_run(tmp_path / "RUN", tmp_path / "nowhere")
 
 

@@ -16,9 +16,9 @@ from caryatid.errors import PlanningError
 from caryatid.exploration import explore
 from caryatid.graph import Support, SupportGraph
 from caryatid.io.graph_json import graph_text
-from caryatid.io.runs import read_run
 from caryatid.manipulation.order import TakeStep
 from caryatid.sources import open_source
+from caryatid.steps import read_run
 from caryatid.support.relations import Effect, predict_removal
 from caryatid.viewer import panels
 from caryatid.viewer.drawing import BY_HAND, LAYERS, Moment

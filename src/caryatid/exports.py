@@ -8,72 +8,57 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-import numpy as np
-
 from caryatid.config import ExportConfig
 from caryatid.config.choices import ExportFormat
 from caryatid.errors import InputError
-from caryatid.geometry.shapes import Cylinder, Shape, Sphere
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.shapes import Cylinder, Sphere
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.staging import write_file
 from caryatid.viz.colours import ink_on, object_colour, rgb
 
-ENDINGS: Final[dict[ExportFormat, tuple[str, ...]]] = {
-    "mjcf": (".xml",),
-    "urdf": (".urdf",),
-    "gltf": (".glb", ".gltf"),
-    "graphml": (".graphml",),
-    "dot": (".dot", ".gv"),
+ENDINGS: Final[dict[str, ExportFormat]] = {
+    ".xml": "mjcf",
+    ".urdf": "urdf",
+    ".glb": "gltf",
+    ".gltf": "gltf",
+    ".graphml": "graphml",
+    ".dot": "dot",
+    ".gv": "dot",
 }
-"""How files of each format end."""
-
+"""How a file's name ends → its format."""
 _ROOT = "world"
 """Name of a URDF's root link."""
-_Z_UP = "z_up"
-"""Name of the node whose frame is caryatid's world; the file itself has y up, as glTF wants."""
-_T_FILE_WORLD = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 
 
-def format_of(path: Path) -> ExportFormat:
+def format_of(path: Path, wanted: ExportFormat | None = None) -> ExportFormat:
     """The format a file's name ends in.
 
     Raises:
-        InputError: None does.
+        InputError: It ends in none, or in another one than is wanted.
     """
-    for format_, endings in ENDINGS.items():
-        if path.suffix.lower() in endings:
-            return format_
-    known = ", ".join(ending for endings in ENDINGS.values() for ending in endings)
-    raise InputError(path, "does not say which format it is to have", f"end its name in one of {known}")
+    found = ENDINGS.get(path.suffix.lower())
+    if found is None or wanted not in (None, found):
+        endings = [ending for ending, format_ in ENDINGS.items() if wanted in (None, format_)]
+        reason = f"does not end as {wanted or 'any format'} does"
+        raise InputError(path, reason, f"end its name in {' or '.join(endings)}")
+    return found
 
 
-def export_graph(
-    graph: SupportGraph,
-    path: str | Path,
-    format_: ExportFormat | None = None,
-    config: ExportConfig | None = None,
-) -> None:
+def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | None = None) -> None:
     """Write a scene model to a file, whole or not at all; a file already there is replaced.
 
     Args:
         graph: The scene model.
-        path: The file.
-        format_: Its format; None takes it from the file's name.
+        path: The file; its name says the format.
         config: Density, friction and how fine meshes are.
 
     Raises:
-        InputError: The name does not end as the format's do, there is nothing to export, or the file cannot
-            be written.
+        InputError: The name ends in no format, there is nothing to export, or the file cannot be written.
     """
-    path = Path(path)
-    chosen = format_ or format_of(path)
-    if path.suffix.lower() not in ENDINGS[chosen]:
-        endings = " or ".join(ENDINGS[chosen])
-        raise InputError(path, f"does not end as {chosen} does", f"end its name in {endings}")
+    path, config = Path(path), config or ExportConfig()
+    chosen = format_of(path)
     if not graph.objects:
         raise InputError("the scene model", "holds no objects", "nothing was written")
-    config = config or ExportConfig()
     match chosen:
         case "mjcf":
             content = to_mjcf(graph, config).encode()
@@ -133,6 +118,8 @@ def to_urdf(graph: SupportGraph, config: ExportConfig) -> str:
     Raises:
         InputError: An object is called `world`.
     """
+    from scipy.spatial.transform import Rotation
+
     robot = Element("robot", name="caryatid")
     SubElement(robot, "link", name=_ROOT)
     for item in graph.objects:
@@ -146,36 +133,25 @@ def to_urdf(graph: SupportGraph, config: ExportConfig) -> str:
         SubElement(inertial, "inertia", diagonal | dict.fromkeys(("ixy", "ixz", "iyz"), "0"))
         for part in ("visual", "collision"):
             geometry = SubElement(SubElement(link, part), "geometry")
-            SubElement(geometry, *_urdf_shape(item.shape))
+            match item.shape:
+                case Cylinder(radius=radius, height=height):
+                    SubElement(geometry, "cylinder", radius=_numbers(radius), length=_numbers(height))
+                case Sphere(radius=radius):
+                    SubElement(geometry, "sphere", radius=_numbers(radius))
+                case _:
+                    SubElement(geometry, "box", size=_numbers(*item.shape.extents))
         material = SubElement(link[1], "material", name=f"colour of {item.id}")
         SubElement(material, "color", rgba=_numbers(*_rgba(item)))
         joint = SubElement(robot, "joint", name=f"{_ROOT}_to_{item.id}", type="fixed")
         SubElement(joint, "parent", link=_ROOT)
         SubElement(joint, "child", link=item.id)
-        T = item.shape.T_world_object
-        SubElement(joint, "origin", xyz=_numbers(*T[:3, 3]), rpy=_numbers(*_rpy(T)))
+        with warnings.catch_warnings():
+            # Straight up or down there are many roll-pitch-yaw angles; SciPy warns and takes one.
+            warnings.simplefilter("ignore", UserWarning)
+            angles = Rotation.from_matrix(item.shape.T_world_object[:3, :3]).as_euler("xyz")
+        SubElement(joint, "origin", xyz=_numbers(*item.centre_world), rpy=_numbers(*angles))
     indent(robot)
     return tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
-
-
-def _urdf_shape(shape: Shape) -> tuple[str, dict[str, str]]:
-    match shape:
-        case Cylinder():
-            return "cylinder", {"radius": _numbers(shape.radius), "length": _numbers(shape.height)}
-        case Sphere():
-            return "sphere", {"radius": _numbers(shape.radius)}
-    return "box", {"size": _numbers(*shape.extents)}
-
-
-def _rpy(T_world_object: Array) -> Array:
-    """Roll, pitch and yaw (3,) [rad] about the world's x, y and z."""
-    from scipy.spatial.transform import Rotation
-
-    with warnings.catch_warnings():
-        # Straight up or down there are many; scipy says so and takes one.
-        warnings.simplefilter("ignore", UserWarning)
-        angles: Array = Rotation.from_matrix(T_world_object[:3, :3]).as_euler("xyz")
-    return angles
 
 
 def _rgba(item: SceneObject) -> tuple[float, float, float, float]:
@@ -202,15 +178,17 @@ def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -
     from trimesh.exchange.gltf import export_glb, export_gltf
     from trimesh.visual.material import PBRMaterial
 
+    # glTF has y up; the frame of the node `z_up` is caryatid's world.
+    T_file_world = [[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
     scene = trimesh.Scene(base_frame="file")
-    scene.graph.update(frame_from="file", frame_to=_Z_UP, matrix=_T_FILE_WORLD)
+    scene.graph.update(frame_from="file", frame_to="z_up", matrix=T_file_world)
     for item in graph.objects:
         mesh = item.shape.mesh(config.corners)
         colour = [*rgb(object_colour(item.label)), 255]
         material = PBRMaterial(name=item.id, baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.8)
         mesh.visual = trimesh.visual.TextureVisuals(material=material)
         mesh.metadata = {"role": item.role, "shape": item.shape.kind, "size": item.shape.size}
-        names = {"node_name": item.id, "geom_name": item.id, "parent_node_name": _Z_UP}
+        names = {"node_name": item.id, "geom_name": item.id, "parent_node_name": "z_up"}
         scene.add_geometry(mesh, **names, transform=item.shape.T_world_object)
     content: bytes = export_glb(scene) if binary else export_gltf(scene, embed_buffers=True)["model.gltf"]
     return content
@@ -232,19 +210,11 @@ def to_graphml(graph: SupportGraph) -> str:
         x, y, z = item.centre_world.tolist()
         size = item.shape.size
         lengths = size.values() if isinstance(size, Mapping) else size
-        plain.add_node(
-            item.id,
-            role=item.role,
-            label=item.label,
-            shape=item.shape.kind,
-            size=" ".join(f"{length:.6g}" for length in lengths),
-            x=x,
-            y=y,
-            z=z,
-            colour=object_colour(item.label),
-            occurrences=item.occurrences,
-            opportunities=item.opportunities,
-        )
+        attributes: dict[str, Any] = {"role": item.role, "label": item.label, "shape": item.shape.kind}
+        attributes |= {"size": " ".join(f"{length:.6g}" for length in lengths), "x": x, "y": y, "z": z}
+        attributes["colour"] = object_colour(item.label)
+        attributes |= {"occurrences": item.occurrences, "opportunities": item.opportunities}
+        plain.add_node(item.id, **attributes)
     for support in graph.supports:
         names = ("kind", "certain", "occurrences", "opportunities")
         plain.add_edge(*support.pair, **{name: getattr(support, name) for name in names})

@@ -16,9 +16,8 @@ from caryatid.config import Config
 from caryatid.evaluation.scores import Score, TrueScene, score
 from caryatid.exploration import Step
 from caryatid.graph import SupportGraph
-from caryatid.io.runs import RunWriter, read_run
 from caryatid.io.staging import write_file
-from caryatid.steps import read_config, read_steps, write_step
+from caryatid.steps import RunWriter, read_config, read_run, read_steps
 from caryatid.viz import make_report, render_html, render_pdf
 from caryatid.viz.strip import read_figures
 
@@ -73,7 +72,7 @@ class RunRecorder:
         self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
         self.graphs.append(step.graph)
         if self.writer is not None:
-            write_step(self.writer, step)
+            self.writer.add(step)
         return self.scores[-1] if self.scores else None
 
     @contextmanager
@@ -98,33 +97,30 @@ class RunRecorder:
         Raises:
             KeyboardInterrupt: The run was interrupted; says what was kept.
         """
+        kept = ""
         if self.writer is not None:
-            record = self._record() | dict(more or {})
-            self.writer.finish(self.graphs[self.views - 1], record, files=files)
-        if self.interrupted and self.writer is not None:
-            kept = "1 view is" if self.views == 1 else f"{self.views} views are"
-            folder = self.writer.folder
-            raise KeyboardInterrupt(f"{kept} kept in {folder}; `caryatid report {folder}` makes the report")
+            last = self.steps[self.views - 1]
+            record: dict[str, Any] = {
+                "command": self.command,
+                "source": self.source,
+                "seed": self.seed,
+                "options": dict(self.options),
+                "settings": asdict(self.config),
+                "versions": {"python": platform.python_version()}
+                | {name: version(name) for name in PACKAGES},
+                "angle_travelled": last["angle_travelled"],
+                "path_travelled": last["path_travelled"],
+                "steps": self.steps[: self.views],
+            }
+            if self.truth is not None:
+                record["scores"] = [asdict(score) for score in self.scores[: self.views]]
+            if self.interrupted:
+                record["interrupted"] = True
+            self.writer.finish(self.graphs[self.views - 1], record | dict(more or {}), files)
+            count, folder = "1 view is" if self.views == 1 else f"{self.views} views are", self.writer.folder
+            kept = f"{count} kept in {folder}; `caryatid report {folder}` makes the report"
         if self.interrupted:
-            raise KeyboardInterrupt
-
-    def _record(self) -> dict[str, Any]:
-        """What run.json holds."""
-        last = self.steps[self.views - 1]
-        record: dict[str, Any] = {
-            "command": self.command,
-            "source": self.source,
-            "seed": self.seed,
-            "options": dict(self.options),
-            "settings": asdict(self.config),
-            "versions": {"python": platform.python_version()} | {name: version(name) for name in PACKAGES},
-            "angle_travelled": last["angle_travelled"],
-            "path_travelled": last["path_travelled"],
-            "steps": self.steps[: self.views],
-        }
-        if self.truth is not None:
-            record["scores"] = [asdict(score) for score in self.scores[: self.views]]
-        return record | ({"interrupted": True} if self.interrupted else {})
+            raise KeyboardInterrupt(*filter(None, [kept]))
 
 
 def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:

@@ -78,12 +78,13 @@ def open_source(
         if robot != HUMANOID:
             reason = "is a recording, its camera can only be where a recorded view is"
             raise InputError(source, reason, "leave --robot out")
-        return _open_recording(open_recording(source, config, segmentation))
+        recording = open_recording(source, config, segmentation)
+        poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
+        return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
     make = find_robot(robot)
     scene = load_scene(source)
     truth_file = Path(scene.source).parent / "gt.json"
-    known = read_truth(truth_file) if truth_file.is_file() else None
-    truth = ground_truth(scene) if known is None else known
+    truth = read_truth(truth_file) if truth_file.is_file() else ground_truth(scene)
     stage = make_simulation(scene, config, noise=noise, seed=seed, robot=make)
     return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth))
 
@@ -125,14 +126,5 @@ def check_segments(source: str, points: Mapping[int, int], config: Config) -> No
     least = config.fit.min_points
     small = sorted(label for label, count in points.items() if label != 0 and count < least)
     if small:
-        raise InputError(
-            source,
-            f"segment {small[0]} has {points[small[0]]} points with depth, a shape needs {least}",
-            "take it out, show more of it, or use --segmentation auto",
-        )
-
-
-def _open_recording(recording: Dataset) -> Source:
-    camera = RecordingCamera(recording)
-    poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
-    return Source(recording.path.name, camera, RecordingRobot(poses), None)
+        reason = f"segment {small[0]} has {points[small[0]]} points with depth, a shape needs {least}"
+        raise InputError(source, reason, "take it out, show more of it, or use --segmentation auto")

@@ -1,76 +1,192 @@
-"""Steps on disk: `views/NN/step.npz` of a run folder, beside graph.json, view.json and the labels."""
+"""Run folders: a folder for each step of a run, written whole or not at all, and read back."""
 
 from __future__ import annotations
 
 import io
 import json
 import zipfile
-from collections.abc import Iterator
-from dataclasses import asdict, fields
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config
 from caryatid.config.settings import changed_settings
-from caryatid.errors import InputError
+from caryatid.errors import CaryatidError, InputError
 from caryatid.exploration import RobotPose, Step
-from caryatid.io.graph_json import read_graph
-from caryatid.io.runs import Run, RunWriter
+from caryatid.graph import SupportGraph
+from caryatid.io import images
+from caryatid.io.graph_json import graph_text, read_graph
+from caryatid.io.json_files import json_text, parse_json, read_json
+from caryatid.io.staging import StagedFolder
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.robots import Posture
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.sensing.views import Cloud, View
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
+FORMAT: Final = "caryatid/run"
+AGAIN: Final = "run caryatid again"
+"""What to do where a file of a run is broken."""
 PARTS = {"cloud": Cloud, "sphere": ViewSphere, "view": View, "candidates": Candidates, "decision": Decision}
 """The parts of a step that hold arrays."""
 
-Arrays = dict[str, NDArray[Any]]
 
+class RunWriter(StagedFolder):
+    """Writes a run folder step by step, in a `with` block.
 
-def write_step(writer: RunWriter, step: Step) -> None:
-    """Write the next view of a run folder.
-
-    Points and normals of the cloud are rounded to float32; all else comes back as it was.
-
-    Raises:
-        InputError: Labels leave 16 bits, or the disk is full or refuses; nothing is left behind.
-    """
-    view = step.view
-    writer.add_view(
-        step.graph,
-        step.labels,
-        name=step.name,
-        T_world_camera=None if view is None else view.T_world_camera,
-        K=None if view is None else view.K,
-        record=_summary(step),
-        step=_encoded(step),
-    )
-
-
-def read_step(folder: Path) -> Step:
-    """Read a step back.
+    Leaving the block without `finish`, by an error or otherwise, leaves nothing behind. After an interrupt
+    call `finish`, inside the block, to keep the views done so far. A run folder already there is replaced, at
+    `finish` and not before; a folder that is no run is never touched.
 
     Args:
-        folder: `views/NN` of a run folder.
+        folder: RUN.
+
+    Attributes:
+        views: Number of views written.
 
     Raises:
-        InputError: step.npz or graph.json is missing or broken.
+        InputError: RUN holds something else, or cannot be written.
     """
-    path = folder / "step.npz"
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = dict(archive)
-        document = json.loads(arrays.pop("document").tobytes())
-        return _decoded(document, arrays, folder)
-    except FileNotFoundError:
-        raise InputError(path, "the file is missing", "explore again") from None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(path, f"is not a step of a run ({error})", "explore again") from error
+
+    def __init__(self, folder: str | Path) -> None:
+        super().__init__(folder, replaces=is_run)
+        self.views = 0
+
+    def add(self, step: Step) -> None:
+        """Write the next view.
+
+        Points and normals of the cloud are rounded to float32; all else comes back as it was.
+
+        Raises:
+            InputError: Labels leave 16 bits, or the disk is full or refuses.
+        """
+        labels, folder = step.labels, _view_folder(self.views)
+        if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
+            reason = f"labels leave 0…{SUPPORT_LABEL}"
+            raise InputError(step.name, reason, "number objects from 1, 0 = nothing")
+        self.write(f"{folder}/graph.json", graph_text(step.graph).encode())
+        if labels.ndim == 2:
+            self.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
+        else:
+            buffer = io.BytesIO()
+            np.save(buffer, labels.astype(np.int32))
+            self.write(f"{folder}/labels.npy", buffer.getvalue())
+        document = {"view": self.views, "name": step.name} | _summary(step)
+        self.write(f"{folder}/view.json", json_text(document).encode())
+        self.write(f"{folder}/step.npz", _encoded(step))
+        self.views += 1
+
+    def finish(
+        self, graph: SupportGraph, record: Mapping[str, Any], files: Mapping[str, bytes] | None = None
+    ) -> None:
+        """Write the rest and put the folder in its place.
+
+        Args:
+            graph: The final fused graph.
+            record: For run.json: settings, seed, versions, source, timings [s], angle and path travelled.
+            files: Further files by their paths in the folder.
+
+        Raises:
+            CaryatidError: No view was added.
+            InputError: The disk is full or refuses.
+        """
+        if self.views == 0:
+            raise CaryatidError(f"{self.folder}: no view was finished, so there is no run to keep")
+        self.remove(_view_folder(self.views))
+        document = {"format": FORMAT, "version": 2, "views": self.views} | dict(record)
+        written = {"graph.json": graph_text(graph).encode(), "run.json": json_text(document).encode()}
+        for path, content in (written | dict(files or {})).items():
+            self.write(path, content)
+        self.publish()
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class RunView:
+    """One view of a run.
+
+    Attributes:
+        index: 0 for the first.
+        name: The view's name; a recording's frame is found again by it.
+        graph: The fused graph after this view.
+        record: All of view.json.
+        folder: Its folder, `views/NN`.
+    """
+
+    index: int
+    name: str
+    graph: SupportGraph
+    record: dict[str, Any]
+    folder: Path
+
+    def load_labels(self) -> NDArray[np.int32]:
+        """Read the label image (H, W), or the labels (N,) of a cloud's points.
+
+        Raises:
+            InputError: The file is missing, broken or of another kind.
+        """
+        path = self.folder / "labels.npy"
+        if not path.exists():
+            return images.read_units(self.folder / "labels.png")
+        try:
+            labels = np.asarray(np.load(path, allow_pickle=False))
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(path, f"is not an array of labels ({error})", AGAIN) from error
+        if labels.ndim != 1 or labels.dtype.kind not in "iu":
+            raise InputError(path, "is not an array of whole numbers (N,)", AGAIN)
+        return labels.astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Run:
+    """A run folder as read.
+
+    Attributes:
+        folder: RUN.
+        record: All of run.json: settings, seed, versions, source, timings.
+        graph: The final fused graph.
+        views: The views in their order.
+    """
+
+    folder: Path
+    record: dict[str, Any]
+    graph: SupportGraph
+    views: tuple[RunView, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _RunFile:
+    """run.json; version 1, of caryatid 0.1.0, has no step.npz."""
+
+    format: Literal["caryatid/run"]
+    version: Literal[1, 2]
+    views: int
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class _ViewFile:
+    name: str
+
+
+def read_run(folder: str | Path) -> Run:
+    """Read a run folder; label images are loaded when asked for.
+
+    Raises:
+        InputError: It is no run folder, or a file in it is missing or broken.
+    """
+    folder, remedy = Path(folder), "give the folder a run was written to with --out"
+    if not folder.is_dir():
+        raise InputError(folder, "is not a folder", remedy)
+    path = folder / "run.json"
+    record = read_json(path, remedy)
+    count = parse_json(_RunFile, record, path, AGAIN).views
+    views = tuple(_read_view(folder / _view_folder(index), index) for index in range(count))
+    return Run(folder, record, read_graph(folder / "graph.json"), views)
 
 
 def read_steps(run: Run) -> Iterator[Step]:
@@ -81,64 +197,79 @@ def read_steps(run: Run) -> Iterator[Step]:
     """
     if run.record["version"] == 1:
         version = run.record.get("versions", {}).get("caryatid", "0.1.0")
+        reason = f"was written by caryatid {version}, which kept no views"
         raise InputError(
-            run.folder,
-            f"was written by caryatid {version}, which kept no views",
-            "make the run again; order, evaluate and export need only its graph",
+            run.folder, reason, "make the run again; order, evaluate and export need only its graph"
         )
-    return (read_step(view.folder) for view in run.views)
+    return (_read_step(view.folder) for view in run.views)
 
 
 def read_config(run: Run) -> Config:
     """Return the settings a run was made with; settings that no longer exist are passed over.
 
     Raises:
-        InputError: run.json holds no settings, or they are not valid.
+        InputError: The settings are not valid.
     """
-    path = str(run.folder / "run.json")
-    return changed_settings(Config(), run.record.get("settings", {}), path)
+    return changed_settings(Config(), run.record.get("settings", {}), str(run.folder / "run.json"))
+
+
+def is_run(folder: Path) -> bool:
+    """Whether a folder was written by `RunWriter`, whatever its version."""
+    try:
+        return read_json(folder / "run.json").get("format") == FORMAT
+    except InputError:
+        return False
+
+
+def _view_folder(index: int) -> str:
+    return f"views/{index:02d}"
+
+
+def _read_view(folder: Path, index: int) -> RunView:
+    path = folder / "view.json"
+    record = read_json(path, AGAIN)
+    name = parse_json(_ViewFile, record, path, AGAIN).name
+    return RunView(index, name, read_graph(folder / "graph.json"), record, folder)
 
 
 def _summary(step: Step) -> dict[str, Any]:
-    """What view.json says of the candidates and of the choice of the next view."""
-    record: dict[str, Any] = {}
+    """What view.json says of the camera, the candidates and the choice of the next view."""
+    record: dict[str, Any] = {key: getattr(step.view, key, None) for key in ("T_world_camera", "K")}
     if step.candidates is not None:
         record["candidates"] = {"reachable": len(step.candidates), "rejected": step.candidates.rejected}
     if step.decision is not None:
-        d = step.decision
-        points = [
-            {"position": p.position_world, "saliency": p.saliency, "subject": list(p.subject), "why": p.why}
-            for p in d.points_of_interest
+        decision = step.decision
+        names = ("T_world_camera", "saliency", "cost", "score", "why")
+        record["next"] = {name: getattr(decision, name) for name in names}
+        record["next"]["points_of_interest"] = [
+            {"position": p.position_world, "saliency": p.saliency, "subject": p.subject, "why": p.why}
+            for p in decision.points_of_interest
         ]
-        figures = {key: getattr(d, key) for key in ("T_world_camera", "saliency", "cost", "score", "why")}
-        record["next"] = figures | {"points_of_interest": points}
-        if d.candidate_saliency is not None:
-            quartiles = np.quantile(d.candidate_saliency, (0.0, 0.25, 0.5, 0.75, 1.0))
+        if decision.candidate_saliency is not None:
+            quartiles = np.quantile(decision.candidate_saliency, (0.0, 0.25, 0.5, 0.75, 1.0))
             record["next"]["candidate_saliency_quartiles"] = quartiles
     return record
 
 
 def _encoded(step: Step) -> bytes:
-    """Arrays are members named `part.field`; all else is in the member `document`."""
-    arrays: Arrays = {"labels": step.labels, "visited": step.visited}
-    for part in PARTS:
-        holder = getattr(step, part)
-        held = {} if holder is None else {name: getattr(holder, name) for name in _names(part).values()}
-        arrays |= {
-            key: held[name]
-            for key, name in _names(part).items()
-            if name in held and isinstance(held[name], np.ndarray)
-        }
-    for name in ("cloud.points", "cloud.normals"):
-        arrays[name] = arrays[name].astype(np.float32)
+    """Content of step.npz: arrays are members named `part.field`, all else is in the member `document`."""
+    arrays: dict[str, NDArray[Any]] = {"labels": step.labels, "visited": step.visited}
     names = ("index", "name", "timings", "angle_travelled", "path_travelled", "stop")
     document: dict[str, Any] = {name: getattr(step, name) for name in names}
-    document |= {"cloud.name": step.cloud.name, "sphere.radius": step.sphere.radius}
-    if step.candidates is not None:
-        document["candidates.rejected"] = step.candidates.rejected
-    if step.decision is not None:
-        names = ("index", "saliency", "cost", "score", "why", "points_of_interest")
-        document["decision"] = {name: getattr(step.decision, name) for name in names}
+    for part, kind in PARTS.items():
+        others: dict[str, Any] = {}
+        for key, name in _names(part, kind).items():
+            value = getattr(getattr(step, part), name, None)
+            if isinstance(value, np.ndarray):
+                arrays[key] = value
+            elif value is not None:
+                others[name] = value
+        if part == "decision" and others:
+            document[part] = others
+        elif part != "view":
+            document |= {f"{part}.{name}": value for name, value in others.items()}
+    for name in ("cloud.points", "cloud.normals"):
+        arrays[name] = arrays[name].astype(np.float32)
     if step.robot is not None:
         document["robot"] = step.robot
     arrays["document"] = np.frombuffer(json.dumps(document, default=_plain).encode(), dtype=np.uint8)
@@ -151,37 +282,43 @@ def _encoded(step: Step) -> bytes:
     return buffer.getvalue()
 
 
-def _decoded(document: dict[str, Any], arrays: Arrays, folder: Path) -> Step:
-    held: dict[str, dict[str, Any]] = {
-        part: {name: arrays.pop(key) for key, name in _names(part).items() if key in arrays} for part in PARTS
-    }
-    for name in ("points_world", "normals_world"):
-        held["cloud"][name] = held["cloud"][name].astype(np.float64)
-    step = {name: value for name, value in (document | arrays).items() if "." not in name}
-    step["graph"] = read_graph(folder / "graph.json")
-    step["cloud"] = Cloud(**held["cloud"], name=document["cloud.name"])
-    step["sphere"] = ViewSphere(**held["sphere"], radius=document["sphere.radius"])
-    step |= {"view": None, "candidates": None, "decision": None}
-    if held["view"]:
-        step["view"] = View(**held["view"], name=document["name"])
-    if held["candidates"]:
-        step["candidates"] = Candidates(**held["candidates"], rejected=document["candidates.rejected"])
-    if "decision" in document:
-        points = (
-            _arrays(p) | {"subject": tuple(p["subject"])} for p in document["decision"]["points_of_interest"]
-        )
-        given = document["decision"] | {"points_of_interest": tuple(PointOfInterest(**p) for p in points)}
-        step["decision"] = Decision(**held["decision"], **given)
-    if "robot" in document:
-        posture = Posture(**_arrays(document["robot"]["posture"]))
-        step["robot"] = RobotPose(**_arrays(document["robot"]) | {"posture": posture})
-    return Step(**step)
+def _read_step(folder: Path) -> Step:
+    """The step in a folder `views/NN`."""
+    path, remedy = folder / "step.npz", "explore again"
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            stored: dict[str, Any] = dict(archive)
+        stored |= json.loads(stored.pop("document").tobytes())
+        return _decoded(stored | {"graph": read_graph(folder / "graph.json")})
+    except FileNotFoundError:
+        raise InputError(path, "the file is missing", remedy) from None
+    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(path, f"is not a step of a run ({error})", remedy) from error
 
 
-def _names(part: str) -> dict[str, str]:
-    """Members that hold the arrays of a part, and the fields they come from."""
-    names = (field.name for field in fields(PARTS[part]) if field.init)
-    return {f"{part}.{name.removesuffix('_world')}": name for name in names}
+def _decoded(stored: dict[str, Any]) -> Step:
+    """The step of its graph and all that step.npz holds."""
+    for name in ("cloud.points", "cloud.normals"):
+        stored[name] = stored[name].astype(np.float64)
+    if "view.depth" in stored:
+        stored["view.name"] = stored["name"]
+    for name, value in stored.get("decision", {}).items():
+        stored[f"decision.{name}"] = value
+        if name == "points_of_interest":
+            points = (_with_arrays(point) | {"subject": tuple(point["subject"])} for point in value)
+            stored[f"decision.{name}"] = tuple(PointOfInterest(**point) for point in points)
+    for part, kind in PARTS.items():
+        given = {name: stored.pop(key) for key, name in _names(part, kind).items() if key in stored}
+        stored[part] = kind(**given) if given else None
+    if "robot" in stored:
+        posture = Posture(**_with_arrays(stored["robot"]["posture"]))
+        stored["robot"] = RobotPose(**_with_arrays(stored["robot"]) | {"posture": posture})
+    return Step(**stored)
+
+
+def _names(part: str, kind: Any) -> dict[str, str]:
+    """Keys of what a part holds, and the fields they come from."""
+    return {f"{part}.{f.name.removesuffix('_world')}": f.name for f in fields(kind) if f.init}
 
 
 def _plain(value: Any) -> Any:
@@ -189,5 +326,5 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else asdict(value)
 
 
-def _arrays(given: dict[str, Any]) -> dict[str, Any]:
+def _with_arrays(given: dict[str, Any]) -> dict[str, Any]:
     return {key: np.array(value) if isinstance(value, list) else value for key, value in given.items()}

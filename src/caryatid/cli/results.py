@@ -52,15 +52,13 @@ class Import(options.Command):
     """Maximum number of views."""
 
     def __call__(self) -> None:
-        from caryatid.io.datasets import Topics
+        from caryatid.io.datasets import OpenOptions
         from caryatid.io.importing import import_recording, reasons
 
         config, output = self.settings.read({"recording.max_views": self.views}), self.output
-        topics = Topics(self.depth, self.info, self.rgb, self.tf)
+        topics = OpenOptions(self.depth, self.info, self.rgb, self.tf, self.camera)
         with output.working(f"reading {self.source.name}"):
-            imported = import_recording(
-                self.source, self.out, topics, camera_file=self.camera, level=self.level, config=config
-            )
+            imported = import_recording(self.source, self.out, topics, level=self.level, config=config)
         if output.json:
             views = [
                 {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}
@@ -122,9 +120,9 @@ class OrderCommand(options.Command):
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
-        from caryatid.io.runs import read_run
         from caryatid.manipulation.order import order_record, plan_order
         from caryatid.runtime.parallel import cores
+        from caryatid.steps import read_run
 
         config, seed, graph = self.settings.read(), self.settings.seed, read_run(self.run).graph
         with self.output.working("rehearsing"):
@@ -185,11 +183,11 @@ class Export(options.Command):
         from caryatid.cli.output import summary
         from caryatid.exports import export_graph, format_of
         from caryatid.io.graph_json import read_graph
-        from caryatid.io.runs import read_run
+        from caryatid.steps import read_run
 
-        config, format_ = self.settings.read(), self.format or format_of(self.out)
+        config, format_ = self.settings.read(), format_of(self.out, self.format)
         graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
-        export_graph(graph, self.out, format_, config.export)
+        export_graph(graph, self.out, config.export)
         if self.output.json:
             self.output.result({"file": str(self.out), "format": format_})
         self.output.say(f"{self.out}: {format_}, {summary(graph)}")

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from caryatid.cli.output import Output
     from caryatid.config import Config
     from caryatid.exploration import Step
-    from caryatid.io.runs import RunWriter
     from caryatid.runs import RunRecorder
     from caryatid.sources import Source
+    from caryatid.steps import RunWriter
     from caryatid.viewer.process import PageProcess
 
 
@@ -83,7 +83,7 @@ class Explore(RunCommand, options.ExploringCommand):
     def run(self, config: Config) -> None:
         """Explore with these settings."""
         from caryatid.cli.view import watched
-        from caryatid.io.runs import RunWriter
+        from caryatid.steps import RunWriter
 
         with watched(self.source, config, self.output) if self.view else nullcontext() as page:
             with RunWriter(self.out) as writer:
@@ -139,9 +139,9 @@ class Extract(RunCommand):
     """For clouds whose labels number parts of objects: object = label // N."""
 
     def __call__(self) -> None:
-        from caryatid.io.runs import RunWriter
         from caryatid.runs import RunRecorder
         from caryatid.sources import CLOUD_SUFFIXES
+        from caryatid.steps import RunWriter
 
         config = self.settings.read()
         is_cloud = Path(self.source).suffix.lower() in CLOUD_SUFFIXES
@@ -216,11 +216,11 @@ class Dismantle(options.ExploringCommand):
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
-        from caryatid.io.runs import RunWriter
         from caryatid.manipulation.dismantling import bodies_of, dismantle, dismantling_record
         from caryatid.manipulation.order import Order, plan_order
         from caryatid.runtime.parallel import cores
         from caryatid.simulation.camera import SimulatedCamera
+        from caryatid.steps import RunWriter
         from caryatid.viz.strip import draw_lifts, stored_figures
 
         config = self.config()

@@ -52,7 +52,7 @@ class View(options.ExploringCommand):
     """Print the address of the page without opening it."""
 
     def __call__(self) -> None:
-        from caryatid.io.runs import is_run
+        from caryatid.steps import is_run
 
         config, output = self.config(), self.output
         # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
@@ -67,8 +67,7 @@ class View(options.ExploringCommand):
             wait_for_interrupt()
 
     def _open_run(self, stack: ExitStack) -> Page:
-        from caryatid.io.runs import read_run
-        from caryatid.steps import read_config, read_steps
+        from caryatid.steps import read_config, read_run, read_steps
         from caryatid.viewer.drawing import Moment
         from caryatid.viewer.page import Page
 

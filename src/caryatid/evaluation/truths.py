@@ -12,11 +12,11 @@ from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueObject, TrueScene, score, score_masks
 from caryatid.io.bop import read_recording
-from caryatid.io.runs import read_run
 from caryatid.simulation import world
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import GroundTruth, read_truth
 from caryatid.simulation.world import SimulatedScene
+from caryatid.steps import read_run
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ def evaluate_run(
     folder = Path(truth_folder)
     run = read_run(run_folder)
     if not folder.is_dir():
-        raise InputError(folder, "is no folder", "give a scene folder or a recording with gt.json")
+        raise InputError(folder, "is not a folder", "give a scene folder or a recording with gt.json")
     if (folder / "scene.xml").is_file():
         scene = read_true_scene(folder)
         scores = [score(view.graph, scene, config=config) for view in run.views]

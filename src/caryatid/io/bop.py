@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -24,9 +24,6 @@ from caryatid.sensing.views import SUPPORT_LABEL, View, check_intrinsics
 
 COLOUR_ENDINGS: Final = (".png", ".jpg", ".jpeg")
 """Files of colour images; the first that exists counts."""
-ROTATION_DRIFT: Final = 0.02
-"""How far RᵀR of a recorded rotation may be from the identity (per entry): trackers that multiply up single
-precision drift by 5e-4 in 1000 frames; a scaled or sheared matrix is far beyond this."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -71,7 +68,7 @@ def read_recording(folder: str | Path) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
     Cameras, poses and the table of masks are checked here, images when a view is asked for. A rotation that
-    has drifted from orthonormal by less than `ROTATION_DRIFT` is replaced by the nearest rotation.
+    has drifted from orthonormal by less than 0.02 is replaced by the nearest rotation.
 
     Args:
         folder: The scene folder. Lengths in it are millimetres.
@@ -105,85 +102,63 @@ def read_recording(folder: str | Path) -> Dataset:
     return Dataset(folder, frames)
 
 
-class RecordingWriter(StagedFolder):
-    """Writes a BOP scene folder view by view; it appears whole, at `finish`, or not at all.
+def write_recording(folder: str | Path, views: Iterable[View]) -> None:
+    """Write views as a BOP scene folder, whole or not at all; `read_recording` gives them back.
+
+    Depth is counted in units of 0.1 mm, which 16 bits take to 6.5 m; where a view reaches farther, in 0.2 mm,
+    0.4 mm and so on.
 
     Args:
         folder: Where; must not exist, or be empty.
+        views: In frame order. Labels become one mask each and `obj_id` = label.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: No views, or the folder cannot be written.
     """
+    with StagedFolder(folder) as staged:
+        write_views(staged, views)
 
-    def __init__(self, folder: str | Path) -> None:
-        super().__init__(folder)
-        self._cameras: dict[str, Any] = {}
-        self._objects: dict[str, Any] = {}
 
-    def add_view(self, view: View, depth_scale: float = 0.1) -> None:
-        """Write the next view.
+def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
+    """Write views into a folder in the making, as `write_recording` does, and publish it.
 
-        Args:
-            view: Labels become one mask each and `obj_id` = label.
-            depth_scale: One unit of depth [mm]; 0.1 reaches to 6.5 m.
-
-        Raises:
-            InputError: Depth beyond what 16 bits hold, or the disk is full or refuses.
-        """
-        index = len(self._cameras)
+    Raises:
+        InputError: No views, the folder's place is taken, or the disk is full or refuses.
+    """
+    cameras: dict[str, Any] = {}
+    objects: dict[str, Any] = {}
+    for index, view in enumerate(views):
+        depth_scale = 0.1
+        while view.depth.max() > depth_scale * np.iinfo(np.uint16).max / 1000.0:
+            depth_scale *= 2.0
         camera: dict[str, Any] = {"cam_K": view.K.ravel(), "depth_scale": depth_scale}
         if view.T_world_camera is not None:
             T_camera_world = transforms.invert(view.T_world_camera)
             camera["cam_R_w2c"] = T_camera_world[:3, :3].ravel()
             camera["cam_t_w2c"] = T_camera_world[:3, 3] * 1000.0
-        self._cameras[str(index)] = camera
-        self.write(f"depth/{index:06d}.png", images.png(_depth_units(view, depth_scale)))
+        cameras[str(index)] = camera
+        units = np.rint(view.depth.astype(np.float64) * (1000.0 / depth_scale)).astype(np.uint16)
+        folder.write(f"depth/{index:06d}.png", images.png(units))
         if view.rgb is not None:
-            self.write(f"rgb/{index:06d}.png", images.png(view.rgb))
+            folder.write(f"rgb/{index:06d}.png", images.png(view.rgb))
         if view.labels is not None:
             present = [int(k) for k in np.unique(view.labels) if k > 0]
-            self._objects[str(index)] = [{"obj_id": k} for k in present]
+            objects[str(index)] = [{"obj_id": k} for k in present]
             for order, label in enumerate(present):
                 mask = np.where(view.labels == label, np.uint8(255), np.uint8(0))
-                self.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
-
-    def finish(self) -> None:
-        """Put the folder in its place.
-
-        Raises:
-            InputError: The place has been taken meanwhile, or the disk is full or refuses.
-        """
-        self.write("scene_camera.json", json_text(self._cameras).encode())
-        if self._objects:
-            self.write("scene_gt.json", json_text(self._objects).encode())
-        self.publish()
-
-
-def write_recording(folder: str | Path, views: Sequence[View], depth_scale: float = 0.1) -> None:
-    """Write views as a BOP scene folder; `read_recording` gives them back to half a `depth_scale`.
-
-    Args:
-        folder: Where; must not exist, or be empty.
-        views: In frame order. Labels become one mask each and `obj_id` = label.
-        depth_scale: One unit of depth [mm]; 0.1 reaches to 6.5 m.
-
-    Raises:
-        InputError: No views, depth beyond what 16 bits hold, or the folder cannot be written.
-    """
-    if not views:
-        raise InputError(folder, "there are no views to write", "give at least one")
-    with RecordingWriter(folder) as writer:
-        for view in views:
-            writer.add_view(view, depth_scale)
-        writer.finish()
+                folder.write(f"mask_visib/{index:06d}_{order:06d}.png", images.png(mask))
+    if not cameras:
+        raise InputError(folder.folder, "there are no views to write", "give at least one")
+    folder.write("scene_camera.json", json_text(cameras).encode())
+    if objects:
+        folder.write("scene_gt.json", json_text(objects).encode())
+    folder.publish()
 
 
 def _frame(folder: Path, number: int, document: Any, masks: Masks | None, source: str) -> Frame:
     camera = parse_json(_Camera, document, source)
-    K, T_world_camera = (
-        check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K"),
-        _pose(camera, source),
-    )
+    K = check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K")
+    T_world_camera = _pose(camera, source)
     depth_path, rgb_path = folder / f"depth/{number:06d}.png", None
     if (folder / "rgb").is_dir():
         paths = [folder / f"rgb/{number:06d}{ending}" for ending in COLOUR_ENDINGS]
@@ -209,7 +184,7 @@ def _read_labels(masks: Masks, depth: NDArray[np.float32]) -> NDArray[np.int32]:
     """Object number of each pixel (H, W), 0 = nothing."""
     labels = np.zeros(depth.shape, dtype=np.int32)
     for path, label in masks:
-        mask = images.read_mask(path)
+        mask = images.decode_image(path, "", images.MASK_MODES, "a grey PNG") > 0
         _check_size(path, mask, depth)
         taken = labels[mask & (labels > 0)]
         if len(taken):
@@ -233,7 +208,8 @@ def _pose(camera: _Camera, name: str) -> Array | None:
         missing = "cam_R_w2c" if camera.cam_R_w2c is None else "cam_t_w2c"
         raise InputError(name, f"the key '{missing}' is missing", "add it")
     R = camera.cam_R_w2c.reshape(3, 3)
-    if np.linalg.det(R) > 0.0 and np.allclose(R.T @ R, np.eye(3), atol=ROTATION_DRIFT):
+    # Trackers that multiply up single precision drift by 5e-4 in 1000 frames; scaled matrices are far beyond.
+    if np.linalg.det(R) > 0.0 and np.allclose(R.T @ R, np.eye(3), atol=0.02):
         left, _, right = np.linalg.svd(R)
         R = left @ right
     T_camera_world = transforms.rigid(R, camera.cam_t_w2c / 1000.0)
@@ -273,11 +249,3 @@ def _by_frame(path: Path, remedy: str) -> dict[int, Any]:
             raise InputError(path, reason, "number the frames 0, 1, …")
         result[int(key)] = item
     return result
-
-
-def _depth_units(view: View, depth_scale: float) -> NDArray[np.uint16]:
-    units = np.rint(view.depth.astype(np.float64) * (1000.0 / depth_scale))
-    if units.max() > np.iinfo(np.uint16).max:
-        reason = f"depth reaches {view.depth.max():.1f} m, 16 bits of {depth_scale:g} mm do not"
-        raise InputError(view.name, reason, "take a larger depth_scale")
-    return units.astype(np.uint16)

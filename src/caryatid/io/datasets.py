@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any, Final, Protocol, runtime_checkable
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +26,9 @@ BUILT_IN: Final = ("bop", "tum", "bags")
 """Modules of `caryatid.io` that are formats, in the order they are tried."""
 ENTRY_POINTS: Final = "caryatid.datasets"
 """Group under which other packages offer formats."""
-
-
 NO_COLOUR: Final = "no colour image of that time"
 NO_POSE: Final = "no pose"
-BROKEN: Final = "broken"
-DARK: Final = "hardly any depth"
-BLURRED: Final = "blurred"
-ALIKE: Final = "seen from where another view is"
-SPARE: Final = "more than are wanted"
-"""Why a frame does not become a view."""
+"""Why a frame of a video does not become a view."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -81,7 +74,6 @@ class Dataset(Sequence[View]):
         skipped: How many others cannot become views, by reason.
         notes: What a person should know.
         is_video: Whether neighbouring frames show nearly the same, so that a few of them should be chosen.
-        depth_scale: Millimetres of the unit its depth is counted in, or None where it is not counted.
     """
 
     path: Path
@@ -89,7 +81,6 @@ class Dataset(Sequence[View]):
     skipped: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     is_video: bool = False
-    depth_scale: float | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -125,66 +116,29 @@ class Dataset(Sequence[View]):
 
 
 @dataclass(frozen=True, slots=True)
-class Topics:
-    """What to take from a bag.
+class OpenOptions:
+    """What a format may need to know.
 
     Attributes:
-        depth: Topic of depth images, registered to the colour where there is one.
+        depth: Topic of a bag's depth images, registered to the colour where there is one.
         info: Topic of the depth images' camera.
         rgb: Topic of colour images, or None.
-        world: Frame to be the world: level, z up; None without poses.
+        world: Frame of a bag to be the world: level, z up; None without poses.
+        camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
     """
 
     depth: str | None = None
     info: str | None = None
     rgb: str | None = None
     world: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class OpenOptions:
-    """What a format may need to know.
-
-    Attributes:
-        topics: What to take from a bag.
-        camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
-    """
-
-    topics: Topics = Topics()
     camera_file: Path | None = None
 
 
-@runtime_checkable
-class Format(Protocol):
-    """An input format."""
-
-    def recognises(self, path: Path) -> bool:
-        """Whether a path looks like a dataset of this format."""
-        ...
-
-    def open_dataset(self, path: Path, config: RecordingConfig, options: OpenOptions) -> Dataset:
-        """Open a dataset.
-
-        Raises:
-            InputError: It is damaged, or does not fit the options.
-        """
-        ...
-
-
-def format_of(path: Path) -> Format | None:
-    """The format of a path, or None where it is no dataset.
-
-    Raises:
-        InputError: A package offers a format that is none.
-    """
+def format_of(path: Path) -> Any:
+    """The format of a path: a module or object with `recognises` and `open_dataset`, or None."""
     ours = (import_module(f"caryatid.io.{name}") for name in BUILT_IN)
     others = (entry_point.load() for entry_point in entry_points(group=ENTRY_POINTS))
-    for known in (*ours, *others):
-        if not isinstance(known, Format):
-            raise InputError(str(known), "is no format of datasets", "give it recognises and open_dataset")
-        if known.recognises(path):
-            return known
-    return None
+    return next((known for known in (*ours, *others) if known.recognises(path)), None)
 
 
 def open_dataset(
@@ -205,10 +159,9 @@ def open_dataset(
         raise InputError(path, "there is no such file or folder", "give a recording")
     known = format_of(path)
     if known is None:
-        raise InputError(
-            path,
-            "is of no known format",
+        remedy = (
             "give a BOP scene folder, a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), or a TUM "
-            "RGB-D folder with depth.txt",
         )
-    return known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
+        raise InputError(path, "is of no known format", remedy + "RGB-D folder with depth.txt")
+    dataset: Dataset = known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
+    return dataset

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from math import inf, isfinite
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Literal
 
 from annotated_types import Ge, Le
 
@@ -17,10 +17,6 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind, Role, SceneObject, Stability, Support, SupportGraph
 from caryatid.io.json_files import Numbers, json_text, parse_json, plain, read_json
 from caryatid.sensing.views import SUPPORT_LABEL
-
-FORMAT: Final = "caryatid/graph"
-VERSION: Final = 1
-"""What graph.json says it is."""
 
 Count = Annotated[int, Ge(0)]
 
@@ -91,7 +87,8 @@ class _Stability:
 
 @dataclass(frozen=True, eq=False)
 class _Graph:
-    version: int
+    format: Literal["caryatid/graph"]
+    version: Literal[1]
     objects: list[_Object]
     supports: list[_Support]
     stability: dict[str, _Stability] = field(default_factory=dict)
@@ -106,8 +103,8 @@ def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
         Plain dicts, lists, texts and numbers.
     """
     document: dict[str, Any] = {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": "caryatid/graph",
+        "version": 1,
         "frame": "world, z up, metres",
         "objects": [_object_to_json(o) for o in graph.objects],
         "supports": [
@@ -145,13 +142,7 @@ def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportG
             transform that is not rigid, or sizes that are not positive.
     """
     name = str(source)
-    if document.get("format") != FORMAT:
-        reason = f"no '{FORMAT}' file (format: {document.get('format')!r})"
-        raise InputError(name, reason, "give a graph.json")
-    given = parse_json(_Graph, document, name)
-    if given.version != VERSION:
-        remedy = f"read it with the caryatid that wrote it, or write version {VERSION}"
-        raise InputError(name, f"version {given.version} of the format is not known", remedy)
+    given = parse_json(_Graph, document, name, "give a graph.json of version 1")
     ids = [o.id for o in given.objects]
     pairs = [(s.supporter, s.supported) for s in given.supports]
     for twice in {i for i in ids if ids.count(i) > 1}:

@@ -6,8 +6,7 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from math import inf
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,6 +19,11 @@ from caryatid.errors import InputError
 DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
+_BAD_BYTES: Final = (
+    *(SyntaxError, ValueError, EOFError, struct.error, zlib.error),
+    *(Image.DecompressionBombError, Image.DecompressionBombWarning),
+)
+"""What Pillow raises on a broken image, and on one that says it is larger than any camera's."""
 
 
 class BrokenImageError(InputError):
@@ -39,27 +43,16 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     Raises:
         InputError: Missing, truncated, or not 16 bit.
     """
-    return (read_units(path).astype(np.float64) * (depth_scale / 1000.0)).astype(np.float32)
+    return (read_units(path) * (depth_scale / 1000.0)).astype(np.float32)
 
 
 def read_colour(image: Path | bytes, name: str = "") -> NDArray[np.uint8]:
     """Read a colour image (H, W, 3), a file or its content; grey ones become three equal channels.
 
     Raises:
-        InputError: Missing, truncated or no image.
+        InputError: Missing, truncated or not an image.
     """
-    with _opened(image, name) as opened:
-        return np.array(opened.convert("RGB"))
-
-
-def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Read a mask (H, W): true where the pixel is not 0.
-
-    Raises:
-        InputError: Missing, truncated, or not of one channel.
-    """
-    with _opened(path, "", MASK_MODES, "a grey PNG") as opened:
-        return np.asarray(opened) > 0
+    return decode_image(image, name)
 
 
 def read_units(image: Path | bytes, name: str = "") -> NDArray[np.int32]:
@@ -68,29 +61,55 @@ def read_units(image: Path | bytes, name: str = "") -> NDArray[np.int32]:
     Raises:
         InputError: Missing, truncated or not 16 bit.
     """
-    with _opened(image, name, DEPTH_MODES, "a 16-bit grey PNG") as opened:
-        return np.asarray(opened).astype(np.int32)
+    return decode_image(image, name, DEPTH_MODES, "a 16-bit grey PNG").astype(np.int32)
 
 
-def decode_image(content: bytes, name: str, modes: tuple[str, ...], what: str, most: int) -> NDArray[Any]:
-    """Decode a PNG or JPEG that came from elsewhere: (H, W), or (H, W, 3) where colour is allowed.
+def decode_image(
+    image: Path | bytes,
+    name: str = "",
+    modes: tuple[str, ...] | None = None,
+    what: str = "",
+    most: float = inf,
+) -> NDArray[Any]:
+    """Decode a PNG or JPEG: (H, W), or (H, W, 3) where colour is allowed.
 
     Args:
-        content: The file.
-        name: What to call it in errors.
-        modes: Pillow modes allowed.
+        image: A file, or its content.
+        name: What to call content in errors.
+        modes: Pillow modes allowed; None allows all.
         what: What the image ought to be, for the error where the mode is another.
         most: Pixels it may have; a larger one is not decoded.
 
     Raises:
-        InputError: It is broken, larger, or no such image.
+        InputError: It is missing or broken, larger, or not such an image.
     """
-    with _opened(content, name, modes, what) as image:
-        width, height = image.size
-        if width * height > most:
-            reason = f"has {width}×{height} pixels, {most} are allowed"
-            raise InputError(name, reason, "give a smaller image")
-        return np.array(image.convert("RGB") if "RGB" in modes else image)
+    source, remedy = image if isinstance(image, Path) else name, "copy or record the file again"
+    try:
+        content = image.read_bytes() if isinstance(image, Path) else image
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with _open(content) as whole:
+                if whole.format == "PNG":
+                    whole.verify()  # decoding passes over a wrong checksum or a missing end
+            with _open(content) as opened:
+                width, height = opened.size
+                if modes is not None and opened.mode not in modes:
+                    reason = f"has pixels of mode {opened.mode}, not {what}"
+                    raise BrokenImageError(source, reason, f"save it as {what}")
+                if width * height > most:
+                    reason = f"has {width}×{height} pixels, {most} are allowed"
+                    raise InputError(source, reason, "give a smaller image")
+                return np.array(opened.convert("RGB") if modes is None or "RGB" in modes else opened)
+    except FileNotFoundError:
+        raise BrokenImageError(source, "the file is missing", remedy) from None
+    except UnidentifiedImageError as error:
+        raise BrokenImageError(source, "is no image", remedy) from error
+    except (*_BAD_BYTES, OSError) as error:
+        raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
+
+
+def _open(content: bytes) -> Image.Image:
+    return Image.open(io.BytesIO(content), formats=("PNG", "JPEG"))
 
 
 def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
@@ -98,38 +117,3 @@ def png(image: NDArray[np.uint8] | NDArray[np.uint16]) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="PNG")
     return buffer.getvalue()
-
-
-@contextmanager
-def _opened(
-    image: Path | bytes, name: str = "", modes: tuple[str, ...] | None = None, what: str = ""
-) -> Iterator[Image.Image]:
-    """Open a PNG or JPEG; whatever Pillow raises on a bad one becomes one sentence."""
-    source = image if isinstance(image, Path) else name
-    remedy = "copy or record the file again"
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            with _open(image) as whole:
-                if whole.format == "PNG":
-                    whole.verify()  # decoding passes over a wrong checksum or a missing end
-            with _open(image) as opened:
-                if modes is not None and opened.mode not in modes:
-                    reason = f"has pixels of mode {opened.mode}, not {what}"
-                    raise BrokenImageError(source, reason, f"save it as {what}")
-                yield opened
-    except FileNotFoundError:
-        raise BrokenImageError(source, "the file is missing", remedy) from None
-    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise BrokenImageError(source, "says it is larger than any camera's image", remedy) from error
-    except UnidentifiedImageError as error:
-        raise BrokenImageError(source, "is no image", remedy) from error
-    except (PermissionError, IsADirectoryError) as error:
-        raise BrokenImageError(source, f"cannot be read ({error.strerror})", remedy) from error
-    except (OSError, SyntaxError, ValueError, EOFError, struct.error, zlib.error) as error:
-        raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
-
-
-def _open(image: Path | bytes) -> Image.Image:
-    file = image if isinstance(image, Path) else io.BytesIO(image)
-    return Image.open(file, formats=("PNG", "JPEG"))

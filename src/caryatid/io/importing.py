@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -16,20 +17,21 @@ from caryatid.config import Config, RecordingConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io import datasets
-from caryatid.io.bop import RecordingWriter
-from caryatid.io.datasets import Dataset, Frame, OpenOptions, Topics, open_dataset
+from caryatid.io.bop import write_views
+from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame, OpenOptions, open_dataset
 from caryatid.io.images import BrokenImageError
+from caryatid.io.staging import StagedFolder
+from caryatid.io.video import SECOND
 from caryatid.segmentation.observation import levelled
-from caryatid.sensing.views import View
 
-SCALES: Final = (0.1, 0.2, 0.5, 1.0)
-"""Units depth is written in [mm]: the finest that reaches far enough."""
+BROKEN: Final = "broken"
+DARK: Final = "hardly any depth"
+SPARE: Final = "more than are wanted"
+"""Why a frame does not become a view."""
 _REMEDIES: Final[Mapping[str, str]] = {
-    datasets.NO_COLOUR: "leave colour out, or allow more with --set recording.colour_gap=SECONDS",
-    datasets.NO_POSE: "record its poses all the time, or allow more with --set recording.pose_gap=SECONDS",
-    datasets.BROKEN: "record it again",
-    datasets.DARK: "allow less with --set recording.min_readings=SHARE",
+    NO_COLOUR: "leave colour out, or allow more with --set recording.colour_gap=SECONDS",
+    NO_POSE: "record its poses all the time, or allow more with --set recording.pose_gap=SECONDS",
+    DARK: "allow less with --set recording.min_readings=SHARE",
 }
 """What to do where no frame is usable for one reason."""
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -55,50 +57,41 @@ class Imported:
 def import_recording(
     source: str | Path,
     out: str | Path,
-    topics: Topics | None = None,
+    options: OpenOptions | None = None,
     *,
-    camera_file: Path | None = None,
     level: bool = False,
     config: Config | None = None,
-    seed: int = 0,
 ) -> Imported:
     """Choose sharp frames from different viewpoints and write them as a BOP scene folder.
 
     Args:
         source: A bag, a TUM RGB-D folder, or another dataset that `open_dataset` recognises.
         out: Folder to write; must not exist, or be empty. It appears whole or not at all.
-        topics: What to take from a bag.
-        camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
+        options: What to take from a bag, and the camera of a TUM RGB-D folder.
         level: Turn the world so that the table is level: for poses whose z axis does not point up.
         config: What is sharp, what is different, and how many views there may be; and how a table is found.
-        seed: Seed of how the table is found.
 
     Raises:
         InputError: The recording is damaged or does not fit the options, no frame of it can become a view,
             there is no table to level the world by, or `out` cannot be written.
     """
     config = config or Config()
-    dataset = open_dataset(source, config.recording, OpenOptions(topics or Topics(), camera_file))
-    with RecordingWriter(out) as writer:
-        chosen, skipped, reach = choose_frames(dataset, config.recording)
+    dataset = open_dataset(source, config.recording, options)
+    with StagedFolder(out) as folder:
+        chosen, skipped = choose_frames(dataset, config.recording)
         T_level_world = np.eye(4)
+        views = (frame.load() for frame in chosen)
         if level and chosen[0].T_world_camera is not None:
-            views = (frame.load() for frame in chosen)
-            T_level_world = level_rotation(dataset.path, views, config, np.random.default_rng(seed))
-        scale = dataset.depth_scale
-        if scale is None:
-            scale = next((s for s in SCALES if reach <= s * 65.535), SCALES[-1])
-        for frame in chosen:
-            view, T = frame.load(), frame.T_world_camera
-            writer.add_view(view if T is None else view.with_pose(T_level_world @ T), scale)
-        writer.finish()
+            T_level_world = _level_rotation(dataset.path, chosen, config)
+            views = (view.with_pose(T_level_world @ view.pose) for view in views)
+        write_views(folder, views)
     turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
     note = (f"world: turned by {turn:.1f}°, so that the table is level",) if turn > 0.0 else ()
     read = len(chosen) + sum(skipped.values())
     return Imported(read, tuple(chosen), skipped, (*dataset.notes, *note))
 
 
-def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame], dict[str, int], float]:
+def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame], dict[str, int]]:
     """Choose sharp frames of a dataset, each from another viewpoint.
 
     Sharpness is the variance of the Laplacian of the brightness. Without colour the share of pixels with a
@@ -109,37 +102,41 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame
         config: What is sharp, what is another viewpoint, and how many frames are wanted.
 
     Returns:
-        The chosen frames in the order of time, how many others there are by reason, and the farthest reading
-        of the usable ones [m].
+        The chosen frames in the order of time, and how many others there are by reason.
 
     Raises:
         InputError: No frame can become a view.
     """
-    skipped, reach = Counter(dataset.skipped), 0.0
+    skipped = Counter(dataset.skipped)
     usable: list[Frame] = []
     sharpness: list[float] = []
     for frame in dataset.frames:
         try:
             view = frame.load()
         except BrokenImageError:
-            skipped[datasets.BROKEN] += 1
+            skipped[BROKEN] += 1
             continue
         readings = float(view.valid.mean())
         if readings < config.min_readings:
-            skipped[datasets.DARK] += 1
+            skipped[DARK] += 1
             continue
         usable.append(frame)
         grey = None if view.rgb is None else view.rgb.mean(axis=2, dtype=np.float32)
         sharpness.append(readings if grey is None else float(laplace(grey).var()))
-        reach = max(reach, float(view.depth.max()))
+    if not usable and not skipped:
+        raise InputError(
+            dataset.path, "holds no depth image", "record it again, or give another --depth TOPIC"
+        )
     if not usable:
-        raise _nothing_usable(dataset.path, skipped)
-    times = np.array([(frame.time - usable[0].time) * 1e-9 for frame in usable])
+        reason = f"none of its {skipped.total()} depth images is usable: {reasons(skipped)}"
+        remedy = _REMEDIES.get(skipped.most_common(1)[0][0], "record it again")
+        raise InputError(dataset.path, reason, remedy)
+    times = np.array([(frame.time - usable[0].time) / SECOND for frame in usable])
     poses = [frame.T_world_camera for frame in usable if frame.T_world_camera is not None]
-    posed = np.stack(poses) if len(poses) == len(usable) else None
-    kept, others = choose_views(times, np.array(sharpness), posed, config)
+    T_world_camera = np.stack(poses) if len(poses) == len(usable) else None
+    kept, others = choose_views(times, np.array(sharpness), T_world_camera, config)
     skipped.update(others)
-    return [usable[index] for index in kept], dict(skipped), reach
+    return [usable[index] for index in kept], dict(skipped)
 
 
 def choose_views(
@@ -151,7 +148,7 @@ def choose_views(
     chosen. Of more than are wanted those stay that are farthest from each other.
 
     Args:
-        times: When frames were taken (N,) [s], rising.
+        times: When frames were taken (N,) [s], rising; N > 0.
         sharpness: How sharp they are (N,); only ratios count.
         T_world_camera: Their poses (N, 4, 4), or None where poses are not known: a single frame is chosen.
         config: What is sharp, and how far apart viewpoints are.
@@ -159,10 +156,8 @@ def choose_views(
     Returns:
         Indices of the chosen frames in the order of time, and how many others there are by reason.
     """
-    if len(times) == 0:
-        return [], {}
     if T_world_camera is None:
-        return [int(np.argmax(sharpness))], _counted({datasets.SPARE: len(times) - 1})
+        return [int(np.argmax(sharpness))], dict(+Counter({SPARE: len(times) - 1}))
     sharp = sharpness >= config.sharp_share * _most_around(times, sharpness, config.sharp_window)
     candidates = np.flatnonzero(sharp)
     chosen: list[int] = []
@@ -174,8 +169,9 @@ def choose_views(
         chosen.append(int(best))
         free &= apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
     kept = _farthest(T_world_camera[chosen], config)
-    counts = {datasets.BLURRED: len(times) - len(candidates), datasets.ALIKE: len(candidates) - len(chosen)}
-    return sorted(chosen[i] for i in kept), _counted(counts | {datasets.SPARE: len(chosen) - len(kept)})
+    others = Counter({"blurred": len(times) - len(candidates), SPARE: len(chosen) - len(kept)})
+    others["seen from where another view is"] = len(candidates) - len(chosen)
+    return sorted(chosen[i] for i in kept), dict(+others)
 
 
 def apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
@@ -194,25 +190,20 @@ def apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) 
 
 def reasons(skipped: Mapping[str, int]) -> str:
     """How many were skipped, by reason, the most frequent one first."""
-    return ", ".join(f"{skipped[reason]} {reason}" for reason in sorted(skipped, key=lambda r: -skipped[r]))
+    return ", ".join(f"{count} {reason}" for reason, count in Counter(skipped).most_common())
 
 
-def level_rotation(path: Path, views: Iterable[View], config: Config, rng: np.random.Generator) -> Array:
-    """Find the smallest turn of the world about its origin (4, 4) that makes the table of views level.
+def _level_rotation(path: Path, frames: Sequence[Frame], config: Config) -> Array:
+    """Find the smallest turn of the world about its origin (4, 4) that makes the table of frames level.
 
     Each view says where up is as if it had no pose, by the largest plane that faces its camera and has the
     rest of the scene in front of it. Of these directions the one counts that is nearest to all the others.
-
-    Args:
-        path: The recording, for errors.
-        views: With poses.
-        config: How a plane is found, and how far two directions of the same table may be apart.
-        rng: Draws the hypotheses.
-
-    Raises:
-        InputError: No view shows a plane, or less than half of those that do agree.
     """
-    found = [up for view in views if (up := _up_world(view, config, rng)) is not None]
+    rng, found = np.random.default_rng(0), []
+    for view in (frame.load() for frame in frames):
+        with suppress(PerceptionError):
+            T_level_camera = levelled(replace(view, T_world_camera=None), config, rng).pose
+            found.append(transforms.rotate(view.pose, T_level_camera[2, :3]))
     if not found:
         raise InputError(path, "no view shows a table to level the world by", "leave --level out")
     ups = np.stack(found)
@@ -225,20 +216,6 @@ def level_rotation(path: Path, views: Iterable[View], config: Config, rng: np.ra
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
 
 
-def _up_world(view: View, config: Config, rng: np.random.Generator) -> Array | None:
-    """The table's normal (3,) in the world of a view, or None where no table can be seen."""
-    try:
-        T_level_camera = levelled(replace(view, T_world_camera=None), config, rng).pose
-    except PerceptionError:
-        return None
-    return transforms.rotate(view.pose, transforms.rotate(transforms.invert(T_level_camera), _UP))
-
-
-def _counted(counts: Mapping[str, int]) -> dict[str, int]:
-    """The reasons there were."""
-    return {reason: count for reason, count in counts.items() if count}
-
-
 def _most_around(times: Array, values: Array, window: float) -> Array:
     """Largest value (N,) within `window` seconds of each time, either way."""
     first = np.searchsorted(times, times - window, side="left")
@@ -246,7 +223,7 @@ def _most_around(times: Array, values: Array, window: float) -> Array:
     return np.array([values[a:b].max() for a, b in zip(first, stop, strict=True)])
 
 
-def _farthest(T_world_camera: Array, config: RecordingConfig) -> Sequence[int]:
+def _farthest(T_world_camera: Array, config: RecordingConfig) -> list[int]:
     """Indices of as many poses as are wanted: the first, then always the one farthest from those before."""
     kept = [0]
     gap = apart(T_world_camera, T_world_camera[0], config)
@@ -254,10 +231,3 @@ def _farthest(T_world_camera: Array, config: RecordingConfig) -> Sequence[int]:
         kept.append(int(np.argmax(gap)))
         gap = np.minimum(gap, apart(T_world_camera, T_world_camera[kept[-1]], config))
     return kept
-
-
-def _nothing_usable(path: Path, skipped: Mapping[str, int]) -> InputError:
-    if not skipped:
-        return InputError(path, "holds no depth image", "record it again, or give another --depth TOPIC")
-    read, most = sum(skipped.values()), max(skipped, key=lambda reason: skipped[reason])
-    return InputError(path, f"none of its {read} depth images is usable: {reasons(skipped)}", _REMEDIES[most])

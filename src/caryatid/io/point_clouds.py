@@ -7,7 +7,7 @@ import re
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,8 @@ from caryatid.geometry.transforms import Array
 from caryatid.sensing.clouds import estimate_normals
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
-MAX_COMPRESSION: Final = 100
-"""Bytes of points one byte of a file can hold: LZF writes at most 264 for 3."""
-
-Parsed = tuple[dict[str, NDArray[Any]], Array]
-"""Fields of one value per point (N,), and viewpoint (3,)."""
+Columns = dict[str, NDArray[Any]]
+"""Fields of one value per point (N,)."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -85,62 +82,44 @@ class StoredCloud:
         )
 
 
-def read_cloud(path: str | Path, config: CloudConfig, label_divisor: int = 1) -> Cloud:
-    """Read the readings of a PCD or PLY file, with normals; see `read_stored_cloud`.
-
-    Args:
-        path: The file.
-        config: How normals are estimated, and what is too far.
-        label_divisor: Labels are divided by this: 10 where a part's label is 10 · object + part.
-
-    Raises:
-        InputError: The file is missing or broken, or holds no readings.
-    """
-    return read_stored_cloud(path, label_divisor).to_cloud(config)
-
-
 def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     """Read all points of a PCD or PLY file.
 
     Args:
         path: A file that ends in .pcd or .ply.
-        label_divisor: The object number is the field `label` divided by this, rounded down. 1 takes the field
-            as it is; sets that number the parts of objects, as mOSD does with object = label // 10, need 10.
+        label_divisor: The object number is the field `label` divided by this, rounded down. Sets that number
+            the parts of objects, as mOSD does with object = label // 10, need 10.
 
     Raises:
         InputError: The file is missing, of another kind, broken, its header lies, it holds no readings, or
             its labels are no object numbers.
     """
-    path = Path(path)
-    if label_divisor < 1:
-        raise InputError("label_divisor", f"is {label_divisor}", "give 1 or more")
+    path, remedy = Path(path), "give a .pcd or .ply file"
     parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
     if parse is None:
         raise InputError(path, "is no .pcd or .ply file", "convert it to one of these")
     try:
         columns, viewpoint = parse(path.read_bytes())
+        points = _triple(columns, "x y z")
+        if points is None or any(columns[axis].dtype.kind != "f" for axis in "xyz"):
+            raise ValueError("there are no fields x y z of floating point numbers")
     except FileNotFoundError:
-        raise InputError(path, "the file is missing", "give a .pcd or .ply file") from None
+        raise InputError(path, "the file is missing", remedy) from None
     except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "give a .pcd or .ply file") from error
+        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
     except Exception as error:
         reason = f"is broken, or the header lies: {_reason(error)}"
         raise InputError(path, reason, "export the cloud again") from error
-    stored = StoredCloud(
-        points=_stack(columns, ("x", "y", "z")),
-        normals=_normals(columns),
-        labels=_labels(columns, label_divisor, path),
-        rgb=_colours(columns),
-        viewpoint=viewpoint,
-        name=path.name,
-    )
+    normals = _triple(columns, "normal_x normal_y normal_z", "nx ny nz")
+    labels = _labels(columns, label_divisor, path)
+    stored = StoredCloud(points, normals, labels, _colours(columns), viewpoint, path.name)
     if not stored.kept.any():
         raise InputError(path, "has no finite points", "give a cloud with readings")
     return stored
 
 
-def _parse_pcd(content: bytes) -> Parsed:
-    """Whatever is wrong with the file is a ValueError, or what pypcd4 raises."""
+def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
+    """The fields and the viewpoint (3,). Whatever is wrong is a ValueError, or what pypcd4 raises."""
     from pypcd4.pypcd4 import MetaData, PointCloud
 
     end = re.search(rb"^DATA\b[^\n]*\n", content[:65536], re.MULTILINE)
@@ -154,9 +133,6 @@ def _parse_pcd(content: bytes) -> Parsed:
     if not len(header.fields) == len(header.size) == len(header.type) == len(header.count):
         raise ValueError("FIELDS, SIZE, TYPE and COUNT do not agree")
     dtype = header.build_dtype()
-    columns = dtype.names or ()
-    if any(axis not in columns or dtype[axis].kind != "f" for axis in "xyz"):
-        raise ValueError("there are no fields x y z of floating point numbers")
     if header.width * header.height != header.points or header.points == 0:
         raise ValueError(f"WIDTH {header.width} × HEIGHT {header.height}, POINTS {header.points}")
     if not np.isfinite(header.viewpoint).all():
@@ -170,32 +146,27 @@ def _parse_pcd(content: bytes) -> Parsed:
             raise ValueError(f"POINTS {header.points}, but more data follows")
     else:
         promised = struct.unpack("<II", body[:8])[1]
-    if promised != needed or needed > MAX_COMPRESSION * len(body.strip()):
+    # LZF writes at most 264 bytes for 3.
+    if promised != needed or needed > 100 * len(body.strip()):
         raise ValueError(f"POINTS {header.points} take {needed} bytes, {len(body)} bytes follow")
     file = io.BytesIO(header.compose_header().encode() + body)
     data = np.atleast_1d(PointCloud.from_fileobj(file).pc_data)
     if len(data) != header.points:
         raise ValueError(f"POINTS {header.points}, but data of {len(data)} points follows")
-    viewpoint = np.array(header.viewpoint[:3], dtype=np.float64)
-    return {name: data[name] for name in header.fields if name in columns}, viewpoint
+    return {name: data[name] for name in dtype.names or ()}, np.array(header.viewpoint[:3], dtype=np.float64)
 
 
-def _parse_ply(content: bytes) -> Parsed:
-    """Whatever is wrong with the file is a ValueError, or what trimesh raises."""
+def _parse_ply(content: bytes) -> tuple[Columns, Array]:
+    """The fields, and the origin as the viewpoint; like `_parse_pcd`."""
     from trimesh.exchange.ply import load_ply
 
     loaded = load_ply(io.BytesIO(content), fix_texture=False, skip_materials=True)
     vertex = loaded["metadata"]["_ply_raw"]["vertex"]
-    data = vertex.get("data")
-    if data is None:
-        raise ValueError("there are no points")
+    data = vertex["data"]
     names = data.keys() if isinstance(data, dict) else data.dtype.names
     columns = {name.lower(): np.asarray(data[name]).reshape(len(data[name]), -1)[:, 0] for name in names}
-    if not {"x", "y", "z"} <= columns.keys():
-        raise ValueError("there are no vertices with x y z")
-    lengths = {len(column) for column in columns.values()}
-    if lengths != {vertex["length"]}:
-        raise ValueError(f"{vertex['length']} points said, {min(lengths)} there")
+    if any(len(column) != vertex["length"] for column in columns.values()):
+        raise ValueError(f"there are not {vertex['length']} points")
     return columns, np.zeros(3)
 
 
@@ -209,39 +180,33 @@ def _reason(error: Exception) -> str:
     return " ".join(str(error).split())[:200] or type(error).__name__
 
 
-def _stack(columns: dict[str, NDArray[Any]], names: tuple[str, ...]) -> Array:
-    return np.stack([columns[name].astype(np.float64) for name in names], axis=-1)
-
-
-def _normals(columns: dict[str, NDArray[Any]]) -> Array | None:
-    for names in (("normal_x", "normal_y", "normal_z"), ("nx", "ny", "nz")):
+def _triple(columns: Columns, *choices: str) -> Array | None:
+    """The first three fields that are all there, as (N, 3)."""
+    for names in map(str.split, choices):
         if columns.keys() >= set(names):
-            return _stack(columns, names)
+            return np.stack([columns[name].astype(np.float64) for name in names], axis=-1)
     return None
 
 
-def _labels(columns: dict[str, NDArray[Any]], divisor: int, path: Path) -> NDArray[np.int32] | None:
+def _labels(columns: Columns, divisor: int, path: Path) -> NDArray[np.int32] | None:
     if "label" not in columns:
         return None
     raw = columns["label"].astype(np.float64)
-    if not np.isfinite(raw).all() or (raw != np.floor(raw)).any() or (raw < 0.0).any():
-        reason = "the field label holds what is no whole number from 0"
-        raise InputError(path, reason, "number objects from 1")
     labels = raw // divisor
-    if (labels >= SUPPORT_LABEL).any():
-        reason = f"the field label reaches {int(labels.max())}"
-        raise InputError(path, reason, f"number objects from 1 to {SUPPORT_LABEL - 1}")
+    if not ((raw >= 0.0) & (raw == np.floor(raw)) & (labels < SUPPORT_LABEL)).all():
+        reason = f"the field label holds other than whole numbers from 0 to {divisor * SUPPORT_LABEL - 1}"
+        raise InputError(path, reason, "number objects from 1")
     return labels.astype(np.int32)
 
 
-def _colours(columns: dict[str, NDArray[Any]]) -> NDArray[np.uint8] | None:
+def _colours(columns: Columns) -> NDArray[np.uint8] | None:
     for name in ("rgb", "rgba"):
         if name in columns and columns[name].dtype.itemsize == 4:
             packed = np.ascontiguousarray(columns[name]).view(np.uint32)
             return np.stack([packed >> 16 & 255, packed >> 8 & 255, packed & 255], axis=-1).astype(np.uint8)
-    if not columns.keys() >= {"red", "green", "blue"}:
+    colours = _triple(columns, "red green blue")
+    if colours is None:
         return None
-    colours = _stack(columns, ("red", "green", "blue"))
     if columns["red"].dtype.kind == "f" and np.nanmax(colours, initial=0.0) <= 1.0:
         colours = colours * 255.0
     return np.clip(np.nan_to_num(colours), 0.0, 255.0).astype(np.uint8)

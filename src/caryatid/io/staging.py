@@ -6,7 +6,7 @@ import errno
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Self
@@ -18,13 +18,14 @@ PARTIAL = ".partial-"
 
 
 class StagedFolder:
-    """A folder in the making.
+    """A folder in the making, to be used in a `with` block.
 
-    Everything is written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place and
-    `discard`, or leaving the `with` block, removes, together with parent folders made for it.
+    Everything is written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place.
+    Leaving the block without it removes what was written, and parent folders made for it.
 
     Args:
         folder: Where the folder shall be.
+        replaces: Whether a folder that is not empty may be replaced; None replaces none.
         durable: Wait until every file, and the folder itself, is on the disk.
 
     Attributes:
@@ -34,50 +35,46 @@ class StagedFolder:
         InputError: The place is taken by something that may not be replaced, or cannot be written.
     """
 
-    remedy = "give a new folder"
-    """What to do where the place is taken."""
-
-    def __init__(self, folder: str | Path, *, durable: bool = False) -> None:
+    def __init__(
+        self, folder: str | Path, *, replaces: Callable[[Path], bool] | None = None, durable: bool = False
+    ) -> None:
         self.folder = Path(folder)
         self._place = self.folder.resolve()
-        self._durable = durable
-        self._check_place()
+        self._replaces, self._durable = replaces, durable
         self._partial = _partial(self._place)
         self._old = self._partial.with_name(f"{self._partial.name}-replaced")
         self._made = [parent for parent in self._place.parents if not parent.exists()]
+        self._check_place()
         try:
             with write_errors(self.folder):
                 self._partial.mkdir(parents=True)
         except BaseException:
-            self.discard()
+            self.__exit__()
             raise
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self.discard()
-
-    def replaces(self, folder: Path) -> bool:
-        """Whether a folder that is not empty may be replaced."""
-        return False
+        """Remove what is not published, and put back what it was to replace."""
+        with suppress(OSError):
+            if self._old.exists() and not self._place.exists():
+                self._old.rename(self._place)
+        shutil.rmtree(self._partial, ignore_errors=True)
+        for parent in self._made:
+            with suppress(OSError):
+                parent.rmdir()
 
     def write(self, name: str, content: bytes) -> None:
         """Write one file, `name` relative to the folder.
 
-        An interrupt leaves the folder as it is, with this file perhaps half written.
-
         Raises:
-            InputError: The disk is full or refuses; the whole folder is discarded then.
+            InputError: The disk is full or refuses.
         """
         path = self._partial / name
-        try:
-            with write_errors(self.folder):
-                path.parent.mkdir(parents=True, exist_ok=True)
-                _write(path, content, self._durable)
-        except InputError:
-            self.discard()
-            raise
+        with write_errors(self.folder):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            _write(path, content, self._durable)
 
     def remove(self, name: str) -> None:
         """Remove a subfolder, `name` relative to the folder, if it is there."""
@@ -87,46 +84,35 @@ class StagedFolder:
         """Put the folder in its place, replacing an older one where that is allowed.
 
         Raises:
-            InputError: The place has been taken meanwhile, or the disk refuses; nothing is left behind.
+            InputError: The place has been taken meanwhile, or the disk refuses.
         """
-        try:
-            self._check_place()
-            with write_errors(self.folder):
+        self._check_place()
+        with write_errors(self.folder):
+            if self._durable:
+                sync(self._partial)
+            if self._place.exists():
+                self._place.rename(self._old)
+            self._partial.rename(self._place)
+            try:
                 if self._durable:
-                    sync(self._partial)
-                if self._place.exists():
-                    self._place.rename(self._old)
-                self._partial.rename(self._place)
-                if self._durable:
-                    try:
-                        sync(self._place.parent)
-                    except OSError:
-                        self._place.rename(self._partial)
-                        raise
-        except BaseException:
-            self.discard()
-            raise
+                    sync(self._place.parent)
+            except OSError:
+                self._place.rename(self._partial)
+                raise
         shutil.rmtree(self._old, ignore_errors=True)
-
-    def discard(self) -> None:
-        """Remove what has been written and leave the place as it was; does nothing after `publish`."""
-        with suppress(OSError):
-            if self._old.exists() and not self._place.exists():
-                self._old.rename(self._place)
-        shutil.rmtree(self._partial, ignore_errors=True)
-        for parent in self._made:
-            with suppress(OSError):
-                parent.rmdir()
 
     def _check_place(self) -> None:
         if not os.path.lexists(self._place):
             return
+        remedy = "give a new folder" + (
+            "; only one written by caryatid is replaced" if self._replaces else ""
+        )
         if not self._place.is_dir():
-            raise InputError(self.folder, "already exists and is not a folder", self.remedy)
+            raise InputError(self.folder, "already exists and is not a folder", remedy)
         with write_errors(self.folder):
             empty = not any(self._place.iterdir())
-        if not empty and not self.replaces(self._place):
-            raise InputError(self.folder, "already exists and holds other files", self.remedy)
+        if not empty and not (self._replaces and self._replaces(self._place)):
+            raise InputError(self.folder, "already exists and holds other files", remedy)
 
 
 def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:

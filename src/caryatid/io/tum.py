@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from annotated_types import Gt, Le
+from numpy.typing import NDArray
 
 from caryatid.config import RecordingConfig
 from caryatid.errors import InputError
-from caryatid.geometry.transforms import Array
 from caryatid.io import images
-from caryatid.io.datasets import Dataset, OpenOptions, Topics
+from caryatid.io.datasets import Dataset, OpenOptions
 from caryatid.io.json_files import parse_json, read_json
-from caryatid.io.video import SECOND, Decoded, TimedImage, TransformTree, is_pose, make_video
+from caryatid.io.video import SECOND, TimedCamera, TimedImage, TransformTree, is_pose, make_video
 from caryatid.sensing.views import check_intrinsics
 
-DEPTH_SCALE: Final = 0.2
-"""Millimetres of one unit of depth in the data set: 5000 units are a metre."""
 PUBLISHED: Final[Mapping[str, tuple[float, float, float, float]]] = {
     "freiburg1": (517.3, 516.5, 318.6, 255.3),
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
@@ -33,38 +32,13 @@ _WORLD, _CAMERA = "world", "camera"
 
 @dataclass(frozen=True, slots=True)
 class _CameraFile:
+    """--camera FILE.json; 5000 units of depth are a metre in the data set."""
+
     fx: float
     fy: float
     cx: float
     cy: float
-    depth_scale: Annotated[float, Gt(0), Le(10)] = DEPTH_SCALE
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class _Camera:
-    """Pinhole matrix, one unit of depth [mm], width and height [px] where known, and where it is from."""
-
-    K: Array
-    depth_scale: float
-    size: tuple[int, int] | None
-    note: str
-
-    def decode(self, depth: _Image, colour: _Image | None) -> Decoded:
-        metres = images.read_depth(depth.path, self.depth_scale)
-        rgb = None if colour is None else images.read_colour(colour.path)
-        if rgb is not None and rgb.shape[:2] != metres.shape:
-            reason = "its colour image is of another size"
-            raise InputError(depth.path, reason, "register the images to one size")
-        if self.size not in (None, metres.shape[::-1]):
-            height, width = metres.shape
-            reason = f"is {width}×{height} pixels, the published camera has 640×480"
-            raise InputError(depth.path, reason, "give --camera FILE.json")
-        return metres, rgb, self.K
-
-
-@dataclass(frozen=True, slots=True)
-class _Image(TimedImage):
-    path: Path
+    depth_scale: Annotated[float, Gt(0), Le(10)] = 0.2
 
 
 def recognises(path: Path) -> bool:
@@ -83,36 +57,34 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     Raises:
         InputError: A list is missing or broken, or the camera is not known.
     """
-    if options.topics != Topics():
+    if options != OpenOptions(camera_file=options.camera_file):
         remedy = f"{path} is a TUM RGB-D folder; leave them out"
         raise InputError("--depth, --info, --rgb, --tf", "are for bags", remedy)
-    camera = _read_camera(path, options.camera_file)
-    depths = _read_list(path / "depth.txt")
-    colours = _read_list(path / "rgb.txt") if (path / "rgb.txt").is_file() else None
-    pose_at, notes = None, [camera.note]
+    file, size, note = _read_camera(path, options.camera_file)
+    K = np.array([[file.fx, 0.0, file.cx], [0.0, file.fy, file.cy], [0.0, 0.0, 1.0]])
+    camera = TimedCamera(f"{path}: camera", 0, _CAMERA, check_intrinsics(K, str(options.camera_file)), size)
+    depths = _read_list(path / "depth.txt", partial(images.read_depth, depth_scale=file.depth_scale))
+    colours = _read_list(path / "rgb.txt", images.read_colour) if (path / "rgb.txt").is_file() else None
+    tree, notes = None, [note]
     if (path / "groundtruth.txt").is_file():
         tree = _read_poses(path / "groundtruth.txt", config.pose_gap)
-        pose_at = lambda depth: tree.between(_WORLD, _CAMERA, depth.time)  # noqa: E731
     else:
         notes.append("no groundtruth.txt: poses are not known, a single frame is taken")
-    video = make_video(path, depths, colours, pose_at, camera.decode, config)
-    return replace(video, notes=tuple(notes), depth_scale=camera.depth_scale)
+    return make_video(path, depths, colours, [camera], tree, _WORLD, config, notes)
 
 
-def _read_camera(folder: Path, camera_file: Path | None) -> _Camera:
-    """The camera that a file describes, or that the data set publishes."""
+def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, tuple[int, int] | None, str]:
+    """The camera that a file describes or the data set publishes, its size [px] if known, and a note."""
     if camera_file is not None:
         document = read_json(camera_file, "give fx, fy, cx, cy [px] and depth_scale [mm]")
-        c = parse_json(_CameraFile, document, camera_file)
-        K = check_intrinsics(_matrix(c.fx, c.fy, c.cx, c.cy), str(camera_file))
-        return _Camera(K, c.depth_scale, None, f"camera: {camera_file}")
+        return parse_json(_CameraFile, document, camera_file), None, f"camera: {camera_file}"
     for name, (fx, fy, cx, cy) in PUBLISHED.items():
         if name in folder.resolve().name.lower():
             note = f"camera: as published for {name}, fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} px"
-            return _Camera(_matrix(fx, fy, cx, cy), DEPTH_SCALE, (640, 480), note)
+            return _CameraFile(fx, fy, cx, cy), (640, 480), note
     raise InputError(
         folder,
-        f"which camera it is from is not known: its name holds none of {', '.join(PUBLISHED)}",
+        f"the camera is not known: the folder's name holds none of {', '.join(PUBLISHED)}",
         'give --camera FILE.json with {"fx": …, "fy": …, "cx": …, "cy": …}',
     )
 
@@ -125,14 +97,14 @@ def _read_poses(path: Path, max_gap: float) -> TransformTree:
         except ValueError:
             pose = []
         if not is_pose(pose):
-            raise _broken(path, f"'{' '.join(words)}' is no pose")
+            raise _broken(path, f"'{' '.join(words)}' is not a pose")
         tree.add(_WORLD, _CAMERA, time, pose)
     return tree
 
 
-def _read_list(path: Path) -> list[_Image]:
+def _read_list(path: Path, read: Callable[[Path], NDArray[Any]]) -> list[TimedImage]:
     files = ((time, path.parent / file) for time, (file,) in _read_rows(path, 2))
-    return [_Image(str(file), time, file) for time, file in files]
+    return [TimedImage(str(file), time, _CAMERA, partial(read, file)) for time, file in files]
 
 
 def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
@@ -141,12 +113,12 @@ def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise _broken(path, f"cannot be read ({error})") from None
-    rows = [words for line in lines if (words := line.partition("#")[0].split())]
-    try:
-        timed = [(int(Decimal(words[0]) * SECOND), words[1:]) for words in rows]
-    except (InvalidOperation, ValueError, OverflowError):
-        raise _broken(path, "a row does not begin with a time in seconds") from None
-    for words in rows:
+    timed = []
+    for words in filter(None, (line.partition("#")[0].split() for line in lines)):
+        try:
+            timed.append((int(Decimal(words[0]) * SECOND), words[1:]))
+        except (InvalidOperation, ValueError, OverflowError):
+            raise _broken(path, "a row does not begin with a time in seconds") from None
         if len(words) != columns:
             raise _broken(path, f"'{' '.join(words)}' has {len(words)} columns, not {columns}")
     return timed
@@ -154,7 +126,3 @@ def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
 
 def _broken(path: Path, reason: str) -> InputError:
     return InputError(path, reason, "take the file as the data set has it")
-
-
-def _matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -1,22 +1,24 @@
-"""Depth images that follow each other in time, each with the colour and the camera pose of its moment."""
+"""Depth images that follow each other in time, each with the colour, camera and pose of its moment."""
 
 from __future__ import annotations
 
 from array import array
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from math import hypot, isfinite
+from operator import attrgetter
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from caryatid.config import RecordingConfig
+from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame
@@ -24,9 +26,6 @@ from caryatid.sensing.views import View
 
 SECOND = 1_000_000_000
 """Nanoseconds of a second: times are whole nanoseconds, which floats cannot hold since 1970."""
-
-Decoded = tuple[NDArray[np.float32], NDArray[np.uint8] | None, Array]
-"""Depth (H, W) [m], colour (H, W, 3) or None, and pinhole matrix (3, 3) [px]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,83 +35,129 @@ class TimedImage:
     Attributes:
         name: What to call it.
         time: When it was taken [ns].
+        frame: Frame of its camera.
+        decode: Gives depth (H, W) [m], or colour (H, W, 3). Raises `InputError` where that cannot be done.
     """
 
     name: str
     time: int
+    frame: str
+    decode: Callable[[], NDArray[Any]]
 
 
-Image = TypeVar("Image", bound=TimedImage)
+@dataclass(frozen=True, eq=False, slots=True)
+class TimedCamera:
+    """The pinhole camera at a time.
+
+    Attributes:
+        name: What to call it in errors.
+        time: When [ns].
+        frame: Its frame.
+        K: Pinhole matrix (3, 3) [px].
+        size: Width and height of its images [px], or None where any will do.
+    """
+
+    name: str
+    time: int
+    frame: str
+    K: Array
+    size: tuple[int, int] | None
+
+
+Timed = TypeVar("Timed", TimedImage, TimedCamera)
 
 
 def make_video(
     path: Path,
-    depths: Sequence[Image],
-    colours: Sequence[Image] | None,
-    pose_at: Callable[[Image], Array] | None,
-    decode: Callable[[Image, Image | None], Decoded],
+    depths: Sequence[TimedImage],
+    colours: Sequence[TimedImage] | None,
+    cameras: Sequence[TimedCamera],
+    tree: TransformTree | None,
+    world: str | None,
     config: RecordingConfig,
+    notes: Sequence[str],
 ) -> Dataset:
-    """Find the colour and the camera pose of each depth image.
+    """Find the colour, camera and pose of each depth image.
 
     Args:
         path: File or folder.
         depths: Depth images; they are numbered in this order.
         colours: Colour images, or None to leave colour out.
-        pose_at: Camera pose (4, 4) of a depth image; raises `MissingTransform`. None leaves poses out.
-        decode: Decodes a depth image and its colour image.
+        cameras: Cameras of the depth images, at least one.
+        tree: Where frames are over time, or None to leave poses out.
+        world: The frame of `tree` that is the world.
         config: How far apart in time depth and colour may be, and what is too far away.
+        notes: What a person should know.
 
     Returns:
         The frames that have all that is wanted in the order of time, and how many have not.
     """
     frames, skipped = [], Counter[str]()
-    ordered = sorted(colours or (), key=lambda colour: colour.time)
-    times = [colour.time for colour in ordered]
+    by_time = attrgetter("time")
+    colours = None if colours is None else sorted(colours, key=by_time)
+    cameras = sorted(cameras, key=by_time)
     for number, depth in enumerate(depths):
         colour, T_world_camera = None, None
         if colours is not None:
-            index = nearest(times, depth.time)
-            if index is None or abs(times[index] - depth.time) > config.colour_gap * SECOND:
+            colour = _nearest(colours, depth.time)
+            if colour is None or abs(colour.time - depth.time) > config.colour_gap * SECOND:
                 skipped[NO_COLOUR] += 1
                 continue
-            colour = ordered[index]
-        if pose_at is not None:
+        if tree is not None and world is not None:
             try:
-                T_world_camera = pose_at(depth)
+                T_world_camera = tree.between(world, depth.frame, depth.time)
             except MissingTransform:
                 skipped[NO_POSE] += 1
                 continue
-        load = partial(_load, decode, depth, colour, T_world_camera, config.far)
+        camera = _nearest(cameras, depth.time) or cameras[0]
+        load = partial(_load, depth, colour, camera, T_world_camera, config.far)
         frames.append(Frame(depth.name, number, load, T_world_camera, depth.time))
     frames.sort(key=lambda frame: (frame.time, frame.number))
-    return Dataset(path, frames, skipped, is_video=True)
+    return Dataset(path, frames, skipped, tuple(notes), is_video=True)
+
+
+def _nearest(items: Sequence[Timed], time: int) -> Timed | None:
+    """The item nearest to a time, of two as near the earlier one; None where there is none."""
+    after = bisect_left(items, time, key=attrgetter("time"))
+    around = items[max(after - 1, 0) : after + 1]
+    return min(around, key=lambda item: abs(item.time - time), default=None)
 
 
 def _load(
-    decode: Callable[[Image, Image | None], Decoded],
-    at: Image,
-    colour: Image | None,
+    depth: TimedImage,
+    colour: TimedImage | None,
+    camera: TimedCamera,
     T_world_camera: Array | None,
     far: float,
 ) -> View:
-    depth, rgb, K = decode(at, colour)
-    depth = np.where(depth <= far, depth, np.float32(0.0))
-    return View(depth, K, T_world_camera, rgb, name=at.name)
+    """Decode a depth image and its colour; both must fit each other and the camera."""
+    metres = depth.decode()
+    size = metres.shape[::-1]
+    shown = _described(size, depth.frame)
+    if camera.size not in (None, size) or camera.frame != depth.frame:
+        others = _described(camera.size or size, camera.frame)
+        reason = f"its images ({others}) are not the depth images ({shown})"
+        raise InputError(camera.name, reason, "give the camera of the depth images")
+    rgb = None if colour is None else colour.decode()
+    if colour is not None and rgb is not None:
+        registered = _described(rgb.shape[1::-1], colour.frame)
+        if registered != shown:
+            reason = f"depth ({shown}) is not registered to colour ({registered})"
+            raise InputError(depth.name, reason, "give depth aligned to colour, or leave colour out")
+    return View(
+        np.where(metres <= far, metres, np.float32(0.0)), camera.K, T_world_camera, rgb, name=depth.name
+    )
 
 
-def nearest(times: Sequence[int], time: int) -> int | None:
-    """Index of the time nearest to another, of two as near the earlier one; None where there is none."""
-    after = bisect_left(times, time)
-    around = range(max(after - 1, 0), min(after + 1, len(times)))
-    return min(around, key=lambda index: abs(times[index] - time), default=None)
+def _described(size: tuple[int, ...], frame: str) -> str:
+    return f"{size[0]}×{size[1]} pixels, frame '{frame}'"
 
 
 class MissingTransform(Exception):  # noqa: N818
     """There is no transform between two frames at a time."""
 
 
-@dataclass(slots=True)
+@dataclass
 class _Link:
     """Where one frame was over time: times [ns], parents, and poses as translation and quaternion, w last.
 
@@ -123,6 +168,7 @@ class _Link:
     parents: list[str] = field(default_factory=list)
     numbers: array[float] = field(default_factory=lambda: array("d"))
 
+    @cached_property
     def in_order(self) -> tuple[NDArray[np.int64], list[str], Array]:
         """Times that rise, with parents and poses (N, 7); of those at the same time the last one counts."""
         times, last = np.unique(np.array(self.times)[::-1], return_index=True)
@@ -140,8 +186,7 @@ class TransformTree:
     def __init__(self, max_gap: float) -> None:
         self._max_gap = round(max_gap * SECOND)
         self._fixed: dict[str, tuple[str, Array]] = {}
-        self._links: dict[str, _Link] = {}
-        self._ordered: dict[str, tuple[NDArray[np.int64], list[str], Array]] = {}
+        self._links: defaultdict[str, _Link] = defaultdict(_Link)
 
     @property
     def frames(self) -> list[str]:
@@ -151,7 +196,7 @@ class TransformTree:
         return sorted({*self._links, *self._fixed} | parents)
 
     def add(self, parent: str, child: str, time: int, pose: Sequence[float], *, fixed: bool = False) -> None:
-        """Take in one pose; of two at the same time the later one counts.
+        """Take in one pose, before any is asked for; of two at the same time the later one counts.
 
         Args:
             parent: Frame the pose is given in.
@@ -165,11 +210,10 @@ class TransformTree:
             rotation = Rotation.from_quat(pose[3:]).as_matrix()
             self._fixed[child] = parent, transforms.rigid(rotation, pose[:3])
             return
-        link = self._links.setdefault(child, _Link())
+        link = self._links[child]
         link.times.append(time)
         link.parents.append(parent)
         link.numbers.extend(pose)
-        self._ordered.pop(child, None)
 
     def between(self, target: str, source: str, time: int) -> Array:
         """`T_target_source` (4, 4): the pose of one frame in another at a time [ns].
@@ -202,9 +246,7 @@ class TransformTree:
         """Parent of a frame and its pose in it at a time, or None where that is not known."""
         if child not in self._links:
             return self._fixed.get(child)
-        if child not in self._ordered:
-            self._ordered[child] = self._links[child].in_order()
-        times, parents, poses = self._ordered[child]
+        times, parents, poses = self._links[child].in_order
         stop = int(np.searchsorted(times, time))
         if stop == len(times):
             return None

@@ -244,10 +244,10 @@ class Session:
         check_view(decoded, self.scene, self._first)
         scene = self.scene.copy()
         graph_text(scene.update(decoded))  # a view whose graph cannot be written is refused, and not kept
-        folder = StagedFolder(self._folder(self.views), durable=True)
-        for name, content in capture.files().items():
-            folder.write(name, content)
-        folder.publish()
+        with StagedFolder(self._folder(self.views), durable=True) as folder:
+            for name, content in capture.files().items():
+                folder.write(name, content)
+            folder.publish()
         self._records.append(record)
         self._first = self._first or decoded
         self.scene = scene
