@@ -22,7 +22,7 @@ from caryatid.simulation import load_scene
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.setup import make_simulation
 
-PAGE = ROOT / "docs/how-to-own-robot.md"
+PAGE = ROOT / "docs/how-to-robot.md"
 
 TOP = (0.0, 0.0, 0.75)
 PROPOSED = ViewSphere.around(TOP, ActiveVisionConfig(sphere_points=1000))

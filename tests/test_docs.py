@@ -261,9 +261,9 @@ def test_the_errors_the_questions_quote_are_what_the_code_says():
 
 
 def test_a_message_of_ros_becomes_a_view_as_the_page_does_it(workplace, views):
-    (text,) = [text for language, text in runs(DOCS / "how-to-ros.md") if "def view_of" in text]
+    (text,) = [text for language, text in runs(DOCS / "how-to-robot.md") if "def view_of" in text]
     names: dict = {}
-    exec(compile(text, "how-to-ros.md", "exec"), names)
+    exec(compile(text, "how-to-robot.md", "exec"), names)
     image = np.round(1e3 * views[0].depth).astype("<u2")
     rows = np.pad(image, ((0, 0), (0, 3)))  # drivers may pad rows
     depth = SimpleNamespace(
