@@ -33,7 +33,7 @@ def gather(cloud, voxels=None, costs=COSTS):
 
 def alone_in(evidence):
     """The explanation of some points as one object."""
-    return explain([evidence], COSTS, FIT, [np.random.default_rng(0)])[0]
+    return explain(evidence, COSTS, FIT, np.random.default_rng(0))
 
 
 def divided(points, normals):
@@ -44,24 +44,9 @@ def divided(points, normals):
 
 
 def pair_of(clouds, changed=None, apart=None, voxels=None, config=CONFIG):
-    evidence = {k: gather(c, voxels) for k, c in clouds.items()}
-    alone = {k: alone_in(e) for k, e in evidence.items()}
+    known = {k: (gather(c, voxels), alone_in(gather(c, voxels))) for k, c in clouds.items()}
     everything = set(clouds) if changed is None else changed
-    return best_merge(evidence, alone, everything, {} if apart is None else apart, config=config, seed=0)
-
-
-SHAPES = [
-    box((0.0, 0.0, 0.05), (0.1, 0.14, 0.1), turn_deg=20.0),
-    cylinder((0.0, 0.0, 0.05), 0.04, 0.1),
-    sphere((0.0, 0.0, 0.05), 0.05),
-]
-
-
-def evidence_of(shape, seed=0, sigma=0.002, turned=0.2, voxels=None) -> Evidence:
-    rng = np.random.default_rng(seed)
-    points, normals = surface_points(shape, rng, eye=EYE, sigma=sigma)
-    normals = transforms.unit(normals + turned * rng.normal(size=normals.shape))
-    return gather(Cloud(points, normals), voxels)
+    return best_merge(known, everything, {} if apart is None else apart, config=config, seed=0)
 
 
 def test_a_point_costs_by_its_distance_over_the_noise_and_by_its_turn():
@@ -82,21 +67,10 @@ def test_points_of_no_shape_are_left_without_one():
         None,
     )
     few = crumpled.select(np.arange(FIT.min_points - 1))
-    for evidence, best in zip((crumpled, few), explain([crumpled, few], COSTS, FIT, [rng, rng]), strict=True):
+    for evidence in (crumpled, few):
+        best = explain(evidence, COSTS, FIT, rng)
         assert best.shape is None
         assert best.cost == pytest.approx(COSTS.irregular * len(evidence.points) + price(None, COSTS))
-
-
-def test_objects_explained_together_are_as_explained_alone():
-    parts = [evidence_of(shape, seed) for seed, shape in enumerate(SHAPES)]
-    together = explain(parts, COSTS, FIT, [np.random.default_rng(k) for k in range(3)])
-    backwards = explain(parts[::-1], COSTS, FIT, [np.random.default_rng(k) for k in (2, 1, 0)])[::-1]
-    for k, part in enumerate(parts):
-        (alone,) = explain([part], COSTS, FIT, [np.random.default_rng(k)])
-        for best in (together[k], backwards[k]):
-            assert best.cost == alone.cost
-            np.testing.assert_array_equal(best.shape.T_world_object, alone.shape.T_world_object)
-    assert explain([], COSTS, FIT, []) == []
 
 
 @pytest.mark.filterwarnings("error")
@@ -106,10 +80,9 @@ def test_points_that_determine_nothing_have_a_finite_cost():
     }
     assert len(finite) > 8
     parts = [Evidence(p, NORMALS[: len(p)], 1.0, 0.003, None) for p in finite.values()]
-    for best in explain(parts, COSTS, FIT, [np.random.default_rng(0)] * len(parts)):
-        assert np.isfinite(best.cost)
     for part in parts:
-        whole = best_explanation([SHAPES[0]], part, COSTS)
+        assert np.isfinite(alone_in(part).cost)
+        whole = best_explanation([STACKED[0]], part, COSTS)
         groups = split(part, whole, list, up=UP, config=CONFIG, rng=np.random.default_rng(0))
         assert groups is None or len(groups) == len(part.points)
 

@@ -6,24 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, hausdorff, random_motion, sphere, surface_points
+from synthetic import box, cylinder, hausdorff, sphere, surface_points
 
 from caryatid.config import FitConfig, VoxelConfig
 from caryatid.fitting import primitives
 from caryatid.fitting.hidden_faces import close_hidden_faces, likeliest_end
-from caryatid.fitting.primitives import (
-    Fit,
-    FitFailure,
-    Oriented,
-    candidates,
-    fit,
-    fit_many,
-    free_inside,
-)
+from caryatid.fitting.primitives import Fit, FitFailure, candidates, fit, free_inside
 from caryatid.fitting.uncertainty import estimate
 from caryatid.geometry import BOX as BOX_CODE
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
+from caryatid.runtime.parallel import on_threads
 from caryatid.sensing.voxel_map import VoxelMap
 
 CONFIG = FitConfig()
@@ -48,8 +41,7 @@ def fit_of(points, normals, config=CONFIG, seed=0):
 
 
 def candidates_of(points, normals, config=CONFIG, seed=0):
-    (found,) = candidates([Oriented(points, normals)], config=config, rngs=[np.random.default_rng(seed)])
-    return found
+    return candidates(points, normals, config=config, rng=np.random.default_rng(seed))
 
 
 def noisy_normals(normals, rng, degrees=5.0):
@@ -205,55 +197,20 @@ def test_points_handed_in_stay_as_they_are():
     np.testing.assert_array_equal(normals, kept[1])
 
 
-# Many objects at once
-
-
-def heap():
-    """Objects of all kinds and numbers of points, one of which has too few and one none."""
-    objects = []
-    for k in range(7):
-        rng = np.random.default_rng(k)
-        shape = SHAPES[k % len(SHAPES)].moved(random_motion(rng, 1.0))
-        eye = shape.T_world_object[:3, 3] + rng.normal(size=3)
-        points, normals = surface_points(
-            shape, rng, eye=eye, spacing=(0.004, 0.008, 0.02)[k % 3], sigma=0.001
-        )
-        objects.append(Oriented(points, noisy_normals(normals, rng)))
-    objects[3] = objects[3].select(np.arange(5))
-    objects[5] = objects[5].select(np.arange(0))
-    return objects
-
-
 def same(a, b):
-    """Whether two results are the same to the last bit."""
-    if isinstance(a, FitFailure) or isinstance(b, FitFailure):
-        return a == b
+    """Whether two fits are the same to the last bit."""
     return (
-        a.shape.kind == b.shape.kind
-        and np.array_equal(a.shape.T_world_object, b.shape.T_world_object)
+        np.array_equal(a.shape.T_world_object, b.shape.T_world_object)
         and np.array_equal(a.shape.extents, b.shape.extents)
         and np.array_equal(a.uncertainty.sides, b.uncertainty.sides)
         and (a.residual, a.inliers, a.seen, a.cost) == (b.residual, b.inliers, b.seen, b.cost)
     )
 
 
-def fits_of(objects, seeds, config=CONFIG):
-    return fit_many(objects, config=config, rngs=[np.random.default_rng(s) for s in seeds])
-
-
-def test_each_of_many_objects_is_fitted_as_it_would_be_alone():
-    objects = heap()
-    together = fits_of(objects, range(7))
-    assert [isinstance(r, Fit) for r in together] == [True, True, True, False, True, False, True]
-    for k in (6, 4, 3, 0):
-        assert same(together[k], fits_of([objects[k]], [k])[0])
-
-
-def test_no_objects_have_no_fits():
-    assert fit_many([], config=CONFIG, rngs=[]) == []
-    assert candidates([], config=CONFIG, rngs=[]) == []
-    nothing = Oriented(np.zeros((0, 3)), np.zeros((0, 3)))
-    assert candidates([nothing, nothing], config=CONFIG, rngs=[np.random.default_rng(0)] * 2) == [[], []]
+def test_fits_on_threads_are_those_of_one_thread():
+    parts = [surface_points(shape, np.random.default_rng(0), eye=EYE, sigma=0.001) for shape in SHAPES]
+    together = on_threads(lambda k: fit_of(*parts[k]), len(parts))
+    assert all(same(fit_of(*part), found) for part, found in zip(parts, together, strict=True))
 
 
 # Only some of the shapes
@@ -360,16 +317,6 @@ def check(points, normals, least):
     assert np.isfinite([result.residual, result.inliers, result.cost]).all()
     for deviation in (result.uncertainty.position, result.uncertainty.sizes, result.uncertainty.sides):
         assert np.isfinite(deviation).all()
-
-
-@pytest.mark.filterwarnings("error")
-def test_one_broken_object_leaves_the_others_alone():
-    good = heap()[:3]
-    broken = [Oriented(points, UP[: len(points)]) for points in BROKEN_POINTS.values()]
-    mixed = fits_of([*broken, *good], [0] * len(broken) + [0, 1, 2])
-    for result, alone in zip(mixed[-3:], fits_of(good, range(3)), strict=True):
-        assert isinstance(result, Fit)
-        assert same(result, alone)
 
 
 def test_a_failure_counts_the_points_that_are_numbers():

@@ -70,7 +70,7 @@ def test_two_united_without_a_shape_that_fits_are_not_looked_up_again(models, mo
     models.fit_all(models.add(observation_of((2,), (CRATE,), seed=3), 1))
     counts = {k: len(models.points.of(k)) for k in (1, 2)}
     failure = FitFailure("too few points")
-    monkeypatch.setattr("caryatid.objects.models.fit_many", lambda parts, **_: [failure] * len(parts))
+    monkeypatch.setattr("caryatid.objects.models.fit", lambda *_, **__: failure)
     ((old, new),) = models.unite({1, 2, 3}).items()
     assert {old, new} == {1, 2}
     assert len(models.points.of(new)) == sum(counts.values())
@@ -99,7 +99,7 @@ def test_a_pair_is_looked_at_again_when_one_of_them_has_been_divided(models, mon
     models.fit_all(models.add(observation_of((1, 1)), 0))
     models.fit_all(models.add(observation_of((2,), (CRATE,), seed=3), 0))
 
-    def all_are_two(evidence, alone, changed, apart, **settings):
+    def all_are_two(known, changed, apart, **settings):
         apart[1, 2] = 10**6
 
     with monkeypatch.context() as patched:
@@ -122,11 +122,15 @@ def cloud(count, label, at=0.0):
     return Cloud(points, np.tile((0.0, 0.0, 1.0), (count, 1)), np.full(count, label, dtype=np.int32))
 
 
+def add(points, cloud, view):
+    points.add(cloud, cloud.labels, view)
+
+
 def two_views():
     points = ObjectPoints()
     for view, at in enumerate((0.0, 100.0)):
         for label, count in ((1, 4), (3, 6), (SUPPORT_LABEL, 5)):
-            points.add(cloud(count, label, at), view)
+            add(points, cloud(count, label, at), view)
     return points
 
 
@@ -166,7 +170,7 @@ def test_dividing_gives_each_group_its_points_and_new_labels_only():
 
 def test_a_move_moves_the_points_of_its_views_only():
     points = two_views()
-    points.add(cloud(3, 9, 7.0), 2)
+    add(points, cloud(3, 9, 7.0), 2)
     before = {k: points.of(k) for k in (1, 3, 9)}
     copied = points.copy()
     T = transforms.rigid(transforms.random_rotation(np.random.default_rng(0)), (1.0, 2.0, 3.0))
@@ -186,7 +190,7 @@ def test_a_move_moves_the_points_of_its_views_only():
 def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
     points = ObjectPoints()
     for view in range(9):
-        points.add(cloud(20, 1, 0.01 * view), view)
+        add(points, cloud(20, 1, 0.01 * view), view)
         points.bound(1, 0.5, 4)
         assert len(points.of(1)) == (20 * (view + 1) if view < 8 else 80)
     left = np.unique(np.round(points.of(1).points_world[:, 0] % 1.0, 9))
@@ -208,6 +212,6 @@ def test_colours_stay_only_where_all_have_them():
     for view, (added, colours) in enumerate(
         [(coloured, True), (coloured, True), (plain, False), (coloured, False)]
     ):
-        points.add(added, view)
+        add(points, added, view)
         assert (points.everything().rgb is not None) == colours
         assert len(points.everything()) == 2 * (view + 1)

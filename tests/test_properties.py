@@ -32,7 +32,7 @@ from synthetic import (
 from caryatid.config import FitConfig, SupportConfig
 from caryatid.evaluation.scores import as_scene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
-from caryatid.fitting.primitives import Fit, Oriented, fit, fit_many
+from caryatid.fitting.primitives import Fit, fit
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.simulation.truth import ground_truth
@@ -110,22 +110,6 @@ def test_a_fit_is_the_same_in_whatever_order_its_points_come(kind, seed):
     # Other samples are drawn, so that it is not the same to the last digit: the best of them are refined.
     assert there.shape.kind == here.shape.kind
     assert abs(there.residual - here.residual) < 0.0005
-
-
-@few(15)
-@given(st.lists(kinds, min_size=2, max_size=6), seeds)
-def test_fits_of_a_heap_are_those_of_its_objects_in_any_order(heap, seed):
-    objects = [Oriented(*half_view(kind, seed + k, 0.001)) for k, kind in enumerate(heap)]
-    order = np.random.default_rng(seed).permutation(len(objects))
-    here, there = (
-        fit_many([objects[k] for k in own], config=FitConfig(), rngs=[np.random.default_rng(k) for k in own])
-        for own in (range(len(objects)), order)
-    )
-    for result, k in zip(there, order, strict=True):
-        assert result.shape.kind == here[k].shape.kind
-        np.testing.assert_array_equal(result.shape.T_world_object, here[k].shape.T_world_object)
-        np.testing.assert_array_equal(result.shape.extents, here[k].shape.extents)
-        assert result.cost == here[k].cost
 
 
 @few(15)

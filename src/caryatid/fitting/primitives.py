@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.fitting.hidden_faces import Seen, close_hidden_faces
@@ -17,10 +14,9 @@ from caryatid.fitting.least_squares import CONVERGED, ROUGHLY, levenberg_marquar
 from caryatid.fitting.scoring import bare_share, judge
 from caryatid.fitting.search import search
 from caryatid.fitting.uncertainty import Uncertainty
-from caryatid.geometry import transforms
+from caryatid.geometry import BOX, SPHERE, transforms
 from caryatid.geometry.shapes import KINDS, Primitives, Shape
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import on_threads
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 SHRINK = 2e-5
@@ -67,38 +63,6 @@ class FitFailure:
     reason: str
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Oriented:
-    """The points of one object.
-
-    Attributes:
-        points: (N, 3) [m], in any frame.
-        normals: Unit normals (N, 3) towards the sensor.
-    """
-
-    points: Array
-    normals: Array
-
-    def finite(self) -> Oriented:
-        """Leave out points that are not finite, or whose normals are not; in the layout that kernels take."""
-        points = np.ascontiguousarray(self.points, dtype=np.float64)
-        normals = np.ascontiguousarray(self.normals, dtype=np.float64)
-        with np.errstate(invalid="ignore", over="ignore"):
-            total = points.sum() + normals.sum()
-        every = Oriented(points, normals)
-        if np.isfinite(total):
-            return every
-        finite = np.isfinite(points) & np.isfinite(normals)
-        return every.select(np.flatnonzero(finite.all(axis=1)))
-
-    def select(self, kept: NDArray[np.intp]) -> Oriented:
-        """Return some of the points, by indices (M,)."""
-        return Oriented(self.points[kept], self.normals[kept])
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
 def fit(
     points: Array,
     normals: Array,
@@ -119,50 +83,43 @@ def fit(
         rng: Source of the samples.
         space: What has been seen free, where points are in the world frame: shapes do not fill it.
     """
-    return fit_many([Oriented(points, normals)], config=config, rngs=[rng], space=space)[0]
-
-
-def fit_many(
-    objects: Sequence[Oriented],
-    *,
-    config: FitConfig,
-    rngs: Sequence[np.random.Generator],
-    space: VoxelMap | None = None,
-) -> list[Fit | FitFailure]:
-    """Fit a shape to each of several objects, on all cores; each is fitted as it would be alone.
-
-    Args:
-        objects: Their points.
-        config: Limits and thresholds.
-        rngs: Source of the samples of each object, one of its own.
-        space: What has been seen free, where points are in the world frame: shapes do not fill it.
-    """
-    if space is not None:
-        _ = space.states  # They are found on all threads, which tasks on threads cannot wait for.
-    return on_threads(lambda k: _fit(objects[k].finite(), config, rngs[k], space), len(objects))
+    points, normals = _finite(points, normals)
+    if len(points) < config.min_points:
+        return FitFailure(f"{len(points)} points are fewer than the {config.min_points} a shape needs")
+    fits, judged_by = _ranked(points, normals, config, rng)
+    best, least = None, np.inf
+    for f in fits:
+        if f.cost >= least:
+            break
+        # A shape pays for what it fills of the space seen free, too.
+        priced = _with_bare(f, judged_by)
+        total = priced.cost
+        if space is not None:
+            inside, free = free_inside(f.shape, space, 1.2 * space.config.size)
+            total += FREE_WEIGHT * (free / max(inside, 1))
+        if total < least:
+            best, least = priced, total
+    if best is None:
+        return FitFailure(f"every shape exceeds the longest extent of {config.max_extent:g} m")
+    shape, residual, inliers, uncertainty = close_hidden_faces(best.shape, best.seen, points, config)
+    poor = residual > config.max_residual
+    return replace(best, shape=shape, residual=residual, inliers=inliers, poor=poor, uncertainty=uncertainty)
 
 
 def candidates(
-    objects: Sequence[Oriented],
-    *,
-    config: FitConfig,
-    rngs: Sequence[np.random.Generator],
-    whole: bool = True,
-) -> list[list[Fit]]:
-    """Return, for each object, the best fit of each shape that could be fitted, least cost first.
+    points: Array, normals: Array, *, config: FitConfig, rng: np.random.Generator, whole: bool = True
+) -> list[Fit]:
+    """Return the best fit of each shape that could be fitted, least cost first; none where points are few.
 
     Args:
-        objects: As of `fit_many`.
-        config: As of `fit_many`.
-        rngs: As of `fit_many`.
+        points: (N, 3) [m], in any frame.
+        normals: Unit normals (N, 3) towards the sensor.
+        config: Limits and thresholds.
+        rng: Source of the samples.
         whole: Whether sides that should have been seen whole cost where they are bare.
     """
-
-    def found(k: int) -> list[Fit]:
-        fits, points = _candidates(objects[k].finite(), config, rngs[k])
-        return sorted((_with_bare(f, points) for f in fits), key=lambda f: f.cost) if whole else fits
-
-    return on_threads(found, len(objects))
+    fits, judged_by = _ranked(*_finite(points, normals), config, rng)
+    return sorted((_with_bare(f, judged_by) for f in fits), key=lambda f: f.cost) if whole else fits
 
 
 def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]:
@@ -176,59 +133,52 @@ def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]
     Returns:
         Cubes of a voxel's size in all, none where the shape is too thin, and those in voxels seen free.
     """
-    half, size = shape.extents / 2.0 - inset, voxels.config.size
+    half = shape.extents / 2.0 - inset
     if half.min() <= 0.0:
         return 0, 0
-    # A row of cubes begins at the surface; one that does not fit in lies in the middle.
-    ticks = [np.arange(-h + size / 2.0, h, size) if h > size / 2.0 else np.zeros(1) for h in half]
-    across = np.equal(shape.ties, shape.ties[0])
-    return _count_free(
-        voxels.states, voxels.origin_world, size, shape.T_world_object, *ticks, across, half[0] ** 2
+    inside, free = _count_free(
+        shape.code, shape.T_world_object, half, voxels.states, voxels.origin_world, voxels.config.size
     )
-
-
-@njit(cache=True, nogil=True)
-def _count_free(states, origin, size, T, x, y, z, across, limit):  # type: ignore[no-untyped-def]
-    """Points of a grid that lie within a shape's round sides, and how many of them lie in free voxels."""
-    inside, free = 0, 0
-    for u in x:
-        for v in y:
-            for w in z:
-                if across[0] * u * u + across[1] * v * v + across[2] * w * w > limit:
-                    continue
-                inside += 1
-                i = math.floor((T[0, 0] * u + T[0, 1] * v + T[0, 2] * w + T[0, 3] - origin[0]) / size)
-                j = math.floor((T[1, 0] * u + T[1, 1] * v + T[1, 2] * w + T[1, 3] - origin[1]) / size)
-                k = math.floor((T[2, 0] * u + T[2, 1] * v + T[2, 2] * w + T[2, 3] - origin[2]) / size)
-                if 0 <= i < states.shape[0] and 0 <= j < states.shape[1] and 0 <= k < states.shape[2]:
-                    free += states[i, j, k] == FREE
     return inside, free
 
 
-def _fit(
-    oriented: Oriented, config: FitConfig, rng: np.random.Generator, space: VoxelMap | None
-) -> Fit | FitFailure:
-    """Do as `fit` does with points that are all finite."""
-    if len(oriented) < config.min_points:
-        return FitFailure(f"{len(oriented)} points are fewer than the {config.min_points} a shape needs")
-    fits, points = _candidates(oriented, config, rng)
-    best, least = None, np.inf
-    for f in fits:
-        if f.cost >= least:
-            break
-        # A shape pays for what it fills of the space seen free, too.
-        priced = _with_bare(f, points)
-        total = priced.cost
-        if space is not None:
-            inside, free = free_inside(f.shape, space, 1.2 * space.config.size)
-            total += FREE_WEIGHT * (free / max(inside, 1))
-        if total < least:
-            best, least = priced, total
-    if best is None:
-        return FitFailure(f"every shape exceeds the longest extent of {config.max_extent:g} m")
-    shape, residual, inliers, uncertainty = close_hidden_faces(best.shape, best.seen, oriented.points, config)
-    poor = residual > config.max_residual
-    return replace(best, shape=shape, residual=residual, inliers=inliers, poor=poor, uncertainty=uncertainty)
+@njit(cache=True, error_model="numpy", nogil=True)
+def _count_free(kind, T, half, states, origin, size):  # type: ignore[no-untyped-def]
+    """Count the cubes of a grid in a shape, and those whose centres lie in free voxels."""
+    inside = free = 0
+    first, count = np.zeros(3), np.ones(3, np.intp)
+    for a in range(3):
+        # A row of cubes begins at the surface; one that does not fit in lies in the middle.
+        if half[a] > size / 2.0:
+            first[a] = size / 2.0 - half[a]
+            count[a] = math.ceil((half[a] - first[a]) / size)
+    for i in range(count[0]):
+        u = first[0] + i * size
+        for j in range(count[1]):
+            v = first[1] + j * size
+            for k in range(count[2]):
+                w = first[2] + k * size
+                across = u * u + (v * v if kind != BOX else 0.0) + (w * w if kind == SPHERE else 0.0)
+                if across > half[0] * half[0]:
+                    continue
+                inside += 1
+                x = math.floor((T[0, 0] * u + T[0, 1] * v + T[0, 2] * w + T[0, 3] - origin[0]) / size)
+                y = math.floor((T[1, 0] * u + T[1, 1] * v + T[1, 2] * w + T[1, 3] - origin[1]) / size)
+                z = math.floor((T[2, 0] * u + T[2, 1] * v + T[2, 2] * w + T[2, 3] - origin[2]) / size)
+                if 0 <= x < states.shape[0] and 0 <= y < states.shape[1] and 0 <= z < states.shape[2]:
+                    free += states[x, y, z] == FREE
+    return inside, free
+
+
+def _finite(points: Array, normals: Array) -> tuple[Array, Array]:
+    """Points that are finite and have finite normals, in the layout that kernels take."""
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    normals = np.ascontiguousarray(normals, dtype=np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        if np.isfinite(points.sum() + normals.sum()):
+            return points, normals
+    finite = (np.isfinite(points) & np.isfinite(normals)).all(axis=1)
+    return points[finite], normals[finite]
 
 
 def _with_bare(f: Fit, points: Array) -> Fit:
@@ -237,80 +187,105 @@ def _with_bare(f: Fit, points: Array) -> Fit:
     return replace(f, cost=f.cost + BARE_WEIGHT * bare)
 
 
-class _Trial(NamedTuple):
-    """A shape of one kind on the way to a fit: what it costs and explains, and where it is, as of `Fit`."""
-
-    cost: float
-    residual: float
-    inliers: float
-    seen: NDArray[np.bool_]
-    R: Array
-    centre: Array
-    half: Array
-
-
-def _candidates(oriented: Oriented, config: FitConfig, rng: np.random.Generator) -> tuple[list[Fit], Array]:
-    """Do as `candidates` does with points that are all finite; also those (N, 3) that fits are judged by."""
-    if len(oriented) < config.min_points:
-        return [], oriented.points
-    count = min(len(oriented), config.max_points)
+def _ranked(
+    points: Array, normals: Array, config: FitConfig, rng: np.random.Generator
+) -> tuple[list[Fit], Array]:
+    """The best fit of each shape, least cost first, and the points (N, 3) that they are judged by."""
+    if len(points) < config.min_points:
+        return [], points
+    count = min(len(points), config.max_points)
     every = max(1, count // config.search_points)
-    if every > 1 or count < len(oriented):
+    if every > 1 or count < len(points):
         # Shuffled: points come row by row, and every so many of a row would leave out whole columns.
-        oriented = oriented.select(rng.choice(len(oriented), count, replace=False))
-    origin = oriented.points.mean(axis=0)
-    points, normals = oriented.points - origin, oriented.normals.copy()
-    some, facing = points[::every].copy(), normals[::every].copy()
-    codes = [KINDS[kind].code for kind in config.shapes]
-    samples = rng.integers(0, len(some), size=(len(codes), config.hypotheses, 2))
-    least_seen = max(config.min_points / 3.0, 0.02 * len(points))  # Points that bear out a side.
-
-    def improved(code: int, start: tuple[Array, ...], some: Array, converged: float) -> _Trial:
-        """Refine a shape by some points, draw in the sides that no point bears out, and score it."""
-        R, centre, half = (part.copy() for part in start)
-        seen = np.empty(6, dtype=np.bool_)
-        levenberg_marquardt(code, R, centre, half, some, config.steps, config.min_extent, SHRINK, converged)
-        residual, turned, inliers = judge(
-            code, R, centre, half, points, normals, config.threshold, least_seen, config.min_extent, seen
-        )
-        x, y, z = half.tolist()
-        size = 4.0 * (x * x + y * y + z * z) / 3.0
-        cost = residual + config.normal_weight * turned + SIZE_PENALTY * size
-        return _Trial(np.inf if math.isnan(cost) else cost, residual, inliers, seen, R, centre, half)
-
-    def within(trial: _Trial) -> bool:
-        return trial.cost < np.inf and 2.0 * max(trial.half.tolist()) <= config.max_extent
-
-    starts, best = {}, {}
-    for code, pairs in zip(codes, samples, strict=True):
-        found = search(
-            code, some, facing, pairs, config.polish, config.threshold, config.max_radius, config.max_extent,
-            config.min_extent,
-        )  # fmt: skip
-        if len(found[0]):
-            starts[code] = list(zip(*found, strict=True))
-            best[code] = improved(code, starts[code][0], some, ROUGHLY)
-    # The first start of each kind tells which kinds' other starts are worth refining: those may halve what it
-    # found, and twice the best may still win.
-    least = min((trial.cost for trial in best.values() if within(trial)), default=np.inf)
-    for code, trial in best.items():
-        if not within(trial) or trial.cost <= 4.0 * least:
-            others = [improved(code, start, some, ROUGHLY) for start in starts[code][1:]]
-            best[code] = min(trial, *others, key=lambda t: t.cost) if others else trial
-    # Kinds are compared once least squares on all the points have nothing left to gain. By now they gain a
-    # thousandth a step, so kinds that cost twice as much as the best cannot catch up.
-    least = min((trial.cost for trial in best.values() if within(trial)), default=np.inf)
+        drawn = rng.choice(len(points), count, replace=False)
+        points, normals = points[drawn], normals[drawn]
+    origin = points.mean(axis=0)
+    kinds = [KINDS[kind] for kind in config.shapes]
+    samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
+    best, score, seen, R, centre, half = _best_of_each(
+        np.array([kind.code for kind in kinds]), points - origin, normals, every, samples,
+        config.polish, config.steps, config.threshold, config.max_radius, config.max_extent,
+        config.min_extent, config.normal_weight, config.min_points,
+    )  # fmt: skip
     fits = []
-    for kind, code in zip(config.shapes, codes, strict=True):
-        if code not in best:
-            continue
-        trial = best[code]
-        if within(trial) and trial.cost <= 2.0 * least:
-            last = improved(code, trial[4:], points, CONVERGED)
-            trial = last if last.cost < trial.cost else trial
-        if within(trial):
-            cost, residual, inliers, seen, R, centre, half = trial
-            shape = KINDS[kind].from_extents(transforms.rigid(R, centre + origin), 2.0 * half)
+    for number, (kind, row) in enumerate(zip(kinds, best.tolist(), strict=True)):
+        if row >= 0:
+            at = number, row
+            shape = kind.from_extents(transforms.rigid(R[at], centre[at] + origin), 2.0 * half[at])
+            cost, residual, inliers = score[at].tolist()
             poor = residual > config.max_residual
-            fits.append(Fit(shape, residual, inliers, tuple(seen.tolist()), cost, poor))
-    return sorted(fits, key=lambda f: f.cost), points + origin
+            fits.append(Fit(shape, residual, inliers, tuple(seen[at].tolist()), cost, poor))
+    return sorted(fits, key=lambda f: f.cost), points
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
+    kinds, points, normals, every, samples, polish, steps, threshold, max_radius, max_extent, min_extent,
+    normal_weight, min_points,
+):  # fmt: skip
+    """Fit each kind of shape: search among every so many of the points, least squares, score by all of them.
+
+    Args:
+        kinds: Codes (K,).
+        points: (N, 3) [m], about the origin.
+        normals: Unit normals (N, 3).
+        every: Every so many of the points are searched.
+        samples: Pairs (K, B, 2) of those points that hypotheses are made from; what follows is as configured.
+
+    Returns:
+        Row (K,) of the best shape of each kind, −1 = none; and of all rows (K, S) the cost, the mean distance
+        and the share of inliers (3), the sides seen (6), axes (3, 3), centre (3) and half extents (3).
+    """
+    some, facing = points[::every].copy(), normals[::every].copy()
+    shape = len(kinds), polish + 2
+    R, centre, half = np.empty(shape + (3, 3)), np.empty(shape + (3,)), np.empty(shape + (3,))
+    score, seen = np.full(shape + (3,), np.inf), np.zeros(shape + (6,), np.bool_)
+    best, found = np.zeros(len(kinds), np.intp), np.zeros(len(kinds), np.intp)
+    within = np.zeros(len(kinds), np.bool_)
+    least_seen = max(min_points / 3.0, 0.02 * len(points))  # Points that bear out a side.
+    for turn in range(4):
+        least = np.inf
+        for k in range(len(kinds)):
+            x, y, z = half[k, best[k]]
+            within[k] = score[k, best[k], 0] < np.inf and 2.0 * max(x, y, z) <= max_extent
+            if within[k]:
+                least = min(least, score[k, best[k], 0])
+        for k in range(len(kinds)):
+            first, last, used = 0, 0, some
+            if turn == 0:
+                found[k] = search(
+                    kinds[k], some, facing, samples[k], polish, threshold, max_radius, max_extent, min_extent,
+                    R[k], centre[k], half[k],
+                )  # fmt: skip
+                last = min(found[k], 1)
+            elif turn == 1 and not (within[k] and score[k, best[k], 0] > 4.0 * least):
+                # The first start of each kind tells which kinds' other starts are worth refining: those may
+                # halve what it found, and twice the best may still win.
+                first, last = 1, found[k]
+            elif turn == 2 and within[k] and score[k, best[k], 0] <= 2.0 * least:
+                # Kinds are compared once least squares on all the points have nothing left to gain. By now
+                # they gain a thousandth a step, so kinds that cost twice as much as the best cannot catch up.
+                first, last, used = polish + 1, polish + 2, points
+                for a in range(3):
+                    centre[k, first, a], half[k, first, a] = centre[k, best[k], a], half[k, best[k], a]
+                    for b in range(3):
+                        R[k, first, a, b] = R[k, best[k], a, b]
+            elif turn == 3 and not within[k]:
+                best[k] = -1
+            for row in range(first, last):
+                levenberg_marquardt(
+                    kinds[k], R[k, row], centre[k, row], half[k, row], used, steps, min_extent, SHRINK,
+                    CONVERGED if turn == 2 else ROUGHLY,
+                )  # fmt: skip
+                residual, turned, inliers = judge(
+                    kinds[k], R[k, row], centre[k, row], half[k, row], points, normals, threshold, least_seen,
+                    min_extent, seen[k, row],
+                )  # fmt: skip
+                x, y, z = half[k, row]
+                size = 4.0 * (x * x + y * y + z * z) / 3.0
+                cost = residual + normal_weight * turned + SIZE_PENALTY * size
+                score[k, row, 0] = cost if cost == cost else np.inf
+                score[k, row, 1], score[k, row, 2] = residual, inliers
+                if score[k, row, 0] < score[k, best[k], 0]:
+                    best[k] = row
+    return best, score, seen, R, centre, half

@@ -25,7 +25,7 @@ def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
     return own
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", inline="always")
 def judge(  # type: ignore[no-untyped-def]
     kind, R, centre, half, points, normals, threshold, least, min_extent, seen
 ):

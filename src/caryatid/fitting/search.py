@@ -19,9 +19,9 @@ AGREEING = float(np.cos(np.radians(25.0)))
 """Least cosine between normals of one face [1]."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", inline="always")
 def search(  # type: ignore[no-untyped-def]
-    kind, points, normals, samples, keep, threshold, max_radius, max_extent, min_extent
+    kind, points, normals, samples, keep, threshold, max_radius, max_extent, min_extent, R, centre, half
 ):
     """Score hypotheses until a better one has become unlikely, and keep the best (MSAC).
 
@@ -35,12 +35,14 @@ def search(  # type: ignore[no-untyped-def]
         max_radius: [m].
         max_extent: [m].
         min_extent: [m].
+        R: Axes (K, 3, 3), columns = x, y, z, with K > keep; written to: of the best hypotheses, the best
+            first, and of a shape for points of one face behind them.
+        centre: Centres (K, 3) [m]; written to.
+        half: Half extents (K, 3) [m]; written to.
 
     Returns:
-        Axes (K, 3, 3), columns = x, y, z, centres (K, 3) and half extents (K, 3) [m] of the best, the best
-        first, and of a shape for points of one face behind them; none where nothing is within the limits.
+        How many there are; none where nothing is within the limits.
     """
-    R, centre, half = np.empty((keep + 1, 3, 3)), np.empty((keep + 1, 3)), np.empty((keep + 1, 3))
     count, cost = len(points), np.full(keep + 1, np.inf)
     most_inliers = found = 0
     for b in range(len(samples)):
@@ -69,7 +71,7 @@ def search(  # type: ignore[no-untyped-def]
         kind, points, normals, min_extent, max_radius, max_extent, R[found], centre[found], half[found]
     ):
         found += 1
-    return R[:found], centre[:found], half[:found]
+    return found
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
@@ -127,7 +129,7 @@ def _of_one_face(  # type: ignore[no-untyped-def]
         for b in range(3):
             centre[a] += R[a, b] * (low[b] + high[b]) / 2.0
     if kind == BOX:
-        return 2.0 * half.max() <= max_extent
+        return 2.0 * max(half[0], half[1], half[2]) <= max_extent
     half[0] = half[1] = (half[0] + half[1]) / 2.0
     return LEAST_RADIUS < half[0] <= max_radius and 2.0 * half[2] <= max_extent
 

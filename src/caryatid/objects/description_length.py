@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import ExplanationConfig, FitConfig
-from caryatid.fitting.primitives import Oriented, candidates, free_inside
-from caryatid.geometry.shapes import Box, Primitives, Shape
+from caryatid.fitting.primitives import candidates, free_inside
+from caryatid.geometry.shapes import Box, Shape
+from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.voxel_map import VoxelMap
 
@@ -68,10 +70,24 @@ def point_costs(shape: Shape | None, evidence: Evidence, config: ExplanationConf
     """Cost (N,) [nats] of each point on a shape, or on an irregular object, before its weight."""
     if shape is None:
         return np.full(len(evidence), config.irregular)
-    distance, outward = Primitives.of([shape]).gradient(0, evidence.points)
-    turned = 1.0 - np.einsum("ij,ij->i", outward, evidence.normals)
-    cost = distance**2 / (2.0 * evidence.noise**2) + config.normal_weight * turned
-    return np.minimum(cost, config.outlier)
+    costs: Array = _point_costs(
+        shape.code, shape.T_world_object, shape.extents / 2.0, evidence.points, evidence.normals,
+        evidence.noise, config.normal_weight, config.outlier,
+    )  # fmt: skip
+    return costs
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _point_costs(kind, T, half, points, normals, noise, normal_weight, outlier):  # type: ignore[no-untyped-def]
+    costs, hx, hy, hz = np.empty(len(points)), half[0], half[1], half[2]
+    centre, origin = T[:3, 3], np.zeros(3)
+    for i in range(len(points)):
+        x, y, z = local(T, centre, points, i)
+        distance, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
+        u, v, w = local(T, origin, normals, i)
+        turned = 1.0 - (gx * u + gy * v + gz * w)
+        costs[i] = min(distance**2 / (2.0 * noise**2) + normal_weight * turned, outlier)
+    return costs
 
 
 def best_explanation(shapes: Sequence[Shape], evidence: Evidence, config: ExplanationConfig) -> Explanation:
@@ -91,27 +107,24 @@ def _cost(shape: Shape | None, evidence: Evidence, config: ExplanationConfig) ->
 
 
 def explain(
-    parts: Sequence[Evidence],
+    evidence: Evidence,
     config: ExplanationConfig,
     fit_config: FitConfig,
-    rngs: Sequence[np.random.Generator],
+    rng: np.random.Generator,
     *,
     first_look: bool = False,
-) -> list[Explanation]:
-    """Find the shape that explains points at the least cost, for each of several objects at once.
+) -> Explanation:
+    """Find the shape that explains points at the least cost.
 
     Args:
-        parts: Their points.
+        evidence: The points.
         config: What explanations cost.
         fit_config: Settings of the fits.
-        rngs: Source of the samples of each.
+        rng: Source of the samples.
         first_look: A quick fit will do, which only tells what is worth a full one.
     """
-    quick = replace(fit_config, hypotheses=10, polish=1, steps=6, max_points=150)
-    full = replace(fit_config, polish=1, search_points=fit_config.max_points)
-    oriented = [Oriented(e.points, e.normals) for e in parts]
-    fits = candidates(oriented, config=quick if first_look else full, rngs=rngs, whole=False)
-    return [
-        best_explanation([f.shape for f in found], evidence, config)
-        for evidence, found in zip(parts, fits, strict=True)
-    ]
+    settings = replace(fit_config, polish=1, search_points=fit_config.max_points)
+    if first_look:
+        settings = replace(fit_config, polish=1, hypotheses=10, steps=6, max_points=150)
+    fits = candidates(evidence.points, evidence.normals, config=settings, rng=rng, whole=False)
+    return best_explanation([f.shape for f in fits], evidence, config)

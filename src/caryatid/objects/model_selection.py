@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import combinations
 
 import numpy as np
@@ -25,6 +25,7 @@ from caryatid.objects.description_length import (
     point_costs,
     price,
 )
+from caryatid.runtime.parallel import on_threads
 
 Groups = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -121,10 +122,8 @@ def _best_two(
     looks = _settled(evidence, starts, near, 0, config, rng, first_look=True)
     # The best two are settled with full fits.
     tried = sorted((look.cost, k) for k, look in enumerate(looks) if look is not None)[:2]
-    finalists = [starts[k] for _, k in tried]
-    settled = _settled(evidence, finalists, near, config.split.rounds, config, rng)
-    better = [two for two in settled if two is not None and two.cost < whole.cost]
-    better = [two for two in better if not _is_layer(evidence, two)]
+    settled = _settled(evidence, [starts[k] for _, k in tried], near, config.split.rounds, config, rng)
+    better = [two for two in settled if two and two.cost < whole.cost and not _is_layer(evidence, two)]
     return min(better, key=lambda two: two.cost, default=None)
 
 
@@ -152,30 +151,47 @@ def _settled(
     Returns:
         What each start settles at; None where one side is left with too few points.
     """
-    costs = config.explanation
+    least = config.split.min_points
     settled: list[TwoObjects | None] = [None] * len(starts)
     moving = dict(enumerate(starts))
     for number in range(rounds + 1):
-        moving = {
-            k: second
-            for k, second in moving.items()
-            if min(second.sum(), (~second).sum()) >= config.split.min_points
-        }
-        sides = [evidence.select(s) for second in moving.values() for s in (~second, second)]
-        found = explain(sides, costs, config.fit, rng.spawn(len(sides)), first_look=first_look)
-        pairs = zip(found[0::2], found[1::2], strict=True)
-        for (k, second), pair in zip(list(moving.items()), pairs, strict=True):
-            moved = second
-            if number < rounds:
-                cost = np.stack([point_costs(e.shape, evidence, costs) for e in pair])
-                cost = (cost + cost[:, near].mean(axis=2)) / 2.0
-                moved = _connected(evidence.points, cost[1] < cost[0])
-            if (moved == second).all():
+        moving = {k: second for k, second in moving.items() if min(second.sum(), (~second).sum()) >= least}
+        rngs = iter(rng.spawn(2 * len(moving)))
+        jobs = [(second, next(rngs), next(rngs)) for second in moving.values()]
+        explained = on_threads(partial(_sides_explained, evidence, jobs, config, first_look), len(jobs))
+        for k, pair in zip(list(moving), explained, strict=True):
+            second = moving[k] if number == rounds else _reassigned(evidence, pair, near, config)
+            if (second == moving[k]).all():
                 settled[k] = _two(evidence, second, pair, near, config)
                 del moving[k]
             else:
-                moving[k] = moved
+                moving[k] = second
     return settled
+
+
+def _sides_explained(
+    evidence: Evidence,
+    jobs: Sequence[tuple[Mask, np.random.Generator, np.random.Generator]],
+    config: Config,
+    first_look: bool,
+    number: int,
+) -> tuple[Explanation, Explanation]:
+    """Explain the first side and the second of one of several divisions."""
+    second, *rngs = jobs[number]
+    first, other = (
+        explain(evidence.select(side), config.explanation, config.fit, rng, first_look=first_look)
+        for side, rng in zip((~second, second), rngs, strict=True)
+    )
+    return first, other
+
+
+def _reassigned(
+    evidence: Evidence, pair: tuple[Explanation, Explanation], near: Groups, config: Config
+) -> Mask:
+    """Points (N,) that the second of two shapes explains better, together with the points around them."""
+    cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
+    cost = (cost + cost[:, near].mean(axis=2)) / 2.0
+    return _connected(evidence.points, cost[1] < cost[0])
 
 
 def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> Iterator[Mask]:
@@ -230,8 +246,7 @@ def _connected(points: Array, second: Mask) -> Mask:
 
 
 def best_merge(
-    evidence: Mapping[int, Evidence],
-    alone: Mapping[int, Explanation],
+    known: Mapping[int, tuple[Evidence, Explanation]],
     changed: set[int],
     apart: MutableMapping[Pair, int],
     *,
@@ -241,8 +256,7 @@ def best_merge(
     """Find the pair of neighbours that it is best to take for one.
 
     Args:
-        evidence: Points of each object, by label.
-        alone: Its explanation as an object of its own.
+        known: Points of each object, by label, and their explanation as an object of its own.
         changed: Only pairs with one of these are looked at.
         apart: Pairs found to be two, with the number of points they had then; they are looked at again when
             they have grown. Added to.
@@ -252,62 +266,48 @@ def best_merge(
     Returns:
         The larger object and the one it takes in, or None where all are better apart.
     """
-    trees = {k: cKDTree(e.points) for k, e in evidence.items()}
+    trees = {k: cKDTree(evidence.points) for k, (evidence, _) in known.items()}
+    sizes = {k: len(evidence) for k, (evidence, _) in known.items()}
     pairs = [
         (a, b)
-        for a, b in combinations(sorted(evidence), 2)
+        for a, b in combinations(sorted(known), 2)
         if {a, b} & changed
-        and len(evidence[a]) + len(evidence[b]) >= GROWTH * apart.get((a, b), 0)
+        and sizes[a] + sizes[b] >= GROWTH * apart.get((a, b), 0)
         and trees[a].count_neighbors(trees[b], config.explanation.reach) > 0
     ]
-    joined = [evidence[a].joined(evidence[b]) for a, b in pairs]
-    twos = []
-    for (a, b), both in zip(pairs, joined, strict=True):
-        second = np.arange(len(both)) >= len(evidence[a])
-        twos.append(_two(both, second, (alone[a], alone[b]), _around(both.points), config))
     best, most = None, 0.0
-    for (a, b), gain in zip(pairs, _gains(joined, twos, pairs, config, seed), strict=True):
+    gains = on_threads(lambda number: _gain(known, pairs[number], config, seed), len(pairs))
+    for (a, b), gain in zip(pairs, gains, strict=True):
         if gain <= 0.0:
-            apart[a, b] = len(evidence[a]) + len(evidence[b])
+            apart[a, b] = sizes[a] + sizes[b]
         elif gain > most:
-            best, most = ((a, b) if len(evidence[a]) >= len(evidence[b]) else (b, a)), gain
+            best, most = ((a, b) if sizes[a] >= sizes[b] else (b, a)), gain
     return best
 
 
-def _gains(
-    joined: Sequence[Evidence],
-    twos: Sequence[TwoObjects],
-    pairs: Sequence[Pair],
-    config: Config,
-    seed: int,
-) -> list[float]:
+def _gain(
+    known: Mapping[int, tuple[Evidence, Explanation]], labels: Pair, config: Config, seed: int
+) -> float:
     """How much less [nats] one object costs than two, by the shapes of both and by fits to all the points.
 
     Nothing where one shape leaves one of the two unexplained; without a shape two are one only where the
     surface goes on from one to the other.
     """
-    costs = config.explanation
-    rngs = [np.random.default_rng([seed, *pair]) for pair in pairs]
-    ones = [
-        best_explanation([e.shape for e in two.explanations if e.shape is not None], both, costs)
-        for both, two in zip(joined, twos, strict=True)
-    ]
-    worth = list(range(len(pairs)))
+    costs, rng = config.explanation, np.random.default_rng([seed, *labels])
+    (first, alone), (second, other) = (known[label] for label in labels)
+    both = first.joined(second)
+    two = _two(both, np.arange(len(both)) >= len(first), (alone, other), _around(both.points), config)
+    one = best_explanation([e.shape for e in (alone, other) if e.shape is not None], both, costs)
     for first_look in (True, False):
-        some, draws = [joined[k] for k in worth], [rngs[k] for k in worth]
-        found = explain(some, costs, config.fit, draws, first_look=first_look)
-        for k, one in zip(worth, found, strict=True):
-            ones[k] = min(ones[k], one, key=lambda e: e.cost)
-        worth = [k for k in worth if ones[k].cost <= twos[k].cost + price(None, costs)]
-    gains = []
-    for both, two, one in zip(joined, twos, ones, strict=True):
-        if one.shape is None:
-            is_one = two.smooth > 0.8
-        else:
-            cost = point_costs(one.shape, both, costs)
-            is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= costs.irregular
-        gains.append(two.cost - one.cost if is_one else 0.0)
-    return gains
+        one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
+        if one.cost > two.cost + price(None, costs):
+            break
+    if one.shape is None:
+        is_one = two.smooth > 0.8
+    else:
+        cost = point_costs(one.shape, both, costs)
+        is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= costs.irregular
+    return two.cost - one.cost if is_one else 0.0
 
 
 def _around(points: Array) -> Groups:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from caryatid.config import Config
-from caryatid.fitting.primitives import FitFailure, Oriented, fit_many
+from caryatid.fitting.primitives import Fit, FitFailure, fit
 from caryatid.geometry import points as kernels
 from caryatid.geometry.points import last_in_voxels, most_central
 from caryatid.geometry.transforms import Array
@@ -20,6 +20,7 @@ from caryatid.graph import SceneObject, object_id
 from caryatid.objects.association import associate
 from caryatid.objects.description_length import Evidence, Explanation, best_explanation
 from caryatid.objects.model_selection import GROWTH, best_merge, split
+from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.observation import UP, Observation
 from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
@@ -48,12 +49,9 @@ class ObjectPoints:
         other._selected = self._selected.copy()
         return other
 
-    def add(self, cloud: Cloud, view: int) -> None:
-        """Add a view's points, which are labelled; colours stay where all points have them."""
-        if cloud.labels is None:
-            raise ValueError("the points of objects are labelled")
-        known = self._cloud
-        rgb = cloud.rgb
+    def add(self, cloud: Cloud, labels: NDArray[np.int32], view: int) -> None:
+        """Add a view's points with their labels (N,); colours stay where all points have them."""
+        known, rgb = self._cloud, cloud.rgb
         if len(known) and rgb is not None:
             rgb = None if known.rgb is None else np.concatenate([known.rgb, rgb])
         self._cloud = Cloud(
@@ -62,8 +60,8 @@ class ObjectPoints:
             rgb=rgb,
         )
         self._views = np.concatenate([self._views, np.full(len(cloud), view)])
-        changed = set(np.unique(cloud.labels).tolist())
-        self._relabel(np.concatenate([self._labels, cloud.labels]), changed)
+        changed = set(np.unique(labels).tolist())
+        self._relabel(np.concatenate([self._labels, labels]), changed)
         self.labels_used = max(self.labels_used, *(changed - {SUPPORT_LABEL}), 0)
 
     @property
@@ -72,17 +70,14 @@ class ObjectPoints:
         labels: list[int] = np.flatnonzero(np.bincount(self._labels)).tolist()
         return [k for k in labels if k != SUPPORT_LABEL]
 
-    def of(self, label: int) -> Cloud:
-        """All points of an object."""
-        if (label, 0.0) not in self._selected:
-            self._selected[label, 0.0] = self._select(np.flatnonzero(self._labels == label))
-        return self._selected[label, 0.0]
-
-    def thinned(self, label: int, edge: float) -> Cloud:
-        """Points of an object, of those in a voxel of this edge length [m] the one nearest to their mean."""
+    def of(self, label: int, edge: float = 0.0) -> Cloud:
+        """Points of an object: all, or of those in each voxel of this edge [m] the one nearest their mean."""
         if (label, edge) not in self._selected:
-            cloud = self.of(label)
-            self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
+            if edge:
+                cloud = self.of(label)
+                self._selected[label, edge] = cloud.select(thin(cloud.points_world, edge))
+            else:
+                self._selected[label, edge] = self._select(np.flatnonzero(self._labels == label))
         return self._selected[label, edge]
 
     def newest(self, label: int) -> Cloud:
@@ -95,19 +90,12 @@ class ObjectPoints:
         return self._select(np.argsort(self._labels, kind="stable"))
 
     def bound(self, label: int, voxel: float, depth: int) -> None:
-        """Leave an object the newest points in each voxel, once more than twice as many views have shown it.
-
-        Args:
-            label: Which.
-            voxel: Edge length of a voxel [m].
-            depth: Points left in each.
-        """
+        """Leave an object the newest points in each voxel [m] where more than twice `depth` views show it."""
         if self._views.max(initial=0) < 2 * depth:
             return
         rows = np.flatnonzero(self._labels == label)
         if np.count_nonzero(np.bincount(self._views[rows])) > 2 * depth:
-            kept = np.ones(len(self._labels), dtype=np.bool_)
-            kept[rows] = False
+            kept = self._labels != label
             kept[rows[last_in_voxels(self._cloud.points_world[rows], voxel, depth)]] = True
             self._reorder(np.flatnonzero(kept), self._labels, {label})
 
@@ -217,7 +205,7 @@ class ObjectModels:
         voxels[0] = 0.0
         voxels[SUPPORT_LABEL:] = config.surface.spacing
         kept = most_central(observation.cloud.points_world, observation.labels, voxels)
-        self.points.add(observation.cloud.select(kept), view)
+        self.points.add(observation.cloud.select(kept), observation.labels[kept], view)
         for label in shown:
             self.points.bound(label, voxels[label], config.cloud.depth)
         return shown - {SUPPORT_LABEL}
@@ -229,11 +217,11 @@ class ObjectModels:
     def fit_newest(self, labels: set[int]) -> None:
         """Fit objects to the newest view's points alone, and forget all other fits (`sg`)."""
         self.fits = {}
-        self._fit({label: self.points.newest(label) for label in labels})
+        self._fit(labels, self.points.newest)
 
     def fit_all(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to all their points so far (`pc`, `pc+sg`), where shapes fill no space seen free."""
-        self._fit({k: self.points.thinned(k, self._config.cloud.voxel) for k in labels}, voxels)
+        self._fit(labels, partial(self.points.of, edge=self._config.cloud.voxel), voxels)
 
     def divide(self, labels: set[int], voxels: VoxelMap | None = None) -> set[int]:
         """Split objects that several shapes explain better than one; returns the labels that changed.
@@ -248,10 +236,10 @@ class ObjectModels:
             cloud = self.points.of(label)
             if len(cloud) < GROWTH * self._undivided.get(label, 0):
                 continue
-            evidence = self._evidence(label, noise, voxels)
+            evidence, whole = self._explained(label, noise, voxels)
             groups = split(
                 evidence,
-                self._alone(label, evidence),
+                whole,
                 partial(self._hints, evidence.points),
                 up=UP,
                 config=self._config,
@@ -276,26 +264,19 @@ class ObjectModels:
         Returns:
             Label given up → label that takes its points.
         """
-        noise = self._noise()
-        evidence = {k: self._evidence(k, noise, voxels) for k in sorted(self.fits)}
-        alone = {k: self._alone(k, e) for k, e in evidence.items()}
-        given_up: dict[int, int] = {}
-        while True:
-            pair = best_merge(evidence, alone, labels, self._apart, config=self._config, seed=self._seed)
-            if pair is None:
-                return given_up
+        noise, given_up = self._noise(), dict[int, int]()
+        known = {k: self._explained(k, noise, voxels) for k in sorted(self.fits)}
+        while pair := best_merge(known, labels, self._apart, config=self._config, seed=self._seed):
             new, old = pair
             self.points.merge(old, new)
             self._forget(set(pair))
             given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
+            del self.fits[old], known[old], known[new]
             self.fit_all({new}, voxels)
-            for label in pair:
-                del evidence[label], alone[label]
-            del self.fits[old]
             if new in self.fits:
-                evidence[new] = self._evidence(new, noise, voxels)
-                alone[new] = self._alone(new, evidence[new])
+                known[new] = self._explained(new, noise, voxels)
             labels = labels | {new}
+        return given_up
 
     def nearest(self, observation: Observation, labels: set[int]) -> Observation:
         """Give the points of a view that carry one of these labels the label of the nearest point of any."""
@@ -311,16 +292,13 @@ class ObjectModels:
         """The fitted objects in the order of their labels."""
         return [self.fits[k] for k in sorted(self.fits)]
 
-    def _evidence(self, label: int, noise: float, voxels: VoxelMap | None) -> Evidence:
-        """What explanations of an object go by."""
+    def _explained(self, label: int, noise: float, voxels: VoxelMap | None) -> tuple[Evidence, Explanation]:
+        """What explanations of an object go by, and its explanation by the shape fitted to it."""
         config = self._config.explanation
-        cloud = self.points.thinned(label, config.spacing)
+        cloud = self.points.of(label, config.spacing)
         weight = config.spacing**2 / config.reading
-        return Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels)
-
-    def _alone(self, label: int, evidence: Evidence) -> Explanation:
-        """An object's explanation by the shape fitted to it."""
-        return best_explanation([self.fits[label].shape], evidence, self._config.explanation)
+        evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels)
+        return evidence, best_explanation([self.fits[label].shape], evidence, config)
 
     def _hints(self, points: Array) -> Sequence[NDArray[np.bool_]]:
         """Points (N,) that segmentation took for a segment of its own in one of the views."""
@@ -347,25 +325,29 @@ class ObjectModels:
         residuals = [o.residual for o in self.fits.values()]
         return max(1.25 * float(np.median(residuals)), 0.002) if residuals else 0.002
 
-    def _fit(self, clouds: Mapping[int, Cloud], voxels: VoxelMap | None = None) -> None:
-        """Fit objects, by label, to these points."""
-        labels = sorted(clouds)
-        results = fit_many(
-            [Oriented(clouds[k].points_world, clouds[k].normals_world) for k in labels],
-            config=self._config.fit,
-            rngs=[np.random.default_rng([self._seed, k]) for k in labels],
-            space=voxels,
-        )
-        for label, result in zip(labels, results, strict=True):
-            if isinstance(result, FitFailure):
-                self.fits.pop(label, None)
-                continue
-            self.fits[label] = SceneObject(
-                id=object_id(label),
-                label=label,
-                shape=result.shape,
-                residual=result.residual,
-                poor_fit=result.poor,
-                seen=result.seen,
-                uncertainty=result.uncertainty,
+    def _fit(
+        self, labels: set[int], points_of: Callable[[int], Cloud], voxels: VoxelMap | None = None
+    ) -> None:
+        """Fit objects to their points, on all cores; each is fitted as it would be alone."""
+        names = sorted(labels)
+
+        def fitted(number: int) -> Fit | FitFailure:
+            cloud, rng = points_of(names[number]), np.random.default_rng([self._seed, names[number]])
+            return fit(
+                cloud.points_world, cloud.normals_world, config=self._config.fit, rng=rng, space=voxels
             )
+
+        if voxels is not None:
+            _ = voxels.states  # Found once, not on each thread.
+        for label, result in zip(names, on_threads(fitted, len(names)), strict=True):
+            self.fits.pop(label, None)
+            if isinstance(result, Fit):
+                self.fits[label] = SceneObject(
+                    id=object_id(label),
+                    label=label,
+                    shape=result.shape,
+                    residual=result.residual,
+                    poor_fit=result.poor,
+                    seen=result.seen,
+                    uncertainty=result.uncertainty,
+                )

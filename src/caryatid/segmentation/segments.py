@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -12,9 +13,10 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
-from caryatid.fitting.primitives import Fit, Oriented, candidates
+from caryatid.fitting.primitives import Fit, candidates
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.lccp import (
     convex_parts,
     convex_together,
@@ -235,9 +237,8 @@ def merge_occluded(
         ]
         asked = list(dict.fromkeys(key for a, b in pairs for key in ((a,), (b,), (a, b))))
         masks = [np.isin(part, key) for key in asked]
-        oriented = [Oriented(samples.points_camera[own], samples.normals_camera[own]) for own in masks]
         rngs = [np.random.default_rng(seed) for seed in rng.integers(2**63, size=len(masks))]
-        found = candidates(oriented, config=quick, rngs=rngs)
+        found = on_threads(partial(_candidates, samples, masks, rngs, quick), len(masks))
         fits = {key: fits[0] if fits else None for key, fits in zip(asked, found, strict=True)}
         for small, large in pairs:
             alone = [(part == number, fits[number,]) for number in (small, large)]
@@ -248,6 +249,14 @@ def merge_occluded(
             return part
         part[part == small] = large
         refused = {pair for pair in refused if large not in pair}
+
+
+def _candidates(
+    samples: Samples, masks: list[Mask], rngs: list[np.random.Generator], config: FitConfig, number: int
+) -> list[Fit]:
+    """Shapes for the samples under one of the masks."""
+    points, normals = samples.points_camera[masks[number]], samples.normals_camera[masks[number]]
+    return candidates(points, normals, config=config, rng=rngs[number])
 
 
 def _insides_merged(samples: Samples, part: Labels) -> Labels:
