@@ -46,11 +46,6 @@ DENSE = tuple(f"dense-{10 + seed % 8}-{seed}" for seed in range(200, 216))
 """Heaps of 10–17 objects between screens and walls, of seeds nothing was developed with."""
 PACKED = tuple(f"packed-20-{seed}" for seed in range(1, 6))
 """Twenty objects, each touching another."""
-SHOWN = (
-    *("edge_precision", "edge_recall", "vertex_precision", "vertex_recall", "mean_iou", "found", "invented"),
-    *("planning_seconds", "perception_seconds"),
-)
-"""Columns of the table beside F1."""
 MEANS, POOLED = ("f1", "edge_recall", "mean_iou"), ("f1", "found", "invented")
 """Figures of a suite: means over scenes; `found` and `invented` of all scenes' objects."""
 Row = dict[str, Any]
@@ -58,13 +53,17 @@ Row = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Extraction:
-    """The extraction of a BOP folder, or of a single simulated frame of a built-in scene without a pose."""
+class Task:
+    """What a process of the pool is given: an episode, or single frames to extract.
 
-    source: str
-    segmentation: SegmentationMethod = "labels"
-    settings: tuple[str, ...] = ()
-    seed: int = 0
+    Attributes:
+        episode: Scene, segmentation, settings, seed, and how many views.
+        frames: The scene is a BOP folder whose frames are extracted, or a built-in scene, of which a single
+            simulated frame without a pose is.
+    """
+
+    episode: Episode
+    frames: bool = False
 
 
 @dataclass(frozen=True)
@@ -92,12 +91,14 @@ class Suite:
     frames: bool = False
     against: str = ""
 
-    def task(self, scene: str, seed: int) -> Episode | Extraction:
-        """What is measured on a scene."""
-        if self.frames:
-            return Extraction(scene, self.segmentation, self.settings, seed)
-        known = {"segmentation": self.segmentation, "settings": self.settings}
-        return Episode(scene, views=max(self.scored), seed=seed, **known)  # type: ignore[arg-type]
+    def tasks(self, seeds: int) -> list[Task]:
+        """What is measured, scene by scene."""
+        known = {"segmentation": self.segmentation, "settings": self.settings, "views": max(self.scored)}
+        return [
+            Task(Episode(scene, seed=seed, **known), self.frames)  # type: ignore[arg-type]
+            for scene in self.scenes
+            for seed in range(seeds)
+        ]
 
 
 BOTH = (*EASY, *DENSE)
@@ -113,53 +114,31 @@ SUITES: Mapping[str, Suite] = {
     "frames-auto": Suite(EASY, (1,), "auto", 0.04, figures=POOLED, frames=True),
 }
 """`noise` has four times the depth noise, `registration` views that are off by σ = 1 cm and 1°."""
-TARGETS: Mapping[str, float] = {
-    "labels.easy.f1@5": 0.985,
-    "labels.easy.edge_recall@5": 0.96,
-    "labels.easy.mean_iou@5": 0.92,
-    "labels.dense.f1@5": 0.93,
-    "labels.dense.f1@10": 0.97,
-    "auto.easy.f1@5": 0.96,
-    "auto.easy.f1@10": 0.975,
-    "auto.dense.f1@5": 0.85,
-    "auto.dense.f1@10": 0.92,
-    "packed.found@5": 0.92,
-    "packed.invented@5": 0.05,
-    "noise.easy.fall@5": 0.05,
-    "noise.dense.fall@5": 0.05,
-    "registration.easy.fall@5": 0.05,
-    "registration.dense.fall@5": 0.05,
-    "frames-labels.f1@1": 0.985,
-    "frames-auto.f1@1": 0.95,
-    "frames-auto.found@1": 0.97,
-    "frames-auto.invented@1": 0.04,
-}
-"""What is asked for; of `frames` it is asked for real frames, see `extract`."""
 
 
-def run(task: Episode | Extraction) -> list[Row]:
-    """Rows of one measurement: what a process of the pool is given."""
-    if isinstance(task, Extraction):
-        return extract(task)
-    outcome = run_episode(task)
+def run(task: Task) -> list[Row]:
+    """Rows of one measurement."""
+    episode = task.episode
+    if task.frames:
+        return extract(episode)
+    outcome = run_episode(episode)
     if outcome.error is not None:
-        raise CaryatidError(f"{task.scene}: {outcome.error}")
-    return [{"scene": task.scene, "seed": task.seed} | row for row in outcome.rows]
+        raise CaryatidError(f"{episode.scene}: {outcome.error}")
+    return [{"scene": episode.scene, "seed": episode.seed} | row for row in outcome.rows]
 
 
-def extract(task: Extraction) -> list[Row]:
+def extract(episode: Episode) -> list[Row]:
     """Extract a recording, and score the graph after each frame by the pixels of all frames so far."""
-    config = read_settings(None, task.settings)
-    if is_builtin(task.source):
+    config = read_settings(None, episode.settings)
+    if is_builtin(episode.scene):
         with TemporaryDirectory() as temporary:
-            recording = Path(temporary) / task.source
-            record_frame(task.source, recording, config, task.seed)
-            return extract(replace(task, source=str(recording)))
-    folder = Path(task.source)
+            recording = Path(temporary) / episode.scene
+            record_frame(episode.scene, recording, config, episode.seed)
+            return extract(replace(episode, scene=str(recording)))
+    folder = Path(episode.scene)
     truth = read_truth(folder / "gt.json")
-    scene = Scene(config, segmentation=task.segmentation, seed=task.seed)
+    scene = Scene(config, segmentation=episode.segmentation, seed=episode.seed)
     labels, true_labels, rows = [], [], []
-    known = {"scene": folder.name, "seed": task.seed}
     for index, frame in enumerate(read_recording(folder).frames):
         started = time.perf_counter()
         graph = scene.update(frame.load())
@@ -168,8 +147,8 @@ def extract(task: Extraction) -> list[Row]:
         labels.append(scene.labels)
         true_labels.append(frame.load_labels())
         found = score_masks(graph, labels, true_labels, truth.vertices, frozenset(truth.pairs))
-        times = {"planning_seconds": 0.0, "perception_seconds": seconds}
-        rows.append(known | {"view": index + 1} | figures_of(found, graph, len(truth.vertices) - 1) | times)
+        known = {"scene": folder.name, "seed": episode.seed, "view": index + 1, "perception_seconds": seconds}
+        rows.append(known | figures_of(found, graph, len(truth.vertices) - 1))
     return rows
 
 
@@ -226,19 +205,14 @@ def _group(scene: str) -> str:
 
 
 def show_rows(rows: Sequence[Row], console: Console, title: str) -> None:
-    """Print F1 per view and the rest of the last view, a line a family, and the worst scenes."""
+    """Print F1 per view and other means after the last view, a line a family, and the worst scenes."""
     frame = pd.DataFrame(rows)
-    frame["scenes"] = frame["scene"].map(family)
+    kinds = frame["scene"].map(family).rename("scenes")
     last = frame[frame["view"] == frame["view"].max()]
-    lines = []
-    for kind, part in last.groupby("scenes"):
-        by_view = frame[frame["scenes"] == kind].groupby("view")["f1"].mean()
-        known = figures(part)
-        f1 = " ".join(f"{value:.3f}" for value in by_view)
-        scenes = f"{kind} ({part['scene'].nunique()})"
-        lines.append({"scenes": scenes, "F1 by view": f1} | {name: known[name] for name in SHOWN})
-    console.print(f"{title}: means over scenes and seeds")
-    print_table(pd.DataFrame(lines).round(3), console)
+    f1 = frame.pivot_table("f1", kinds, "view")
+    rest = last[["edge_precision", "edge_recall", "mean_iou", "perception_seconds"]].groupby(kinds).mean()
+    console.print(f"{title}: F1 by view, and the rest after the last")
+    print_table(f1.join(rest).round(3).reset_index(), console)
     worst = last.nsmallest(6, "f1")[["scene", "seed", "f1"]].itertuples(index=False)
     console.print("lowest: " + ", ".join(f"{scene} (seed {seed}) {f1:.3f}" for scene, seed, f1 in worst))
 
@@ -257,8 +231,7 @@ class SuiteRun(Gated):
         if unknown := [name for name in self.names if name not in SUITES]:
             raise CaryatidError(f"no suite '{unknown[0]}': choose from {', '.join(SUITES)}")
         names = self.names or tuple(SUITES)
-        seeds = range(self.seeds)
-        tasks = [(n, SUITES[n].task(s, k)) for n in names for s in SUITES[n].scenes for k in seeds]
+        tasks = [(name, task) for name in names for task in SUITES[name].tasks(self.seeds)]
         rows: dict[str, list[Row]] = {name: [] for name in names}
         for (name, _), part in zip(tasks, self.each(run, [task for _, task in tasks]), strict=True):
             rows[name] += part
@@ -269,7 +242,7 @@ class SuiteRun(Gated):
             return (suite := name.split(".")[0]) in SUITES and suite not in names
 
         self.write(rows)
-        return self.finish(measures(rows), BASELINE, console, TARGETS, kept)
+        return self.finish(measures(rows), BASELINE, console, kept)
 
 
 @dataclass(frozen=True)
@@ -285,7 +258,10 @@ class Extract(Spread):
 
     def run(self, console: Console) -> int:
         """Extract and print."""
-        tasks = [Extraction(folder, self.segmentation, self.set) for folder in self.recordings]
+        tasks = [
+            Task(Episode(source, segmentation=self.segmentation, settings=self.set), frames=True)
+            for source in self.recordings
+        ]
         rows = [row for part in self.each(run, tasks) for row in part]
         show_rows(rows, console, "extract")
         self.write(rows)

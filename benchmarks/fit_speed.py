@@ -3,21 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import Literal
 
 import fits
 import numpy as np
-from peers import (
-    NEIGHBOURS,
-    THRESHOLD,
-    Estimate,
-    cgal_fit,
-    open3d_box,
-    pyransac3d_fit,
-    told,
-)
+from peers import NEIGHBOURS, THRESHOLD, Estimate, cgal_fit, open3d_box, pyransac3d_fit, told
 from rows import Effort, Row, median, timed, timed_row
 from speed import fit_limit
 
@@ -63,7 +56,7 @@ def measure_fits(kind: Kind, effort: Effort) -> list[Row]:
     return [row for count, side in settings for row in _compare(kind, count, side, effort.runs)]
 
 
-def _compare(kind: Kind, count: int, side: str, runs: int) -> list[Row]:
+def _compare(kind: Kind, count: int, side: str, runs: int) -> Iterator[Row]:
     """Rows of our fits beside the peers': time and, with the usual number of points, the errors."""
     peers = [
         p
@@ -71,15 +64,14 @@ def _compare(kind: Kind, count: int, side: str, runs: int) -> list[Row]:
         if not (p == PYRANSAC3D and count >= SLOW) and not (p == CGAL_ALONE and side != "one side")
     ]
     variants = ["fit", "choose"] if count == USUAL else ["fit"]
+    fitters = [*variants, *(["fit alone"] if CGAL_ALONE in peers else []), *peers]
     seconds: dict[str, list[float]] = defaultdict(list)
     errors: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     missing: dict[str, str] = {}
     for seed in range(runs):
         shape, points, normals, eye = draw(kind, count, side, seed)
         makers = _fitters(kind, points, normals, eye)
-        for name in [*variants, *(["fit alone"] if CGAL_ALONE in peers else []), *peers]:
-            if name in missing:
-                continue
+        for name in [name for name in fitters if name not in missing]:
             try:
                 call = makers[name]()
                 for _ in range(1 if name == PYRANSAC3D else RUNS):
@@ -89,6 +81,7 @@ def _compare(kind: Kind, count: int, side: str, runs: int) -> list[Row]:
                 if name not in peers:
                     raise
                 missing[name] = told(error)
+                seconds[name], errors[name] = [], defaultdict(list)
                 continue
             for quantity, off in errors_of(estimate, shape).items():
                 errors[name][quantity].append(off)
@@ -96,41 +89,25 @@ def _compare(kind: Kind, count: int, side: str, runs: int) -> list[Row]:
         f"{kind}.{count // 1000}k-{side.replace(' ', '-')}",
         f"{kind}, {count // 1000}k points, {side}",
     )
-    rows = []
-    for variant in variants:
-        for peer in peers:
-            if peer == CGAL_ALONE and variant != "fit":
-                continue
-            ours = "fit alone" if peer == CGAL_ALONE else variant
-            name, usual = f"{variant}.{where}.{NAMES[peer]}", count == USUAL
-            theirs = [] if peer in missing else seconds[peer]
-            target = FASTER.get((kind, peer)) if usual and variant == "fit" else None
-            limit, note = fit_limit(count), missing.get(peer, "")
-            row = timed_row(
-                name, words, seconds[ours], peer=peer, theirs=theirs, limit=limit, target=target, note=note
-            )
-            rows.append(row)
-            for quantity, ours_off in errors[ours].items() if usual else ():
-                better = 1.0 if variant == "fit" and (kind, peer) == ("cylinder", CGAL) else None
-                known, lost = _known(ours_off)
-                peer_known, peer_lost = _known([] if peer in missing else errors[peer][quantity])
-                notes = [note] if note else [f"{peer} found nothing in {peer_lost}"] if peer_lost else []
-                notes += [f"ours found another shape in {lost} of {len(ours_off)}"] if lost else []
-                rows.append(
-                    Row(
-                        f"{name}.{quantity}",
-                        f"{words}: error of the {quantity}",
-                        median(known)[0] if known else None,
-                        UNITS[quantity],
-                        median(known)[1] if known else 0.0,
-                        len(known),
-                        peer,
-                        median(peer_known)[0] if peer_known else None,
-                        target=better,
-                        note="; ".join(notes),
-                    )
-                )
-    return rows
+    for variant, peer in product(variants, peers):
+        if peer == CGAL_ALONE and variant != "fit":
+            continue
+        ours, name = "fit alone" if peer == CGAL_ALONE else variant, f"{variant}.{where}.{NAMES[peer]}"
+        usual, note = count == USUAL, missing.get(peer, "")
+        yield timed_row(
+            name, words, seconds[ours], peer=peer, theirs=seconds[peer], limit=fit_limit(count), note=note,
+            target=FASTER.get((kind, peer)) if usual and variant == "fit" else None,
+        )  # fmt: skip
+        for quantity in errors[ours] if usual else ():
+            value, spread, known, lost = _median_known(errors[ours][quantity])
+            theirs, _, _, theirs_lost = _median_known(errors[peer][quantity])
+            notes = [note] if note else [f"{peer} found nothing in {theirs_lost}"] if theirs_lost else []
+            notes += [f"ours found another shape in {lost} of {known + lost}"] if lost else []
+            target = 1.0 if variant == "fit" and (kind, peer) == ("cylinder", CGAL) else None
+            yield Row(
+                f"{name}.{quantity}", f"{words}: error of the {quantity}", value, UNITS[quantity], spread,
+                known, peer, theirs, target=target, note="; ".join(notes),
+            )  # fmt: skip
 
 
 def _fitters(kind: Kind, points: Array, normals: Array, eye: Array) -> dict[str, Callable[[], Fitter]]:
@@ -146,10 +123,11 @@ def _fitters(kind: Kind, points: Array, normals: Array, eye: Array) -> dict[str,
     }
 
 
-def _known(errors: list[float]) -> tuple[list[float], int]:
-    """The errors where something was found, and how often nothing was."""
+def _median_known(errors: Sequence[float]) -> tuple[float | None, float, int, int]:
+    """Median and spread of the errors where something was found, how many these are, and how many not."""
     known = [e for e in errors if not np.isnan(e)]
-    return known, len(errors) - len(known)
+    value, spread = median(known) if known else (None, 0.0)
+    return value, spread, len(known), len(errors) - len(known)
 
 
 def draw(kind: Kind, count: int, side: str, seed: int) -> tuple[Shape, Array, Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -81,7 +81,6 @@ class Gated(Spread):
         found: Sequence[Measure],
         baseline: Path,
         console: Console,
-        targets: Mapping[str, float] | None = None,
         kept: Callable[[str], bool] = lambda name: False,
     ) -> int:
         """Print measures, keep and compare them as asked for; returns the exit status.
@@ -90,10 +89,11 @@ class Gated(Spread):
             found: The measures.
             baseline: The committed ones.
             console: Where to print.
-            targets: What is asked for, by name.
             kept: Names in the baseline that were not measured and stay there.
         """
-        show(found, targets or {}, console)
+        rows = [(m.name, f"{m.value:.3f}", m.unit, m.better, f"{m.tolerance:.3g}") for m in found]
+        columns = ["measure", "value", "unit", "better", "± tolerated"]
+        print_table(pd.DataFrame(rows, columns=columns), console)
         if self.update:
             names = {m.name for m in found}
             others = [m for m in read_baseline(baseline) if m.name not in names and kept(m.name)]
@@ -125,16 +125,6 @@ def gate(measures: Iterable[Measure], path: Path, console: Console) -> int:
             console.print(f"worse: {m.name} = {m.value:.4g} {m.unit}, {was}")
     console.print("gate: " + (f"{failed} measures are worse" if failed else "nothing is worse"))
     return min(failed, 1)
-
-
-def show(measures: Iterable[Measure], targets: Mapping[str, float], console: Console) -> None:
-    """Print measures beside what is asked for."""
-    rows = []
-    for m in measures:
-        target, sign = targets.get(m.name), "≥" if m.better == "higher" else "≤"
-        asked = "" if target is None else f"{sign} {target:g}" + (" missed" if m.worse_than(target) else "")
-        rows.append((m.name, f"{m.value:.3f}", m.unit, f"{m.tolerance:.3g}", asked))
-    print_table(pd.DataFrame(rows, columns=["measure", "value", "unit", "± tolerated", "asked for"]), console)
 
 
 def print_table(table: pd.DataFrame, console: Console) -> None:

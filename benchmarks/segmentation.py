@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
@@ -65,21 +65,6 @@ class Args(Gated):
     """Settings, e.g. `--set segmentation.concavity=12`."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """One view: how many true objects and parts there are, and what became of them."""
-
-    source: str
-    view: int
-    true: int
-    parts: int
-    found: int
-    invented: int
-    split: int
-    merged: int
-    seconds: float
-
-
 def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
     """The views of a source, with true labels."""
     if is_recording(source):
@@ -96,53 +81,48 @@ def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
         yield opened.camera.capture(T_world_camera)
 
 
-def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> tuple[int, int, int, int, int, int]:
-    """Count true objects, parts, those found, invented, split and merged.
+def compare(labels: NDArray[np.int32], truth: NDArray[np.int32]) -> dict[str, int]:
+    """Count true objects and parts, and of them those found, invented, split and merged.
 
     Args:
         labels: Parts of the pixels with a reading (N,).
         truth: Their objects (N,).
     """
-    objects = [int(k) for k in np.unique(truth) if k > 0]
-    parts = [int(k) for k in np.unique(labels) if k > 0]
-    both = np.array([[np.sum((labels == p) & (truth == t)) for t in objects] for p in parts], dtype=float)
-    both = both.reshape(len(parts), len(objects))
-    sizes = np.array([np.sum(truth == t) for t in objects], dtype=float)
-    part_sizes = np.array([np.sum(labels == p) for p in parts], dtype=float)
+    counts = pd.crosstab(labels, truth).drop(index=0, errors="ignore")
+    part_sizes = counts.sum(axis=1).to_numpy()
+    counts = counts.drop(columns=0, errors="ignore").reindex(columns=[k for k in np.unique(truth) if k > 0])
+    both, parts, objects = counts.fillna(0).to_numpy(), counts.index.tolist(), counts.columns.tolist()
+    sizes = np.array([np.sum(truth == k) for k in objects])
     asked = sizes >= LEAST_PIXELS
     pairs = assign(mask_ious([labels], [truth], parts, objects), MIN_IOU)
-    paired = {i for i, _ in pairs}
     crumbs = both[:, ~asked].sum(axis=1) > 0.5 * part_sizes
-    invented = sum(not crumb for i, crumb in enumerate(crumbs) if i not in paired)
+    invented = len(parts) - len(pairs) - sum(crumbs[i] for i in range(len(parts)) if i not in dict(pairs))
     pieces = (both >= SHARE * sizes) & asked
     inside = both >= 0.5 * part_sizes[:, None]
-    return (
-        int(asked.sum()),
-        len(paired) + invented,
-        sum(bool(asked[j]) for _, j in pairs),
-        invented,
-        int(((pieces & inside).sum(axis=0) > 1).sum()),
-        int((pieces[pieces.sum(axis=1) > 1].any(axis=0)).sum()),
-    )
+    return {
+        "true": int(asked.sum()),
+        "parts": int(len(pairs) + invented),
+        "found": sum(bool(asked[j]) for _, j in pairs),
+        "invented": int(invented),
+        "split": int(((pieces & inside).sum(axis=0) > 1).sum()),
+        "merged": int((pieces[pieces.sum(axis=1) > 1].any(axis=0)).sum()),
+    }
 
 
-def measure(task: tuple[str, Args]) -> list[Row]:
-    """Segment the views of one source."""
+def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
+    """Segment the views of one source: a row for each."""
     source, args = task
     config = read_settings(None, args.set)
     rows = []
     for number, view in enumerate(views_of(source, args, config)):
         rng = np.random.default_rng(args.seed)
-        observation = observe(view, config, segmentation="auto", known=None, rng=rng)
-        if observation.view is None or view.labels is None:
+        seen = observe(view, config, segmentation="auto", known=None, rng=rng)
+        if seen.view is None or view.labels is None:
             raise CaryatidError(f"{view.name}: has no masks to compare with")
         started = time.perf_counter()
-        labels = segment(
-            observation.view, observation.surface, config.segmentation, config.cloud, config.fit, rng
-        )
-        seconds = time.perf_counter() - started
-        name = Path(source).name
-        rows.append(Row(name, number, *compare(labels[view.valid], view.labels[view.valid]), seconds))
+        labels = segment(seen.view, seen.surface, config.segmentation, config.cloud, config.fit, rng)
+        known = {"source": Path(source).name, "view": number, "seconds": time.perf_counter() - started}
+        rows.append(known | compare(labels[view.valid], view.labels[view.valid]))
     return rows
 
 
@@ -161,31 +141,16 @@ def measures(rows: pd.DataFrame) -> list[Measure]:
     ]
 
 
-def show(rows: pd.DataFrame, console: Console) -> None:
-    """Print one line a family, and the worst views."""
-    families = list(rows.groupby(rows["source"].map(family)))
-    lines = [
-        {
-            "sources": f"{name} ({group['source'].nunique()})",
-            "views": len(group),
-            "objects": group["true"].sum(),
-            **{field: f"{100.0 * share:.1f} %" for field, share in shares(group).items()},
-            "ms": round(1000.0 * group["seconds"].median()),
-        }
-        for name, group in [*families, ("all", rows)]
-    ]
-    print_table(pd.DataFrame(lines), console)
-    worst = rows.loc[(rows["found"] - rows["true"] - rows["invented"]).nsmallest(8).index].itertuples()
-    console.print("worst: " + ", ".join(f"{r.source} view {r.view}: {r.found} of {r.true}" for r in worst))
-
-
 def main() -> int:
     """Run the measurement."""
     args = tyro.cli(Args)
     console = Console(width=160)
     parts = args.each(measure, [(source, args) for source in args.sources])
-    rows = pd.DataFrame([asdict(row) for part in parts for row in part])
-    show(rows, console)
+    rows = pd.DataFrame([row for part in parts for row in part])
+    sums = rows.groupby(rows["source"].map(family).rename("sources")).sum(numeric_only=True)
+    print_table(sums.drop(columns="view").reset_index().round(2), console)
+    worst = rows.loc[(rows["found"] - rows["true"] - rows["invented"]).nsmallest(8).index].itertuples()
+    console.print("worst: " + ", ".join(f"{r.source} view {r.view}: {r.found} of {r.true}" for r in worst))
     args.write(rows.to_dict("records"))
     return args.finish(measures(rows), BASELINE, console)
 

@@ -55,13 +55,12 @@ def test_the_gate_fails_beyond_the_tolerance(tmp_path, loss, status):
     assert measures.gate(worse, tmp_path / "baseline.json", Console(quiet=True)) == status
 
 
-def test_targets_and_baseline_are_of_what_is_measured_and_every_scene_is_built_in():
+def test_the_baseline_is_of_what_is_measured_and_every_scene_is_built_in():
     everything = {
         name: [ROW | {"scene": scene, "view": v} for scene in suite.scenes for v in suite.scored]
         for name, suite in accuracy.SUITES.items()
     }
     measured = set(values(everything))
-    assert set(accuracy.TARGETS) <= measured
     assert {m.name for m in measures.read_baseline(accuracy.BASELINE)} == measured
     assert all(is_builtin(scene) for suite in accuracy.SUITES.values() for scene in suite.scenes)
 
@@ -72,7 +71,7 @@ def test_a_recording_is_scored_frame_by_frame(recording):
         TrueEdge(supporter="object1", supported="object2", kind="bottom-up"),
     )
     write_truth(GroundTruth(("table", "object1", "object2"), edges), recording / "gt.json")
-    scored = accuracy.run(accuracy.Extraction(str(recording)))
+    scored = accuracy.run(accuracy.Task(accuracy.Episode(str(recording)), frames=True))
     assert [r["view"] for r in scored] == [1, 2, 3]
     assert all((r["objects"], r["returned"], r["matched"]) == (2, 2, 2) for r in scored[-1:])
     assert scored[-1]["f1"] == 1.0

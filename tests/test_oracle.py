@@ -55,7 +55,7 @@ def exploration(planner, name="hidden_stack", config=CONFIG, seed=3):
     if planner == "oracle":
         chooser, camera = planner_for(planner, stage.camera, truth, config, **options)
     steps = list(explore(camera, stage.robot, planner=chooser, config=config, early_stop=False, **options))
-    return steps, [score(s.graph, truth, np.random.default_rng(0)).f1 for s in steps]
+    return steps, [score(s.graph, truth).f1 for s in steps]
 
 
 @pytest.fixture(scope="module")

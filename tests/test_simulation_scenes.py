@@ -1,5 +1,9 @@
+"""Scenes: from MJCF, built in, generated, written; their solids, and the ground truth physics gives."""
+
 from __future__ import annotations
 
+import json
+from functools import cache
 from pathlib import Path
 
 import mujoco
@@ -11,24 +15,44 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.simulation import (
+    GroundTruth,
+    SimulatedScene,
     bounds,
     contains,
+    generate,
+    ground_truth,
+    list_scenes,
     load_scene,
+    read_truth,
     static_boxes,
     table_centre,
     table_top,
     true_shapes,
     write_scene,
+    write_truth,
 )
-from caryatid.simulation.truth import ground_truth, read_truth
-from caryatid.simulation.world import scene_from_spec, settle, state_of
+from caryatid.simulation.scenes import DESIGNED, is_builtin
+from caryatid.simulation.truth import mean_contact_forces
+from caryatid.simulation.world import palette, scene_from_spec, settle, state_of
 
 SHARED = Path(__file__).parents[2] / "shared" / "scenes"
+NEEDS_SHARED = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is absent")
 
 TABLE = '<body name="table"><geom name="top" type="box" size="0.3 0.45 0.02" pos="0 0 0.73"/></body>'
 CUBE = '<body name="cube" pos="0 0 0.78"><freejoint/><geom type="box" size="0.03 0.02 0.03"/></body>'
-
 SHAPELESS = '<body name="a"><freejoint/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'
+EASY = {"vertices": ["table", "a"], "edges": [{"supporter": "table", "supported": "a"}]}
+INTENDED = {
+    "tower": {("table", 0), (0, 1), (1, 2), (2, 3), ("table", 4)},
+    "bridge": {("table", 0), ("table", 1), ("table", 4), (0, 2), (1, 2), (2, 3)},
+    "counterweight": {("table", 0), (0, 1), (1, 2), (2, 1, "top-down"), ("table", 3)},
+    "leaning_plank": {("table", 0), ("table", 1), (0, 1, "lean"), ("table", 2), (2, 3)},
+    "hidden_stack": {("table", 0), ("table", 1), (1, 2), (2, 3), ("table", 4)},
+    "shelf": {("table", 0), ("table", 1), (0, 2), (1, 2), ("table", 3), (3, 4), (2, 5), (2, 6)},
+    "clutter": {*(("table", k) for k in (0, 3, 4, 5, 7)), (0, 1), (1, 2), (4, 6), (5, 6), (3, 8)},
+}
+
+generated = cache(generate)
 
 
 def mjcf(body: str, asset: str = "") -> str:
@@ -36,13 +60,16 @@ def mjcf(body: str, asset: str = "") -> str:
     return f"<mujoco><asset>{asset}</asset><worldbody>{floor}{body}</worldbody></mujoco>"
 
 
-def scene_of(body: str, asset: str = ""):
+def scene_of(body: str, asset: str = "") -> SimulatedScene:
     return scene_from_spec(mujoco.MjSpec.from_string(mjcf(body, asset)), "test", "test.xml")
 
 
 def write(path: Path, text: str) -> Path:
     path.write_text(text, encoding="utf-8")
     return path
+
+
+# MJCF
 
 
 def test_objects_are_the_free_bodies_in_their_order():
@@ -219,7 +246,7 @@ def test_writing_where_one_cannot_is_an_error(tmp_path: Path):
         write_scene(load_scene("tower"), blocked / "scene")
 
 
-@pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is absent: no scanned objects")
+@NEEDS_SHARED
 def test_scanned_objects(tmp_path: Path):
     scene = load_scene(SHARED / "ycb00_4")
     assert true_shapes(scene) == {}
@@ -232,3 +259,186 @@ def test_scanned_objects(tmp_path: Path):
     assert (path.parent / "assets" / "tennis_ball_hull_0.stl").is_file()
     copied = load_scene(path)
     np.testing.assert_allclose(bounds(copied, 4)[0], low, atol=1e-5)
+
+
+# Built-in and generated scenes
+
+
+def edges_of(scene: SimulatedScene) -> set[tuple[str, str, str]]:
+    return {(e["supporter"], e["supported"], e["kind"]) for e in ground_truth(scene).edges}
+
+
+def named(supporter, supported, kind="bottom-up") -> tuple[str, str, str]:
+    return supporter if supporter == "table" else f"object{supporter}", f"object{supported}", kind
+
+
+def assert_settled(scene: SimulatedScene) -> None:
+    """At rest, on the table, and still there a second later."""
+    half, height = table_top(scene).extents[:2] / 2.0, table_centre(scene)[2]
+    assert scene.at_rest
+    for label, shape in true_shapes(scene).items():
+        assert bounds(scene, label)[0][2] > height - 0.002
+        assert (np.abs(shape.T_world_object[:2, 3]) < half).all()
+    data = state_of(scene)
+    mujoco.mj_step(scene.model, data, nstep=500)
+    assert np.abs(data.xpos - scene.data.xpos).max() < 0.01
+
+
+@pytest.mark.parametrize("name", DESIGNED)
+def test_designed_scenes_settle_to_the_intended_graph(name: str):
+    scene = load_scene(name)
+    assert scene.name == name
+    assert_settled(scene)
+    assert edges_of(scene) == {named(*edge) for edge in INTENDED[name]}
+
+
+@pytest.mark.parametrize(("size", "seed"), [(1, 0), (4, 1), (8, 3), (12, 0)])
+def test_piles_are_settled_and_of_the_size(size: int, seed: int):
+    scene = generated("pile", size, seed)
+    assert len(scene.object_bodies) == len(true_shapes(scene)) == size
+    assert len(static_boxes(scene)) == 5
+    assert_settled(scene)
+
+
+@pytest.mark.parametrize(
+    ("kind", "size", "seeds"),
+    [("pile", 8, range(3, 6)), pytest.param("dense", 14, range(2), marks=pytest.mark.slow)],
+)
+def test_much_of_a_heap_lies_on_something_else(kind: str, size: int, seeds: range):
+    edges = [edge for seed in seeds for edge in edges_of(generated(kind, size, seed))]
+    assert sum(supporter != "table" for supporter, _, _ in edges) >= 6
+
+
+@pytest.mark.parametrize(("size", "seed"), [(10, 0), pytest.param(25, 2, marks=pytest.mark.slow)])
+def test_dense_scenes_have_screens_a_heap_and_walls(size: int, seed: int):
+    scene = generated("dense", size, seed)
+    shapes = true_shapes(scene).values()
+    assert len(shapes) == size
+    assert_settled(scene)
+    tall = [s for s in shapes if isinstance(s, Box) and s.extents[2] > 0.2 and s.T_world_object[2, 2] > 0.999]
+    assert 2 <= len(tall) <= 4
+    walls = [wall.T_world_object[:2, 3] for wall in static_boxes(scene)[5:]]
+    assert 1 <= len(walls) <= 2
+    assert all(x > 0.5 or abs(y) > 0.7 for x, y in walls)
+
+
+def test_packed_objects_touch_one_another():
+    shapes = list(true_shapes(generate("packed", 6, 3)).values())
+    for shape in shapes:
+        surface = shape.surface(0.003)[0]
+        gaps = [float(other.signed_distance(surface).min()) for other in shapes if other is not shape]
+        assert -0.002 < min(gaps) < 0.004
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4", "packed-5-1"])
+def test_generated_names_repeat_byte_for_byte(name: str):
+    a, b = load_scene(name), load_scene(name)
+    np.testing.assert_array_equal(a.data.qpos, b.data.qpos)
+    assert a.spec.to_xml() == b.spec.to_xml() != load_scene(f"{name}1").spec.to_xml()
+
+
+def test_neighbouring_objects_differ_in_colour():
+    colours = np.array([palette(k)[:3] for k in range(25)])
+    apart = np.abs(colours[:, None] - colours[None]).max(axis=-1) + np.eye(len(colours))
+    assert apart.min() > 0.02
+
+
+@pytest.mark.parametrize("name", ["pile-0-1", "pile-99-1", "dense-3-1", "dense-26-0", "packed-1-0"])
+def test_sizes_and_seeds_out_of_range_are_refused(name: str):
+    with pytest.raises(InputError, match=r"ask for \d+ to \d+"):
+        load_scene(name)
+    with pytest.raises(InputError, match="negative"):
+        generate("pile", 3, -1)
+
+
+def test_names():
+    assert list_scenes()[: len(DESIGNED)] == list(DESIGNED)
+    assert is_builtin("clutter")
+    assert is_builtin("pile-8-3")
+    assert not is_builtin("scenes/clutter")
+    assert not is_builtin("pile-8")
+
+
+# Ground truth
+
+
+@NEEDS_SHARED
+@pytest.mark.slow
+def test_physics_agrees_with_the_given_ground_truth():
+    given, found, common, same_kind = 0, 0, 0, 0
+    for folder in sorted(SHARED.iterdir()):
+        reference, computed = read_truth(folder / "gt.json"), ground_truth(load_scene(folder))
+        assert computed.vertices == reference.vertices
+        kinds = {(e["supporter"], e["supported"]): e["kind"] for e in reference.edges}
+        given += len(reference.pairs)
+        found += len(computed.pairs)
+        common += len(reference.pairs & computed.pairs)
+        same_kind += sum(kinds.get((e["supporter"], e["supported"])) == e["kind"] for e in computed.edges)
+    assert given > 100
+    assert common >= 0.98 * given
+    assert found - common <= 0.02 * given
+    assert same_kind >= 0.98 * given
+
+
+def test_forces_carry_the_weight():
+    scene = load_scene("bridge")
+    forces = mean_contact_forces(scene)
+    for label in scene.object_bodies:
+        held = sum(force[2] for (_, b), force in forces.items() if b == label)
+        weight = scene.model.body_mass[scene.body_id(label)] * 9.81
+        assert held == pytest.approx(weight, rel=0.02)
+    for (a, b), force in forces.items():
+        np.testing.assert_allclose(force, -forces[b, a])
+
+
+def test_removal_names_what_comes_down_and_trying_it_changes_nothing():
+    scene = load_scene("tower")
+    before = scene.data.qpos.copy()
+    truth = ground_truth(scene)
+    assert truth.removal["object0"] == ("object1", "object2", "object3")
+    assert truth.removal["object2"] == ("object3",)
+    assert truth.removal["object4"] == ()
+    assert ground_truth(scene) == truth
+    np.testing.assert_array_equal(scene.data.qpos, before)
+
+
+def test_truth_files_come_back_and_kind_and_removal_may_be_missing(tmp_path: Path):
+    truth, path = ground_truth(load_scene("counterweight")), tmp_path / "gt.json"
+    write_truth(truth, path)
+    assert read_truth(path) == truth
+    edge = {"supporter": "table", "supported": "object0", "kind": "bottom-up"}
+    assert json.loads(path.read_text())["edges"][0] == edge
+    easy = read_truth(write(path, json.dumps(EASY)))
+    assert easy == GroundTruth(("table", "a"), (edge | {"supported": "a"},), {})
+    assert easy.pairs == {("table", "a")}
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ('{"vertices": [', "broken JSON"),
+        ("[]", "not an object"),
+        (json.dumps({**EASY, "vertices": "table"}), "'vertices'"),
+        (json.dumps({**EASY, "vertices": ["table", "a", "a"]}), "twice"),
+        (json.dumps({"vertices": ["table"]}), "'edges'"),
+        (json.dumps({**EASY, "edges": [3]}), "edges: '0' is 3"),
+        (json.dumps({**EASY, "vertices": ["table", "b"]}), "'a', which is no vertex"),
+        (json.dumps({**EASY, "edges": [{"supported": "a"}]}), "edges.0: the key 'supporter' is missing"),
+        (json.dumps({**EASY, "edges": [{**EASY["edges"][0], "kind": "glue"}]}), "glue.*bottom-up"),
+        (json.dumps({**EASY, "removal": {"a": ["ghost"]}}), "'ghost', which is no vertex"),
+        (json.dumps({**EASY, "removal": {"a": [{}]}}), "removal"),
+    ],
+)
+def test_broken_truth_files_are_refused_by_name(tmp_path: Path, text: str, reason: str):
+    path = write(tmp_path / "gt.json", text)
+    with pytest.raises(InputError, match=reason) as error:
+        read_truth(path)
+    assert str(path) in str(error.value)
+
+
+def test_a_missing_truth_and_a_missing_folder(tmp_path: Path):
+    with pytest.raises(InputError, match="missing"):
+        read_truth(tmp_path / "gt.json")
+    with pytest.raises(InputError, match="cannot be written"):
+        write_truth(GroundTruth(("table",), ()), tmp_path / "absent" / "gt.json")

@@ -127,17 +127,11 @@ def summarise_store(store: ResultStore, reference: str | None = None) -> list[Su
         known, methods = SUITES.get(name), set(table["method"])
         wanted = (reference, known.reference if known else None, table["method"].iloc[0])
         chosen = str(next(method for method in wanted if method in methods))
-        failed = table[table["error"].notna()]
-        failures = [
-            [
-                row.method,
-                row.condition,
-                Path(row.scene).name,
-                str(row.seed),
-                row.error.replace(row.scene, Path(row.scene).name),
-            ]
-            for row in failed.itertuples()
-        ]
+        failures = []
+        for row in table[table["error"].notna()].itertuples():
+            scene = Path(row.scene).name
+            error = row.error.replace(row.scene, scene)
+            failures.append([row.method, row.condition, scene, str(row.seed), error])
         results.append(
             SuiteResult(
                 name,

@@ -16,6 +16,7 @@ from concurrent.futures import (
     as_completed,
     wait,
 )
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing import active_children, get_context, parent_process
 from threading import Lock, Thread
@@ -79,16 +80,23 @@ def run_on_cluster(
         InputError: No scheduler answers.
         CaryatidError: It is gone, or a worker has other code.
     """
+    code = fingerprint()
     with connect(address, patience) as client:
         pool = client.get_executor(pure=False)
-        futures = {pool.submit(run_on_worker, _absolute(e), fingerprint()): e for e in episodes}
+        futures = {}
+        for episode in episodes:  # workers have other current folders
+            placed = replace(episode, scene=os.path.abspath(episode.scene)) if episode.content else episode
+            futures[pool.submit(run_on_worker, placed, code)] = episode
         waiting, told = set(futures), False
         while waiting:
             done, waiting = wait(waiting, timeout=patience, return_when=FIRST_COMPLETED)
             for future in done:
                 yield futures.pop(future), _cluster_outcome(future, address)
-            if not done and not told and (told := _has_no_workers(client)):
-                tell(f"no workers; waiting for some: dask worker {address} --nthreads 1 --nworkers N")
+            if done or told:
+                continue
+            with suppress(OSError):
+                if told := not client.nthreads():
+                    tell(f"no workers; waiting for some: dask worker {address} --nthreads 1 --nworkers N")
 
 
 def connect(address: str, patience: float = 10.0) -> Client:
@@ -137,7 +145,7 @@ def run_on_worker(episode: Episode, code: str) -> Outcome:
     from numba import set_num_threads
 
     if fingerprint() != code:
-        raise _other_code("a worker", fingerprint())
+        raise _other_code(fingerprint())
     if plugin_of(episode.planner) != episode.plugin:
         raise CaryatidError(
             f"a worker has not the same package that offers the planner {episode.planner}; "
@@ -163,26 +171,14 @@ def _cluster_outcome(future: Future[Outcome], address: str) -> Outcome:
             f"the scheduler at {address} is gone; what is done is kept: start again"
         ) from None
     except Exception as error:
-        raise _other_code("a worker", f"{type(error).__name__}: {error}") from None
+        raise _other_code(f"{type(error).__name__}: {error}") from None
 
 
-def _has_no_workers(client: Client) -> bool:
-    try:
-        return not client.nthreads()
-    except OSError:
-        return False
-
-
-def _other_code(worker: str, found: str) -> CaryatidError:
+def _other_code(found: str) -> CaryatidError:
     return CaryatidError(
-        f"{worker} runs other code ({found}) than this process ({fingerprint()}); "
+        f"a worker runs other code ({found}) than this process ({fingerprint()}); "
         "install the same caryatid and the same libraries there and start it again"
     )
-
-
-def _absolute(episode: Episode) -> Episode:
-    """The episode with the full path of its scene folder: workers have other current folders."""
-    return replace(episode, scene=os.path.abspath(episode.scene)) if episode.content else episode
 
 
 def _end_with_parent() -> None:

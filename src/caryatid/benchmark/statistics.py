@@ -187,8 +187,7 @@ def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Figure]:
     def ratios(f1: Array, path: Array, other_f1: Array, other_path: Array) -> Array:
         # A resample that misses the threshold counts as infinitely far, against the method.
         ours, theirs = _paths(f1, path), _paths(other_f1, other_path)
-        known = np.isfinite(ours) & (theirs > 0.0)
-        return np.divide(ours, theirs, out=np.full_like(ours, np.inf), where=known)
+        return np.where(np.isfinite(ours) & (theirs > 0.0), ours / theirs, np.inf)
 
     yield from _counts(own[own.index.isin(other.index)], "paired ")
     difference = bootstrap([own, other], lambda ours, theirs: ours - theirs)
@@ -202,7 +201,7 @@ def _gap_closed(own: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> lis
     """(F1 − that of low) / (F1 of high − that of low) after each view."""
 
     def closed(own: Array, low: Array, high: Array) -> Array:
-        return np.divide(own - low, high - low, out=np.full_like(own, np.nan), where=high != low)
+        return np.where(high == low, np.nan, (own - low) / (high - low))
 
     found = bootstrap([frame["f1"] for frame in (own, low, high)], closed)
     return _named([("gap", view) for view in own["f1"].columns], found)

@@ -59,14 +59,15 @@ class ResultStore:
         self.outcomes: dict[str, Outcome] = {}
         self._file: BinaryIO | None = None
         self._lock = FileLock(f"{path}.lock", timeout=0)
-        if fingerprint is None and not path.is_file():
-            raise InputError(path, "there is no result file", "run a suite first: --suite NAME")
-        try:
-            if fingerprint is not None:
-                self._open()
+        if fingerprint is None:
+            if not path.is_file():
+                raise InputError(path, "there is no result file", "run a suite first: --suite NAME")
             self._read()
-            if fingerprint is not None:
-                self._begin({**(about or {}), "format": FORMAT, "fingerprint": fingerprint})
+            return
+        try:
+            self._open()
+            self._read()
+            self._begin({**(about or {}), "format": FORMAT, "fingerprint": fingerprint})
         except BaseException:
             self.__exit__()
             raise
