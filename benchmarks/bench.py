@@ -68,12 +68,10 @@ class Bench:
 
 def selected(wanted: Sequence[str]) -> list[str]:
     """Names of the measurements that names or beginnings of names ask for; all where there are none."""
-    for name in wanted:
-        if not any(f"{known}.".startswith(f"{name}.") for known in MEASUREMENTS):
-            raise InputError(
-                "--only", f"nothing is called '{name}'", f"choose from {', '.join(MEASUREMENTS)}"
-            )
-    return [n for n in MEASUREMENTS if not wanted or any(f"{n}.".startswith(f"{w}.") for w in wanted)]
+    chosen = [n for n in MEASUREMENTS if not wanted or f"{n}.".startswith(tuple(f"{w}." for w in wanted))]
+    if not chosen:
+        raise InputError("--only", "Nothing is called so", f"choose from {', '.join(MEASUREMENTS)}")
+    return chosen
 
 
 def show(rows: Sequence[Row], console: Console) -> None:

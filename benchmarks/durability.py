@@ -3,7 +3,8 @@
     python benchmarks/durability.py [--kills 200] [--views 200]
 
 `caryatid session add` and `caryatid serve` are killed; after each kill the session is opened and its graph
-compared with that of the same views without any kill. Then clients put load on a service.
+compared with that of the same views without any kill. Then clients put load on a service. An `AssertionError`
+says that a view was lost, or that a session does not open or is not what its views make it.
 """
 
 from __future__ import annotations
@@ -48,8 +49,7 @@ from robot_client import RobotClient
 SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 """Small images: a view takes a tenth of a second, so that much happens in little time."""
 
-FORKS = multiprocessing.get_context("forkserver")
-"""Starts commands in processes that have imported everything and begun nothing."""
+FORKS = multiprocessing.get_context("forkserver")  # processes that have imported everything, begun nothing
 FORKS.set_forkserver_preload(["caryatid.sessions.session", "caryatid.cli.sessions", "caryatid.service.app"])
 
 
@@ -116,17 +116,8 @@ def graphs_of(views: Sequence[View]) -> list[str]:
     return [graph_text(scene.graph), *(graph_text(scene.update(view)) for view in views)]
 
 
-def begin(session: Path) -> None:
-    """Begin a session."""
-    Session.begin(session, segmentation="labels").close()
-
-
 def views_in(session: Path, acknowledged: int, graphs: Sequence[str]) -> int:
-    """How many views a session has after a kill: those acknowledged, and perhaps one more.
-
-    Raises:
-        AssertionError: A view was lost, or the session is not what its views make it.
-    """
+    """How many views a session has after a kill: those acknowledged, and perhaps one more."""
     with Session.open(session) as opened:
         found = opened.views
         assert 0 <= found - acknowledged <= 1, f"{found} views where {acknowledged} were acknowledged"
@@ -138,21 +129,18 @@ def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> C
     """Kill `session add` at random moments; every other time once it has begun to write.
 
     Returns what became of the views: killed before or after they were kept, or not killed in time.
-
-    Raises:
-        AssertionError: A view was lost, or a session does not open, or is not what its views make it.
     """
     chance, tally, graphs = random.Random(seed), Counter[str](), graphs_of(views)
-    words = []
+    words: list[list[str]] = []
     for number, view in enumerate(views):
         files = sent(view)
-        paths = {name: folder / f"{name}-{number}" for name in ("depth", "labels", "camera")}
-        for name in ("depth", "labels"):
-            paths[name].write_bytes(files.pop(name))
-        paths["camera"].write_text(json.dumps(files))
-        words.append([f"--{name}={path}" for name, path in paths.items()])
+        files["camera"] = json.dumps({name: files.pop(name) for name in ("K", "T_world_camera")}).encode()
+        words.append([])
+        for name, content in files.items():
+            (folder / f"{name}-{number}").write_bytes(content)
+            words[-1].append(f"--{name}={folder / f'{name}-{number}'}")
     session, usual, known = folder / "session-0", 1.0, 0
-    begin(session)
+    Session.begin(session, segmentation="labels").close()
     while tally["kept"] + tally["not kept"] < kills:
         begun = time.monotonic()
         options = [*words[known], "--json", "--number", known]
@@ -174,7 +162,7 @@ def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> C
         known = found
         if known == len(views):
             session, known = folder / f"session-{sum(tally.values())}", 0
-            begin(session)
+            Session.begin(session, segmentation="labels").close()
     return tally
 
 
@@ -189,17 +177,11 @@ def _wait(session: Path, chance: random.Random, usual: float, *, writing: bool) 
 
 
 def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
-    """Kill `serve` while two clients add views to a session each.
-
-    Returns how many views were acknowledged, and kept without that.
-
-    Raises:
-        AssertionError: A view was lost, or a session does not open, or is not what its views make it.
-    """
+    """Kill `serve` while two clients add views to a session each; returns what became of these."""
     chance, tally, graphs = random.Random(seed), Counter[str](), graphs_of(views)
     payloads, kept = [sent(view) for view in views], {"table-0": 0, "table-1": 0}
     for name in kept:
-        begin(folder / name)
+        Session.begin(folder / name, segmentation="labels").close()
     for _ in range(kills):
         (folder / "said").unlink(missing_ok=True)
         process = start(["serve", folder, "--port", 0, "--json"], folder / "said")
@@ -232,7 +214,7 @@ def kill_serving(folder: Path, views: Sequence[View], kills: int, seed: int) -> 
             if found == len(views):
                 del kept[name]
                 kept[f"{name}-"] = 0
-                begin(folder / f"{name}-")
+                Session.begin(folder / f"{name}-", segmentation="labels").close()
     return tally
 
 
@@ -246,9 +228,6 @@ def put_load(
     Returns:
         Of each session which of the views each of its views is; how long each answer took [s]; the memory of
         the service after each answer [MB].
-
-    Raises:
-        AssertionError: A view was lost, or a graph is not that of its views added one by one.
     """
     names = [f"table-{n}" for n in range(sessions)]
     orders: dict[str, list[int]] = {name: [] for name in names}
@@ -286,10 +265,7 @@ def put_load(
     return orders, seconds, memory
 
 
-def main(
-    *, kills: int = 200, seed: int = 0, views: int = 200, clients: int = 8, sessions: int = 4,
-    open_sessions: int = 4,
-) -> None:  # fmt: skip
+def main(*, kills: int = 200, seed: int = 0, views: int = 200, clients: int = 8, sessions: int = 4) -> None:
     """Kill and put load, and say what became of the views.
 
     Args:
@@ -297,8 +273,7 @@ def main(
         seed: Seed of the moments.
         views: Views of the load.
         clients: Clients that put it.
-        sessions: Sessions they add to.
-        open_sessions: Sessions the service keeps open; fewer than there are: they take turns.
+        sessions: Sessions they add to; the service keeps four open.
     """
     around = views_around("clutter", max(12, views))
     for what, kill_some in (("session add", kill_adding), ("serve", kill_serving)):
@@ -307,7 +282,7 @@ def main(
             tally = kill_some(Path(folder), around[:12], kills, seed)
         figures = ", ".join(f"{count} {name}" for name, count in sorted(tally.items()))
         print(f"{what}: {figures}; none lost ({time.monotonic() - begun:.0f} s)", flush=True)
-    begun, limit = time.monotonic(), ("--open-sessions", open_sessions)
+    begun, limit = time.monotonic(), ("--open-sessions", 4)
     with TemporaryDirectory() as folder:
         _, seconds, memory = put_load(
             Path(folder), around[:views], clients=clients, sessions=sessions, options=limit

@@ -48,23 +48,11 @@ ONE_VIEW = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
 
 
 @dataclass(frozen=True)
-class Args(Gated):
-    """Fit shapes to synthetic half views."""
-
-    trials: int = 200
-    """Trials a shape."""
-
-
-@dataclass(frozen=True)
 class Trial:
-    """What came of one fit.
+    """One fit: the shape there was, the one found (`none` where nothing could be), and a note to read.
 
-    Attributes:
-        kind: Shape that was there.
-        found: Shape that was fitted, `none` where nothing could be.
-        errors: (quantity, error, claimed standard deviation) [mm, deg] of all that the view can tell; none
-            where the shape is wrong.
-        note: The trial, for a person to read.
+    `errors` are (quantity, error, claimed standard deviation) [mm, deg] of all that the view can tell; none
+    where the shape is wrong.
     """
 
     kind: str
@@ -183,6 +171,14 @@ def measures(prefix: str, trials: list[Trial]) -> list[Measure]:
                 full = f"{prefix}{kind}.{name}.{label}"
                 found.append(Measure(full, float(figure), unit, "lower", 0.1 + 0.1 * float(figure)))
     return found
+
+
+@dataclass(frozen=True)
+class Args(Gated):
+    """Fit shapes to synthetic half views."""
+
+    trials: int = 200
+    """Trials a shape."""
 
 
 def main() -> int:

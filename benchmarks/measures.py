@@ -23,15 +23,7 @@ R = TypeVar("R")
 
 @dataclass(frozen=True)
 class Measure:
-    """One figure of a benchmark.
-
-    Attributes:
-        name: What was measured.
-        value: Its value.
-        unit: `1` for shares, `s` for seconds.
-        better: Which way is better, `higher` or `lower`.
-        tolerance: How much worse than the baseline it may be, in its unit.
-    """
+    """One figure of a benchmark; `better` is `higher` or `lower`, the tolerance is in its unit."""
 
     name: str
     value: float
@@ -85,11 +77,7 @@ class Gated(Spread):
     ) -> int:
         """Print measures, keep and compare them as asked for; returns the exit status.
 
-        Args:
-            found: The measures.
-            baseline: The committed ones.
-            console: Where to print.
-            kept: Names in the baseline that were not measured and stay there.
+        Names in the baseline that were not measured stay there where `kept` says so.
         """
         rows = [(m.name, f"{m.value:.3f}", m.unit, m.better, f"{m.tolerance:.3g}") for m in found]
         columns = ["measure", "value", "unit", "better", "± tolerated"]

@@ -25,25 +25,10 @@ OPEN3D, PYRANSAC3D, CGAL = "open3d", "pyransac3d", "CGAL.CGAL_Shape_detection"
 DISTRIBUTIONS = {OPEN3D: "open3d", PYRANSAC3D: "pyransac3d", CGAL: "cgal"}
 """Module → the package of the registry it comes with."""
 
-VOXEL = 0.005
-"""Edge of the voxels Open3D's chain thins by [m]."""
-PLANE = (0.01, 3, 1000)
-"""Threshold [m], points of a sample and iterations of its plane."""
-CLUSTER = (0.015, 10)
-"""Reach [m] and fewest points of its clusters."""
-
 THRESHOLD = 0.004
 """Distance within which points belong to a shape [m]: 4σ."""
 ITERATIONS = 1000
 """Of pyransac3d: its default for spheres; those for cuboids and cylinders are 5 and 10 times as many."""
-CGAL_SHARE = 0.3
-"""Share of the points a shape of CGAL's has at least: less makes it look for more shapes than the one."""
-CGAL_GAP = 0.05
-"""Distance beyond which points of one shape are two for CGAL [m]: wide, there is one; it is fastest so."""
-CGAL_NORMAL = 0.9
-"""Cosine of the angle between a point's normal and the shape's for CGAL; its default."""
-CGAL_MISS = 0.01
-"""Probability that CGAL overlooks a larger shape; its default."""
 NEIGHBOURS = 20
 """Points a normal is estimated from."""
 
@@ -83,15 +68,7 @@ def _open3d() -> Any:
 
 
 def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
-    """Open3D from the depth image to a box a cluster.
-
-    Args:
-        view: Depth [m] and intrinsics [px].
-        max_depth: Readings beyond count for nothing [m].
-
-    Returns:
-        The call; it returns how many boxes there are.
-    """
+    """Open3D from a depth image, readings up to a depth [m], to a box a cluster, counting the boxes."""
     o3d = _open3d()
     height, width = view.depth.shape
     K = o3d.camera.PinholeCameraIntrinsic(
@@ -103,10 +80,10 @@ def open3d_chain(view: View, max_depth: float) -> Callable[[], int]:
         cloud = o3d.geometry.PointCloud.create_from_depth_image(
             image, K, depth_scale=1.0, depth_trunc=max_depth
         )
-        cloud = cloud.voxel_down_sample(VOXEL)
-        _, table = cloud.segment_plane(*PLANE)
+        cloud = cloud.voxel_down_sample(0.005)
+        _, table = cloud.segment_plane(distance_threshold=0.01, ransac_n=3, num_iterations=1000)
         rest = cloud.select_by_index(table, invert=True)
-        clusters = np.asarray(rest.cluster_dbscan(*CLUSTER))
+        clusters = np.asarray(rest.cluster_dbscan(eps=0.015, min_points=10))
         boxes = 0
         for k in range(clusters.max(initial=-1) + 1):
             cluster = rest.select_by_index(np.flatnonzero(clusters == k))
@@ -146,11 +123,6 @@ def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Es
     """CGAL's efficient RANSAC of a `cylinder` or a `sphere`; with no normals it estimates them first.
 
     Copying the points into CGAL's set, which goes through Python one by one, is not part of the call.
-
-    Args:
-        kind: Which shape.
-        points: (N, 3) [m].
-        normals: Unit normals (N, 3), or None.
     """
     shapes = import_module(CGAL)
     kernel, sets = import_module("CGAL.CGAL_Kernel"), import_module("CGAL.CGAL_Point_set_3")
@@ -167,7 +139,12 @@ def cgal_fit(kind: str, points: Array, normals: Array | None) -> Callable[[], Es
         if normals is None:
             processing.pca_estimate_normals(cloud, NEIGHBOURS)
         lines = shapes.efficient_RANSAC(
-            cloud, owner, int(CGAL_SHARE * len(points)), THRESHOLD, CGAL_GAP, CGAL_NORMAL, CGAL_MISS,
+            cloud, owner,
+            int(0.3 * len(points)),  # fewer points a shape make it look for more shapes than the one
+            THRESHOLD,
+            0.05,  # gap at which points of one shape are two [m]: wide, there is one; it is fastest so
+            0.9,  # cosine of the angle between a point's normal and the shape's; the default
+            0.01,  # probability of overlooking a larger shape; the default
             False, False, kind == "cylinder", kind == "sphere", False,
         )  # fmt: skip
         return _read_cgal(lines[0]) if len(lines) else {}

@@ -21,7 +21,7 @@ import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from caryatid import Config, Step, explore
 from caryatid.errors import CaryatidError
@@ -77,8 +77,8 @@ def sheet(pictures: Sequence[Titled], width: int, columns: int, heading: str = "
         for row, height in zip(rows, heights, strict=True):
             for column, (picture, title) in enumerate(row):
                 tall = width * picture.height / picture.width
-                middle = (column + 0.5) / columns
-                figure.text(middle, 1.0 - (top + TITLE / 2) / size[1], title, ha="center", va="center")
+                at = (column + 0.5) / columns, 1.0 - (top + TITLE / 2) / size[1]
+                figure.text(*at, title, ha="center", va="center")
                 bottom = 1.0 - (top + TITLE + tall) / size[1]
                 picture.put(figure, (column / columns + 0.005, bottom, 0.99 / columns, tall / size[1]))
             top += height
@@ -196,14 +196,13 @@ def film() -> tuple[list[Image.Image], list[int]]:
     def add(step: Step, phase: str, time: int, *, found: bool) -> None:
         view, number = step.view, step.index + 1
         assert view is not None
-        seen = plain(view, step.labels, step.graph) if found else plain(view)
         pictures = [
-            (seen, "what the camera sees"),
+            (plain(view, step.labels, step.graph) if found else plain(view), "what the camera sees"),
             (draw_cloud(step.cloud, graph, azimuth_of(view) - 0.4), "what is known: points and shapes"),
             (draw_sphere(step if time == CHOOSE else replace(step, decision=None)), "where to look from"),
             (draw_graph(graph), "the support graph"),
         ]
-        f1 = score(graph, truth, np.random.default_rng(0)).f1 if graph.objects else 0.0
+        f1 = score(graph, truth).f1 if graph.objects else 0.0
         images.append(sheet(pictures, 400, 2, f"view {number} · F1 {f1:.2f} · {phase}"))
         times.append(time)
 
@@ -214,17 +213,10 @@ def film() -> tuple[list[Image.Image], list[int]]:
         if step.decision is None:
             add(step, f"done: {step.stop}", END, found=True)
             break
-        add(
-            step,
-            textwrap.shorten(f"next view: {step.decision.why}", 90, placeholder=" …"),
-            CHOOSE,
-            found=True,
-        )
-    width, height = images[0].width, max(image.height for image in images)
-    pages = [Image.new("RGB", (width, height), "white") for _ in images]
-    for page, image in zip(pages, images, strict=True):
-        page.paste(image)
-    return pages, times
+        why = textwrap.shorten(f"next view: {step.decision.why}", 90, placeholder=" …")
+        add(step, why, CHOOSE, found=True)
+    size = images[0].width, max(image.height for image in images)
+    return [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images], times
 
 
 @dataclass(frozen=True)

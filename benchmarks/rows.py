@@ -28,16 +28,7 @@ Limit = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How many runs, and up to which sizes.
-
-    Attributes:
-        runs: Of each figure at least [1].
-        points: Numbers of points that fits are measured with.
-        widths: Of images [px] for growth with points.
-        objects: On the table.
-        voxels: Their edges [m].
-        views: Seen one after the other [1].
-    """
+    """How many runs; sizes of fits [points], images [px], tables [objects], voxels [m] and many views."""
 
     runs: int = 7
     points: tuple[int, ...] = (1000, 5000, 20_000)
@@ -138,13 +129,10 @@ def timed_row(
     note: str = "",
 ) -> Row:
     """Make a row, in milliseconds, of runs [s] of ours and of a peer."""
-    value, spread = median(ours)
+    value, spread = median([1e3 * t for t in ours])
+    peer_value = median([1e3 * t for t in theirs])[0] if theirs else None
     bound, least = ("", None) if limit is None else limit_of(*limit)
-    peer_value = 1e3 * median(theirs)[0] if len(theirs) else None
-    least = None if least is None else 1e3 * least
-    return Row(
-        name, what, 1e3 * value, "ms", 1e3 * spread, len(ours), peer, peer_value, bound, least, target, note
-    )  # fmt: skip
+    return Row(name, what, value, "ms", spread, len(ours), peer, peer_value, bound, least, target, note)
 
 
 def median(values: Sequence[float]) -> tuple[float, float]:
@@ -201,11 +189,11 @@ def _triad(a: Array, b: Array, c: Array, s: float) -> None:
 
 
 def limit_of(size: float, operations: float) -> tuple[str, float]:
-    """What takes longer of moving so many bytes and so many operations, and how long [s]."""
+    """What takes longer of moving so many bytes and so many operations, and how long [ms]."""
     passing, computing = size / machine()["bandwidth"], operations / machine()["arithmetic"]
     count, unit, seconds = (operations, "flop", computing) if computing > passing else (size, "B", passing)
     power = min(int(np.log10(max(count, 1.0)) // 3), 3)
-    return f"{count / 1e3**power:.3g} {('', 'k', 'M', 'G')[power]}{unit}", seconds
+    return f"{count / 1e3**power:.3g} {('', 'k', 'M', 'G')[power]}{unit}", 1e3 * seconds
 
 
 def _figure(value: float | None, unit: str) -> str:

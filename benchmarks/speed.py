@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import os
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -35,7 +34,7 @@ from caryatid.robots import Robot
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.observation import UP
 from caryatid.segmentation.segments import segment
-from caryatid.segmentation.support_plane import find_support_surface
+from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.view_sphere import ViewSphere, direction
 from caryatid.sensing.voxel_map import VoxelMap
@@ -59,8 +58,6 @@ PITCH = 0.11
 SEGMENTATIONS: tuple[SegmentationMethod, ...] = ("auto", "labels")
 SEGMENTS = {"auto": "automatic segments", "labels": "labels given"}
 TARGETS = {"turn.auto": 0.5, "turn.labels": 0.5, "perceive.labels": 0.25}
-SHAPE_NUMBERS = 22
-"""Numbers a fitted shape is told by [1]: pose and size, and how sure each is."""
 OBJECTS, POINTS = 36, 30
 """Objects on the table and points of interest of Algorithm 1 that a decision is about [1]."""
 PATIENCE = 90.0
@@ -220,12 +217,11 @@ def _stages(recording: Recording, later: dict[str, list[dict[str, float]]], effo
     loose = np.flatnonzero(view.labels.ravel()[pixels] == 0)
     loose = loose[:: max(1, len(loose) // 20_000)]
 
-    def surface() -> object:
-        return find_support_surface(
-            points[loose], normals[loose], UP, config.surface, np.random.default_rng(0)
-        )
+    def surface() -> SupportSurface:
+        rng = np.random.default_rng(0)
+        return find_support_surface(points[loose], normals[loose], UP, config.surface, rng)
 
-    found = find_support_surface(points[loose], normals[loose], UP, config.surface, np.random.default_rng(0))
+    found = surface()
 
     def segments() -> object:
         rng = np.random.default_rng(0)
@@ -246,14 +242,15 @@ def _stages(recording: Recording, later: dict[str, list[dict[str, float]]], effo
         for name, (what, call, limit) in alone.items()
     ]
     valid, objects = float(view.valid.sum()), len(np.unique(view.labels)) - 1
+    shape_numbers = 22  # pose and size of a fitted shape, and how sure each is
     voxels = float(np.prod(np.ceil(np.array(config.voxels.extent) / config.voxels.size)))
     limits: dict[str, Limit] = {
         "segment": (4.0 * size + 56.0 * valid, 64.0 * size),
         "register": (48.0 * valid, 0.0),
         "map": (4.0 * size + 4.0 * voxels, 0.0),
         "fit": fit_limit(int(np.count_nonzero(view.labels[view.valid]))),
-        "infer": (8.0 * SHAPE_NUMBERS * objects, 6.0 * objects * (objects - 1)),
-        "fuse": (8.0 * SHAPE_NUMBERS * objects, 0.0),
+        "infer": (8.0 * shape_numbers * objects, 6.0 * objects * (objects - 1)),
+        "fuse": (8.0 * shape_numbers * objects, 0.0),
         "plan": plan_limit(voxels, config.active.sphere_points, config),
     }
     for name in SEGMENTATIONS:
@@ -303,10 +300,8 @@ def measure_decision(effort: Effort) -> list[Row]:
         },
         effort.runs,
     )
-    what, limit = (
-        f"one decision, {POINTS} points of interest",
-        plan_limit(voxels.hits.size, len(state.candidates), config),
-    )
+    what = f"one decision, {POINTS} points of interest"
+    limit = plan_limit(voxels.hits.size, len(state.candidates), config)
     note = (
         f"{len(sphere.directions):,} views, {len(state.candidates):,} within reach; the planner beside it "
         f"looks from one in {config.active.look_directions:,} directions all around"
@@ -469,12 +464,8 @@ def _over_views(segmentation: SegmentationMethod, views: int) -> Iterator[Row]:
     row = _exponent("views", segmentation, sizes, [median([turns[v - 1] for v in b])[0] for b in bins])
     what = f"peak memory of {views} views, {SEGMENTS[segmentation]}"
     memory = Row(f"growth.memory.{segmentation}", what, peak, "MB", target=1024.0)
-    if len(turns) < views:
-        note = (
-            f"only {len(turns)} views were done in {PATIENCE:.0f} s: {row.value:.2f}, {peak:.0f} MB by then"
-        )
-        row, memory = replace(row, value=None, note=note), replace(memory, value=None, note=note)
-    yield from (row, memory)
+    done = f"only {len(turns)} views were done in {PATIENCE:.0f} s: {row.value:.2f}, {peak:.0f} MB by then"
+    yield from (one if len(turns) == views else replace(one, value=None, note=done) for one in (row, memory))
 
 
 def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[float], float]:
@@ -486,7 +477,6 @@ def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[floa
         turns.append(episode.look(T_world_camera, simulation.camera.capture(T_world_camera))["turn"])
         if time.perf_counter() - started > PATIENCE:
             break
-    status = Path("/proc/self/status")
-    if status.is_file() and (peak := re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="ascii"))):
-        return turns, int(peak[1]) / 1024.0
-    return turns, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    # Unlike getrusage's, this peak is not that of the process that started this one.
+    (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
+    return turns, int(peak) / 1024.0

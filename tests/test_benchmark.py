@@ -29,7 +29,7 @@ from caryatid.benchmark.statistics import bootstrap, summarise
 from caryatid.benchmark.store import RESULTS, Member, ResultStore, collect_provenance
 from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.errors import InputError
-from caryatid.simulation.scenes import is_builtin, load_scene, write_scene
+from caryatid.simulation.scenes import is_builtin
 
 QUICK = tuple(flag.removeprefix("--set=") for flag in SMALL)
 
@@ -103,7 +103,9 @@ def test_planners_take_the_place_of_the_methods_and_an_option_is_no_setting():
 
 def test_folders_of_scenes_are_found(tmp_path):
     for name in ("tower", "bridge"):
-        write_scene(load_scene(name), tmp_path / name)
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "scene.xml").write_text(name)
+        (tmp_path / name / "gt.json").write_text("{}")
     folders = [str(tmp_path / "bridge"), str(tmp_path / "tower")]
     assert find_scenes([str(tmp_path), str(tmp_path / "tower"), "shelf"]) == [*folders, "shelf"]
     assert [family(s) for s in ("tower", "pile-4-1", "a/ycb4_8")] == ["designed", "pile", "ycb"]

@@ -57,7 +57,7 @@ def main() -> None:
     """Build, install and try; say what came of it, a line for each Python."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "dist", help="where wheel and sdist go")
-    parser.add_argument("--python", action="append", help="only this version, say 3.12; may be repeated")
+    parser.add_argument("--python", nargs="*", default=VERSIONS, help="only these versions, say 3.12")
     options = parser.parse_args()
     shutil.rmtree(options.out, ignore_errors=True)
     run(sys.executable, "-m", "build", "--outdir", str(options.out), str(ROOT))
@@ -65,18 +65,18 @@ def main() -> None:
     run(sys.executable, "-m", "twine", "check", "--strict", str(wheel), str(sdist))
     for file in (wheel, sdist):
         print(f"{file.name}: {file.stat().st_size / 1e6:.2f} MB", flush=True)
-    tried = 0
-    for wanted in options.python or VERSIONS:
-        python = find_python(wanted)
+    pythons = {wanted: find_python(wanted) for wanted in options.python}
+    distributions = [wheel, sdist]
+    for wanted, python in pythons.items():
         if python is None:
             print(f"Python {wanted}: not on this machine, not tried", flush=True)
             continue
-        for distribution in (wheel,) if tried else (wheel, sdist):
+        for distribution in distributions:
             with tempfile.TemporaryDirectory(prefix="caryatid-") as folder:
                 told = try_out(python, distribution, Path(folder))
             print(f"Python {wanted}, {distribution.suffix.lstrip('.')}: {json.dumps(told)}", flush=True)
-        tried += 1
-    if not tried:
+        distributions = [wheel]
+    if not any(pythons.values()):
         sys.exit("no Python was found that the classifiers promise")
 
 

@@ -24,6 +24,8 @@ HEAPED = tuple(f"pile-{6 + i % 7}-{401 + i}" for i in range(60))
 """Piles of 6 to 12 to be taken apart; nothing is tuned on these seeds."""
 DENSE = tuple(f"dense-{10 + i % 16}-{301 + i}" for i in range(32))
 """Heaps of 10 to 25 between screens and walls; nothing is tuned on these seeds."""
+MIXED = (*DESIGNED, *PILES[2::2], *DENSE[:8])
+"""Some of each."""
 LABELS = "labels, Carmine noise"
 """The condition under which methods are compared where no other is said."""
 
@@ -136,8 +138,10 @@ _FIG5: Changes = {
     "random SG": {"planner": "random", "fusion": "sg"},
 }
 _PLANNERS = ("support", "attention", "paper", "random", "ring", "farthest", *VOLUMETRIC, "oracle")
-_FREE = ("active.path_cost=none",)
+_FREE: dict[str, Any] = {"label": "{}, w = 0", "settings": ("active.path_cost=none",)}
 """Volumetric planners that do not mind the way."""
+_GIVEN = {"settings": ("registration.enabled=false",)}
+"""Views whose poses are taken as they come."""
 _BOTH = {
     "eq. 2 with 2π": "active.saliency=paper",
     "point at midpoint": "active.edge_point=midpoint",
@@ -177,8 +181,14 @@ _NOISE: Changes = {
 }
 
 
-def _planners(*names: str) -> Changes:
-    return {name: {"planner": name} for name in names}
+def _planners(*names: str, label: str = "{}", **changes: Any) -> Changes:
+    return {label.format(name): {"planner": name, **changes} for name in names}
+
+
+def _ablation(planner: str, settings: Mapping[str, str]) -> Changes:
+    """A planner, and the same with one setting changed at a time."""
+    changed = {label: {"planner": planner, "settings": (setting,)} for label, setting in settings.items()}
+    return {**_planners(planner), **changed}
 
 
 _ALL = (
@@ -200,10 +210,7 @@ _ALL = (
     Suite(
         "planners",
         "Who finds the support graph with the fewest views, where views differ: in dense heaps.",
-        {
-            **_planners(*_PLANNERS),
-            **{f"{name}, w = 0": {"planner": name, "settings": _FREE} for name in VOLUMETRIC},
-        },
+        {**_planners(*_PLANNERS), **_planners(*VOLUMETRIC, **_FREE)},
         DENSE,
         reference="random",
         gap=("random", "oracle"),
@@ -211,10 +218,7 @@ _ALL = (
     Suite(
         "path",
         "How far one has to go in dense heaps until the support graph is good.",
-        {
-            **_planners("support", "random", "ring"),
-            "proximity-count, w = 0": {"planner": "proximity-count", "settings": _FREE},
-        },
+        {**_planners("support", "random", "ring"), **_planners("proximity-count", **_FREE)},
         DENSE,
         views=10,
         reference="random",
@@ -222,29 +226,20 @@ _ALL = (
     Suite(
         "ablation",
         "What the paper leaves open, one setting at a time, for the default planner.",
-        {"support": {}, **{label: {"settings": (s,)} for label, s in _SUPPORT.items()}, **_TOP_DOWN},
+        {**_ablation("support", _SUPPORT), **_TOP_DOWN},
         DENSE[:16],
     ),
     Suite(
         "ablation-attention",
         "What the paper leaves open, one setting at a time, for Algorithm 2 read with these settings.",
-        {
-            **_planners("attention"),
-            **{label: {"planner": "attention", "settings": (s,)} for label, s in _ATTENTION.items()},
-        },
+        _ablation("attention", _ATTENTION),
         DENSE[:16],
     ),
     Suite(
         "poses",
         "What fusing points, graphs or both makes of views whose poses are taken as they come.",
-        {
-            **_FUSED,
-            **{
-                f"{label}, poses as they come": {**own, "settings": ("registration.enabled=false",)}
-                for label, own in _FUSED.items()
-            },
-        },
-        (*DESIGNED, *PILES[2::2], *DENSE[:8]),
+        {**_FUSED, **{f"{label}, poses as they come": {**own, **_GIVEN} for label, own in _FUSED.items()}},
+        MIXED,
         seeds=1,
         views=10,
     ),
@@ -252,7 +247,7 @@ _ALL = (
         "noise",
         "What depth noise, wrong poses and automatic segments cost.",
         _planners("support", "random"),
-        (*DESIGNED, *PILES[2::2], *DENSE[:8]),
+        MIXED,
         {**_NOISE, **_AUTO},
         seeds=1,
     ),

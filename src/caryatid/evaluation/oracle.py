@@ -24,9 +24,6 @@ from caryatid.scene import Scene
 from caryatid.sensing.views import Camera, View
 from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
 
-SURFACE_CELL = 0.01
-"""Edge of the cells ground-truth surface is counted in [m]; that of a voxel of the map."""
-
 
 class _WatchedCamera:
     """A camera that remembers pose (4, 4) and view of each capture that nobody has asked about yet."""
@@ -45,8 +42,8 @@ class OraclePlanner:
     """Takes the candidate that raises F1, vertices and edges together, most.
 
     Of equal ones it takes that which shows most true surface no earlier view has shown, then the shorter way,
-    then the first. True surface is counted in cells of `SURFACE_CELL`, object by object: those
-    in which a ray of a camera without noise meets the object. The views tried are spread evenly over the
+    then the first. True surface is counted in cells as large as the map's voxels, object by object: those in
+    which a ray of a camera without noise meets the object. The views tried are spread evenly over the
     candidates, away from the views so far; the one the default planner would choose is tried too, so that no
     step of that planner can be better.
 
@@ -107,7 +104,7 @@ class OraclePlanner:
                 break
         index = int(tried[best])
         cost = float(path_cost(state)[index])
-        area, now = float(unseen[best]) * SURFACE_CELL**2, self._f1(self._scene.graph)
+        area, now = float(unseen[best]) * self._config.voxels.size**2, self._f1(self._scene.graph)
         why = f"F1 goes from {now:.2f} to {reached:.2f}, the best of {len(tried)} views; "
         why += f"{1e4 * area:.0f} cm² of surface come into sight"
         return Decision(candidates.T_world_camera[index], index, reached, cost, reached - cost, why)
@@ -155,7 +152,7 @@ class OraclePlanner:
         reach = image.depth.ravel()[on_object, None]
         points_world = T_world_camera[:3, 3] + reach * rays_world[on_object]
         cells = 4096  # along each axis around the world's origin: 41 m
-        place = np.floor(points_world / SURFACE_CELL).astype(np.int64) + cells // 2
+        place = np.floor(points_world / self._config.voxels.size).astype(np.int64) + cells // 2
         return np.unique(
             np.ravel_multi_index(
                 (labels[on_object], *np.clip(place, 0, cells - 1).T), (int(labels.max()) + 1, *(cells,) * 3)

@@ -181,20 +181,11 @@ def _score_matches(
     """Eqs. 4 and 5 once it is known which extracted vertex is which true one, one-to-one."""
     v, e = len(matches), sum((matches.get(a), matches.get(b)) in edges for a, b in found_edges)
     precision, recall = _ratios(v + e, len(found_vertices) + len(found_edges), len(vertices) + len(edges))
-    vertex_precision, vertex_recall = _ratios(v, len(found_vertices), len(vertices))
-    edge_precision, edge_recall = _ratios(e, len(found_edges), len(edges))
-    return Score(
-        precision=precision,
-        recall=recall,
-        f1=_harmonic_mean(precision, recall),
-        vertex_precision=vertex_precision,
-        vertex_recall=vertex_recall,
-        edge_precision=edge_precision,
-        edge_recall=edge_recall,
-        mean_iou=float(np.mean(list(ious.values()))) if ious else 0.0,
-        matches=matches,
-        ious=ious,
-    )
+    of_vertices = _ratios(v, len(found_vertices), len(vertices))
+    of_edges = _ratios(e, len(found_edges), len(edges))
+    mean_iou = float(np.mean(list(ious.values()))) if ious else 0.0
+    f1 = _harmonic_mean(precision, recall)
+    return Score(precision, recall, f1, *of_vertices, *of_edges, mean_iou, matches, ious)
 
 
 def volume_ious(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.generation import generate
-from caryatid.simulation.scenes import is_builtin, list_scenes, load_scene, write_scene
+from caryatid.simulation.scenes import is_builtin, list_scenes, load_scene
 from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, read_truth, write_truth
 from caryatid.simulation.world import (
     SimulatedScene,
@@ -33,6 +33,5 @@ __all__ = [
     "table_centre",
     "table_top",
     "true_shapes",
-    "write_scene",
     "write_truth",
 ]

@@ -153,8 +153,9 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
             return build(solids)
         solid, stacked = plan.draw(below)
         tried = build([*solids, solid], impatient, least=0.3)
-        insist = stacked and failures < TRIES // 2
-        if _stands(tried, solids[:fixed] or solids, plan, physics) and (not insist or _is_raised(tried)):
+        on_the_table = bounds(tried, len(solids) + 1)[0][2] <= TABLE_HEIGHT + GAP
+        slipped = stacked and failures < TRIES // 2 and on_the_table
+        if not slipped and _stands(tried, solids[:fixed] or solids, plan, physics):
             shapes = true_shapes(tried).values()
             solids = [replace(s, shape=shape) for s, shape in zip([*solids, solid], shapes, strict=True)]
             below, failures = tried, 0
@@ -184,20 +185,13 @@ def _stands(scene: SimulatedScene, firm: Sequence[Solid], plan: _Plan, physics: 
         shift = shapes[label].T_world_object[:3, 3] - solid.shape.T_world_object[:3, 3]
         if np.linalg.norm(shift) > 0.04:
             return False
-    return scene.at_rest and _keeps_still(scene, physics)
-
-
-def _keeps_still(scene: SimulatedScene, physics: PhysicsConfig) -> bool:
-    """Nothing moves by itself, not even slowly, while one would watch what taking an object away does."""
+    if not scene.at_rest:
+        return False
+    # Nothing moves by itself, not even slowly, while one would watch what taking an object away does.
     data = state_of(scene)
     mujoco.mj_step(scene.model, data, nstep=round(physics.removal_time / scene.model.opt.timestep))
     distance, angle = displacement(body_poses(scene.data), body_poses(data))
     return bool(distance.max() < physics.moved / 2.0 and angle.max() < np.deg2rad(physics.turned) / 2.0)
-
-
-def _is_raised(scene: SimulatedScene) -> bool:
-    """The last object does not reach the table."""
-    return bool(bounds(scene, len(scene.object_bodies))[0][2] > TABLE_HEIGHT + GAP)
 
 
 def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Solid:

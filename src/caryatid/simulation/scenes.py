@@ -1,4 +1,4 @@
-"""Scenes by name or file: MJCF from disk, designed and generated ones; and scenes written to disk."""
+"""Scenes by name or file: MJCF from disk, designed and generated ones."""
 
 from __future__ import annotations
 
@@ -6,23 +6,20 @@ import re
 from os import PathLike, fspath
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, cast
+from typing import Final, cast
 
 import mujoco
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.simulation.generation import SIZES, GeneratedKind, generate
-from caryatid.simulation.truth import ground_truth, write_truth
 from caryatid.simulation.world import (
     SimulatedScene,
     Solid,
-    body_pose,
     box,
     build_spec,
     cylinder,
     mujoco_warnings_ignored,
-    quaternion,
     scene_from_spec,
     sphere,
 )
@@ -122,51 +119,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         return scene_from_spec(build_spec(DESIGNED[text], text), text, text, config, least=1.0)
     if match := _GENERATED.fullmatch(text):
         return generate(cast(GeneratedKind, match[1]), int(match[2]), int(match[3]), config)
-    return _load_file(text, config)
-
-
-def list_scenes() -> list[str]:
-    """Names `load_scene` knows: the designed scenes, then the generators with their range of sizes."""
-    return [*DESIGNED, *(f"{kind}-SIZE-SEED (SIZE {a}…{b})" for kind, (a, b) in SIZES.items())]
-
-
-def is_builtin(source: str | PathLike[str]) -> bool:
-    """Whether `load_scene` takes this for the name of a built-in scene."""
-    return fspath(source) in DESIGNED or bool(_GENERATED.fullmatch(fspath(source)))
-
-
-def write_scene(scene: SimulatedScene, folder: str | PathLike[str]) -> Path:
-    """Write a scene as it lies, with its ground truth: `scene.xml`, `gt.json` and meshes in `assets/`.
-
-    Args:
-        scene: The scene.
-        folder: Where to; made if missing.
-
-    Returns:
-        The path of `scene.xml`.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
-    target = Path(folder)
-    spec = scene.spec.copy()
-    for label, name in scene.object_bodies.items():
-        T_world_body = body_pose(scene, label)
-        body = spec.body(name)
-        body.pos, body.quat = T_world_body[:3, 3], quaternion(T_world_body[:3, :3])
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        _collect_assets(spec, target)
-        spec.compile()
-        (target / SCENE_FILE).write_text(spec.to_xml(), encoding="utf-8")
-    except OSError as error:
-        raise InputError(target, f"cannot be written ({error.strerror})", "choose another folder") from None
-    write_truth(ground_truth(scene), target / TRUTH_FILE)
-    return target / SCENE_FILE
-
-
-def _load_file(source: str, config: PhysicsConfig | None) -> SimulatedScene:
-    path = Path(source)
+    path = Path(text)
     if path.is_dir():
         path = path / SCENE_FILE
     if not path.exists():
@@ -184,19 +137,11 @@ def _load_file(source: str, config: PhysicsConfig | None) -> SimulatedScene:
     return scene_from_spec(spec, name or path.stem, str(path), config)
 
 
-def _collect_assets(spec: Any, target: Path) -> None:
-    """Copy the files a spec names into `target`/assets and name those."""
-    origin = Path(spec.modelfiledir)
-    files = [(asset, spec.compiler.meshdir) for asset in spec.meshes]
-    files += [(asset, spec.compiler.texturedir) for asset in spec.textures]
-    files += [(asset, "") for asset in spec.hfields]
-    assets: dict[str, bytes] = {}
-    for asset, directory in files:
-        if asset.file:
-            name = f"assets/{Path(asset.file).name}"
-            assets[name], asset.file = (origin / (directory or "") / asset.file).read_bytes(), name
-    for name, content in assets.items():
-        (target / name).parent.mkdir(exist_ok=True)
-        (target / name).write_bytes(content)
-    spec.compiler.meshdir = spec.compiler.texturedir = ""
-    spec.modelfiledir = str(target)
+def list_scenes() -> list[str]:
+    """Names `load_scene` knows: the designed scenes, then the generators with their range of sizes."""
+    return [*DESIGNED, *(f"{kind}-SIZE-SEED (SIZE {a}…{b})" for kind, (a, b) in SIZES.items())]
+
+
+def is_builtin(source: str | PathLike[str]) -> bool:
+    """Whether `load_scene` takes this for the name of a built-in scene."""
+    return fspath(source) in DESIGNED or bool(_GENERATED.fullmatch(fspath(source)))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import mujoco
 import numpy as np
@@ -40,12 +40,10 @@ class GroundTruth:
     Attributes:
         vertices: Body names, the table first.
         edges: Supports, sorted by the order of the vertices: supporter first, then supported.
-        removal: Per object, which others are disturbed when it is taken away; empty where nobody tried.
     """
 
     vertices: tuple[str, ...]
     edges: tuple[TrueEdge, ...]
-    removal: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
     def pairs(self) -> set[tuple[str, str]]:
@@ -68,23 +66,21 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
     config = config or PhysicsConfig()
     names = {0: scene.table, **scene.object_bodies}
     forces = mean_contact_forces(scene)
-    removals = {a: displaced_without(scene, a, config) for a in scene.object_bodies}
+    removals = {a: displaced_without(scene, a, config) for a in {a for a, _ in forces} - {0}}
+    gravity = np.linalg.norm(scene.model.opt.gravity)
+    weights = {a: scene.model.body_subtreemass[scene.body_id(a)] * gravity for a in names}
     kinds: dict[tuple[int, int], Kind] = {}
     for (a, b), force in forces.items():
-        if b != 0 and force[2] > config.force_share * _weight(scene, b):
+        if b != 0 and force[2] > config.force_share * weights[b]:
             kinds[a, b] = "bottom-up"
-        elif a != 0 and b != 0 and _beyond(removals[a][b], config.moved, config.turned):
-            # A force nearer to the horizontal than 30° leans, a steeper one that points down presses.
-            steep = -force[2] > np.sin(np.deg2rad(30.0)) * np.linalg.norm(force)
-            kinds[a, b] = "top-down" if steep else "lean"
-    return GroundTruth(
-        tuple(names.values()),
-        tuple(TrueEdge(supporter=names[a], supported=names[b], kind=kinds[a, b]) for a, b in sorted(kinds)),
-        {  # what is displaced by 2 cm or turned by 15° slid or fell, and did not merely settle
-            names[a]: tuple(names[b] for b, by in moves.items() if _beyond(by, 0.02, 15.0))
-            for a, moves in removals.items()
-        },
-    )
+        elif a != 0 and b != 0:
+            distance, angle = removals[a][b]
+            if distance > config.moved or angle > np.deg2rad(config.turned):
+                # A force nearer to the horizontal than 30° leans, a steeper one that points down presses.
+                steep = -force[2] > np.sin(np.deg2rad(30.0)) * np.linalg.norm(force)
+                kinds[a, b] = "top-down" if steep else "lean"
+    edges = [TrueEdge(supporter=names[a], supported=names[b], kind=kinds[a, b]) for a, b in sorted(kinds)]
+    return GroundTruth(tuple(names.values()), tuple(edges))
 
 
 def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
@@ -152,7 +148,6 @@ class _Edge:
 class _Document:
     vertices: tuple[str, ...]
     edges: tuple[_Edge, ...]
-    removal: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 def read_truth(path: Path) -> GroundTruth:
@@ -166,12 +161,11 @@ def read_truth(path: Path) -> GroundTruth:
         raise InputError(path, "'vertices' is empty", _REMEDY)
     if len(set(read.vertices)) != len(read.vertices):
         raise InputError(path, "'vertices' names a body twice", "name each body once")
-    named = [name for edge in read.edges for name in (edge.supporter, edge.supported)]
-    for name in [*named, *(name for moved in read.removal.values() for name in moved)]:
+    for name in [name for edge in read.edges for name in (edge.supporter, edge.supported)]:
         if name not in read.vertices:
             raise InputError(path, f"names {name!r}, which is no vertex", "name one of the vertices")
     edges = [TrueEdge(supporter=e.supporter, supported=e.supported, kind=e.kind) for e in read.edges]
-    return GroundTruth(read.vertices, tuple(edges), read.removal)
+    return GroundTruth(read.vertices, tuple(edges))
 
 
 def write_truth(truth: GroundTruth, path: Path) -> None:
@@ -180,20 +174,7 @@ def write_truth(truth: GroundTruth, path: Path) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    document: dict[str, Any] = {"vertices": truth.vertices, "edges": truth.edges}
-    if truth.removal:
-        document["removal"] = truth.removal
     try:
-        path.write_text(json_text(document), encoding="utf-8")
+        path.write_text(json_text(asdict(truth)), encoding="utf-8")
     except OSError as error:
         raise InputError(path, f"cannot be written ({error.strerror})", "choose another place") from None
-
-
-def _beyond(by: tuple[float, float], distance: float, angle: float) -> bool:
-    """Whether a displacement ([m], [rad]) is more than a distance [m] or an angle [deg]."""
-    return by[0] > distance or by[1] > np.deg2rad(angle)
-
-
-def _weight(scene: SimulatedScene, label: int) -> float:
-    mass = scene.model.body_subtreemass[scene.body_id(label)]
-    return float(mass * np.linalg.norm(scene.model.opt.gravity))

@@ -20,11 +20,10 @@ from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import SUPPORT_LABEL
 
+_GEOM = mujoco.mjtGeom
+
 TABLE = "table"
 """Name of the body that is the support surface."""
-
-_WARNING = mujoco.mjtWarning
-_BLOWN_UP = (_WARNING.mjWARN_BADQPOS, _WARNING.mjWARN_BADQVEL, _WARNING.mjWARN_BADQACC)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -146,6 +145,8 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
         InputError: The simulation blew up.
     """
     window = max(1, round(config.rest_window / model.opt.timestep))
+    kinds = mujoco.mjtWarning
+    blown_up = kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC
     at_rest = False
     with mujoco_warnings_ignored():
         mujoco.mj_forward(model, data)
@@ -155,7 +156,7 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
             before, poses = data.qpos.copy(), body_poses(data)
             mujoco.mj_step(model, data, nstep=window)
             mujoco.mj_forward(model, data)
-            if any(data.warning[int(kind)].number for kind in _BLOWN_UP):
+            if any(data.warning[int(kind)].number for kind in blown_up):
                 raise InputError(
                     source, "its simulation is unstable", "shorten the time step or mend overlapping bodies"
                 )
@@ -191,15 +192,6 @@ def state_of(scene: SimulatedScene) -> Any:
     data.mocap_quat[:] = scene.data.mocap_quat
     mujoco.mj_forward(scene.model, data)
     return data
-
-
-def body_pose(scene: SimulatedScene, label: int) -> Array:
-    """`T_world_body` (4, 4) of an object's body, or of the table's with label 0."""
-    body = scene.body_id(label)
-    T_world_body = np.eye(4)
-    T_world_body[:3, :3] = scene.data.xmat[body].reshape(3, 3)
-    T_world_body[:3, 3] = scene.data.xpos[body]
-    return T_world_body
 
 
 def _subtree(model: Any, body: int) -> list[int]:
@@ -306,10 +298,11 @@ def build_spec(
         The `mujoco.MjSpec`.
     """
     spec = empty_spec(name)
-    spec.worldbody.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
-    for index, side in enumerate(walls):
-        _add_wall(spec.worldbody, f"wall{index}", side, table_size)
-    _add_table(spec.worldbody.add_body(name=TABLE), table_size)
+    spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
+    table = spec.worldbody.add_body(name=TABLE)
+    for part, centre, half, colour in _furniture(table_size, walls):
+        owner = spec.worldbody if part.startswith("wall") else table
+        owner.add_geom(name=part, type=_GEOM.mjGEOM_BOX, pos=centre, size=half, rgba=(*colour, 1.0))
     for index, solid in enumerate(solids):
         add_solid(spec, f"object{index}", solid, palette(index))
     return spec
@@ -334,33 +327,28 @@ def _placed(at: Vector, turn: Vector) -> Array:
     return transforms.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
 
 
-def _add_table(table: Any, size: tuple[float, float]) -> None:
-    """A top 4 cm thick on legs of 4 cm by 4 cm, a little inside its corners."""
+def _furniture(
+    size: tuple[float, float], walls: Sequence[Side]
+) -> Iterator[tuple[str, Array, Array, Vector]]:
+    """Name, centre [m], half extents [m] and colour of the static boxes: walls, table top and its legs.
+
+    A wall is 3.2 m long, 2 m high and 6 cm thick. The top is 4 cm thick; the legs of 4 cm by 4 cm stand a
+    little inside its corners.
+    """
+    half = np.array([0.03, 1.6, 1.0])
+    for index, side in enumerate(walls):
+        across = "xy".index(side[1])
+        away = size[across] / 2.0 + (0.24, 0.32)[across] + half[0]
+        order = [1, 0, 2] if across else [0, 1, 2]
+        centre = np.array([away if side[0] == "+" else -away, 0.0, half[2]])
+        yield f"wall{index}", centre[order], half[order], (0.85, 0.85, 0.82)
     x, y, thick, leg = size[0] / 2.0, size[1] / 2.0, 0.04, 0.04
     under = TABLE_HEIGHT - thick
-    middle = (0.0, 0.0, TABLE_HEIGHT - thick / 2.0)
-    _add_box(table, "table_top", middle, (x, y, thick / 2.0), (0.72, 0.58, 0.42, 1.0))
+    top = np.array([0.0, 0.0, TABLE_HEIGHT - thick / 2.0])
+    yield "table_top", top, np.array([x, y, thick / 2.0]), (0.72, 0.58, 0.42)
     for index, (sign_x, sign_y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        centre = (sign_x * (x - 0.75 * leg), sign_y * (y - 0.75 * leg), under / 2.0)
-        half = (leg / 2.0, leg / 2.0, under / 2.0)
-        _add_box(table, f"table_leg{index}", centre, half, (0.6, 0.48, 0.35, 1.0))
-
-
-def _add_wall(world: Any, name: str, side: Side, table_size: tuple[float, float]) -> None:
-    """A wall 3.2 m long, 2 m high and 6 cm thick beside the table."""
-    half, gap = [0.03, 1.6, 1.0], {"+x": 0.24, "+y": 0.32, "-y": 0.32}[side]
-    away = table_size["xy".index(side[1])] / 2.0 + gap + half[0]
-    centre = [away if side[0] == "+" else -away, 0.0, half[2]]
-    if side[1] == "y":
-        centre[:2], half[:2] = centre[1::-1], half[1::-1]
-    _add_box(world, name, centre, half, (0.85, 0.85, 0.82, 1.0))
-
-
-def _add_box(
-    body: Any, name: str, centre: Sequence[float], half: Sequence[float], rgba: Sequence[float]
-) -> None:
-    kind = mujoco.mjtGeom.mjGEOM_BOX
-    body.add_geom(name=name, type=kind, pos=list(centre), size=list(half), rgba=list(rgba))
+        centre = np.array([sign_x * (x - 0.75 * leg), sign_y * (y - 0.75 * leg), under / 2.0])
+        yield f"table_leg{index}", centre, np.array([leg, leg, under]) / 2.0, (0.6, 0.48, 0.35)
 
 
 def add_solid(
@@ -378,23 +366,20 @@ def add_solid(
     T_world_body = shape.T_world_object
     body = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
     body.add_freejoint()
-    kind, size, torsional, rolling = mujoco.mjtGeom.mjGEOM_BOX, shape.extents / 2.0, 0.005, 0.001
+    kind, size, torsional, rolling = _GEOM.mjGEOM_BOX, shape.extents / 2.0, 0.005, 0.001
     if isinstance(shape, Cylinder):
-        kind, size = mujoco.mjtGeom.mjGEOM_CYLINDER, np.array([shape.radius, shape.height / 2.0, 0.0])
+        kind, size = _GEOM.mjGEOM_CYLINDER, np.array([shape.radius, shape.height / 2.0, 0.0])
     elif isinstance(shape, Sphere):
-        kind, size = mujoco.mjtGeom.mjGEOM_SPHERE, np.array([shape.radius, 0.0, 0.0])
+        kind, size = _GEOM.mjGEOM_SPHERE, np.array([shape.radius, 0.0, 0.0])
         torsional, rolling = 0.01, 0.01
     body.add_geom(
         type=kind,
         size=size,
-        condim=4 if kind == mujoco.mjtGeom.mjGEOM_BOX else 6,
+        condim=4 if kind == _GEOM.mjGEOM_BOX else 6,
         friction=[solid.friction, torsional, rolling],
         density=solid.density,
         rgba=rgba,
     )
-
-
-_GEOM = mujoco.mjtGeom
 
 
 def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[np.bool_]:
@@ -545,5 +530,5 @@ def _mesh_vertices(model: Any, geom: int) -> Array:
 
 def _unsupported(model: Any, geom: int) -> InputError:
     body = model.body(model.geom_bodyid[geom]).name
-    kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+    kind = _GEOM(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
     return InputError(f"body '{body}'", f"a {kind} geom is no solid shape", "use primitives or meshes")
