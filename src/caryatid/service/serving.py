@@ -31,13 +31,9 @@ def check_token(host: str, token: str | None) -> None:
 
 
 def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], None]) -> None:
-    """Serve sessions until Ctrl-C or SIGTERM; what has been asked by then is answered.
+    """Serve until Ctrl-C or SIGTERM, at any free port for 0; what has been asked by then is answered.
 
-    Args:
-        app: The application.
-        host: Address to listen at.
-        port: Port to listen at; 0 = any that is free.
-        listening: Called with the address.
+    `listening` is called with the address.
 
     Raises:
         InputError: The address is taken.

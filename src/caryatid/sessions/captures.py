@@ -87,13 +87,9 @@ class Capture:
         Raises:
             InputError: It has no pose.
         """
-        named = {
-            "depth": view.depth,
-            "rgb": view.rgb,
-            "labels": view.labels,
-            "normals": view.normals_camera,
-        }
-        images = {key: _npy(array) for key, array in named.items() if array is not None}
+        arrays = (view.depth, view.rgb, view.labels, view.normals_camera)
+        named = zip(("depth", "rgb", "labels", "normals"), arrays, strict=True)
+        images = {key: _npy(array) for key, array in named if array is not None}
         return cls(images, CameraRecord(view.K, view.pose, name=view.name))
 
     @classmethod
@@ -157,15 +153,8 @@ class Capture:
         depth = decoded["depth"]
         if depth.dtype.kind in "iu":
             depth = (depth.astype(np.float64) * (camera.depth_scale / 1000.0)).astype(np.float32)
-        return View(
-            depth=depth,
-            K=camera.K,
-            T_world_camera=camera.T_world_camera,
-            rgb=decoded.get("rgb"),
-            labels=decoded.get("labels"),
-            normals_camera=decoded.get("normals"),
-            name=camera.name,
-        )
+        rgb, labels, normals_camera = (decoded.get(key) for key in ("rgb", "labels", "normals"))
+        return View(depth, camera.K, camera.T_world_camera, rgb, labels, normals_camera, camera.name)
 
 
 def _decoded(key: str, content: bytes, name: str, max_pixels: int) -> NDArray[Any]:

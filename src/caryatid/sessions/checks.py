@@ -12,12 +12,7 @@ from caryatid.sensing.views import View
 
 
 def check_view(view: View, scene: Scene, first: View | None) -> None:
-    """Refuse a view that cannot belong to a session.
-
-    Args:
-        view: A view with a pose.
-        scene: The scene so far.
-        first: The session's first view, or None before it.
+    """Refuse a view that cannot belong to a session with this scene and this first view, if there is one.
 
     Raises:
         InputError: Its camera is implausible, pose or depth are in other units than metres, its camera or

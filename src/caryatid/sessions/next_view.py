@@ -71,14 +71,9 @@ class Reachable:
 def plan_next(
     scene: Scene, T_world_cameras: Sequence[Array], reachable: Reachable | None, planner: str, robot_name: str
 ) -> tuple[Decision, Posture | None]:
-    """Choose the next view, and say how the robot would stand there where it is not one of those given.
+    """Choose the next view, after views from poses (4, 4), and say how the robot of this name stands there.
 
-    Args:
-        scene: What is known.
-        T_world_cameras: Where the views so far were taken (4, 4), the last one last.
-        reachable: What a robot says it reaches; None = what the robot of this name reaches.
-        planner: Name of the planner.
-        robot_name: As `find_robot` knows it.
+    A robot that says itself what it reaches has no posture.
 
     Raises:
         PlanningError: Nothing has been seen yet, or no view can be reached.
