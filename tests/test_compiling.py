@@ -21,7 +21,7 @@ from caryatid.runtime.parallel import for_each
 
 SOURCE = "from numba import njit\n@njit(cache=True)\ndef f(x):\n    return x\n"
 
-SMALL_REHEARSAL = """
+SMALL_WARM_UP = """
 import os
 from numba import njit
 from numba.core import event
@@ -44,22 +44,20 @@ class Compiled(event.Listener):
 
 event.register("numba:compile", Compiled())
 
-def rehearse(number):
+def warm_up(number):
     for kernel in (inner, outer) if number else (outer, inner):
         kernel(1)
 """
 
-HOOKED = (
-    "from caryatid.runtime.display import hooks\nimport caryatid\nhooks['rehearsal'] = 'small:rehearse'\n"
-)
+HOOKED = "from caryatid.runtime.display import hooks\nimport caryatid\nhooks['warm-up'] = 'small:warm_up'\n"
 
-REHEARSED = """
+WARMED_UP = """
 import logging
 from caryatid.runtime.compiling import compile_kernels
 logging.basicConfig(level=logging.INFO, format="%(message)s")
 compile_kernels()
-from small import rehearse
-rehearse(0)
+from small import warm_up
+warm_up(0)
 compile_kernels()
 """
 
@@ -67,12 +65,12 @@ compile_kernels()
 @pytest.mark.slow
 def test_two_processes_compile_each_kernel_once(tmp_path):
     """Both begin with an empty cache; one compiles, the other waits, and neither compiles anything later."""
-    (tmp_path / "small.py").write_text(SMALL_REHEARSAL)
+    (tmp_path / "small.py").write_text(SMALL_WARM_UP)
     (tmp_path / "sitecustomize.py").write_text(HOOKED)
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     compiled = tmp_path / "compiled"
     environment = {"PYTHONPATH": path, "NUMBA_CACHE_DIR": str(tmp_path), "COMPILED": str(compiled)}
-    command = [sys.executable, "-c", REHEARSED]
+    command = [sys.executable, "-c", WARMED_UP]
     both = [
         subprocess.Popen(command, env=os.environ | environment, stderr=subprocess.PIPE, text=True)
         for _ in range(2)

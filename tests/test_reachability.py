@@ -6,7 +6,6 @@ from arms import HIGH, LIMITS, LOW, PITCH, gantry
 
 from caryatid.config import ArmConfig
 from caryatid.errors import InputError
-from caryatid.robots import reachability as reachability_npz
 from caryatid.robots.reachability import (
     ReachabilityMap,
     read_reachability,
@@ -68,41 +67,30 @@ class TestReachabilityMap:
 
     def test_impossible_postures_are_left_out(self):
         def forward(joints):
-            T = gantry(joints)
-            T[joints[:, 0] > 0.35] = np.nan
-            return T
+            return np.where((joints[:, 0] > 0.35)[:, None, None], np.nan, gantry(joints))
 
         found = sample_reachability(forward, LIMITS, 50_000, np.random.default_rng(0), CONFIG)
         assert found(poses(LIMITS[:, 0], [0.3, *LIMITS[1:, 1]])).mean() > 0.9
         assert not found(poses([0.41, *LIMITS[1:, 0]], LIMITS[:, 1])).any()
 
 
-class TestWhatCannotBeSampled:
-    @pytest.mark.parametrize(
-        ("limits", "message"),
-        [
-            (np.zeros((6, 3)), r"\(6, 3\) is not \(J, 2\)"),
-            ([[0.0, np.nan]], "finite"),
-            ([[0.0, 1.0], [1.0, 0.5]], "joint 1 begins above its end"),
-        ],
-    )
-    def test_limits(self, limits, message):
-        with pytest.raises(InputError, match=message):
-            sample_reachability(gantry, limits, 10, np.random.default_rng(0))
-
-    @pytest.mark.parametrize(
-        ("forward", "message"),
-        [
-            (lambda joints: gantry(joints)[:, :3], r"returned shape \(1, 3, 4\) for 1 postures"),
-            (lambda joints: gantry(joints)[:-1], r"returned shape \(0, 4, 4\)"),
-            (lambda joints: 2.0 * gantry(joints), "last row"),
-            (lambda joints: gantry(joints) * np.array([-1.0, 1.0, 1.0, 1.0]), "no rotation"),
-            (lambda joints: np.full((len(joints), 4, 4), np.nan), "no posture possible"),
-        ],
-    )
-    def test_forward_kinematics(self, forward, message):
-        with pytest.raises(InputError, match=message):
-            sample_reachability(forward, LIMITS, 10, np.random.default_rng(0))
+@pytest.mark.parametrize(
+    ("forward", "limits", "count", "message"),
+    [
+        (gantry, np.zeros((6, 3)), 10, r"\(6, 3\) is not \(J, 2\)"),
+        (gantry, [[0.0, np.nan]], 10, "finite"),
+        (gantry, [[0.0, 1.0], [1.0, 0.5]], 10, "joint 1 begins above its end"),
+        (gantry, LIMITS, 0, "0 postures"),
+        (lambda joints: gantry(joints)[:, :3], LIMITS, 10, r"returned shape \(1, 3, 4\) for 1 postures"),
+        (lambda joints: gantry(joints)[:-1], LIMITS, 10, r"returned shape \(0, 4, 4\)"),
+        (lambda joints: 2.0 * gantry(joints), LIMITS, 10, "last row"),
+        (lambda joints: gantry(joints) * np.array([-1.0, 1.0, 1.0, 1.0]), LIMITS, 10, "no rotation"),
+        (lambda joints: np.full((len(joints), 4, 4), np.nan), LIMITS, 10, "no posture possible"),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused(forward, limits, count, message):
+    with pytest.raises(InputError, match=message):
+        sample_reachability(forward, limits, count, np.random.default_rng(0))
 
 
 class TestFiles:
@@ -129,17 +117,14 @@ class TestFiles:
     @pytest.mark.parametrize(
         ("change", "message"),
         [
-            ({"format": None}, "no map of what an arm reaches"),
-            ({"format": np.array("caryatid/graph")}, "no map of what an arm reaches"),
+            ({"format": np.array("caryatid/graph")}, "is not a reachability map"),
             ({"version": np.array(2)}, "version 2, not 1"),
-            ({"version": np.array([1, 1])}, "version"),
-            ({"cell": None}, "holds no cell"),
-            ({"cell": np.array(0.0)}, "0 m wide"),
-            ({"cell": np.array(np.nan)}, "cell is not a finite number"),
-            ({"origin_base": np.zeros(2)}, "origin_base is not a finite number"),
-            ({"reached": np.zeros((2, 2, 2, 2))}, "float64 of shape"),
-            ({"reached": np.zeros((2, 2, 2), dtype=np.uint8)}, "not uint8"),
-            ({"reached": np.zeros((0, 2, 2, 2), dtype=np.uint8)}, "not uint8"),
+            ({"cell": None}, "its arrays"),
+            ({"cell": np.array(np.nan)}, "its arrays"),
+            ({"origin_base": np.zeros(2)}, "its arrays"),
+            ({"reached": np.zeros((2, 2, 2, 2))}, "its arrays"),
+            ({"reached": np.zeros((2, 2, 2), dtype=np.uint8)}, "its arrays"),
+            ({"reached": np.zeros((0, 2, 2, 2), dtype=np.uint8)}, "its arrays"),
             ({"reached": np.array([None])}, "pickle"),
         ],
     )
@@ -156,12 +141,7 @@ class TestFiles:
         np.savez(file, **content)
         assert read_reachability(file).reached.shape == (2, 2, 2, 3)
         np.savez(file, **{k: v for k, v in (content | change).items() if v is not None})
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError, match=rf"map\.npz: .*{message}"):
             read_reachability(file)
-
-    def test_what_would_fill_the_memory_is_not_unpacked(self, reachability, tmp_path, monkeypatch):
-        write_reachability(tmp_path / "map.npz", reachability)
-        monkeypatch.setattr(reachability_npz, "MAX_BYTES", reachability.reached.nbytes - 1)
-        monkeypatch.setattr(np, "load", lambda *args, **kwargs: pytest.fail("unpacked"))
-        with pytest.raises(InputError, match="would unpack to"):
-            read_reachability(tmp_path / "map.npz")
+        with pytest.raises(InputError, match="the file is missing"):
+            read_reachability(tmp_path / "other.npz")

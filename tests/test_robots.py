@@ -21,8 +21,6 @@ from caryatid.robots.reachability import sample_reachability, write_reachability
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sessions import Session
 from caryatid.sessions.next_view import table_floor
-from caryatid.simulation import load_scene
-from caryatid.simulation.setup import make_simulation
 
 QUICK = [*SMALL, "--views=2", "--no-report", "--quiet"]
 
@@ -34,7 +32,7 @@ def make_arm(around: Surroundings) -> ArmRobot:
 
 @pytest.fixture
 def surroundings():
-    floor = FloorGrid.from_boxes(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3, 3)), RobotConfig())
+    floor = FloorGrid.from_boxes((), RobotConfig())
     config = Config(arm=ArmConfig(base=(-0.4, 0.1, 0.05), base_yaw=90.0))
     return Surroundings(np.array([0.0, 0.0, 0.75]), floor, config)
 
@@ -75,12 +73,6 @@ def test_a_robot_of_another_package_is_found_by_its_entry_point(surroundings, mo
 def test_what_cannot_be_found_is_said(name, message):
     with pytest.raises(InputError, match=message):
         find_robot(name)
-
-
-def test_the_default_robot_is_the_humanoid():
-    assert isinstance(
-        make_simulation(load_scene("tower"), Config(), noise="none", seed=0).robot, HumanoidRobot
-    )
 
 
 @pytest.mark.slow

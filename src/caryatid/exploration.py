@@ -14,7 +14,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.candidates import Candidates
-from caryatid.planning.decision import ATTEMPTS, Decision, Planner, PlanningState, path_cost
+from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
 from caryatid.planning.planners import make_planner
 from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.robots.arm import ArmRobot
@@ -24,6 +24,9 @@ from caryatid.runtime.stopwatch import Stopwatch
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
+
+ATTEMPTS = 20
+"""Refusals by the robot in one step before the loop stops [1]; a coarse map errs about every tenth view."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -106,7 +109,6 @@ class Explorer:
         scene: What is known so far.
         robot: The robot.
         step: The newest step, or None before the first view.
-        changed: Whether the newest view changed the graph.
 
     Raises:
         InputError: There is no such planner.
@@ -125,7 +127,6 @@ class Explorer:
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
         self.robot = robot
         self.step: Step | None = None
-        self.changed = False
         self._camera = camera
         self.use_planner(planner)
 
@@ -135,7 +136,7 @@ class Explorer:
         Raises:
             InputError: There is no such planner.
         """
-        self._planner = make_planner(planner) if isinstance(planner, str) else planner
+        self._planner = make_planner(planner)
 
     def look(self, given: View | Cloud | None = None) -> Step:
         """Take a view where the robot stands and update the scene with it.
@@ -154,23 +155,24 @@ class Explorer:
         source = self._captured() if given is None else given
         watch.lap("capture")
         graph = scene.update(source)
-        self.changed = scene.changed
-        if scene.sphere is None or scene.labels is None:
-            raise RuntimeError("an updated scene has a sphere and labels")
+        assert scene.sphere is not None
+        assert scene.labels is not None
+
         view = source if isinstance(source, View) else None
-        unposed = view is not None and (robot is None or view.T_world_camera is None)
-        if view is not None and unposed and scene.T_world_camera is not None:
-            view = view.with_pose(scene.T_world_camera)
-        sphere = scene.sphere if robot is None else view_sphere_of(robot, scene.sphere)
-        T_world_camera = scene.T_world_camera if robot is None else robot.T_world_camera
-        visited = np.zeros((0, 3)) if before is None else before.visited
-        angle, path = (0.0, 0.0) if before is None else (before.angle_travelled, before.path_travelled)
+        found = scene.T_world_camera
+        if view is not None and found is not None and (robot is None or view.T_world_camera is None):
+            view = view.with_pose(found)
+        T_world_camera = found if robot is None else robot.T_world_camera
+        sphere = view_sphere_of(robot, scene.sphere)
+        visited, angle, path = np.zeros((0, 3)), 0.0, 0.0
+        if before is not None:
+            visited, angle, path = before.visited, before.angle_travelled, before.path_travelled
+            if robot is None and view is not None and before.view is not None:
+                path += float(np.linalg.norm(view.pose[:3, 3] - before.view.pose[:3, 3]))
         if T_world_camera is not None:
             visited = np.concatenate([visited, sphere.direction_of(T_world_camera)[None]])
         if len(visited) > 1:
             angle += float(transforms.angle_between(visited[-2], visited[-1]))
-        if robot is None and view is not None and before is not None and before.view is not None:
-            path += float(np.linalg.norm(view.pose[:3, 3] - before.view.pose[:3, 3]))
         self.step = Step(
             scene.views - 1, source.name, view, scene.labels, graph, scene.cloud, sphere, visited,
             None, None, {"capture": watch.laps["capture"]} | scene.timings, angle, path, None,
@@ -193,9 +195,8 @@ class Explorer:
         candidates: Candidates | None = None
         try:
             candidates = robot.candidates(step.sphere)
-            decision, candidates = _decide(
-                self.scene, robot, step.sphere, candidates, step.visited, self._planner, self.scene.seed
-            )
+            state = _state(self.scene, step.sphere, step.visited, candidates)
+            decision, candidates = _decide(state, robot, self._planner, self.scene.seed)
         except PlanningError as error:
             stop = str(error)
         watch.lap("plan")
@@ -203,15 +204,26 @@ class Explorer:
         self.step = replace(step, candidates=candidates, decision=decision, stop=stop, timings=timings)
         return self.step
 
-    def alternative(self, index: int) -> Decision:
-        """What choosing another candidate by hand means, with the planner's figures for it.
+    def choose(self, chosen: Decision | int) -> Step:
+        """Take another view in place of the planner's choice.
 
         Args:
-            index: Which of the newest step's candidates.
+            chosen: A decision, or which of the newest step's candidates: then with the planner's figures.
+
+        Returns:
+            The newest step, with this decision.
 
         Raises:
-            PlanningError: There is no such candidate, or nothing has been planned.
+            PlanningError: There is no such candidate, the robot cannot take it, or nothing has been planned.
         """
+        decision = self._by_hand(chosen) if isinstance(chosen, int) else chosen
+        refused = refusal_of(self._moving(), decision.T_world_camera)
+        if refused is not None:
+            raise PlanningError(refused.reason)
+        self.step = replace(self._newest(), decision=decision, stop=None)
+        return self.step
+
+    def _by_hand(self, index: int) -> Decision:
         step = self._newest()
         if step.decision is None or step.candidates is None or not 0 <= index < len(step.candidates):
             raise PlanningError("there is no such view to choose")
@@ -228,21 +240,6 @@ class Explorer:
             why="chosen by hand",
         )
 
-    def choose(self, decision: Decision) -> Step:
-        """Take this decision in place of the planner's.
-
-        Returns:
-            The newest step, with this decision.
-
-        Raises:
-            PlanningError: The robot cannot take the view, or nothing has been seen yet.
-        """
-        refused = refusal_of(self._moving(), decision.T_world_camera)
-        if refused is not None:
-            raise PlanningError(refused.reason)
-        self.step = replace(self._newest(), decision=decision, stop=None)
-        return self.step
-
     def go(self) -> None:
         """Send the robot to the next view.
 
@@ -254,11 +251,6 @@ class Explorer:
             raise PlanningError("there is no next view to go to")
         path = self._moving().move_to(step.decision.T_world_camera)
         self.step = replace(step, path_travelled=step.path_travelled + path)
-
-    def stop(self, reason: str) -> Step:
-        """End the exploration; returns the newest step, with the reason."""
-        self.step = replace(self._newest(), stop=reason)
-        return self.step
 
     def _captured(self) -> View:
         if self._camera is None:
@@ -305,9 +297,10 @@ def explore(
     """
     explorer = Explorer(camera, robot, planner=planner, config=config, segmentation=segmentation, seed=seed)
     while True:
-        views = explorer.look().index + 1
-        reason = reason_to_stop(views, explorer.changed or not early_stop, explorer.scene.config.active)
-        step = explorer.plan() if reason is None else explorer.stop(reason)
+        step = explorer.look()
+        changed = explorer.scene.changed or not early_stop
+        reason = reason_to_stop(step.index + 1, changed, explorer.scene.config.active)
+        step = explorer.plan() if reason is None else replace(step, stop=reason)
         yield step
         if step.decision is None:
             return
@@ -357,7 +350,6 @@ def next_best_view(
     """
     if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
-    chooser = make_planner(planner) if isinstance(planner, str) else planner
     sphere = view_sphere_of(robot, scene.sphere)
     if robot is not None and visited is None:
         visited = sphere.direction_of(robot.T_world_camera)[None]
@@ -365,29 +357,23 @@ def next_best_view(
         candidates = robot.candidates(sphere)
     if visited is None or candidates is None:
         raise PlanningError("there is no robot; give the views so far, and those to choose from")
-    return _decide(scene, robot, sphere, candidates, visited, chooser, seed)[0]
+    return _decide(_state(scene, sphere, visited, candidates), robot, make_planner(planner), seed)[0]
 
 
 @one_blas_thread
 def _decide(
-    scene: Scene,
-    robot: Robot | None,
-    sphere: ViewSphere,
-    candidates: Candidates,
-    visited: Array,
-    planner: Planner,
-    seed: int,
+    state: PlanningState, robot: Robot | None, planner: Planner, seed: int
 ) -> tuple[Decision, Candidates]:
     """Return the decision and the candidates it was taken among: without those the robot refused."""
-    rng = np.random.default_rng([seed, len(visited)])
+    rng = np.random.default_rng([seed, len(state.visited)])
     why = ""
     for _ in range(ATTEMPTS):
-        decision = planner.plan(_state(scene, sphere, visited, candidates), rng)
+        decision = planner.plan(state, rng)
         refused = refusal_of(robot, decision.T_world_camera)
         if refused is None:
-            return decision, candidates
+            return decision, state.candidates
         why = refused.reason
-        candidates = candidates.without(decision.index, why)
+        state = replace(state, candidates=state.candidates.without(decision.index, why))
     raise PlanningError(f"the robot could take none of {ATTEMPTS} views: {why}")
 
 

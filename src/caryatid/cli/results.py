@@ -120,7 +120,7 @@ class OrderCommand(options.Command):
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
-        from caryatid.manipulation.order import order_record, plan_order
+        from caryatid.manipulation.order import plan_order
         from caryatid.runtime.parallel import cores
         from caryatid.steps import read_run
 
@@ -134,7 +134,7 @@ class OrderCommand(options.Command):
             for number, step in enumerate(order.steps, start=1)
         ]
         shown = table(f"{self.run}: {outcome}{goal}", ("", "take", "hold", "why"), rows)
-        self.output.result(order_record(order), shown, f"{order.refusal}\n" if order.refusal else "")
+        self.output.result(order.to_json(), shown, f"{order.refusal}\n" if order.refusal else "")
 
 
 @dataclass(frozen=True, kw_only=True)

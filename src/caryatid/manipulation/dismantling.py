@@ -41,13 +41,18 @@ class Taken:
         """Nothing was disturbed."""
         return not self.disturbed
 
+    def to_json(self) -> dict[str, Any]:
+        """One entry of `steps` in what `--json` writes."""
+        done = {"body": self.body, "held": list(self.held), "ok": self.ok, "disturbed": list(self.disturbed)}
+        return self.step.to_json() | done
 
-def bodies_of(graph: SupportGraph, truth: TrueScene, seed: int = 0) -> dict[str, str]:
+
+def bodies_of(graph: SupportGraph, truth: TrueScene) -> dict[str, str]:
     """Body each extracted object stands for, by id: what a hand that reaches for it would take hold of.
 
     It is the one it overlaps most; one that overlaps by less than 0.01 (IoU) stands for none.
     """
-    found = score(graph, truth, np.random.default_rng(seed), replace(EvaluationConfig(), min_iou=0.01))
+    found = score(graph, truth, np.random.default_rng(0), replace(EvaluationConfig(), min_iou=0.01))
     table = graph.support_surface
     return {i: body for i, body in found.matches.items() if table is None or i != table.id}
 
@@ -77,25 +82,15 @@ def dismantle(
             yield Taken(step, None, held, (), np.zeros((0, len(names), 7)))
             continue
         lift = lifting.lift(state, names.index(body), config.lift, held=[names.index(h) for h in held])
-        disturbed = tuple(names[k] for k in np.flatnonzero(lift.disturbed))
         state = lift.state
         gone.add(body)
-        yield Taken(step, body, held, disturbed, lift.film)
+        yield Taken(step, body, held, tuple(names[k] for k in np.flatnonzero(lift.disturbed)), lift.film)
 
 
 def dismantling_record(order: Order, taken: Sequence[Taken], left: Sequence[str]) -> dict[str, Any]:
     """What came of an order whose steps were done; `left` names the bodies that nobody took."""
-    steps = [
-        t.step.to_json() | {"body": t.body, "held": list(t.held), "ok": t.ok, "disturbed": list(t.disturbed)}
-        for t in taken
-    ]
-    record = {"success": succeeded(taken, left), "steps": steps, "left": list(left)}
-    return record | {"safe": order.safe, "refusal": order.refusal or None}
-
-
-def succeeded(taken: Sequence[Taken], left: Sequence[str]) -> bool:
-    """Everything was taken and nothing disturbed."""
-    return not left and all(t.ok for t in taken)
+    success = not left and all(t.ok for t in taken)
+    return {"success": success, **order.to_json(), "steps": [t.to_json() for t in taken], "left": list(left)}
 
 
 def poses_of(scene: SimulatedScene) -> Array:

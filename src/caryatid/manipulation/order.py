@@ -61,6 +61,11 @@ class Order(Pictured):
         taken = ", ".join(s.object_id + "".join(f" (hold {i})" for i in s.hold) for s in self.steps)
         return f"Order({taken}; {self.refusal or 'safe'})"
 
+    def to_json(self) -> dict[str, Any]:
+        """Its steps, whether it is safe, and why not."""
+        steps = [step.to_json() for step in self.steps]
+        return {"steps": steps, "safe": self.safe, "refusal": self.refusal or None}
+
 
 def plan_order(
     graph: SupportGraph,
@@ -92,25 +97,17 @@ def plan_order(
     config = config or Config()
     rehearsal = Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
     if goal is not None and goal not in rehearsal.ids:
-        raise InputError(goal, "is no object of the graph", f"there are {', '.join(rehearsal.ids)}")
+        raise InputError(goal, "is not an object of the graph", f"there are {', '.join(rehearsal.ids)}")
     steps: list[TakeStep] = []
     refusal = ""
-    while left := rehearsal.left():
-        if goal is not None and goal not in left:
-            break
+    while (left := rehearsal.left()) and (goal is None or goal in left):
         wanted = _in_turn(graph, left) if goal is None else _on_the_way(graph, goal, left, rehearsal)
         trial, tried = _safest(rehearsal, wanted, hands)
         if trial.risk > 0.0 and not refusal:
             refusal = _refusal(trial, tried)
-        steps.append(_step(graph, trial, rehearsal))
+        steps.append(_step(graph, trial, left, config.rehearsal.draws))
         rehearsal.take(trial)
     return Order(tuple(steps), refusal)
-
-
-def order_record(order: Order) -> dict[str, Any]:
-    """An order: its steps, whether it is safe, and why not."""
-    steps = [step.to_json() for step in order.steps]
-    return {"steps": steps, "safe": order.safe, "refusal": order.refusal or None}
 
 
 def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:
@@ -156,12 +153,10 @@ def _with_hold(rehearsal: Rehearsal, tried: Sequence[Trial]) -> Iterator[Trial]:
             yield rehearsal.try_lift(trial.object_id, [held])
 
 
-def _step(graph: SupportGraph, trial: Trial, rehearsal: Rehearsal) -> TakeStep:
-    left = rehearsal.left()
+def _step(graph: SupportGraph, trial: Trial, left: Sequence[str], draws: int) -> TakeStep:
     carried = [s.supported for s in graph.supports if s.supporter == trial.object_id and s.supported in left]
     what = f"supports {', '.join(carried)}" if carried else "supports nothing that is left"
     with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
-    draws = len(trial.lifts)
     worst = ", ".join(f"{i} in {share * draws:.0f}" for i, share in trial.harmed.items())
     harm = f"nothing in {draws} rehearsals" if trial.risk == 0.0 else f"{worst} of {draws} rehearsals"
     why = f"it {what}; lifting it{with_hold} disturbed {harm}"
@@ -173,7 +168,7 @@ def _refusal(trial: Trial, tried: Sequence[Trial]) -> str:
     blocked = nx.DiGraph((t.object_id, i) for t in tried for i in t.harmed)
     try:
         edges = nx.find_cycle(blocked, trial.object_id)
-        said = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
-        return f"no safe order: {said}; whichever goes first"
     except nx.NetworkXNoCycle:
         return f"no safe order: lifting {trial.object_id} disturbs {', '.join(trial.harmed)}"
+    cycle = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
+    return f"no safe order: {cycle}; whichever goes first"

@@ -45,14 +45,6 @@ class Trial:
     lifts: tuple[Lift, ...]
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Scene:
-    """One drawn scene: its physics, and which objects (N,) do not stay where they were seen."""
-
-    lifting: Lifting
-    restless: NDArray[np.bool_]
-
-
 class Rehearsal:
     """Scenes in which to try lifts, and where their objects are once some have been taken.
 
@@ -69,75 +61,60 @@ class Rehearsal:
     def __init__(
         self, graph: SupportGraph, config: Config, rng: np.random.Generator, *, threads: int = 1
     ) -> None:
-        table = graph.support_surface
-        if table is None:
+        if graph.support_surface is None:
             raise InputError("graph", "has no support surface", "extract one; lifts need a table")
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
         if not self.ids:
             raise InputError("graph", "has no objects", "there is nothing to take away")
         self._graph, self._config, self._threads = graph, config, threads
         self._trials: dict[tuple[str, ...], Trial] = {}
-        draws = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
-        settled = self._each(lambda k: _settled(draws[k], self.ids, config))
-        self._scenes: list[_Scene] = [scene for scene, _ in settled]
-        self._states: list[Array] = [state for _, state in settled]
-
-    @property
-    def restless(self) -> dict[str, float]:
-        """In what share of the scenes each object did not stay where it was seen [1]; the others left out."""
-        return self._shares([scene.restless for scene in self._scenes])
+        specs = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
+        settled = self._each(lambda k: _settled(specs[k], self.ids, config))
+        self._liftings: list[Lifting] = [lifting for lifting, _, _ in settled]
+        # Of D scenes with N objects: which do not stay where they were seen (D, N), and all states (D, N, 7).
+        self._restless = np.stack([restless for _, restless, _ in settled])
+        self._states = np.stack([state for _, _, state in settled])
 
     def left(self) -> list[str]:
         """Ids of the objects that have not been taken yet."""
-        return [i for k, i in enumerate(self.ids) if self._states[0][k, 2] < ASIDE / 2.0]
+        return [i for i, height in zip(self.ids, self._states[0, :, 2], strict=True) if height < ASIDE / 2.0]
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> Trial:
         """Lift an object in every scene, others being held; nothing changes, and it is done only once."""
         asked = (object_id, *sorted(hold))
         if asked not in self._trials:
             lifts = self._each(lambda k: self._lift(k, object_id, hold))
-            harm = [lift.disturbed | self._bereft(k, object_id, hold) for k, lift in enumerate(lifts)]
-            risk = float(np.any(harm, axis=1).mean())
-            self._trials[asked] = Trial(object_id, tuple(hold), risk, self._shares(harm), tuple(lifts))
+            harm = np.stack([lift.disturbed for lift in lifts])
+            # What is held in a scene, because it does not stay there, must not lose a support of the graph.
+            needs = {s.supported for s in self._graph.supports if s.supporter == object_id} - set(hold)
+            harm |= self._restless & np.isin(self.ids, list(needs.intersection(self.left())))
+            shares = zip(self.ids, harm.mean(axis=0).tolist(), strict=True)
+            harmed = {i: share for i, share in shares if share > 0.0}
+            risk = float(harm.any(axis=1).mean())
+            self._trials[asked] = Trial(object_id, tuple(hold), risk, harmed, tuple(lifts))
         return self._trials[asked]
-
-    def _shares(self, which: Sequence[NDArray[np.bool_]]) -> dict[str, float]:
-        """In what share of the scenes each object (N,) is one of some, by id; 0 left out."""
-        shares = np.mean(which, axis=0)
-        return {i: float(s) for i, s in zip(self.ids, shares, strict=True) if s > 0.0}
 
     def take(self, trial: Trial) -> None:
         """Go on without an object whose lift was tried: where others moved, they are put back."""
         index = self.ids.index(trial.object_id)
         self._trials.clear()
-        for k, (lift, scene) in enumerate(zip(trial.lifts, self._scenes, strict=True)):
-            calm = not lift.disturbed.any()
-            state = (lift.state if calm else self._states[k]).copy()
-            state[scene.restless] = self._states[k][scene.restless]
-            state[index, :3] = (0.0, 0.0, ASIDE + index)
-            self._states[k] = state
+        moved = np.array([lift.disturbed.any() for lift in trial.lifts])
+        stays = self._restless | moved[:, None]
+        after = np.stack([lift.state for lift in trial.lifts])
+        self._states = np.where(stays[..., None], self._states, after)
+        self._states[:, index, :3] = (0.0, 0.0, ASIDE + index)
 
     def _lift(self, k: int, object_id: str, hold: Collection[str]) -> Lift:
-        index, scene = self.ids.index(object_id), self._scenes[k]
-        held = {self.ids.index(i) for i in hold} | set(np.flatnonzero(scene.restless).tolist())
-        return scene.lifting.lift(
+        index = self.ids.index(object_id)
+        held = {self.ids.index(i) for i in hold} | set(np.flatnonzero(self._restless[k]).tolist())
+        return self._liftings[k].lift(
             self._states[k], index, self._config.lift, held=held - {index}, to_the_end=False
         )
 
-    def _bereft(self, k: int, object_id: str, hold: Collection[str]) -> NDArray[np.bool_]:
-        """Which objects (N,) are held in a scene but would lose a support of the graph."""
-        needs = {s.supported for s in self._graph.supports if s.supporter == object_id} - set(hold)
-        there = set(self.left())
-        losing = [i in needs and i in there for i in self.ids]
-        return self._scenes[k].restless & np.array(losing, dtype=np.bool_)
-
     def _each(self, do: Callable[[int], Any]) -> list[Any]:
         """Do something for every scene, in order."""
-        count = self._config.rehearsal.draws
-        if self._threads < 2:
-            return [do(k) for k in range(count)]
         with ThreadPoolExecutor(self._threads) as pool:
-            return list(pool.map(do, range(count)))
+            return list(pool.map(do, range(self._config.rehearsal.draws)))
 
 
 def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
@@ -174,13 +151,17 @@ def _add_table(spec: Any, table: SceneObject) -> None:
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
 
 
-def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[_Scene, Array]:
-    """Let a scene come to rest: what moves too far is put back and held, until nothing else does."""
+def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[Lifting, NDArray[np.bool_], Array]:
+    """Let a scene come to rest: what moves too far is put back and held, until nothing else does.
+
+    Returns:
+        The scene, which objects (N,) had to be held, and the state (N, 7) of all.
+    """
     lifting = Lifting(spec, ids)
     seen, restless = lifting.start, np.zeros(len(ids), dtype=np.bool_)
     while True:
         state = lifting.rest(seen, np.flatnonzero(restless).tolist(), config.rehearsal.settling)
         moved = lifting.strayed(seen, state, config.lift) & ~restless
         if not moved.any():
-            return _Scene(lifting, restless), np.where(restless[:, None], seen, state)
+            return lifting, restless, np.where(restless[:, None], seen, state)
         restless |= moved

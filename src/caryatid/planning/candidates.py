@@ -14,7 +14,7 @@ from caryatid.geometry.transforms import Array
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Looks:
-    """Some of N views, and which of them each of all stands with.
+    """Some of N views, which stand for all.
 
     Attributes:
         chosen: Indices (C,) of the views, ascending.
@@ -24,31 +24,10 @@ class Looks:
     chosen: NDArray[np.intp]
     nearest: NDArray[np.intp]
 
-    def without(self, left_out: NDArray[np.bool_], directions: Array) -> Looks:
-        """Leave some of the chosen (C,) out; directions (N, 3) of all views tell which is nearest now."""
-        kept = np.flatnonzero(~left_out)
-        place = np.full(len(self.chosen), -1)
-        place[kept] = np.arange(len(kept))
-        nearest = place[self.nearest]
-        orphans = np.flatnonzero(nearest < 0)
-        nearest[orphans] = np.argmax(directions[orphans] @ directions[self.chosen[kept]].T, axis=1)
-        return Looks(self.chosen[kept], nearest)
-
-
-def looks_among(directions: Array, count: int) -> Looks:
-    """Pick the views nearest to those of `count` directions all over the sphere that have one near.
-
-    Args:
-        directions: Unit vectors (N, 3) of the views.
-        count: How many there would be on the whole sphere; of fewer than an eighth of that all are taken.
-    """
-    if len(directions) <= count // 8:
-        every = np.arange(len(directions))
-        return Looks(every, every)
-    distance, nearest = KDTree(directions).query(fibonacci_sphere(count))
-    near = distance < np.sqrt(4.0 * np.pi / count)
-    chosen = np.unique(nearest[near]) if near.any() else np.unique(nearest)
-    return Looks(chosen, KDTree(directions[chosen]).query(directions)[1])
+    @classmethod
+    def of(cls, chosen: NDArray[np.intp], directions: Array) -> Looks:
+        """Let each view, of directions (N, 3), be represented by the nearest of the chosen (C,)."""
+        return cls(chosen, KDTree(directions[chosen]).query(directions)[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +37,7 @@ class Candidates:
     Attributes:
         T_world_camera: Camera poses (N, 4, 4).
         directions: Unit vectors (N, 3) from the view sphere's centre.
-        path_length: Way (N,) [m] from where the robot is: over the floor, or of its hand.
+        path_length: Path length (N,) [m] from where the robot is: over the floor, or of its hand.
         rejected: Reason → how many views of the sphere were refused for it.
         indices: Which point of the view sphere each candidate is (N,), or None where they lie elsewhere.
     """
@@ -74,21 +53,29 @@ class Candidates:
         return len(self.directions)
 
     def looks(self, count: int) -> Looks:
-        """Pick those nearest to `count` directions all over the sphere; found once for the same views."""
+        """Pick the views nearest to those of `count` directions all over the sphere that have one near.
+
+        Where there are fewer than an eighth of that, all are picked. Found once for the same views.
+        """
+        if len(self) <= count // 8:
+            return Looks(np.arange(len(self)), np.arange(len(self)))
         if count not in self._looks:
-            self._looks[count] = looks_among(self.directions, count)
+            distance, nearest = KDTree(self.directions).query(fibonacci_sphere(count))
+            near = distance < np.sqrt(4.0 * np.pi / count)
+            chosen = np.unique(nearest[near] if near.any() else nearest)
+            self._looks[count] = Looks.of(chosen, self.directions)
         return self._looks[count]
 
     def without(self, index: int, reason: str) -> Candidates:
         """Return the other views, the one at an index being refused for a reason."""
         fields = (self.T_world_camera, self.directions, self.path_length)
-        poses, directions, way = (np.delete(of_each, index, axis=0) for of_each in fields)
+        poses, directions, lengths = (np.delete(of_each, index, axis=0) for of_each in fields)
         indices = None if self.indices is None else np.delete(self.indices, index)
         rejected = self.rejected | {reason: self.rejected.get(reason, 0) + 1}
-        return Candidates(poses, directions, way, rejected, indices)
+        return Candidates(poses, directions, lengths, rejected, indices)
 
     def from_elsewhere(self, path_length: Array) -> Candidates:
-        """Return the same views as they are to a robot with another way (N,) [m] to each."""
+        """Return the same views for a robot elsewhere, with another path length (N,) [m] to each."""
         others = replace(self, path_length=path_length)
         object.__setattr__(others, "_looks", self._looks)
         return others

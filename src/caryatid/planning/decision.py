@@ -22,9 +22,6 @@ from caryatid.runtime.parallel import one_blas_thread
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.voxel_map import VoxelMap
 
-ATTEMPTS = 20
-"""Refusals by the robot in one step before the loop stops [1]; a coarse map errs about every tenth view."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlanningState:
@@ -51,22 +48,19 @@ class PlanningState:
         return f"PlanningState(views={views}, candidates={candidates}, graph={self.graph})"
 
 
-class Painted:
-    """A field whose value is given, or painted when it is first looked at: most pictures are never drawn."""
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._key = f"_{name}"
+class PaintedLate:
+    """A field that holds an array, or a function that is called for it at the first look."""
 
     def __get__(self, holder: object, owner: type | None = None) -> Array | None:
         if holder is None:
             return None
-        value = holder.__dict__[self._key]
+        value = holder.__dict__["painted"]
         if callable(value):
-            value = holder.__dict__[self._key] = value()
+            value = holder.__dict__["painted"] = value()
         return value
 
     def __set__(self, holder: object, value: Array | Callable[[], Array] | None) -> None:
-        holder.__dict__[self._key] = value
+        holder.__dict__["painted"] = value
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +76,8 @@ class Decision(Pictured):
         why: One sentence for a person to read.
         points_of_interest: What the planner took into account.
         candidate_saliency: s (N,) of every candidate, or None.
-        sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None; may be given as what
-            paints it.
+        sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None. A function may be
+            given that returns it, since most pictures are never drawn.
     """
 
     T_world_camera: Array
@@ -94,7 +88,7 @@ class Decision(Pictured):
     why: str
     points_of_interest: tuple[PointOfInterest, ...] = ()
     candidate_saliency: Array | None = None
-    sphere_saliency: Painted = Painted()
+    sphere_saliency: PaintedLate = PaintedLate()
 
     def __repr__(self) -> str:
         return f"Decision(candidate {self.index}, score {self.score:.3f}: {self.why})"
@@ -131,7 +125,7 @@ def path_cost(state: PlanningState) -> Array:
     """What it costs to go to each candidate, h(v) of eq. 3 (N,).
 
     `angle`: sin(α/2), α the angle at the sphere's centre between the current view and the candidate.
-    `path`: the way over the floor in diameters of the view sphere. `none`: nothing.
+    `path`: the path length in diameters of the view sphere. `none`: nothing.
     """
     match state.config.path_cost:
         case "angle":
@@ -168,29 +162,21 @@ def decide(
     best = int(np.argmax(score))
     index = best if looks is None else int(looks.chosen[best])
     candidate_saliency = saliency if looks is None else saliency[looks.nearest]
-    return Decision(
-        candidates.T_world_camera[index],
-        index,
-        float(saliency[best]),
-        float(cost[best]),
-        float(score[best]),
-        why(best),
-        points,
-        candidate_saliency,
-        partial(_paint, elsewhere, candidates.indices, candidate_saliency),
-    )
+    figures = (float(saliency[best]), float(cost[best]), float(score[best]), why(best))
+    paint = partial(_paint, elsewhere, candidates.indices, candidate_saliency)
+    return Decision(candidates.T_world_camera[index], index, *figures, points, candidate_saliency, paint)
+
+
+@one_blas_thread
+def _paint(elsewhere: Callable[[], Array], indices: NDArray[np.intp] | None, saliency: Array) -> Array:
+    """Saliency (M,) of the view sphere with that of the candidates at their points."""
+    sphere_saliency = elsewhere()
+    if indices is not None:
+        sphere_saliency[indices] = saliency
+    return sphere_saliency
 
 
 def go_to(state: PlanningState, index: int, why: str) -> Decision:
     """Take a candidate by its index: the decision of planners that do not look at the scene."""
     cost = float(path_cost(state)[index])
     return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)
-
-
-@one_blas_thread
-def _paint(elsewhere: Callable[[], Array], indices: NDArray[np.intp] | None, saliency: Array) -> Array:
-    """Saliency (M,) of the view sphere with that of the candidates at their points."""
-    painted = elsewhere()
-    if indices is not None:
-        painted[indices] = saliency
-    return painted

@@ -14,9 +14,6 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.sensing.view_sphere import ViewSphere, spread
 
-MAX_SALIENCY = 1.0
-"""Saliency of an object nothing is known to support: eq. 2 never exceeds it."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PointOfInterest:
@@ -64,8 +61,10 @@ def points_of_interest(
             reason = f"nothing is known to support {supported.id}"
             points.append(_looked_at(supported, sphere, middle, reason))
         for support in supports:
-            between = (centres[support.supporter] + centres[support.supported]) / 2.0
-            points.append(_relation(support, between, sphere, views, config))
+            position = (centres[support.supporter] + centres[support.supported]) / 2.0
+            if config.edge_point == "contact" and support.contact_world is not None:
+                position = support.contact_world
+            points.append(_relation(support, position, sphere, views, config))
     return points
 
 
@@ -118,9 +117,7 @@ def surface_point(shape: Shape, towards_world: Array) -> Array:
 
 def painted(points: Sequence[PointOfInterest], directions: Array, sigma: float) -> Array:
     """Saliency (M, K) points give views in directions (M, 3): their own, falling off with σ [rad]."""
-    if not points:
-        return np.zeros((len(directions), 0))
-    tops = np.stack([p.direction for p in points])
+    tops = np.array([p.direction for p in points]).reshape(-1, 3)
     return spread(tops, directions, sigma) * np.array([p.saliency for p in points])
 
 
@@ -134,15 +131,13 @@ def _looked_at(subject: SceneObject, sphere: ViewSphere, azimuth: float, reason:
     middle = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     position = surface_point(subject.shape, sphere.centre_world + sphere.radius * middle)
     gap = f"the largest gap between views is at {np.rad2deg(azimuth):.0f}°"
-    return PointOfInterest(position, middle, MAX_SALIENCY, (subject.id,), f"{reason}; {gap}")
+    # Its saliency is the largest eq. 2 can give.
+    return PointOfInterest(position, middle, 1.0, (subject.id,), f"{reason}; {gap}")
 
 
 def _relation(
-    support: Support, between: Array, sphere: ViewSphere, views: int, config: ActiveVisionConfig
+    support: Support, position: Array, sphere: ViewSphere, views: int, config: ActiveVisionConfig
 ) -> PointOfInterest:
-    """Where two objects meet, `between` (3,) [m] the middle of their centres."""
-    touch = support.contact_world if config.edge_point == "contact" else None
-    position = between if touch is None else touch
     offset = position - sphere.centre_world
     length = math.sqrt(offset @ offset)
     direction = offset / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])

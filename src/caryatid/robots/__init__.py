@@ -10,14 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caryatid.errors import InputError, PlanningError
-from caryatid.robots.protocol import (
-    OwnViews,
-    Posture,
-    Robot,
-    Unreachable,
-    refusal_of,
-    view_sphere_of,
-)
+from caryatid.robots.protocol import OwnViews, Posture, Robot, Unreachable, refusal_of, view_sphere_of
 
 if TYPE_CHECKING:
     from caryatid.config import Config, RobotConfig
@@ -103,9 +96,8 @@ def find_robot(name: str) -> RobotMaker:
     try:
         maker: RobotMaker = point.load()
     except (ImportError, AttributeError, ValueError) as error:
-        raise InputError(
-            "robot", f"'{point.value}' cannot be imported ({error})", "give module:callable of Python's path"
-        ) from None
+        remedy = "give module:callable of Python's path"
+        raise InputError("robot", f"'{point.value}' cannot be imported ({error})", remedy) from None
     return maker
 
 
@@ -125,14 +117,12 @@ def home_view(robot: Robot, sphere: ViewSphere, config: RobotConfig) -> Array:
     from caryatid.sensing.view_sphere import direction
 
     candidates = robot.candidates(view_sphere_of(robot, sphere))
-    if len(candidates) == 0:
-        why = ", ".join(f"{reason} ({count})" for reason, count in candidates.rejected.items())
-        raise PlanningError(f"no view of the sphere can be reached: {why}")
+    rejected = dict(candidates.rejected)
     nearness = candidates.directions @ direction(*np.deg2rad(config.home))
-    reasons: set[str] = set()
-    for index in np.argsort(-nearness, kind="stable"):
-        refused = refusal_of(robot, candidates.T_world_camera[index])
+    for T_world_camera in candidates.T_world_camera[np.argsort(-nearness, kind="stable")]:
+        refused = refusal_of(robot, T_world_camera)
         if refused is None:
-            return candidates.T_world_camera[index]
-        reasons.add(refused.reason)
-    raise PlanningError(f"no view of the sphere can be reached: {', '.join(sorted(reasons))}")
+            return T_world_camera
+        rejected[refused.reason] = rejected.get(refused.reason, 0) + 1
+    reasons = ", ".join(f"{reason} ({count})" for reason, count in rejected.items())
+    raise PlanningError(f"no view of the sphere can be reached: {reasons}")

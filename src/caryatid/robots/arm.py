@@ -30,9 +30,6 @@ REASONS = (
 UNCONFIRMED = "the arm cannot go there on a closer look"
 """Why one is refused that seemed to be within reach."""
 
-RADII = 13
-"""View spheres tried from the smallest to the largest [1]; 5 cm apart."""
-
 RADIUS_SHARE = 0.65
 """Share of the views within reach on the best of these spheres that makes a larger one do [1]; from farther
 away a view shows more of the table, and the nearest spheres show too little of it."""
@@ -66,9 +63,6 @@ class ArmRobot(SimulatedRobot, OwnViews):
     Raises:
         InputError: A pose is no rigid transform.
     """
-
-    nowhere = "the camera is nowhere yet; move the arm to a first view"
-    carrier = "camera"
 
     def __init__(
         self,
@@ -105,26 +99,15 @@ class ArmRobot(SimulatedRobot, OwnViews):
             )
         return self._sphere
 
-    def solve(self, T_world_camera: Array, target_world: Array | None = None) -> Posture | Unreachable:
-        """Say how the arm would hold its camera at a pose, or why it cannot.
+    def solve(self, T_world_camera: Array) -> Posture | Unreachable:
+        """Say how the arm would hold its camera at a pose (4, 4), with its roll, or why it cannot.
 
-        Args:
-            T_world_camera: Camera pose (4, 4), with the roll it has.
-            target_world: A point (3,) [m] on the table no wall may hide and over which the camera has to keep
-                clear, or None.
-
-        Returns:
-            The platform of the posture is the base; its yaw and pitch are where the camera looks.
+        The platform of the posture is the base; its yaw and pitch are where the camera looks.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
-        code = int(self._refused(T[None], target_world)[0])
-        if code >= 0:
-            return Unreachable(REASONS[code])
         if not self._reaches(T[None])[0]:
             distance = float(np.linalg.norm(T[:3, 3] - self.T_world_base[:3, 3]))
-            turned = self._in_some_roll(T[None])[1][0]
-            how = "; rolled otherwise it does" if turned else ""
-            return Unreachable(f"{REASONS[2]}, {distance:.2f} m from the base{how}")
+            return Unreachable(f"{REASONS[2]}, {distance:.2f} m from the base")
         here = self._T_world_camera
         is_there = here is not None and np.array_equal(T, here)
         if not is_there and (refused := self.confirm(T)) is not None:
@@ -153,11 +136,12 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return float(self._distances(T_world_camera[None])[0])
 
     def _radius_around(self, centre_world: Array) -> float:
-        config = self._config
-        if config.radius[0] == config.radius[1]:
-            return config.radius[0]
-        radii = np.linspace(*config.radius, RADII)
-        spheres = [self._sphere_around(centre_world, float(r), config.radius_views) for r in radii]
+        smallest, largest = self._config.radius
+        if smallest == largest:
+            return smallest
+        # Thirteen spheres, 5 cm apart with the default radii.
+        radii = np.linspace(smallest, largest, 13)
+        spheres = [self._sphere_around(centre_world, float(r), self._config.radius_views) for r in radii]
         views = np.array([len(self._offered(sphere)) for sphere in spheres])
         return float(radii[views >= RADIUS_SHARE * views.max()][-1])
 
@@ -172,22 +156,16 @@ class ArmRobot(SimulatedRobot, OwnViews):
 
     def _offered(self, sphere: ViewSphere) -> Candidates:
         poses = sphere.poses(sphere.directions)
-        code = self._refused(poses, sphere.centre_world)
+        eyes = poses[:, :3, 3]
+        code = np.full(len(poses), -1)
+        if self._furniture is not None:
+            code[self._furniture.hidden(eyes, sphere.centre_world)] = 1
+        code[eyes[:, 2] < sphere.centre_world[2] + self._config.clearance] = 0
         left = np.flatnonzero(code < 0)
         held, reached = self._in_some_roll(poses[left])
         code[left[~reached]] = 2
         rejected, good = count_reasons(code, REASONS), left[reached]
         return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
-
-    def _refused(self, T_world_camera: Array, target_world: Array | None) -> NDArray[np.intp]:
-        """Which reason the surroundings give against poses (N, 4, 4) looking at a target (3,), −1 = none."""
-        code = np.full(len(T_world_camera), -1)
-        if target_world is not None:
-            eyes = T_world_camera[:, :3, 3]
-            if self._furniture is not None:
-                code[self._furniture.hidden(eyes, target_world)] = 1
-            code[eyes[:, 2] < target_world[2] + self._config.clearance] = 0
-        return code
 
     def _in_some_roll(self, T_world_camera: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Roll poses (N, 4, 4) as little as the hand needs; return them, and which it reaches (N,)."""
@@ -197,12 +175,8 @@ class ArmRobot(SimulatedRobot, OwnViews):
         turns = np.minimum(turns, 2.0 * np.pi - turns) * np.where(turns > np.pi, -1.0, 1.0)
         for turn in turns[np.argsort(np.abs(turns), kind="stable")]:
             left = np.flatnonzero(~reached)
-            if len(left) == 0:
-                break
-            rolled = T_world_camera[left]
-            if turn != 0.0:
-                R = transforms.rotation_from_vector((0.0, 0.0, turn))
-                rolled = rolled @ transforms.rigid(R, np.zeros(3))
+            R = transforms.rotation_from_vector((0.0, 0.0, turn))
+            rolled = T_world_camera[left] @ transforms.rigid(R, np.zeros(3))
             found = self._reaches(rolled)
             held[left[found]], reached[left[found]] = rolled[found], True
         return held, reached

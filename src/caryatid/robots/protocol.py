@@ -81,17 +81,13 @@ class OwnViews:
 
         Args:
             proposed: The sphere of the settings around the middle of the table top.
-
-        Returns:
-            The proposed one, unless a robot says otherwise.
         """
         return proposed
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
         """Say why a candidate (4, 4) that was chosen cannot be taken after all; then another one is chosen.
 
-        Returns:
-            None, go ahead, unless a robot says otherwise.
+        None = go ahead.
         """
         return None
 
@@ -99,8 +95,6 @@ class OwnViews:
 class SimulatedRobot(Robot):
     """What robots in simulation share: where the camera is, and going on from there."""
 
-    carrier = "robot"
-    nowhere = "the robot stands nowhere yet; move it to a first view"
     _T_world_camera: Array | None = None
 
     @property
@@ -111,7 +105,7 @@ class SimulatedRobot(Robot):
             PlanningError: It has not been put anywhere.
         """
         if self._T_world_camera is None:
-            raise PlanningError(self.nowhere)
+            raise PlanningError("the robot is nowhere yet; move it to a first view")
         return self._T_world_camera
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
@@ -126,7 +120,7 @@ class SimulatedRobot(Robot):
         """
         posture = self.solve(T_world_camera)
         if isinstance(posture, Unreachable):
-            raise PlanningError(f"the {self.carrier} cannot go to this view: {posture.reason}")
+            raise PlanningError(f"the robot cannot go to this view: {posture.reason}")
         length = self._go(posture, T_world_camera)
         self._T_world_camera = T_world_camera.copy()
         return length

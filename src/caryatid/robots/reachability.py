@@ -7,7 +7,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -25,17 +25,8 @@ from caryatid.io.staging import write_file
 Forward = Callable[[Array], Array]
 """Forward kinematics: joints (N, J) [rad, or m] → `T_base_camera` (N, 4, 4)."""
 
-ROLLS = 8
-"""Rolls a map tells apart: the bits of a byte, 45° each."""
-
-CHUNK = 100_000
-"""Postures that are sampled at a time at the most: 13 MB of poses."""
-
 FORMAT, VERSION = "caryatid/reachability", 1
 """What the file says it is."""
-
-MAX_BYTES = 2**31
-"""A larger map is refused before it is unpacked; 3 m of cells of 2 cm with 600 directions are as much."""
 
 REMEDY = "sample it again and write it with write_reachability"
 """What to do where a file is broken."""
@@ -46,15 +37,14 @@ class ReachabilityMap:
     """In which cells, looking which way, and rolled how an arm has been seen to hold its camera.
 
     A camera looks the same way however it is rolled, so a cell and a direction have one byte, and each of its
-    bits is an eighth of a turn about the optical axis. Who needs a view from there takes the roll that was
-    reached; who asks for a pose is told about its own roll.
+    bits is an eighth of a turn about the optical axis. A pose is reached if its own roll is.
 
     Attributes:
         reached: Rolls (X, Y, Z, D) uint8 by cell and by the nearest of D directions all over the sphere.
         origin_base: Lowest corner (3,) of the cells in the frame of the base [m].
         cell: Edge of a cell [m].
-        fresh: Share of the last samples, at most a tenth of all, that were the first in their cell and
-            direction [1]; so much of what such an arm can reach is about missing in the map.
+        fresh: Share of the last tenth of the samples that were the first in their cell and direction [1]; so
+            much of what such an arm can reach is about missing in the map.
     """
 
     reached: NDArray[np.uint8]
@@ -65,8 +55,7 @@ class ReachabilityMap:
     def __call__(self, T_base_camera: Array) -> NDArray[np.bool_]:
         """Which camera poses (N, 4, 4) lie in a cell, direction and roll that was reached (N,)."""
         cells = np.floor((T_base_camera[:, :3, 3] - self.origin_base) / self.cell).astype(np.intp)
-        shape = np.array(self.reached.shape[:3])
-        inside = np.logical_and.reduce((cells >= 0) & (cells < shape), axis=1)
+        inside = np.all((cells >= 0) & (cells < self.reached.shape[:3]), axis=1)
         x, y, z = np.where(inside[:, None], cells, 0).T
         directions, bits = _Bins(self.reached.shape[3]).of(T_base_camera)
         return inside & ((self.reached[x, y, z, directions] & bits) != 0)
@@ -97,30 +86,28 @@ def sample_reachability(
     bounds = np.asarray(limits, dtype=np.float64)
     if bounds.ndim != 2 or bounds.shape[1] != 2 or len(bounds) == 0 or not np.isfinite(bounds).all():
         raise InputError("limits", f"shape {bounds.shape} is not (J, 2) of finite numbers", "give low, high")
-    crossed = np.flatnonzero(bounds @ (1.0, -1.0) > 0.0)
+    crossed = np.flatnonzero(bounds[:, 0] > bounds[:, 1])
     if len(crossed):
         raise InputError("limits", f"joint {crossed[0]} begins above its end", "give the lowest value first")
     if count < 1:
         raise InputError("count", f"{count} postures make no map", "draw some hundred thousand")
     bins = _Bins(config.view_directions)
     held = []
-    chunk = min(CHUNK, -(-count // 10))
-    for start in range(0, count, chunk):
-        joints = rng.uniform(bounds[:, 0], bounds[:, 1], (min(chunk, count - start), len(bounds)))
+    for part in np.array_split(np.arange(count), min(10, count)):
+        joints = rng.uniform(bounds[:, 0], bounds[:, 1], (len(part), len(bounds)))
         T_base_camera = _checked_poses(forward(joints), len(joints))
         cells = np.floor(T_base_camera[:, :3, 3] / config.cell).astype(np.intp)
-        if len(cells):
-            held.append(np.column_stack([cells, *bins.of(T_base_camera)]))
-    if not held:
-        raise InputError("forward", "holds no posture possible, all are NaN", "check it and the limits")
+        held.append(np.column_stack([cells, *bins.of(T_base_camera)]))
     places, early = np.concatenate(held), sum(map(len, held[:-1]))
+    if len(places) == 0:
+        raise InputError("forward", "holds no posture possible, all are NaN", "check it and the limits")
     low = np.append(places[:, :3].min(axis=0), 0)
     bits = places[:, 4].astype(np.uint8)
     shape = places[:, :3].max(axis=0) + 1 - low[:3]
     reached = np.zeros((*shape, config.view_directions), dtype=np.uint8)
     before, last = (tuple((part - low).T) for part in (places[:early, :4], places[early:, :4]))
     np.bitwise_or.at(reached, before, bits[:early])
-    fresh = float((reached[last] == 0).mean())
+    fresh = float((reached[last] == 0).mean()) if len(held[-1]) else 0.0
     np.bitwise_or.at(reached, last, bits[early:])
     return ReachabilityMap(reached, low[:3].astype(np.float64) * config.cell, config.cell, fresh)
 
@@ -132,8 +119,7 @@ def write_reachability(path: str | os.PathLike[str], reachability: ReachabilityM
         InputError: The file cannot be written.
     """
     buffer = io.BytesIO()
-    content: dict[str, Any] = {"format": FORMAT, "version": VERSION}
-    content |= {name: getattr(reachability, name) for name in ("reached", "origin_base", "cell", "fresh")}
+    content: dict[str, Any] = {"format": FORMAT, "version": VERSION} | asdict(reachability)
     np.savez_compressed(buffer, **content)
     write_file(Path(path), buffer.getvalue())
 
@@ -146,19 +132,35 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
     """
     file = Path(path)
     try:
-        with zipfile.ZipFile(file) as archive:
-            size = sum(entry.file_size for entry in archive.infolist())
-        if size > MAX_BYTES:
-            raise InputError(file, f"would unpack to {size / 2**30:.1f} GiB", "sample it with larger cells")
         with np.load(file, allow_pickle=False) as stored:
-            held = {name: stored[name] for name in stored.files}
+            held = dict(stored)
     except FileNotFoundError:
         raise InputError(file, "the file is missing", REMEDY) from None
     except OSError as error:
         raise InputError(file, f"cannot be read ({error.strerror})", "give a file you may read") from error
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError, MemoryError) as error:
-        raise InputError(file, f"is no readable .npz: {error}", REMEDY) from None
-    return _checked_map(held, file)
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        ValueError,
+        EOFError,
+        RuntimeError,
+        MemoryError,
+        TypeError,
+    ) as error:
+        raise InputError(file, f"is not a readable .npz: {error}", REMEDY) from None
+    if "format" not in held or str(held["format"]) != FORMAT:
+        raise InputError(file, f"is not a reachability map, its format is not '{FORMAT}'", REMEDY)
+    version = held.get("version", np.zeros(0))
+    if not np.array_equal(version, VERSION):
+        raise InputError(file, f"has version {version}, not {VERSION}", REMEDY)
+    reached = held.get("reached", np.zeros(0))
+    good = reached.ndim == 4 and reached.dtype == np.uint8 and reached.size > 0
+    for name, shape in (("origin_base", (3,)), ("cell", ()), ("fresh", ())):
+        value = held.get(name, np.zeros(0))
+        good &= value.shape == shape and value.dtype.kind == "f" and bool(np.isfinite(value).all())
+    if not good or held["cell"] <= 0.0:
+        raise InputError(file, "its arrays are not those of a reachability map", REMEDY)
+    return ReachabilityMap(reached, held["origin_base"], float(held["cell"]), float(held["fresh"]))
 
 
 class _Bins:
@@ -179,7 +181,7 @@ class _Bins:
         right = T_base_camera[:, :3, 0]
         x = np.einsum("ij,ij->i", right, self._right[nearest])
         y = np.einsum("ij,ij->i", right, self._down[nearest])
-        eighth = np.floor(np.arctan2(y, x) * (ROLLS / (2.0 * np.pi))).astype(np.intp) % ROLLS
+        eighth = np.floor(np.arctan2(y, x) * (8 / (2.0 * np.pi))).astype(np.intp) % 8
         return nearest, np.left_shift(1, eighth).astype(np.uint8)
 
 
@@ -197,30 +199,3 @@ def _checked_poses(T_base_camera: ArrayLike, count: int) -> Array:
     if odd.any():
         transforms.as_rigid(poses[int(np.argmax(odd))], "forward")
     return poses
-
-
-def _checked_map(held: dict[str, Any], file: Path) -> ReachabilityMap:
-    """Make a map of the arrays of a file, if they are those of one."""
-    if "format" not in held or str(held["format"]) != FORMAT:
-        raise InputError(file, f"is no map of what an arm reaches, its format is not '{FORMAT}'", REMEDY)
-    wanted = ("version", "reached", "origin_base", "cell", "fresh")
-    if missing := [name for name in wanted if name not in held]:
-        raise InputError(file, f"holds no {missing[0]}", REMEDY)
-    if held["version"].shape != () or held["version"] != VERSION:
-        raise InputError(file, f"has version {held['version']}, not {VERSION}", REMEDY)
-    reached = held["reached"]
-    if reached.ndim != 4 or reached.dtype != np.uint8 or reached.size == 0:
-        found = f"{reached.dtype} of shape {reached.shape}"
-        raise InputError(file, f"its map is {found}, not uint8 (X, Y, Z, D)", REMEDY)
-    for name, shape in (("origin_base", (3,)), ("cell", ()), ("fresh", ())):
-        value = held[name]
-        if value.shape != shape or value.dtype.kind != "f" or not np.isfinite(value).all():
-            raise InputError(file, f"its {name} is not a finite number of shape {shape}", REMEDY)
-    if held["cell"] <= 0.0:
-        raise InputError(file, f"its cells are {held['cell']:g} m wide", REMEDY)
-    origin_base, cell, fresh = (
-        held["origin_base"].astype(np.float64),
-        float(held["cell"]),
-        float(held["fresh"]),
-    )
-    return ReachabilityMap(reached, origin_base, cell, fresh)

@@ -17,47 +17,30 @@ from caryatid.sensing.views import View
 
 
 class RecordingRobot(SimulatedRobot):
-    """Reaches each view of a recording once.
+    """Reaches each view of a recording once, and begins at the first.
 
     Args:
-        T_world_cameras: The recorded poses (N, 4, 4).
-        start: Index of the view it begins at.
-
-    Raises:
-        InputError: There is no recorded pose, or `start` is not one of them.
+        T_world_cameras: The recorded poses (N, 4, 4), N ≥ 1.
     """
 
-    def __init__(self, T_world_cameras: Array | Sequence[Array], start: int = 0) -> None:
-        self._recorded = np.array(T_world_cameras, dtype=np.float64).reshape(-1, 4, 4)
-        if not 0 <= start < len(self._recorded):
-            why = f"has no view {start} of {len(self._recorded)}"
-            raise InputError("recording", why, "give poses to be at")
-        self._used = [start]
+    def __init__(self, T_world_cameras: Array | Sequence[Array]) -> None:
+        self._recorded = np.array(T_world_cameras, dtype=np.float64)
+        self._T_world_camera = self._recorded[0]
+        self._used = [0]
 
-    @property
-    def T_world_camera(self) -> Array:
-        """Where the camera is now (4, 4)."""
-        return self._recorded[self._used[-1]]
-
-    def index_of(self, T_world_camera: Array) -> int | None:
-        """Which recorded view has this pose (4, 4) to 1 mm and 2 mrad; of several the first not used yet."""
-        distance = np.linalg.norm(self._recorded[:, :3, 3] - T_world_camera[:3, 3], axis=-1)
-        cosine = (np.einsum("nij,ij->n", self._recorded[:, :3, :3], T_world_camera[:3, :3]) - 1.0) / 2.0
-        angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-        same = np.flatnonzero((distance <= 1e-3) & (angle <= 2e-3))
-        unused = [int(i) for i in same if i not in self._used]
-        return unused[0] if unused else (int(same[0]) if len(same) else None)
+    def _index_of(self, T_world_camera: Array) -> int | None:
+        """Which recorded view has this pose (4, 4) to 1 mm and 1 mrad; of several the first not used yet."""
+        same = np.flatnonzero(np.abs(self._recorded - T_world_camera).max(axis=(1, 2)) <= 1e-3).tolist()
+        return min(same, key=lambda i: (i in self._used, i), default=None)
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
         """Say where the recording's camera was, or that it has not been at a pose (4, 4)."""
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
-        index = self.index_of(T)
+        index = self._index_of(T)
         if index is None:
             nearest = float(np.linalg.norm(self._recorded[:, :3, 3] - T[:3, 3], axis=-1).min())
-            return Unreachable(
-                f"the recording has no view from there; the nearest of its {len(self._recorded)} views is "
-                f"{nearest:.2f} m away"
-            )
+            why = f"the nearest of its {len(self._recorded)} views is {nearest:.2f} m away"
+            return Unreachable(f"the recording has no view from there; {why}")
         if index in self._used:
             return Unreachable(f"view {index} of the recording has already been used")
         forward = T[:3, 2]
@@ -74,10 +57,10 @@ class RecordingRobot(SimulatedRobot):
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
         """The straight distance to a recorded view [m], which is then used."""
-        before, index = self.T_world_camera, self.index_of(T_world_camera)
+        index = self._index_of(T_world_camera)
         assert index is not None
         self._used.append(index)
-        return float(np.linalg.norm(self.T_world_camera[:3, 3] - before[:3, 3]))
+        return float(np.linalg.norm(self._recorded[index, :3, 3] - self.T_world_camera[:3, 3]))
 
 
 class RecordingCamera:

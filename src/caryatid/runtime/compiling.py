@@ -1,10 +1,10 @@
 """Kernels are compiled once after installation, by a few processes side by side, before the first view.
 
 numba compiles a kernel at its first call and keeps it on disk. So there is no list of kernels to maintain:
-the processes *rehearse*. Each does on small scenes all that calls kernels (`caryatid.simulation.rehearsal`),
+the processes *warm up*. Each does on small scenes all that calls kernels (`caryatid.simulation.warm_up`),
 beginning with another part. A kernel that one of them is compiling the others wait for, and then read from
-disk. What no rehearsal calls is compiled at its first call, as ever; a new kernel needs an entry there only
-if nothing in the rehearsal calls it yet.
+disk. What no warm-up calls is compiled at its first call, as ever; a new kernel needs an entry there only
+if nothing in the warm-up calls it yet.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 ROOT = Path(__file__).parents[1]
 MARK = "CARYATID_COMPILES"
-"""Set in the environment of the processes that rehearse: they start no more of their kind."""
+"""Set in the environment of the processes that warm up: they start no more of their kind."""
 
 PROCESSES = 4
 """Most processes [1]: more would wait for the kernels that take longest."""
@@ -48,8 +48,8 @@ PATIENCE = 1200.0
 CODE = """
 import sys
 sys.path.append(sys.argv[1])
-from caryatid.runtime.compiling import rehearse
-rehearse(sys.argv[2], int(sys.argv[3]))
+from caryatid.runtime.compiling import warm_up
+warm_up(sys.argv[2], int(sys.argv[3]))
 """
 """What such a process runs; where it does not find caryatid otherwise, it looks where this process did."""
 
@@ -85,7 +85,7 @@ def compile_kernels() -> None:
         stamp.write_text(json.dumps(wanted), encoding="utf-8")
 
 
-def rehearse(locks: str, number: int) -> None:
+def warm_up(locks: str, number: int) -> None:
     """Call all kernels; run in a process of its own.
 
     Args:
@@ -93,7 +93,7 @@ def rehearse(locks: str, number: int) -> None:
         number: Number of the process, which says what it begins with.
     """
     _take_turns(Path(locks))
-    call("rehearsal", number)
+    call("warm-up", number)
 
 
 @cache
@@ -116,7 +116,7 @@ def cache_of(folder: Path) -> Path:
 
 
 def _run_processes() -> None:
-    """Rehearse in several processes, and wait for them."""
+    """Warm up in several processes, and wait for them."""
     with TemporaryDirectory(prefix="caryatid-compiling-") as work:
         processes: list[subprocess.Popen[bytes]] = []
         end = time.monotonic() + PATIENCE

@@ -11,6 +11,7 @@ import numpy as np
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import next_best_view
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
 from caryatid.io.json_files import Numbers
 from caryatid.planning.candidates import Candidates
@@ -104,10 +105,10 @@ def table_floor(scene: Scene) -> FloorGrid:
         raise PlanningError("nothing has been seen yet; add a first view")
     shape = scene.surface.shape
     top = float(scene.surface.point_world[2])
-    centre = np.array([*shape.T_world_object[:2, 3], top / 2.0])
-    half = np.array([*shape.extents[:2] / 2.0, max(abs(top) / 2.0, STEP)])
-    R = shape.T_world_object[:3, :3]
-    return FloorGrid.from_boxes([centre], [half], [R], scene.config.robot, scene.sphere.centre_world[:2])
+    T_world_box = transforms.rigid(shape.T_world_object[:3, :3], (*shape.T_world_object[:2, 3], top / 2.0))
+    extents = np.array([*shape.extents[:2], max(abs(top), 2.0 * STEP)])
+    box = Box(T_world_box, extents)
+    return FloorGrid.from_boxes([box], scene.config.robot, scene.sphere.centre_world[:2])
 
 
 def _given(reachable: Reachable, T_world_camera: Array, sphere: ViewSphere) -> Candidates:

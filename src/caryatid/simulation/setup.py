@@ -50,15 +50,8 @@ def make_simulation(
         InputError: There is no robot of this name.
         PlanningError: No view of the table can be reached.
     """
-    boxes = static_boxes(scene)
     centre = table_centre(scene)
-    floor = FloorGrid.from_boxes(
-        [b.T_world_object[:3, 3] for b in boxes],
-        [b.extents / 2.0 for b in boxes],
-        [b.T_world_object[:3, :3] for b in boxes],
-        config.robot,
-        centre[:2],
-    )
+    floor = FloorGrid.from_boxes(static_boxes(scene), config.robot, centre[:2])
     make = find_robot(robot) if isinstance(robot, str) else robot
     made = make(Surroundings(centre, floor, config))
     made.move_to(home_view(made, ViewSphere.around(centre, config.active), config.robot))

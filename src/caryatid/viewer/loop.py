@@ -101,7 +101,9 @@ class Loop:
             f1 = score(step.graph, self.source.truth, np.random.default_rng(0)).f1
         self.moments.append(Moment(step, f1))
         self.planned, self.ended = step.decision, step.stop
-        self.pause = step.stop or reason_to_stop(step.index + 1, self._explorer.changed, self.config.active)
+        self.pause = step.stop or reason_to_stop(
+            step.index + 1, self._explorer.scene.changed, self.config.active
+        )
         return self.moments[-1]
 
     def use_planner(self, name: str) -> Moment | None:
@@ -144,10 +146,10 @@ class Loop:
         Raises:
             PlanningError: There is no next view to choose, or the robot cannot take it.
         """
-        return self._go_to(self._explorer.alternative(index), by_hand=True)
+        return self._go_to(index, by_hand=True)
 
-    def _go_to(self, decision: Decision, *, by_hand: bool) -> Moment:
-        step = self._explorer.choose(decision)
+    def _go_to(self, chosen: Decision | int, *, by_hand: bool) -> Moment:
+        step = self._explorer.choose(chosen)
         self.moments[-1] = replace(self.moments[-1], step=step, by_hand=by_hand)
         return self.moments[-1]
 

@@ -34,22 +34,25 @@ BUILT_IN: dict[str, tuple[str, ...]] = {
 ORACLE = "oracle"
 """Name of the planner that knows the ground truth; `caryatid.evaluation.oracle` makes it."""
 
-ENTRY_POINTS = "caryatid.planners"
-"""Group under which other packages offer planners: callables without arguments that return a `Planner`."""
-
 
 def offered() -> dict[str, EntryPoint]:
-    """Planners of other packages by name; a name of ours stays ours."""
-    return {p.name: p for p in entry_points(group=ENTRY_POINTS) if p.name not in {*BUILT_IN, ORACLE}}
+    """Planners of other packages by name: callables without arguments that return a `Planner`.
+
+    They are entry points in the group `caryatid.planners`. A name of ours stays ours.
+    """
+    points = entry_points(group="caryatid.planners")
+    return {point.name: point for point in points if point.name not in {*BUILT_IN, ORACLE}}
 
 
-def make_planner(name: str) -> Planner:
-    """Return the planner of this name.
+def make_planner(name: Planner | str) -> Planner:
+    """Return the planner of this name; a planner is returned as it is.
 
     Raises:
         InputError: There is none, then the message lists those there are; or it is `oracle`.
     """
     planner: Planner
+    if not isinstance(name, str):
+        return name
     if name in BUILT_IN:
         module, maker, *arguments = BUILT_IN[name]
         planner = getattr(import_module(f"{__name__}.{module}"), maker)(*arguments)

@@ -41,9 +41,6 @@ from caryatid.planning.points_of_interest import (
 WORTH_SAYING = 0.05
 """Shares of the whole below this are not mentioned."""
 
-RELATION_WEIGHT = 0.1
-"""Worth of all relations' points of interest against all the objects' surfaces [1]."""
-
 
 class SupportPlanner:
     """Takes the candidate that promises to show most of what is hidden, at little cost."""
@@ -60,7 +57,6 @@ class SupportPlanner:
         relations = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
         relations += points_of_doubt(state.graph, sphere, state.visited)
         samples, gain = _expected_gain(state, relations, candidates.T_world_camera[looks.chosen])
-
         inhibition = inhibition_of_return(state.visited, candidates.directions[looks.chosen], config)
         points = (*relations, *_hidden_points(state, samples, gain))
         return decide(
@@ -80,14 +76,14 @@ def _expected_gain(
     """Samples, and what cameras (C, 4, 4) show of them anew (K, C)."""
     config = state.config
     solid = state.voxels.solid([o.shape for o in state.graph.objects])
-    surfaces = surface_samples(state.graph, solid)
-    points = relation_samples(relations)
+    surfaces, points = surface_samples(state.graph, solid), relation_samples(relations)
     T_world_visited = state.sphere.poses(state.visited)
     seen = visibility(join([surfaces, points]), T_world_visited, solid, config).max(axis=1, initial=0.0)
     shares = unseen_shares(surfaces, seen[: len(surfaces.weights)])
     surfaces = replace(surfaces, weights=surfaces.weights * shares)
+    # All relations' points of interest are worth a tenth of all the objects' surfaces.
+    points = replace(points, weights=0.1 * points.weights)
     space = space_samples(state.graph, solid)
-    points = replace(points, weights=points.weights * RELATION_WEIGHT)
     samples = join([surfaces, points, space])
     before = np.concatenate([seen, np.zeros(len(space.weights))])
     return samples, shown_anew(samples, before, T_world_camera, solid, config)
@@ -107,16 +103,13 @@ def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[
     Its saliency is how much of that there is, in shares of the subject with most of it.
     """
     left = gain.max(axis=1, initial=0.0)
-    about, count = samples.subjects, len(samples.names)
-    worth = np.bincount(about, weights=left, minlength=count)
-    shown = np.bincount(about, weights=left > 0.0, minlength=count)
-    spots, ways = (
-        np.stack([np.bincount(about, weights=left * v, minlength=count) for v in vectors.T], axis=-1)
-        for vectors in (samples.points_world, samples.normals_world)
-    )
+    sums = np.zeros((len(samples.names), 8))
+    columns = (left, left > 0.0, left[:, None] * samples.points_world, left[:, None] * samples.normals_world)
+    np.add.at(sums, samples.subjects, np.column_stack(columns))
+    worth, shown = sums[:, 0], sums[:, 1]
     points = []
     for i in np.flatnonzero((worth > WORTH_SAYING * worth.max(initial=0.0)) & (shown > 1)):
-        name, middle, outward = samples.names[i], spots[i] / worth[i], ways[i]
+        name, middle, outward = samples.names[i], sums[i, 2:5] / worth[i], sums[i, 5:]
         if np.linalg.norm(outward) < 1e-9:
             outward = middle - state.sphere.centre_world
         subject = () if name == SPACE else (name,)

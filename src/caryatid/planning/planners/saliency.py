@@ -19,9 +19,6 @@ from caryatid.planning.points_of_interest import (
     points_of_interest,
 )
 
-CLEARANCE = 0.05
-"""Neighbourhood of a point of interest that its line of sight leaves first [m]; half a common object."""
-
 
 class AttentionPlanner:
     """Saliency painted on the view sphere around projected points of interest.
@@ -38,15 +35,9 @@ class AttentionPlanner:
         after that of the hidden ones is negated; a candidate that none reaches has none.
         """
         check_candidates(state)
-        config, candidates, sphere = state.config, state.candidates, state.sphere
-        points = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
-
-        saliency, strongest = np.zeros(len(candidates)), np.full(len(candidates), -1)
-        if points:
-            given, reached = _given(points, candidates.directions, config)
-            signed = np.where(_hidden(points, state), -1.0, 1.0) * given
-            saliency, strongest = _largest(signed, reached)
-        saliency = saliency + inhibition_of_return(state.visited, candidates.directions, config)
+        config, directions, visited = state.config, state.candidates.directions, state.visited
+        points = points_of_interest(state.graph, state.sphere, visited, len(visited), config)
+        saliency, strongest = _largest(points, directions, config, _hidden(points, state))
 
         def why(best: int) -> str:
             if strongest[best] < 0:
@@ -54,12 +45,12 @@ class AttentionPlanner:
             return points[strongest[best]].why
 
         return decide(
-            candidates,
-            saliency,
+            state.candidates,
+            saliency + inhibition_of_return(visited, directions, config),
             path_cost(state),
             why,
             points=tuple(points),
-            elsewhere=partial(_on_sphere, tuple(points), state.visited, sphere.directions, config),
+            elsewhere=partial(_on_sphere, tuple(points), visited, state.sphere.directions, config),
         )
 
 
@@ -87,34 +78,41 @@ def _on_sphere(
     points: Sequence[PointOfInterest], visited: Array, directions: Array, config: ActiveVisionConfig
 ) -> Array:
     """Saliency (M,) of views that are not asked whether points are hidden from them."""
-    inhibition = inhibition_of_return(visited, directions, config)
-    return _largest(*_given(points, directions, config))[0] + inhibition if points else inhibition
+    return _largest(points, directions, config)[0] + inhibition_of_return(visited, directions, config)
 
 
-def _given(
-    points: Sequence[PointOfInterest], directions: Array, config: ActiveVisionConfig
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Saliency each point gives each view (M, K), and where it reaches: all, or the nearest alone."""
+def _largest(
+    points: Sequence[PointOfInterest],
+    directions: Array,
+    config: ActiveVisionConfig,
+    hidden: NDArray[np.bool_] | None = None,
+) -> tuple[Array, NDArray[np.intp]]:
+    """Largest saliency (M,) that reaches each view, 0 where none does, and whose it is (M,), −1 for none.
+
+    A point reaches all views, or its nearest one alone where saliency does not spread. `hidden` says which
+    points are hidden from which views (M, K).
+    """
+    if not points:
+        return np.zeros(len(directions)), np.full(len(directions), -1)
     if config.propagation:
         given = painted(points, directions, float(np.deg2rad(config.spread)))
-        return given, np.ones(given.shape, dtype=np.bool_)
-    tops = np.stack([p.direction for p in points])
-    reached = np.zeros((len(directions), len(points)), dtype=np.bool_)
-    reached[np.argmax(directions @ tops.T, axis=0), np.arange(len(points))] = True
-    return np.where(reached, [p.saliency for p in points], 0.0), reached
+    else:
+        tops = np.stack([p.direction for p in points])
+        given = np.full((len(directions), len(points)), np.nan)
+        given[np.argmax(directions @ tops.T, axis=0), np.arange(len(points))] = [p.saliency for p in points]
+    if hidden is not None:
+        given = np.where(hidden, -given, given)
+    counted = np.where(np.isnan(given), -np.inf, given)
+    largest = counted.max(axis=1)
+    strongest = np.where(largest > -np.inf, counted.argmax(axis=1), -1)
+    return np.where(strongest < 0, 0.0, largest), strongest
 
 
-def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[np.bool_]:
-    """Which points are hidden from which candidates (N, K); none where `config.occlusion` ignores it."""
-    if state.config.occlusion == "ignore":
-        return np.zeros((len(state.candidates), len(points)), dtype=np.bool_)
+def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[np.bool_] | None:
+    """Which points are hidden from which candidates (N, K); None where that does not matter."""
+    if not points or state.config.occlusion == "ignore":
+        return None
     positions = np.stack([p.position_world for p in points])
+    # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
     eyes_world = state.candidates.T_world_camera[:, :3, 3]
-    return state.voxels.solid().blocked(positions, eyes_world, CLEARANCE).T
-
-
-def _largest(given: Array, reached: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:
-    """Largest saliency (M,) that reaches each view, 0 where none does, and whose it is (M,), −1 for none."""
-    counted = np.where(reached, given, -np.inf)
-    strongest = np.where(reached.any(axis=1), counted.argmax(axis=1), -1)
-    return np.where(strongest < 0, 0.0, counted.max(axis=1)), strongest
+    return state.voxels.solid().blocked(positions, eyes_world, 0.05).T

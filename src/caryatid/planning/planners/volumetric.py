@@ -26,7 +26,6 @@ from functools import cache, partial
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from caryatid.config import ActiveVisionConfig
@@ -39,23 +38,19 @@ from caryatid.planning.planners import VOLUMETRIC
 from caryatid.runtime.parallel import for_each
 from caryatid.sensing.voxel_map import OCCUPIED, UNKNOWN, VoxelMap
 
-RAY_SPACING = 0.02
-"""Spacing of the rays at the sphere's centre [m]; 2 voxels, no object is missed."""
 PROXIMITY = 0.1
 """d_max of `proximity-count` [m]; a common object reaches that far behind its seen side."""
-COST_WEIGHT = 1.0
-"""Weight w of the cost in the utility [1]; the usual one."""
 
 
 class VolumetricPlanner:
-    """Takes the candidate with the largest utility IG / ΣIG − w · cost / Σcost.
+    """Takes the candidate with the largest utility IG / ΣIG − cost / Σcost.
 
     Args:
         formulation: How information is counted, one of `VOLUMETRIC`.
     """
 
     def __init__(self, formulation: str) -> None:
-        self.formulation = formulation
+        self._formulation = formulation
         self._column = VOLUMETRIC.index(formulation)
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
@@ -63,21 +58,23 @@ class VolumetricPlanner:
 
         The decision's saliency, cost and score are the two terms of the utility and their difference, in
         units of the largest share of information. Candidates beside an earlier view are left out: a planner
-        of the field does not choose a view of its list twice.
+        of the field does not choose a view of its list twice. Without a table or objects there is no box to
+        look into, and nothing is gathered.
         """
         check_candidates(state)
         candidates, config = state.candidates, state.config
         looks = _new_views(state, candidates.looks(config.look_directions))
-        T_world_camera = candidates.T_world_camera[looks.chosen]
-        proximity = PROXIMITY if self.formulation == "proximity-count" else 0.0
-        gain = ray_information(state, T_world_camera, proximity)[:, self._column]
-        largest = float(gain.max())
-        saliency = gain / largest if largest > 0.0 else gain
-        cost = COST_WEIGHT * _shares(path_cost(state)[looks.chosen])
+        corners = space_above(state.graph, state.voxels)
+        gain = np.zeros(len(looks.chosen))
+        if corners is not None:
+            T_world_camera = candidates.T_world_camera[looks.chosen]
+            box = state.voxels.cut(*corners)
+            gain = ray_information(box, T_world_camera, image_rays(config))[:, self._column]
+        saliency, cost = gain / (gain.max() or 1.0), path_cost(state)[looks.chosen]
         return decide(
             candidates,
             saliency,
-            cost * float(saliency.sum()) if largest > 0.0 else cost,
+            cost / (cost.sum() or 1.0) * (saliency.sum() or 1.0),
             lambda best: self._why(gain, best),
             looks=looks,
             elsewhere=partial(np.zeros, len(state.sphere.directions)),
@@ -86,58 +83,9 @@ class VolumetricPlanner:
     def _why(self, gain: Array, best: int) -> str:
         """One sentence: how the chosen view's information compares with the others'."""
         if gain.max() <= 0.0:
-            return f"no view is expected to give {self.formulation} information; the cheapest new view"
+            return f"no view is expected to give {self._formulation} information; the cheapest new view"
         ratio, share = gain[best] / gain.mean(), gain[best] / gain.max()
-        return f"{ratio:.1f} times the views' mean {self.formulation} information, {share:.0%} of the most"
-
-
-def ray_information(state: PlanningState, T_world_camera: Array, proximity: float = 0.0) -> Array:
-    """What the rays of cameras (C, 4, 4) gather (C, 5), a column each of `VOLUMETRIC`.
-
-    Without a table or objects there is no box to look into, and nothing is gathered; without a `proximity`,
-    d_max [m], nothing is near.
-    """
-    corners = space_above(state.graph, state.voxels)
-    if corners is None:
-        return np.zeros((len(T_world_camera), len(VOLUMETRIC)))
-    box, config = state.voxels.cut(*corners), state.config
-    return gather(
-        np.ascontiguousarray(box.states),
-        layers(box, proximity),
-        np.ascontiguousarray(T_world_camera),
-        image_rays(config),
-        box.origin_world,
-        box.config.size,
-    )
-
-
-def layers(voxels: VoxelMap, proximity: float) -> NDArray[np.float32]:
-    """Occupancy [1], its entropy [bit] and nearness of unknown voxels to occupied ones [m] (X, Y, Z, 3).
-
-    Nearness is d_max − d where that is more than 0, d_max the `proximity` [m].
-    """
-    occupancy = voxels.occupancy
-    entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
-    nearness = np.zeros_like(occupancy)
-    occupied = voxels.states == OCCUPIED
-    if proximity > 0.0 and occupied.any():
-        distance = voxels.config.size * distance_transform_edt(~occupied)
-        unknown = voxels.states == UNKNOWN
-        nearness[unknown] = np.maximum(proximity - distance[unknown], 0.0)
-    return np.stack([occupancy, entropy, nearness], axis=-1)
-
-
-@cache
-def image_rays(config: ActiveVisionConfig) -> Array:
-    """Directions (R, 3) in the camera, unit: a square grid over the image within `config.view_cone`.
-
-    Neighbours are `RAY_SPACING` apart at the view sphere's centre.
-    """
-    spacing, edge = RAY_SPACING / config.sphere_radius, np.tan(np.deg2rad(config.view_cone))
-    steps = spacing * np.arange(-np.floor(edge / spacing), np.floor(edge / spacing) + 1.0)
-    x, y = (g.ravel() for g in np.meshgrid(steps, steps))
-    inside = np.hypot(x, y) <= edge
-    return unit(np.column_stack([x[inside], y[inside], np.ones(inside.sum())]))
+        return f"{ratio:.1f} times the views' mean {self._formulation} information, {share:.0%} of the most"
 
 
 def _new_views(state: PlanningState, looks: Looks) -> Looks:
@@ -145,45 +93,50 @@ def _new_views(state: PlanningState, looks: Looks) -> Looks:
     directions = state.candidates.directions
     cosine = directions[looks.chosen] @ state.visited.T
     old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / state.config.look_directions))
-    return looks if old.all() else looks.without(old, directions)
+    return looks if old.all() else Looks.of(looks.chosen[~old], directions)
 
 
-def _shares(values: Array) -> Array:
-    """Each value's share of their sum; nought where that is nought."""
-    total = float(values.sum())
-    return values / total if total > 0.0 else np.zeros_like(values)
+@cache
+def image_rays(config: ActiveVisionConfig) -> Array:
+    """Directions (R, 3) in the camera, unit: a square grid over the image within `config.view_cone`.
+
+    Neighbours are 2 cm, two voxels, apart at the view sphere's centre, so that no object is missed.
+    """
+    spacing, edge = 0.02 / config.sphere_radius, np.tan(np.deg2rad(config.view_cone))
+    steps = spacing * np.arange(-np.floor(edge / spacing), np.floor(edge / spacing) + 1.0)
+    x, y = (g.ravel() for g in np.meshgrid(steps, steps))
+    inside = np.hypot(x, y) <= edge
+    return unit(np.column_stack([x[inside], y[inside], np.ones(inside.sum())]))
 
 
-def gather(
-    states: NDArray[np.int8],
-    layers: NDArray[np.float32],
-    T_world_camera: Array,
-    rays_camera: Array,
-    origin: Array,
-    size: float,
-) -> Array:
-    """Sum the information the rays of each candidate gather.
+def ray_information(voxels: VoxelMap, T_world_camera: Array, rays_camera: Array) -> Array:
+    """Sum the information the rays of each camera gather.
 
     Args:
-        states: State (X, Y, Z) of each voxel: 0 unknown, 1 free, 2 occupied.
-        layers: Occupancy [1], its entropy [bit] and the nearness to a surface of each voxel (X, Y, Z, 3).
-        T_world_camera: Candidates (C, 4, 4).
+        voxels: Where they gather it.
+        T_world_camera: Cameras (C, 4, 4).
         rays_camera: Unit directions (R, 3) of the rays in the camera.
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        size: Edge of a voxel [m].
 
     Returns:
-        (C, 5), a column each of `VOLUMETRIC`.
+        (C, 5), a column each of `VOLUMETRIC`: [bit] for entropies, [m] for `proximity-count`.
     """
+    occupancy, states = voxels.occupancy, np.ascontiguousarray(voxels.states)
+    entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
+    nearness = np.zeros_like(occupancy)
+    if (states == OCCUPIED).any():
+        distance = voxels.config.size * distance_transform_edt(states != OCCUPIED)
+        nearness[states == UNKNOWN] = np.maximum(PROXIMITY - distance[states == UNKNOWN], 0.0)
+    layers = np.stack([occupancy, entropy, nearness], axis=-1)
+    cameras = (np.ascontiguousarray(T_world_camera), rays_camera)
     gathered = np.zeros((len(T_world_camera), len(VOLUMETRIC)))
-    data = (states, layers, T_world_camera, rays_camera, origin, size, gathered)
-    for_each(_gather_one, len(T_world_camera), data)
+    data = (states, layers, *cameras, voxels.origin_world, voxels.config.size, gathered)
+    for_each(_gather, len(T_world_camera), data)
     return gathered
 
 
 @njit(cache=True)
-def _gather_one(c, data):  # type: ignore[no-untyped-def]
-    """Sum what the rays of one candidate gather."""
+def _gather(c, data):  # type: ignore[no-untyped-def]
+    """Sum what the rays of one camera gather."""
     states, layers, T_world_camera, rays, origin, size, gathered = data
     T, found = T_world_camera[c], room(states.shape)
     start = ((T[0, 3] - origin[0]) / size, (T[1, 3] - origin[1]) / size, (T[2, 3] - origin[2]) / size)

@@ -1,4 +1,4 @@
-"""A rehearsal of all that calls compiled kernels, on small images, so that they are compiled beforehand."""
+"""All that calls compiled kernels, called on small images, so that they are compiled beforehand."""
 
 from __future__ import annotations
 
@@ -16,11 +16,8 @@ from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import Simulation, make_simulation
 
-SENSOR = SensorConfig(width=160, height=120, focal=131.25)
-"""A quarter of the usual image."""
 
-
-def rehearse(number: int) -> None:
+def warm_up(number: int) -> None:
     """Fit shapes, explore with and without given segments, plan with all planners, and take a point cloud.
 
     Args:
@@ -37,8 +34,8 @@ def _fit() -> None:
 
 
 def _explore_by_colour_and_depth() -> None:
-    simulation, steps = _explore("dense-12-0", "auto")
-    scene = Scene(_config(), segmentation="auto")
+    config, simulation, steps = _explore("dense-12-0", "auto")
+    scene = Scene(config, segmentation="auto")
     for step in steps:
         if step.view is not None:
             scene.update(step.view)
@@ -47,22 +44,18 @@ def _explore_by_colour_and_depth() -> None:
 
 
 def _explore_with_labels() -> None:
-    _, steps = _explore("tower", "labels")
+    config, _, steps = _explore("tower", "labels")
     cloud = steps[0].cloud
     labels = cloud.labels
-    Scene(_config()).update(replace(cloud, labels=None))
+    Scene(config).update(replace(cloud, labels=None))
     if labels is not None:
-        Scene(_config()).update(replace(cloud, labels=np.where(labels == SUPPORT_LABEL, 0, labels)))
+        Scene(config).update(replace(cloud, labels=np.where(labels == SUPPORT_LABEL, 0, labels)))
 
 
-def _explore(name: str, segmentation: SegmentationMethod) -> tuple[Simulation, list[Step]]:
-    config = _config()
+def _explore(name: str, segmentation: SegmentationMethod) -> tuple[Config, Simulation, list[Step]]:
+    """Explore with a quarter of the usual image."""
+    active = replace(Config().active, sphere_points=4000, max_views=3)
+    config = Config(sensor=SensorConfig(width=160, height=120, focal=131.25), active=active)
     simulation = make_simulation(load_scene(name), config, noise="carmine", seed=0)
-    return simulation, list(
-        explore(simulation.camera, simulation.robot, config=config, segmentation=segmentation)
-    )
-
-
-def _config() -> Config:
-    config = Config()
-    return replace(config, sensor=SENSOR, active=replace(config.active, sphere_points=4000, max_views=3))
+    steps = explore(simulation.camera, simulation.robot, config=config, segmentation=segmentation)
+    return config, simulation, list(steps)
