@@ -73,6 +73,7 @@ def graph_of(views):
 
 
 def test_a_session_over_http_is_the_session(client, views):
+    assert client.get("/docs").status_code == 200
     assert client.get("/sessions/a/next").status_code == 409
     answers = [client.post("/sessions/a/views", json=body(view)) for view in views[:2]]
     for number, answer in enumerate(answers):
@@ -103,10 +104,6 @@ def test_a_session_over_http_is_the_session(client, views):
     assert client.delete("/sessions/a/views/last").json() == {"views": 1, "graph": graph_of(views[:1])}
     assert client.delete("/sessions/a/views/last").json()["views"] == 0
     assert client.delete("/sessions/a/views/last").status_code == 409
-
-
-def test_there_is_an_openapi_page(client):
-    assert client.get("/docs").status_code == 200
 
 
 def camera_of(view, **changes):
