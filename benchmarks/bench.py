@@ -145,8 +145,9 @@ def main() -> int:
     rows = [row for part in rows_by_name.values() for row in part]
     show(rows, console)
     if args.out is not None:
-        figures = ("to_peer", "to_limit", "met")
-        told = [asdict(row) | {name: getattr(row, name) for name in figures} for row in rows]
+        told = [
+            asdict(row) | {"to_peer": row.to_peer, "to_limit": row.to_limit, "met": row.met} for row in rows
+        ]
         about = {"machine": machine(), "provenance": collect_provenance(), "peers": peers.versions()}
         args.out.write_text(json.dumps(about | {"rows": told}, indent=1) + "\n", encoding="utf-8")
     if args.docs is not None:

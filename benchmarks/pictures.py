@@ -12,9 +12,9 @@ import io
 import sys
 import textwrap
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from caryatid import Config, Step, explore
-from caryatid.errors import CaryatidError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
@@ -219,50 +218,27 @@ def film() -> tuple[list[Image.Image], list[int]]:
     return [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images], times
 
 
-@dataclass(frozen=True)
-class Concepts:
-    """Draw the pictures of docs/concepts.md."""
+def main(
+    what: Annotated[Literal["concepts", "film"], tyro.conf.Positional], names: tuple[str, ...] = ()
+) -> None:
+    """Draw the pictures of docs/concepts.md or the film of README.md.
 
-    names: tuple[str, ...] = ()
-    """Pictures. [default: all]"""
-    out: Path = PICTURES / "concepts"
-    """Folder to write to."""
-
-    def run(self) -> None:
-        """Draw and write."""
-        drawn = concepts()
-        if unknown := sorted({*self.names} - {*drawn}):
-            raise CaryatidError(f"there is no picture '{unknown[0]}'; there are {', '.join(drawn)}")
-        self.out.mkdir(parents=True, exist_ok=True)
-        for name in self.names or drawn:
-            image = drawn[name].quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-            image.save(self.out / f"{name}.png", optimize=True)
-
-
-@dataclass(frozen=True)
-class Film:
-    """Draw the film of README.md: a robot explores; what it sees, what it knows, where it looks next."""
-
-    out: Path = PICTURES / "explore.gif"
-    """GIF to write."""
-
-    def run(self) -> None:
-        """Draw and write."""
+    Args:
+        what: Which of the two.
+        names: Of the concepts, only these.
+    """
+    known: dict[str, Any] = {"method": Image.Quantize.MEDIANCUT, "dither": Image.Dither.NONE}
+    if what == "film":
         images, times = film()
-        none = Image.Dither.NONE
-        flat = [image.quantize(256, method=Image.Quantize.MEDIANCUT, dither=none) for image in images]
-        flat[0].save(self.out, save_all=True, append_images=flat[1:], duration=times, loop=0, optimize=False)
-        sys.stdout.write(f"{self.out.name}: {len(flat)} frames, {self.out.stat().st_size / 1e6:.2f} MB\n")
-
-
-def main() -> None:
-    """Draw."""
-    commands: dict[str, Any] = {"concepts": Concepts, "film": Film}
-    tyro.extras.subcommand_cli_from_dict(commands).run()
+        first, *others = [image.quantize(256, **known) for image in images]
+        file = PICTURES / "explore.gif"
+        first.save(file, save_all=True, append_images=others, duration=times, loop=0, optimize=False)
+        sys.stdout.write(f"{file.name}: {len(images)} frames, {file.stat().st_size / 1e6:.2f} MB\n")
+        return
+    drawn = concepts()
+    for name in names or drawn:
+        drawn[name].quantize(256, **known).save(PICTURES / "concepts" / f"{name}.png", optimize=True)
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except CaryatidError as error:
-        sys.exit(f"error: {error}")
+    tyro.cli(main)

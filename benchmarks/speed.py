@@ -140,6 +140,10 @@ def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool 
     return Cylinder(T, size[0] / 2.0, size[2]) if kind == "cylinder" else Sphere(T, size[0] / 2.0)
 
 
+Laps = dict[str, float]
+"""What a turn and its parts took [s]."""
+
+
 def fresh(view: View, *, labels: bool = True) -> View:
     """The view as its camera's images make it: nothing is worked out of it yet."""
     return replace(view, labels=view.labels if labels else None)
@@ -153,7 +157,7 @@ class Episode:
         self._robot, self._labels = copy.copy(recording.robot), segmentation == "labels"
         self._visited: list[Array] = []
 
-    def look(self, T_world_camera: Array, view: View) -> dict[str, float]:
+    def look(self, T_world_camera: Array, view: View) -> Laps:
         """Take in a view and choose the next one; what `turn`, `perceive`, `plan` and each stage took [s]."""
         time.sleep(PAUSE)
         self._robot.move_to(T_world_camera)
@@ -179,16 +183,14 @@ def measure_turns(effort: Effort) -> list[Row]:
         chains = [open3d_chain(view, recording.config.cloud.max_depth) for view in recording.views]
     except (ImportError, OSError) as error:
         missing = told(error)
-    first: dict[str, list[dict[str, float]]] = defaultdict(list)
-    later: dict[str, list[dict[str, float]]] = defaultdict(list)
+    first, later = defaultdict[str, list[Laps]](list), defaultdict[str, list[Laps]](list)
     for repeat in range(effort.runs + 1):
         episodes = {name: Episode(recording, name) for name in SEGMENTATIONS}
         for k in range(len(recording.views) if repeat <= min(3, effort.runs) else 1):
-            found = first if k == 0 else later
             took = {"chain": {"chain": timed(chains[k], warm=False)[0]}} if chains else {}
             took |= {n: e.look(recording.poses[k], recording.views[k]) for n, e in episodes.items()}
-            for name, laps in took.items():
-                found[name] += [laps] * (repeat > 0)
+            for name, laps in took.items() if repeat else ():
+                (later if k else first)[name].append(laps)
     view = recording.views[0]
     images = view.depth.nbytes + (0 if view.rgb is None else view.rgb.nbytes)
     rows = [
@@ -209,7 +211,7 @@ def measure_turns(effort: Effort) -> list[Row]:
     return rows + _stages(recording, later, effort)
 
 
-def _stages(recording: Recording, later: dict[str, list[dict[str, float]]], effort: Effort) -> list[Row]:
+def _stages(recording: Recording, later: dict[str, list[Laps]], effort: Effort) -> list[Row]:
     """Rows of the stages: those that can be called by themselves, on the first view, and the turns' own."""
     config, view = recording.config, recording.views[0]
     points, normals, pixels = oriented_points(view, config.cloud)

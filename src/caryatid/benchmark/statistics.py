@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 CONFIG = StatisticsConfig()
 COLUMNS = ("condition", "family", "method", "quantity", "at", "value", "low", "high")
 """Columns of a summary. `family` is empty for all scenes; `at` is the view, threshold or quantile."""
-EPISODE = ("method", "scene", "seed")
 CURVE = ["f1", "path"]
 
 Figure = tuple[str, float, float, float, float]
@@ -49,30 +48,37 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
     Raises:
         ValueError: Two episodes of a method have the same scene and seed.
     """
-    pandas = import_pandas()
     rows: list[tuple[str | float, ...]] = []
     for condition, part in table.groupby("condition", sort=False):
         families = list(part["family"].unique())
         for family in ("", *(families if len(families) > 1 else ())):
             group = part[part["family"] == family] if family else part
-            done = group[group["error"].isna()]
-            wide = done.pivot(index=list(EPISODE), columns="view", values=list(MEASURES)).astype(float)
-            known = {str(method): own.droplevel("method") for method, own in wide.groupby("method")}
-            path = wide["path"].iloc[:, -1:].groupby(["method", "scene"]).mean().groupby("method").mean()
-            budget = float(path.median().iloc[0]) if len(path) else 0.0
-            for method, episodes in group.groupby("method", sort=False):
-                own = known.get(str(method), wide.droplevel("method").iloc[:0])
-                failed = float(episodes["error"].notna().sum())
-                figures = [*_counts(own), _plain("failed", 0.0, failed)]
-                if len(own):
-                    figures += _alone(own, budget)
-                    if method != reference and reference in known:
-                        figures += _against(own, known[reference])
-                    if gap is not None and method not in gap and set(gap) <= set(known):
-                        figures += _gap_closed(own, *(known[end] for end in gap))
-                rows += [(str(condition), family, str(method), *figure) for figure in figures]
-    summary: pd.DataFrame = pandas.DataFrame(rows, columns=list(COLUMNS))
+            for method, figure in _compare(group, reference, gap):
+                rows.append((str(condition), family, method, *figure))
+    summary: pd.DataFrame = import_pandas().DataFrame(rows, columns=list(COLUMNS))
     return summary
+
+
+def _compare(
+    group: pd.DataFrame, reference: str, gap: tuple[str, str] | None
+) -> Iterator[tuple[str, Figure]]:
+    """Figures of each method in a group of episodes that can be compared."""
+    done = group[group["error"].isna()]
+    wide = done.pivot(index=["method", "scene", "seed"], columns="view", values=list(MEASURES)).astype(float)
+    known = {str(method): own.droplevel("method") for method, own in wide.groupby("method")}
+    lengths = [float(own["path"].iloc[:, -1].groupby("scene").mean().mean()) for own in known.values()]
+    budget = float(np.median(lengths)) if lengths else 0.0
+    for name, episodes in group.groupby("method", sort=False):
+        method = str(name)
+        own = known.get(method, wide.droplevel("method").iloc[:0])
+        figures = [*_counts(own), _plain("failed", 0.0, episodes["error"].notna().sum())]
+        if len(own):
+            figures += _alone(own, budget)
+            if method != reference and reference in known:
+                figures += _against(own, known[reference])
+            if gap is not None and method not in gap and set(gap) <= set(known):
+                figures += _gap_closed(own, *(known[end] for end in gap))
+        yield from ((method, figure) for figure in figures)
 
 
 def bootstrap(frames: Sequence[pd.DataFrame], figures: Callable[..., Array]) -> Array:
