@@ -251,31 +251,18 @@ def test_a_view_is_scored_by_the_pixels_seen_up_to_it(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("gt.json", None, "missing"),
-        ("gt.json", "{", "broken JSON"),
-        ("gt.json", '{"vertices": ["table"]}', "edges"),
         ("gt.json", '{"vertices": ["table", "ghost"], "edges": []}', "ghost"),
-        ("gt.json", '{"vertices": ["table"], "edges": [{"supporter": "table", "supported": "x"}]}', "x"),
         ("scene.xml", "<mujoco", "scene.xml"),
-        ("scene.xml", None, "neither scene.xml nor"),
     ],
 )
 def test_a_bad_truth_is_refused(tmp_path, scene_folder, name, content, said):
     write_run(tmp_path / "RUN", [scene_graph(2)])
     path = scene_folder / name
-    path.unlink() if content is None else path.write_text(content)
+    path.write_text(content)
     with pytest.raises(InputError, match=said) as caught:
         evaluate_run(tmp_path / "RUN", scene_folder)
     assert str(scene_folder) in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_missing_folders_are_refused(tmp_path, scene_folder):
-    with pytest.raises(InputError, match="is not a folder"):
-        evaluate_run(tmp_path / "nowhere", scene_folder)
-    write_run(tmp_path / "RUN", [scene_graph(2)])
-    with pytest.raises(InputError, match="is not a folder"):
-        evaluate_run(tmp_path / "RUN", tmp_path / "nowhere")
 
 
 @pytest.mark.slow
