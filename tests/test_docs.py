@@ -41,8 +41,13 @@ FENCE = re.compile(r"^(`{3,})([^\n`]*)\n(.*?)^\1$", re.M | re.S)
 COMMAND = re.compile(r"^(?:\$ )?(?:caryatid|pip|make|python|dask|docker|git|import|from) ", re.M)
 STAYS = {"serve", "view"}
 """Commands that go on until they are stopped."""
-SHORT = {"explore", "demo", "dismantle"}
-"""Commands that are given few pixels and views here."""
+SHORT = {
+    "explore": (*SMALL, "--views=2", "--no-report"),
+    "demo": (*SMALL, "--views=2", "--no-report"),
+    "dismantle": (*SMALL, "--views=2"),
+    "extract": ("--no-report",),
+}
+"""Few pixels, few views and no report make commands quick here."""
 
 
 def name_of(page: Path) -> str:
@@ -153,11 +158,11 @@ def run_line(words: list[str], capsys) -> None:
         case ["caryatid", *command]:
             redirected = command[command.index(">") + 1] if ">" in command else None
             arguments = command[: command.index(">")] if redirected else command
-            small = [*SMALL, "--views=2"] if arguments[0] in SHORT else []
-            given = {word.split("=")[1] for word in arguments if word.startswith("sensor.")}
-            small = [] if given else small
+            changes = list(SHORT.get(arguments[0], ()))
+            if "sensor.width" in " ".join(arguments):
+                changes = changes[len(SMALL) :]
             capsys.readouterr()
-            assert run_command(*arguments, *small) == 0, command
+            assert run_command(*arguments, *changes) == 0, command
             if redirected:
                 Path(redirected).write_text(capsys.readouterr().out)
         case _:

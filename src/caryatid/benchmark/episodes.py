@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -82,7 +82,7 @@ class Episode:
 
     def key(self, fingerprint: str) -> str:
         """Digest of the episode and of the code that runs it, wherever a scene's folder lies."""
-        known = asdict(self) | ({"scene": ""} if self.content else {})
+        known = {name: getattr(self, name) for name in self.__slots__} | ({"scene": ""} if self.content else {})
         return hashlib.sha256(json.dumps([fingerprint, known], sort_keys=True).encode()).hexdigest()
 
 

@@ -26,8 +26,6 @@ SUITES = (
 )  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
 
-options.Words = tyro.conf.UseAppendAction[tuple[str, ...]]
-
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark(options.Command):
