@@ -82,7 +82,9 @@ class Episode:
 
     def key(self, fingerprint: str) -> str:
         """Digest of the episode and of the code that runs it, wherever a scene's folder lies."""
-        known = {name: getattr(self, name) for name in self.__slots__} | ({"scene": ""} if self.content else {})
+        known = {name: getattr(self, name) for name in self.__slots__}
+        if self.content:
+            known["scene"] = ""
         return hashlib.sha256(json.dumps([fingerprint, known], sort_keys=True).encode()).hexdigest()
 
 
