@@ -9,7 +9,7 @@ from synthetic import TABLE_TOP, motion_about_vertical, moved, random_motion, si
 from caryatid.config import Config
 from caryatid.errors import InputError, PerceptionError
 from caryatid.geometry import transforms
-from caryatid.segmentation.observation import label_image, level_cloud, observe
+from caryatid.segmentation.observation import label_image, level_transform, observe
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 CONFIG = Config()
@@ -142,7 +142,7 @@ def test_an_empty_cloud_is_an_error_that_names_it():
     with pytest.raises(PerceptionError, match="cloud 7: holds no points"):
         observation_of(nothing)
     with pytest.raises(PerceptionError, match="cloud 7: holds no points"):
-        level_cloud(nothing, CONFIG, segmentation=None, rng=np.random.default_rng(0))
+        level_transform(nothing, CONFIG, np.random.default_rng(0))
 
 
 def test_a_view_of_a_wall_has_no_support_surface():
@@ -211,7 +211,7 @@ def test_a_cloud_in_its_sensors_frame_is_levelled():
     T_camera_world = transforms.invert(VIEW.pose)
     world = replace(observation.cloud, labels=VIEW.labels.ravel()[observation.pixels])
     stored = moved(world, T_camera_world)
-    level = level_cloud(stored, CONFIG, segmentation=None, rng=np.random.default_rng(0))
+    level = stored.moved(level_transform(stored, CONFIG, np.random.default_rng(0), use_labels=True))
     above = world.points_world[:, 2] - TABLE_TOP
     np.testing.assert_allclose(level.points_world[:, 2], above, atol=0.003)
     np.testing.assert_allclose(level.normals_world[:, 2], world.normals_world[:, 2], atol=0.005)
@@ -223,4 +223,4 @@ def test_levelling_finds_no_table_where_there_is_none():
     rng = np.random.default_rng(0)
     noise = Cloud(rng.normal(size=(500, 3)), transforms.unit(rng.normal(size=(500, 3))), name="noise")
     with pytest.raises(PerceptionError, match="noise: "):
-        level_cloud(moved(noise, random_motion(rng)), CONFIG, segmentation=None, rng=rng)
+        level_transform(moved(noise, random_motion(rng)), CONFIG, rng)

@@ -174,7 +174,7 @@ class Extract(RunCommand):
 
         from caryatid.exploration import Explorer
         from caryatid.io.point_clouds import read_stored_cloud
-        from caryatid.segmentation.observation import level_cloud
+        from caryatid.segmentation.observation import level_transform
         from caryatid.sources import check_segments
 
         with self.output.working("reading the cloud"):
@@ -186,9 +186,9 @@ class Extract(RunCommand):
         explorer = Explorer(config=config, segmentation=self.segmentation, seed=self.settings.seed)
         with self.output.working("extracting"):
             rng = np.random.default_rng(self.settings.seed)
-            cloud = level_cloud(
-                stored.to_cloud(config.cloud), config, segmentation=self.segmentation, rng=rng
-            )
+            cloud = stored.to_cloud(config.cloud)
+            use_labels = self.segmentation != "auto"
+            cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
             step = explorer.look(cloud)
         yield replace(step, labels=stored.spread(step.labels))
 

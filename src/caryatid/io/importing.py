@@ -22,7 +22,7 @@ from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame, OpenOptions
 from caryatid.io.images import BrokenImageError
 from caryatid.io.staging import StagedFolder
 from caryatid.io.video import SECOND
-from caryatid.segmentation.observation import levelled
+from caryatid.segmentation.observation import level_transform
 
 BROKEN: Final = "broken"
 DARK: Final = "hardly any depth"
@@ -202,7 +202,7 @@ def _level_rotation(path: Path, frames: Sequence[Frame], config: Config) -> Arra
     rng, found = np.random.default_rng(0), []
     for view in (frame.load() for frame in frames):
         with suppress(PerceptionError):
-            T_level_camera = levelled(replace(view, T_world_camera=None), config, rng).pose
+            T_level_camera = level_transform(replace(view, T_world_camera=None), config, rng)
             found.append(transforms.rotate(view.pose, T_level_camera[2, :3]))
     if not found:
         raise InputError(path, "no view shows a table to level the world by", "leave --level out")

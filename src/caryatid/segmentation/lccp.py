@@ -16,17 +16,9 @@ from caryatid.sensing.clouds import thin
 
 Index = NDArray[np.intp]
 
-MAX_JUMP = 0.009
-"""A difference in inverse depth beyond this parts two surfaces, however steep [1/m]."""
-MIN_RISE = 0.015
-"""Height over a neighbour's plane from which a depth step repels [m]; above staircases on steep faces."""
-
 
 def grid_edges(
-    places: NDArray[np.bool_],
-    points: Array,
-    normals: Array,
-    edge_jump: float,
+    places: NDArray[np.bool_], points: Array, normals: Array, edge_jump: float
 ) -> tuple[Index, Index]:
     """Pairs of samples that are neighbours in the image: on one surface, and at a step.
 
@@ -83,11 +75,13 @@ def _find_pairs(number, points, normals, planes, ways, edge_jump):  # type: igno
                 from_j += planes[j, axis] * points[i, axis]
             first, second = 1.0 / points[i, 2], 1.0 / points[j, 2]
             off = min(abs(from_i - 1.0) * second, abs(from_j - 1.0) * first)
-            if abs(first - second) <= MAX_JUMP and off <= edge_jump:
+            # A difference in inverse depth of more than 0.009 / m parts two surfaces, however steep; a step
+            # repels from 1.5 cm on, above staircases on steep faces.
+            if abs(first - second) <= 0.009 and off <= edge_jump:
                 if k < 4:
                     edges[edge_count, 0], edges[edge_count, 1] = i, j
                     edge_count += 1
-            elif max(rise_i, rise_j) > MIN_RISE:
+            elif max(rise_i, rise_j) > 0.015:
                 steps[step_count, 0], steps[step_count, 1] = i, j
                 step_count += 1
     return edges[:edge_count], steps[:step_count]
@@ -132,8 +126,8 @@ def convex_parts(
     min_width = config.min_width / np.median(apart) if len(apart) else 0.0
     cluster = _absorb_slivers(cluster, sizes, pairs, lengths, config.min_size, min_width)
     part = np.where(owner >= 0, cluster[owner], -1)
-    large = np.bincount(part + 1)[1:] >= config.min_size
-    return number_by_appearance(np.where((part >= 0) & np.append(large, False)[part], part, -1))
+    large = np.bincount(part + 1) >= config.min_size
+    return number_by_appearance(np.where(large[part + 1], part, -1))
 
 
 @njit(cache=True)
@@ -225,14 +219,8 @@ def _with_steps(
 def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array) -> Index:
     """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
 
-    Args:
-        count: Number of nodes N.
-        pairs: Borders (B, 2) between nodes, each once.
-        attraction: Signed attraction of each border (B,).
-        lengths: Weight of each border in the mean (B,).
-
-    Returns:
-        Cluster of each node (N,): the number of one of its nodes.
+    Borders are pairs (B, 2) of N = `count` nodes, each once, with a signed attraction (B,) and their length
+    (B,), which weighs it. The cluster of each node (N,) is the number of one of its nodes.
     """
     node = np.array(pairs, dtype=np.intp).ravel()
     return _roots(_merge_all(count, node, attraction, attraction * lengths, np.array(lengths, dtype=float)))
@@ -343,38 +331,10 @@ def wide_parts(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
     return wide
 
 
-def convex_together(
-    points: Array, normals: Array, first: Index, second: Index, share: float, config: SegmentationConfig
-) -> bool:
-    """Whether hardly a sample of one patch rises above the tangent plane of one of the other.
-
-    Args:
-        points: Samples (N, 3) [m].
-        normals: Unit normals (N, 3).
-        first: Samples of the one.
-        second: Samples of the other.
-        share: Greatest share of the pairs of which one rises [1].
-        config: How far counts: a height, and an angle as normals err.
-    """
-    between = points[second] - points[first, None]
-    over = np.einsum("nmi,ni->nm", between, normals[first])
-    under = -np.einsum("nmi,mi->nm", between, normals[second])
-    bend = np.sin(np.radians(config.concavity)) * np.linalg.norm(between, axis=-1)
-    return float((np.maximum(over, under) > config.rise + bend).mean()) <= share
-
-
 def hollowness(points: Array, normals: Array, part: NDArray[np.integer]) -> Array:
-    """How much parts look inwards: mean cosine between their normals and the way to their middle.
+    """How much parts 0 … P − 1 look inwards: mean cosine (P,) between normals and the way to their middle.
 
-    0 on a plane, positive on the inside of a bowl, negative on the outside.
-
-    Args:
-        points: Samples (N, 3) [m].
-        normals: Unit normals (N, 3).
-        part: Part of each (N,), 0 … P − 1.
-
-    Returns:
-        Of each part (P,); 0 of one without samples.
+    0 on a plane, positive on the inside of a bowl, negative on the outside. Points are (N, 3) [m].
     """
     sizes = np.maximum(np.bincount(part), 1)
     middles = np.stack([np.bincount(part, x) for x in points.T], axis=-1) / sizes[:, None]

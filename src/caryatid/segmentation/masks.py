@@ -13,9 +13,6 @@ from caryatid.sensing.views import SUPPORT_LABEL
 
 Masks = NDArray[np.bool_]
 
-SAME = 0.8
-"""Two masks with a larger intersection over union are one object seen twice [1]."""
-
 
 def labels_from_masks(
     masks: ArrayLike | Sequence[ArrayLike],
@@ -47,7 +44,8 @@ def labels_from_masks(
     kept &= quality >= config.min_score
     chosen: list[int] = []
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: (-quality[k], k)):
-        if all(_iou(stack[k], stack[other]) <= SAME for other in chosen):
+        # Of the same object masks overlap by more.
+        if all(_iou(stack[k], stack[other]) <= 0.8 for other in chosen):
             chosen.append(k)
     labels = np.zeros(stack.shape[1:], dtype=np.int32)
     for k in sorted(chosen, key=lambda k: (-pixels[k], k)):

@@ -40,7 +40,7 @@ class Observation:
     def labels(self) -> NDArray[np.int32]:
         """Label (N,) of each point."""
         if self.cloud.labels is None:
-            raise ValueError("a observation's cloud is labelled")
+            raise ValueError("an observation's cloud is labelled")
         return self.cloud.labels
 
     @property
@@ -96,7 +96,7 @@ def observe(
     if isinstance(source, View) and source.T_world_camera is None:
         if known is not None:
             raise InputError(source.name, "has no camera pose", "only a single view may come without one")
-        source = levelled(source, config, rng, use_labels=use_labels)
+        source = source.with_pose(level_transform(source, config, rng, use_labels=use_labels))
     cloud, pixels = _points(source, config, known)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     surface = _surface(cloud, given, known, UP, config, rng)
@@ -113,34 +113,10 @@ def observe(
     return Observation(view, replace(cloud, labels=labels), pixels, surface)
 
 
-def level_cloud(
-    cloud: Cloud, config: Config, *, segmentation: SegmentationMethod | None, rng: np.random.Generator
-) -> Cloud:
-    """Move a cloud from its sensor's frame into the world frame of its support plane.
-
-    Args:
-        cloud: The points, in the frame of their sensor.
-        config: How the plane is found.
-        segmentation: `auto` ignores labels.
-        rng: For every random choice.
-
-    Raises:
-        PerceptionError: There are no points, or no support surface.
-    """
-    if len(cloud) == 0:
-        raise PerceptionError(f"{cloud.name}: holds no points")
-    given = None if segmentation == "auto" else cloud.labels
-    surface = _surface(cloud, given, None, None, config, rng)
-    T = transforms.level_world(surface.normal_world, surface.point_world)
-    return cloud.moved(T)
-
-
 def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.int32]:
     """Labels of all pixels (H, W) of a view, or of all points (N,) of a cloud."""
-    labels = observation.labels
-    shape = source.depth.shape if isinstance(source, View) else (len(source),)
-    image = np.zeros(shape, dtype=np.int32)
-    image.ravel()[observation.pixels] = labels
+    image = np.zeros(source.depth.shape if isinstance(source, View) else len(source), dtype=np.int32)
+    image.ravel()[observation.pixels] = observation.labels
     return image
 
 
@@ -170,11 +146,13 @@ def _points(
     return Cloud(points, normals, None, rgb, eye, source.name), pixels
 
 
-def levelled(view: View, config: Config, rng: np.random.Generator, *, use_labels: bool = False) -> View:
-    """Give a view without a pose the world frame of its support plane.
+def level_transform(
+    source: View | Cloud, config: Config, rng: np.random.Generator, *, use_labels: bool = False
+) -> Array:
+    """`T_world_source` (4, 4) by the support plane: of a view without a pose, a cloud in its sensor's frame.
 
     Args:
-        view: Without a pose.
+        source: The view or cloud.
         config: How points and planes are found.
         rng: Draws the hypotheses.
         use_labels: Leave out what belongs to a labelled object.
@@ -182,10 +160,10 @@ def levelled(view: View, config: Config, rng: np.random.Generator, *, use_labels
     Raises:
         PerceptionError: There are no readings, or no support surface.
     """
-    cloud, pixels = _points(view, config)
-    given = np.take(view.labels, pixels) if use_labels and view.labels is not None else None
+    cloud, pixels = _points(source, config)
+    given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     surface = _surface(cloud, given, None, None, config, rng)
-    return view.with_pose(transforms.level_world(surface.normal_world, surface.point_world))
+    return transforms.level_world(surface.normal_world, surface.point_world)
 
 
 def _surface(

@@ -18,15 +18,6 @@ from caryatid.sensing.views import View
 Grid = tuple[slice, slice]
 Labels = NDArray[np.int32]
 
-NORMAL_SIZE = 0.013
-"""Side of the narrow window of a sample's tangent plane, at the objects' median distance [m]; of 5 px at
-least, as fewer leave the noise, and of 13 px at most, as more cost time."""
-WIDE_RADIUS, WIDE_TOLERANCE = 5, 0.004
-"""Radius [px] of the wide window the plane is refined over, and how near its readings lie to the plane [1/m];
-3σ of the sensor at 2 m."""
-MARGIN = 16
-"""Pixels beyond the foreground that gaps may look at [px]."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
@@ -78,13 +69,15 @@ def take_samples(
         config: The grid.
         clouds: How far readings count.
     """
-    rows, columns = np.flatnonzero(foreground.any(axis=1)), np.flatnonzero(foreground.any(axis=0))
-    corner = [max(0, int(i[0]) - MARGIN) // config.stride * config.stride for i in (rows, columns)]
-    ends = int(rows[-1]) + MARGIN + 1, int(columns[-1]) + MARGIN + 1
+    # Gaps may look 16 pixels beyond the foreground.
+    seen = [np.flatnonzero(foreground.any(axis=axis)) for axis in (1, 0)]
+    corner = [max(0, int(index[0]) - 16) // config.stride * config.stride for index in seen]
+    ends = [int(index[-1]) + 17 for index in seen]
     grid = slice(corner[0], ends[0], config.stride), slice(corner[1], ends[1], config.stride)
     places, depth = foreground[grid].copy(), view.depth[grid]
     row, column = np.argwhere(places).T * config.stride + np.array(corner)[:, None]
-    rays = _rays(view.K, row, column)
+    x, y = (column - view.K[0, 2]) / view.K[0, 0], (row - view.K[1, 2]) / view.K[1, 1]
+    rays = np.column_stack([x, y, np.ones(len(row))])
     if view.normals_camera is None:
         scale = view.K[0, 0] / float(np.median(depth[places]))
         planes = _tangent_planes(view, row, column, scale, clouds)
@@ -108,42 +101,29 @@ def take_samples(
     return Samples(grid, places, points, normals, height, depth, rgb, K)
 
 
-def _rays(K: Array, row: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
-    """Directions (N, 3) of pixels, at z = 1."""
-    return np.column_stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1], np.ones(len(row))])
-
-
 def _tangent_planes(
     view: View, row: NDArray[np.intp], column: NDArray[np.intp], scale: float, clouds: CloudConfig
 ) -> Array:
-    """Fit a plane to the surface around each pixel that ends at its creases.
+    """Planes 1/z = c + a·du + b·dv (N, 3) [1/m, 1/m per px] of the surface around pixels, up to its creases.
 
-    Each plane is 1/z = c + a·du + b·dv about its pixel, by least squares: first to the readings of a narrow
-    window that lie near the pixel's own, then in two rounds to those of a wide one that lie near the plane.
-    Where a wide window determines none, the plane stays as it was.
-
-    Args:
-        view: Its readings.
-        row: Of each pixel (N,); all hold a reading.
-        column: Of each pixel (N,).
-        scale: That of the usual object [px/m].
-        clouds: Working range, and which readings are near the pixel's own.
-
-    Returns:
-        c, a, b (N, 3) [1/m, 1/m per px]; zero where readings are too few for a first plane.
+    By least squares: first over the readings of a narrow window that lie near the pixel's own, then in two
+    rounds over those of a wide one that lie near the plane. Where a wide window determines none, the plane
+    stays as it was; where readings are too few for a first plane it is zero. `scale` is that of the usual
+    object [px/m].
     """
-    radius = int(np.clip(np.floor(NORMAL_SIZE * scale / 2.0), 2, 6))
+    # 13 mm at the objects' median distance; fewer than 5 px leave the noise, more than 13 px cost time.
+    radius = int(np.clip(np.floor(0.013 * scale / 2.0), 2, 6))
     radius = min(radius, max(1, round((clouds.normal_size * scale - 1.0) / 2.0)))
     counts = (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
     inverse_depth = np.zeros(view.depth.shape, dtype=np.float32)
     np.divide(np.float32(1.0), view.depth, out=inverse_depth, where=counts)
     shares = np.array_split(np.column_stack([row, column]), SHARES)
-    windows = radius, clouds.edge_jump, clouds.max_slope, WIDE_RADIUS, WIDE_TOLERANCE
+    windows = radius, clouds.edge_jump, clouds.max_slope
     return np.concatenate(on_threads(lambda k: _fit_planes(inverse_depth, shares[k], *windows), SHARES))
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _fit_planes(image, pixels, radius, jump, slope, wide_radius, wide_tolerance):  # type: ignore[no-untyped-def]
+def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-def]
     """Fit the planes (N, 3) of some pixels (N, 2) as `_tangent_planes` says."""
     planes = np.zeros((len(pixels), 3))
     side = 2.0 * radius + 1.0
@@ -154,14 +134,15 @@ def _fit_planes(image, pixels, radius, jump, slope, wide_radius, wide_tolerance)
         # A quarter of the window is needed, less is a corner, or flying; and more than readings on a line.
         known = _refit(image, row, column, radius, jump, slope, 0.25 * side * side, 0.01, plane)
         if not known or plane[0] <= 0.0:
-            plane[:] = 0.0
+            plane[0] = plane[1] = plane[2] = 0.0
             continue
         plane[1] *= own / plane[0]
         plane[2] *= own / plane[0]
         plane[0] = own
         for _ in range(2):
-            # Three times the readings that determine a plane even out their noise, if not on a line.
-            if not _refit(image, row, column, wide_radius, wide_tolerance, 0.0, 9.0, 12.0, plane):
+            # Three times the readings that determine a plane even out their noise, if not on a line. They lie
+            # as near to it as 3σ of the sensor at 2 m.
+            if not _refit(image, row, column, 5, 0.004, 0.0, 9.0, 12.0, plane):
                 break
     return planes
 

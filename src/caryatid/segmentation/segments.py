@@ -19,7 +19,6 @@ from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.lccp import (
     convex_parts,
-    convex_together,
     grid_edges,
     hollowness,
     number_by_appearance,
@@ -28,13 +27,11 @@ from caryatid.segmentation.lccp import (
 from caryatid.segmentation.samples import Samples, take_samples
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
+from caryatid.sensing.visibility import depth_behind
 
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
-OTHER_COLOUR = 0.08
-"""Distance between the mean shares of red, green and blue beyond which two plain colours differ [1]; a plain
-one spreads by a quarter of it."""
 MEETING = 5
 """Rows and columns of samples on which two parts must meet to be taken for one [1]; 3 cm at 1.5 m."""
 
@@ -140,15 +137,9 @@ def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-unt
 def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labels:
     """Cut parts that consist of plainly coloured pieces with straight borders, and of hardly anything else.
 
-    This tells flush boxes apart. A printed box has more colours, or borders all over; it stays whole.
-
-    Args:
-        labels: Parts (H, W), 1 … n, 0 = none.
-        rgb: Colours (H, W, 3).
-        min_size: Pixels a piece needs.
-
-    Returns:
-        Parts (H, W); pieces that are cut off have numbers above n.
+    This tells flush boxes apart. A printed box has more colours, or borders all over; it stays whole. Parts
+    are an image (H, W), 1 … n, and so are colours (H, W, 3); pieces that are cut off, of `min_size` pixels at
+    least, get numbers above n.
     """
     result = labels.copy()
     shares: Array = rgb.astype(np.float64) + 1.0
@@ -162,7 +153,8 @@ def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labe
         if len(pieces) < 2 or sizes[pieces].sum() < 0.9 * sizes[part_of == part].sum():
             continue
         colours = {k: shares[patch == k] for k in pieces.tolist()}
-        if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours.values()) > OTHER_COLOUR / 4.0:
+        # A plain colour spreads by a quarter of what sets two apart, 0.08.
+        if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours.values()) > 0.02:
             continue
         loose = ~np.isin(patch, pieces)
         nearest = ndimage.distance_transform_edt(loose, return_distances=False, return_indices=True)
@@ -183,7 +175,7 @@ def _colour_patches(labels: Labels, shares: Array) -> NDArray[np.intp]:
     up, left = np.s_[:-1], np.s_[:, :-1]
     for here, there, between in ((down, up, np.s_[1::2, ::2]), (right, left, np.s_[::2, 1::2])):
         step = shares[here] - shares[there]
-        alike = np.einsum("hwc,hwc->hw", step, step) < (OTHER_COLOUR / 2.0) ** 2
+        alike = np.einsum("hwc,hwc->hw", step, step) < 0.04**2
         connected[between] = alike & (labels[here] == labels[there]) & (labels[here] > 0)
     return np.asarray(ndimage.label(connected)[0][::2, ::2], dtype=np.intp)
 
@@ -195,7 +187,7 @@ def _borders_are_clean(piece_of: NDArray[np.intp], colours: dict[int, Array]) ->
         if len(border) < 3:
             continue
         bend, length = np.sqrt(np.linalg.eigvalsh(np.cov(border.T)))
-        alike = np.linalg.norm(colours[first] - colours[second]) <= OTHER_COLOUR
+        alike = np.linalg.norm(colours[first] - colours[second]) <= 0.08
         if alike or bend > 1.0 + length / 4.0:  # Round bodies bend their borders more.
             return False
     return True
@@ -212,17 +204,8 @@ def merge_occluded(
 
     The inside of a bowl belongs to the outside whose rim it ends at. Two parts are one object when a nearer
     surface hides what would lie between them, neither rises above the other's tangent planes, a single shape
-    explains as many samples of both as the shape of each does, and that shape fills no space seen empty.
-
-    Args:
-        samples: Samples N of a view.
-        part: Part of each (N,), 0 = none.
-        config: Tolerances.
-        fit_config: Limits of the shapes.
-        rng: Draws the samples of the fits.
-
-    Returns:
-        The parts (N,) with the number of the larger where two were merged.
+    explains as many samples of both as the shape of each does, and that shape fills no space seen empty. The
+    parts (N,) of samples get the number of the larger where two are merged.
     """
     part = _insides_merged(samples, part)
     inverse_depth = _inverse_depth(samples, part > 0)
@@ -233,7 +216,7 @@ def merge_occluded(
         pairs = [
             pair
             for pair in _hidden_pairs(samples, part, inverse_depth, config)
-            if pair not in refused and _is_convex(samples, part, pair, config)
+            if pair not in refused and _convex_together(samples, part, pair, config)
         ]
         asked = list(dict.fromkeys(key for a, b in pairs for key in ((a,), (b,), (a, b))))
         masks = [np.isin(part, key) for key in asked]
@@ -305,16 +288,30 @@ def _hidden_pairs(
     return [(a, b) if (sizes[a], b) < (sizes[b], a) else (b, a) for a, b in pairs]
 
 
-def _is_convex(samples: Samples, part: Labels, pair: tuple[int, int], config: SegmentationConfig) -> bool:
-    """Whether hardly a sample of one part rises above the planes of the other; creases are rounded."""
+def _convex_together(
+    samples: Samples, part: Labels, pair: tuple[int, int], config: SegmentationConfig
+) -> bool:
+    """Whether hardly a sample of one part rises above the tangent plane of one of the other.
+
+    It may by a height, and by an angle as normals err; creases are rounded.
+    """
     own = [np.flatnonzero(part == number) for number in pair]
     first, second = (index[:: max(1, len(index) // 60)] for index in own)
-    return convex_together(samples.points_camera, samples.normals_camera, first, second, 0.1, config)
+    points, normals = samples.points_camera, samples.normals_camera
+    between = points[second] - points[first, None]
+    over = np.einsum("nmi,ni->nm", between, normals[first])
+    under = -np.einsum("nmi,mi->nm", between, normals[second])
+    bend = np.sin(np.radians(config.concavity)) * np.linalg.norm(between, axis=-1)
+    return float((np.maximum(over, under) > config.rise + bend).mean()) <= 0.1
 
 
 def _is_one(joint: Fit | None, alone: list[tuple[Mask, Fit | None]], samples: Samples) -> bool:
     """Whether a shape explains about as many samples of each part as its own and fills nothing seen empty."""
-    if joint is None or _seen_empty(joint.shape, samples) > 0.1:  # Edges fray.
+    if joint is None:
+        return False
+    # Faces towards the camera behind which it saw something; edges fray.
+    behind = depth_behind(joint.shape, samples.depth, samples.K)
+    if len(behind) == 0 or float((behind > 0.02).mean()) > 0.1:
         return False
     return all(
         fit is not None and _explained(joint.shape, samples, own) >= _explained(fit.shape, samples, own) - 0.1
@@ -329,34 +326,12 @@ def _explained(shape: Shape, samples: Samples, own: Mask) -> float:
     return float(((np.abs(distance) < 0.006) & (cosine > 0.7)).mean())
 
 
-def _seen_empty(shape: Shape, samples: Samples) -> float:
-    """Share of the shape's faces towards the camera behind which the camera saw something."""
-    points, outward = shape.surface(0.01)
-    facing = np.einsum("ij,ij->i", points, outward) < 0.0
-    points = points[facing & (points[:, 2] > 0.0)]
-    u, v = np.rint((points @ samples.K.T)[:, :2] / points[:, 2:]).astype(np.intp).T
-    height, width = samples.depth.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    if not inside.any():
-        return 1.0
-    depth = samples.depth[v[inside], u[inside]]
-    return float((depth > points[inside, 2] + 0.02).mean())
-
-
 def occlusion_gaps(labels: Labels, inverse_depth: Array, jump: float, longest: int) -> NDArray[np.intp]:
     """Count the rows and columns on which one part ends, another begins, and all between lies nearer.
 
-    Between, each reading must lie nearer than the line from end to beginning by the jump; a pixel without
-    one says nothing, but one at least must be nearer.
-
-    Args:
-        labels: Parts (H, W), 1 … N, 0 = none.
-        inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
-        jump: How much nearer [1/m].
-        longest: Longest gap that is looked across [px].
-
-    Returns:
-        Counts (N + 1, N + 1), symmetric; row and column 0 are empty.
+    Between, each reading of inverse depth (H, W) [1/m] must lie nearer than the line from end to beginning by
+    the jump [1/m]; a pixel without one, 0, says nothing, but one at least must be nearer. Gaps of up to
+    `longest` pixels are looked across. Of parts (H, W) 1 … N the counts are (N + 1, N + 1), symmetric.
     """
     votes = np.zeros((int(labels.max(initial=0)) + 1,) * 2, dtype=np.intp)
     for image, depth in ((labels, inverse_depth), (labels.T, inverse_depth.T)):

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from caryatid.config import CloudConfig
-from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.points import most_central
 from caryatid.geometry.transforms import Array
@@ -17,8 +16,8 @@ from caryatid.sensing.views import View
 
 Image = NDArray[np.float32]
 
-ZERO, ONE = np.float32(0.0), np.float32(1.0)
-"""Numbers that leave sums in single precision."""
+ZERO = np.float32(0.0)
+"""Leaves sums and comparisons in single precision."""
 
 
 def oriented_points(
@@ -53,11 +52,12 @@ def oriented_points(
         points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
         for_each(_orient, SHARES, (pixels, planes, np.ascontiguousarray(view.K), T, points, normals))
         return points, normals, pixels
-    row, column = np.divmod(pixels, view.depth.shape[1])
-    z = np.take(view.depth, pixels).astype(np.float64)
-    x, y = (column - view.K[0, 2]) / view.K[0, 0] * z, (row - view.K[1, 2]) / view.K[1, 1] * z
-    normals_camera = np.take(given.reshape(-1, 3), pixels, axis=0).astype(np.float64)
-    return transforms.transform(T, np.stack([x, y, z], axis=-1)), transforms.rotate(T, normals_camera), pixels
+    points_camera, normals_camera = view.points_camera.reshape(-1, 3), given.reshape(-1, 3).astype(np.float64)
+    return (
+        transforms.transform(T, points_camera[pixels]),
+        transforms.rotate(T, normals_camera[pixels]),
+        pixels,
+    )
 
 
 def _inverse_depth(
@@ -195,7 +195,7 @@ def _solve(own, sums, enough, a, b, c, variance):  # type: ignore[no-untyped-def
         a[i] = slope_u if known else ZERO
         b[i] = slope_v if known else ZERO
         c[i] = level if known else ZERO
-        variance[i] = max(squares, ZERO) / max(n - np.float32(3.0), ONE) if known else ZERO
+        variance[i] = max(squares, ZERO) / max(n - np.float32(3.0), np.float32(1.0)) if known else ZERO
 
 
 @njit(cache=True)
@@ -254,20 +254,8 @@ def estimate_normals(points: Array, viewpoint: Array, neighbours: int) -> Array:
 
     Returns:
         Unit normals (N, 3).
-
-    Raises:
-        InputError: Points are not (N, 3) and finite.
     """
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise InputError(
-            "points", f"shape {points.shape} with NaN or not (N, 3)", "give finite points (N, 3) [m]"
-        )
-    normals = np.zeros_like(points)
-    if len(points) == 0:
-        return normals
-    tree = cKDTree(points)
-    count = min(max(neighbours, 1), len(points))
+    normals, tree, count = np.zeros_like(points), cKDTree(points), min(neighbours, len(points))
     # Neighbourhoods of some points at a time bound the memory.
     for start in range(0, len(points), 100_000):
         part = slice(start, start + 100_000)
@@ -294,11 +282,5 @@ def thin(points: Array, voxel: float) -> NDArray[np.intp]:
 
     Returns:
         Indices (M,), ascending.
-
-    Raises:
-        InputError: The voxel's size is not positive.
     """
-    if not voxel > 0.0:
-        raise InputError("thin", f"voxel size {voxel:g} is not positive", "give metres above zero")
-    points = np.asarray(points, dtype=np.float64)
     return most_central(points, np.zeros(len(points), dtype=np.int32), np.array([voxel]))

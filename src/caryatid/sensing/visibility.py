@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from caryatid.geometry import transforms
 from caryatid.geometry.rays import Grid, room, traverse
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import for_each
+from caryatid.runtime.parallel import SHARES, for_each
 from caryatid.sensing.views import View
-
-SHARES = 64
-"""Parts the work is dealt out to in turn, so that every thread has as much to do [1]."""
-BEHIND = 0.02
-"""A reading this far behind a point contradicts it [m]; 2σ of registration and depth together."""
 
 
 def shown(
@@ -116,20 +112,29 @@ def _hide(data, found, p, first, end):  # type: ignore[no-untyped-def]
 
 
 def seen_through(shape: Shape, view: View) -> bool:
-    """Whether a view looks through most of where the shape should be.
+    """Whether a view with a pose looks through most of where a shape in the world frame should be."""
+    behind = depth_behind(shape.moved(transforms.invert(view.pose)), view.depth, view.K)
+    read = np.isfinite(behind)
+    # A reading 2 cm behind a point contradicts it: 2σ of registration and depth together.
+    return bool(read.any()) and bool((behind[read] > 0.02).mean() > 0.5)
+
+
+def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
+    """How far readings lie behind the surface of a shape where it faces the camera.
 
     Args:
-        shape: In the world frame.
-        view: A view with a pose.
+        shape: In the camera frame.
+        depth: Readings (H, W) [m], 0 = none.
+        K: Pinhole matrix (3, 3) [px].
+
+    Returns:
+        Of points about 1 cm apart that are in the image (N,) [m]; −inf where there is no reading.
     """
-    points_world, normals_world = shape.surface(0.01)
-    facing = np.sum((view.pose[:3, 3] - points_world) * normals_world, axis=1) > 0.0
-    p = transforms.transform(transforms.invert(view.pose), points_world[facing])
-    p = p[p[:, 2] > 1e-3]
-    u = np.rint(p[:, 0] / p[:, 2] * view.K[0, 0] + view.K[0, 2]).astype(np.intp)
-    v = np.rint(p[:, 1] / p[:, 2] * view.K[1, 1] + view.K[1, 2]).astype(np.intp)
-    height, width = view.depth.shape
+    points, outward = shape.surface(0.01)
+    facing = np.einsum("ij,ij->i", points, outward) < 0.0
+    points = points[facing & (points[:, 2] > 1e-3)]
+    u, v = np.rint((points @ K.T)[:, :2] / points[:, 2:]).astype(np.intp).T
+    height, width = depth.shape
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    depth = view.depth[v[inside], u[inside]]
-    read = depth > 0.0
-    return bool(read.any()) and bool((depth[read] > p[inside, 2][read] + BEHIND).mean() > 0.5)
+    reading = depth[v[inside], u[inside]]
+    return np.where(reading > 0.0, reading - points[inside, 2], -np.inf)

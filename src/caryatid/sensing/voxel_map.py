@@ -23,9 +23,9 @@ from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.signed_distance import local, signed_distance
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import for_each
+from caryatid.runtime.parallel import SHARES, for_each
 from caryatid.sensing.views import View
-from caryatid.sensing.visibility import SHARES, shown
+from caryatid.sensing.visibility import shown
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
@@ -49,12 +49,7 @@ class VoxelMap:
 
     @classmethod
     def around(cls, center_world: ArrayLike, config: VoxelConfig) -> VoxelMap:
-        """Build a map in which nothing is known, around the view sphere's centre.
-
-        Args:
-            center_world: The middle of the table top (3,) [m].
-            config: Size of the map and of its voxels, and the evidence.
-        """
+        """Build a map in which nothing is known, around the middle of the table top (3,) [m]."""
         extent = np.asarray(config.extent, dtype=np.float64)
         shape = tuple(int(n) for n in np.ceil(extent / config.size - 1e-9))
         corner = np.array([-extent[0] / 2.0, -extent[1] / 2.0, -config.below])
@@ -122,12 +117,9 @@ class VoxelMap:
         low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
         low = np.clip(np.floor(low).astype(np.int64), 0, self.hits.shape)
         high = np.clip(np.ceil(high).astype(np.int64), 0, self.hits.shape)
-        some = (low < high).all(axis=1)
-        beyond = max(self.hits.shape)
-        lowest = low[some].min(axis=0, initial=beyond)
-        lowest = np.minimum(lowest, self.occupied.min(axis=1, initial=beyond))
-        highest = high[some].max(axis=0, initial=0)
-        highest = np.maximum(highest, self.occupied.max(axis=1, initial=-1) + 1)
+        some, index = (low < high).all(axis=1), self.occupied.T
+        lowest = np.concatenate([low[some], index]).min(axis=0, initial=max(self.hits.shape))
+        highest = np.concatenate([high[some], index + 1]).max(axis=0, initial=0)
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
         grid[tuple(self.occupied - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
@@ -135,19 +127,13 @@ class VoxelMap:
         return Solid(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
-        """Return the part of the map whose voxels lie, all or in part, between two corners.
-
-        Args:
-            low_world: The lower corner (3,) [m].
-            high_world: The upper corner (3,) [m].
-        """
-        ends = (low_world - self.origin_world, high_world - self.origin_world)
-        low = np.clip(np.floor(ends[0] / self.config.size + 1e-9).astype(int), 0, self.hits.shape)
-        high = np.clip(np.ceil(ends[1] / self.config.size - 1e-9).astype(int), low, self.hits.shape)
+        """Return the part of the map whose voxels lie, all or in part, between two corners (3,) [m]."""
+        size, shape = self.config.size, self.hits.shape
+        low = np.clip(np.floor((low_world - self.origin_world) / size + 1e-9).astype(int), 0, shape)
+        high = np.clip(np.ceil((high_world - self.origin_world) / size - 1e-9).astype(int), low, shape)
         window = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-        origin_world = self.origin_world + self.config.size * low
         hits, passes = (np.ascontiguousarray(counts[window]) for counts in (self.hits, self.passes))
-        return VoxelMap(origin_world, hits, passes, self.config)
+        return VoxelMap(self.origin_world + size * low, hits, passes, self.config)
 
     def centres_world(self, index: NDArray[np.integer]) -> Array:
         """Centres (N, 3) [m] of the voxels with these indices (N, 3)."""
@@ -155,7 +141,7 @@ class VoxelMap:
 
     def state_at(self, points_world: Array) -> NDArray[np.int8]:
         """State (N,) of the voxels that hold points (N, 3) [m]; 0 outside the map."""
-        return values_at(self.states, points_world, self.origin_world, self.config.size)
+        return _values_at(self.states, points_world, self.origin_world, self.config.size)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -175,7 +161,7 @@ class Solid:
     def holds(self, points_world: Array) -> NDArray[np.bool_]:
         """Whether points (N, 3) [m] lie in solid voxels (N,)."""
         solid = self.grid.view(np.int8)
-        return values_at(solid, points_world, self.origin_world, self.voxels.config.size) > 0
+        return _values_at(solid, points_world, self.origin_world, self.voxels.config.size) > 0
 
     def blocked(self, points_world: Array, targets_world: Array, clearance: float) -> NDArray[np.bool_]:
         """Test lines of sight.
@@ -198,18 +184,8 @@ class Solid:
         return free == 0.0
 
 
-def values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
-    """What the voxels of a grid hold at points; 0 outside.
-
-    Args:
-        grid: Its values (X, Y, Z).
-        points: Where to look (N, 3) [m].
-        origin: Corner (3,) [m] of voxel [0, 0, 0].
-        size: Edge of a voxel [m].
-
-    Returns:
-        The values (N,).
-    """
+def _values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
+    """Values (N,) that the voxels of a grid (X, Y, Z) hold at points (N, 3) [m]; 0 outside."""
     index = np.floor((points - origin) / size).astype(np.intp)
     inside = ((index >= 0) & (index < grid.shape)).all(axis=1)
     values = np.zeros(len(index), dtype=np.int8)
