@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 
 from caryatid.geometry.transforms import Array
 
-WORTH_SIFTING = 64
-"""Points above which it takes less time to leave out those far inside than to sort them [1]."""
-
 
 @njit(cache=True, error_model="numpy")
 def hull(points: NDArray[np.float64]) -> Array:
@@ -58,7 +55,7 @@ def _maybe_corners(points: NDArray[np.float64]) -> tuple[Array, int]:
     p = np.empty((count, 2))
     for i in range(count):
         p[i, 0], p[i, 1] = points[i, 0], points[i, 1]
-    if count < WORTH_SIFTING:
+    if count < 64:  # Fewer are sorted in less time.
         return p, count
     # Outermost to the right, the upper right, and so on counter-clockwise.
     outermost = np.zeros(8, dtype=np.int64)
@@ -150,10 +147,7 @@ def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple
 
 @njit(cache=True, error_model="numpy")
 def cap(
-    corners: NDArray[np.float64],
-    edges: NDArray[np.int64],
-    direction: NDArray[np.float64],
-    depth: float,
+    corners: NDArray[np.float64], edges: NDArray[np.int64], direction: NDArray[np.float64], depth: float
 ) -> Array:
     """Outline (K, 2) on the ground of the part of a convex solid near its outermost point along a direction.
 

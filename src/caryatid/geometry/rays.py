@@ -64,7 +64,7 @@ def traverse(
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
-def _clip(start: float, ray: float, count: float, t_from: float, t_to: float) -> tuple[float, float, float]:
+def _clip(start, ray, count, t_from, t_to):  # type: ignore[no-untyped-def]
     """Cut a ray to the grid along one axis: t per voxel, begin and end; nothing where the end is no later."""
     if ray == 0.0:
         return np.inf, t_from, t_to if 0.0 <= start < count else t_from
@@ -74,16 +74,7 @@ def _clip(start: float, ray: float, count: float, t_from: float, t_to: float) ->
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _slabs(
-    found: NDArray[np.int32],
-    counts: Triple,
-    strides: Triple,
-    start: Triple,
-    ray: Triple,
-    per_voxel: float,
-    t_from: float,
-    t_to: float,
-) -> int:
+def _slabs(found, counts, strides, start, ray, per_voxel, t_from, t_to):  # type: ignore[no-untyped-def]
     """Do as `traverse` does, the axes turned so that the ray goes along the first most."""
     x, y, z = start
     dx, dy, dz = ray

@@ -18,11 +18,6 @@ from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
 
-LINE_POINTS = 33
-"""Points of a straight line that draws a shape [1]; a circle has nearly twice as many."""
-CREASE = 20.0
-"""Turn between two faces of a mesh from which on their common edge is drawn [deg]."""
-
 KINDS: dict[str, type[Shape]] = {}
 """Every kind of shape by its name, as in graph.json."""
 
@@ -102,7 +97,11 @@ class Shape(Pictured):
 
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
-        return Primitives.of([self]).signed_distance(0, points_world)
+        from caryatid.geometry.signed_distance import signed_distances
+
+        points = np.ascontiguousarray(points_world, np.float64)
+        distances: Array = signed_distances(*Primitives.of([self]).row(0), points)
+        return distances
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3): the shape's support function."""
@@ -130,10 +129,10 @@ class Shape(Pictured):
         mesh, T = self.mesh(), self.T_world_object
         eye = transforms.transform(transforms.invert(T), eye_world)
         faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
-        drawn = mesh.face_adjacency_angles > np.radians(CREASE)
+        drawn = mesh.face_adjacency_angles > np.radians(20.0)
         drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
         edges = mesh.vertices[mesh.face_adjacency_edges[drawn]]
-        return [transforms.transform(T, np.linspace(a, b, LINE_POINTS)) for a, b in edges]
+        return [transforms.transform(T, np.linspace(a, b, 33)) for a, b in edges]
 
     def moved(self, T: Array) -> Self:
         """Return the shape moved by a rigid transform (4, 4) of the world: T @ T_world_object."""
@@ -274,7 +273,7 @@ class Cylinder(Shape):
             towards, reach = np.arctan2(eye[1], eye[0]), np.arccos(self.radius / distance)
             for angle in (towards - reach, towards + reach):
                 foot = self.radius * np.array([np.cos(angle), np.sin(angle), 0.0])
-                found.append(np.linspace(ends[0] + foot, ends[1] + foot, LINE_POINTS))
+                found.append(np.linspace(ends[0] + foot, ends[1] + foot, 33))
         return [transforms.transform(T, line) for line in found]
 
 
@@ -377,20 +376,12 @@ class Primitives(NamedTuple):
         reach[balls] = self.half[balls]
         return self.centres - reach, self.centres + reach
 
-    def signed_distance(self, index: int, points_world: Array) -> Array:
-        """Distance (M,) [m] of points (M, 3) to the surface of one shape, negative inside."""
-        from caryatid.geometry.signed_distance import signed_distances
-
-        distances: Array = signed_distances(*self.row(index), np.ascontiguousarray(points_world, np.float64))
-        return distances
-
     def gradient(self, index: int, points_world: Array) -> tuple[Array, Array]:
         """Signed distances (M,) [m] of points (M, 3) to one shape, and their outward directions (M, 3)."""
         from caryatid.geometry.signed_distance import distances_and_gradients
 
-        distances, outward = distances_and_gradients(
-            *self.row(index), np.ascontiguousarray(points_world, np.float64)
-        )
+        points = np.ascontiguousarray(points_world, np.float64)
+        distances, outward = distances_and_gradients(*self.row(index), points)
         return distances, outward @ self.R[index].T
 
     def surface(self, spacings: NDArray[np.float64]) -> tuple[Array, Array, NDArray[np.intp]]:
@@ -446,5 +437,5 @@ def _place(shape: Shape) -> str:
 def _circle(centre: Array, axis: Array, radius: float) -> Array:
     u = transforms.perpendicular(axis)
     v = np.cross(axis, u)
-    angle = np.linspace(0.0, 2.0 * np.pi, 2 * LINE_POINTS - 1)[:, None]
+    angle = np.linspace(0.0, 2.0 * np.pi, 65)[:, None]
     return centre + radius * (np.cos(angle) * u + np.sin(angle) * v)

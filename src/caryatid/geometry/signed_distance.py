@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from caryatid.geometry import CYLINDER, SPHERE
-from caryatid.geometry.transforms import Array
 
 GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 """Angle by which one point of a ball is turned against the last [rad]."""
@@ -28,38 +26,16 @@ def local(R, centre, points, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def signed_distances(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-) -> Array:
-    """Distance (N,) [m] of points (N, 3) to a shape's surface, negative inside; arguments as below."""
+def signed_distances(kind, R, centre, half, points):  # type: ignore[no-untyped-def]
+    """Distances (N,) [m] of points (N, 3) to a shape's surface, negative inside."""
     distance = np.empty(len(points))
     write_distances(kind, R, centre, half, points, distance)
     return distance
 
 
 @njit(cache=True, error_model="numpy")
-def write_distances(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-    distance: NDArray[np.float64],
-) -> None:
-    """Find the distance of points to a shape's surface, negative inside.
-
-    Args:
-        kind: Code of the shape.
-        R: Axes (3, 3), columns = x, y, z of the object.
-        centre: (3,) [m].
-        half: Half extents (3,) [m] along the axes.
-        points: (N, 3) [m].
-        distance: (N,) [m]; written to.
-    """
+def write_distances(kind, R, centre, half, points, distance):  # type: ignore[no-untyped-def]
+    """Do as `signed_distances` does, into an array (N,)."""
     hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
         x, y, z = local(R, centre, points, i)
@@ -67,18 +43,8 @@ def write_distances(
 
 
 @njit(cache=True, inline="always")
-def signed_distance(kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float) -> float:
-    """Signed distance [m] of one point in the object's frame to a shape with these half extents [m].
-
-    Args:
-        kind: Code of the shape.
-        x: x of the point [m].
-        y: Its y.
-        z: Its z.
-        hx: Half extent along x [m].
-        hy: Along y.
-        hz: Along z.
-    """
+def signed_distance(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
+    """Signed distance [m] of one point in the object's frame to a shape with these half extents [m]."""
     if kind == SPHERE:
         return np.sqrt(x * x + y * y + z * z) - hx
     if kind == CYLINDER:
@@ -95,22 +61,8 @@ def signed_distance(kind: int, x: float, y: float, z: float, hx: float, hy: floa
 
 
 @njit(cache=True, error_model="numpy")
-def distances_and_gradients(
-    kind: int,
-    R: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    half: NDArray[np.float64],
-    points: NDArray[np.float64],
-) -> tuple[Array, Array]:
-    """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame.
-
-    Args:
-        kind: Code of the shape.
-        R: Its axes (3, 3).
-        centre: Its centre (3,) [m].
-        half: Its half extents (3,) [m].
-        points: (N, 3) [m].
-    """
+def distances_and_gradients(kind, R, centre, half, points):  # type: ignore[no-untyped-def]
+    """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame."""
     distance = np.empty(len(points))
     gradients = np.empty((len(points), 3))
     hx, hy, hz = half[0], half[1], half[2]
@@ -121,20 +73,8 @@ def distances_and_gradients(
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def gradient(
-    kind: int, x: float, y: float, z: float, hx: float, hy: float, hz: float
-) -> tuple[float, float, float, float]:
-    """Signed distance [m] of one point in the object's frame, and its gradient there.
-
-    Args:
-        kind: Code of the shape.
-        x: x of the point [m].
-        y: Its y.
-        z: Its z.
-        hx: Half extent along x [m].
-        hy: Along y.
-        hz: Along z.
-    """
+def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
+    """Signed distance [m] of one point in the object's frame, and its gradient (3) there."""
     if kind == SPHERE:
         length = np.sqrt(x * x + y * y + z * z)
         inverse = 1.0 / max(length, 1e-12)
@@ -164,24 +104,12 @@ def gradient(
 
 
 @njit(cache=True, error_model="numpy")
-def sample_surfaces(
-    kinds: NDArray[np.int64],
-    R: NDArray[np.float64],
-    centres: Array,
-    half: Array,
-    spacings: NDArray[np.float64],
-) -> tuple[Array, Array, NDArray[np.intp]]:
-    """Spread points over the surfaces of S shapes, one after the other, as each one's `surface` does.
-
-    Args:
-        kinds: Codes (S,).
-        R: Axes (S, 3, 3), columns = x, y, z of the object.
-        centres: (S, 3) [m].
-        half: Half extents (S, 3) [m] along the axes.
-        spacings: About how far apart on each (S,) [m].
+def sample_surfaces(kinds, R, centres, half, spacings):  # type: ignore[no-untyped-def]
+    """Spread points over the surfaces of S shapes, about as far apart on each as `spacings` (S,) [m] says.
 
     Returns:
-        Points (N, 3) [m], outward unit normals (N, 3), and how many are on each shape (S,).
+        Points (N, 3) [m], one shape after the other, outward unit normals (N, 3), and how many are on each
+        shape (S,).
     """
     most = 0
     for s in range(len(kinds)):
@@ -216,21 +144,13 @@ def sample_surfaces(
 
 
 @njit(cache=True, error_model="numpy")
-def _cells(half: float, spacing: float) -> int:
+def _cells(half, spacing):  # type: ignore[no-untyped-def]
     """How many equal cells cover [−half, half]."""
     return max(2, int(np.ceil(2.0 * half / spacing)))
 
 
 @njit(cache=True, error_model="numpy")
-def _face(
-    points: Array,
-    normals: Array,
-    start: int,
-    half: NDArray[np.float64],
-    face: int,
-    spacing: float,
-    disc: bool,
-) -> int:
+def _face(points, normals, start, half, face, spacing, disc):  # type: ignore[no-untyped-def]
     """Write the points of face −x, +x, −y, …, or of the disc within it, and return the row after the last."""
     axis, sign = face // 2, 2.0 * (face % 2) - 1.0
     n, u, v = start, (axis + 1) % 3, (axis + 2) % 3
@@ -248,9 +168,7 @@ def _face(
 
 
 @njit(cache=True, error_model="numpy")
-def _mantle(
-    points: Array, normals: Array, start: int, radius: float, half_height: float, spacing: float
-) -> int:
+def _mantle(points, normals, start, radius, half_height, spacing):  # type: ignore[no-untyped-def]
     """Write the points of a cylinder's mantle and return the row after the last."""
     n, around = start, max(8, int(np.rint(2.0 * np.pi * radius / spacing)))
     up = _cells(half_height, spacing)
@@ -266,7 +184,7 @@ def _mantle(
 
 
 @njit(cache=True, error_model="numpy")
-def _ball(points: Array, normals: Array, start: int, radius: float, spacing: float) -> int:
+def _ball(points, normals, start, radius, spacing):  # type: ignore[no-untyped-def]
     """Write the points of a ball from a row on and return the row after the last."""
     count = max(20, int(np.rint(4.0 * np.pi * (radius / spacing) ** 2)))
     for n in range(count):

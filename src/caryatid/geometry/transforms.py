@@ -10,6 +10,7 @@ from caryatid.errors import InputError
 Array = NDArray[np.float64]
 """An array of float64; its shape is told where it is used."""
 
+
 RIGID_TOLERANCE = 1e-4
 """How far RᵀR may be from the identity (per entry, no unit) before a matrix is refused as a rotation."""
 
@@ -42,12 +43,7 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
 
 
 def rigid(R: ArrayLike, t: ArrayLike) -> Array:
-    """Put a rotation and a translation together into a transform (4, 4).
-
-    Args:
-        R: Rotation (3, 3).
-        t: Translation (3,) [m].
-    """
+    """Put a rotation (3, 3) and a translation (3,) [m] together into a transform (4, 4)."""
     T = np.eye(4)
     T[:3, :3] = R
     T[:3, 3] = t
@@ -65,22 +61,12 @@ def invert(T_a_b: Array) -> Array:
 
 
 def transform(T_a_b: Array, points_b: Array) -> Array:
-    """Move points (..., 3) [m] from frame b to frame a.
-
-    Args:
-        T_a_b: Rigid transform (4, 4).
-        points_b: Points (..., 3) [m].
-    """
+    """Move points (..., 3) [m] from frame b to frame a by a rigid transform (4, 4)."""
     return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
 
 
 def rotate(T_a_b: Array, vectors_b: Array) -> Array:
-    """Turn vectors (..., 3) from frame b into frame a, without the translation.
-
-    Args:
-        T_a_b: Rigid transform (4, 4).
-        vectors_b: Vectors (..., 3).
-    """
+    """Turn vectors (..., 3) from frame b into frame a by the rotation of a rigid transform (4, 4)."""
     return vectors_b @ T_a_b[:3, :3].T
 
 
@@ -92,12 +78,7 @@ def unit(vectors: ArrayLike) -> Array:
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
-    """Angle (...) between vectors [rad], exact for small and for opposite directions.
-
-    Args:
-        a: Vectors (..., 3), not zero.
-        b: Vectors (..., 3), not zero; broadcast against the others.
-    """
+    """Angle (...) [rad] between vectors (..., 3) that are not zero, exact for small and opposite ones too."""
     u, v = unit(a), unit(b)
     return 2.0 * np.arctan2(np.linalg.norm(u - v, axis=-1), np.linalg.norm(u + v, axis=-1))
 
