@@ -17,7 +17,6 @@ import platform
 import re
 import subprocess
 import sys
-import time
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -39,11 +38,6 @@ log = logging.getLogger(__name__)
 ROOT = Path(__file__).parents[1]
 MARK = "CARYATID_COMPILES"
 """Set in the environment of the processes that warm up: they start no more of their kind."""
-
-PROCESSES = 4
-"""Most processes [1]: more would wait for the kernels that take longest."""
-PATIENCE = 1200.0
-"""A process that takes longer is stopped [s]; far more than a machine busy with other work needs."""
 
 CODE = """
 import sys
@@ -78,7 +72,7 @@ def compile_kernels() -> None:
         log.info("compiling kernels, once after installation: about 30 s")
         for module in wanted.keys() - {name for name, digest in done.items() if wanted.get(name) == digest}:
             # numba itself does not see that a kernel of another module, which this one calls, has changed.
-            source = _source(module)
+            source = ROOT / f"{module.replace('.', '/')}.py"
             for index in cache_of(source.parent).glob(f"{source.stem}.*.nbi"):
                 index.unlink(missing_ok=True)
         _run_processes()
@@ -116,32 +110,28 @@ def cache_of(folder: Path) -> Path:
 
 
 def _run_processes() -> None:
-    """Warm up in several processes, and wait for them."""
+    """Rehearse in several processes, and wait for them."""
     with TemporaryDirectory(prefix="caryatid-compiling-") as work:
         processes: list[subprocess.Popen[bytes]] = []
-        end = time.monotonic() + PATIENCE
         try:
-            for number in range(min(cores(), PROCESSES)):
-                with open(Path(work) / f"{number}.log", "wb") as output:
-                    process = subprocess.Popen(
-                        [sys.executable, "-P", "-c", CODE, str(ROOT.parent), work, str(number)],
-                        env=os.environ | {MARK: "1", "NUMBA_NUM_THREADS": "1"},
-                        stdin=subprocess.DEVNULL,
-                        stdout=output,
-                        stderr=output,
-                        process_group=0,  # Ctrl-C reaches this process only.
-                    )
-                    processes.append(process)
+            for number in range(min(cores(), 4)):  # more would wait for the kernels that take longest
+                process = subprocess.Popen(
+                    [sys.executable, "-P", "-c", CODE, str(ROOT.parent), work, str(number)],
+                    env=os.environ | {MARK: "1", "NUMBA_NUM_THREADS": "1"},
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    process_group=0,  # Ctrl-C reaches this process only.
+                )
+                processes.append(process)
             for process in processes:
-                process.wait(max(end - time.monotonic(), 0.0))
+                process.wait(1200.0)  # [s], far more than a machine busy with other work needs
         except (OSError, subprocess.TimeoutExpired) as error:
             log.debug("kernels are compiled at their first calls: %s", error)
         finally:
             for process in processes:
                 process.kill()
                 process.wait()
-        for output_file in sorted(Path(work).glob("*.log")):
-            log.debug("%s", output_file.read_text(encoding="utf-8", errors="replace"))
 
 
 def _take_turns(folder: Path) -> None:
@@ -171,10 +161,6 @@ def _take_turns(folder: Path) -> None:
         lock_of(self).release()
 
     FunctionCache.load_overload, FunctionCache.save_overload = load_or_lock, save_and_unlock
-
-
-def _source(module: str) -> Path:
-    return ROOT / f"{module.replace('.', '/')}.py"
 
 
 def _digests() -> dict[str, str]:
