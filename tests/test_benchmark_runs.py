@@ -166,73 +166,58 @@ def test_a_second_run_on_a_folder_is_refused_and_reading_is_not(started, tmp_pat
 # Processes of this machine
 
 
-def test_rows_are_the_same_on_any_number_of_processes(monkeypatch):
-    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    before = dict(os.environ)
+def test_rows_are_the_same_on_any_number_of_processes():
     suite = change_suite(SUITES["smoke"], planners=["support", "random"])
     suite = replace(suite, scenes=("tower", "dense-99-1"), seeds=1, views=2)
     episodes = [replace(m.episode, settings=QUICK) for m in suite.members()]
     found = [{e: without_times(o) for e, o in run_locally(episodes, jobs)} for jobs in (1, 2)]
     assert found[0] == found[1]
     assert [found[0][e].error is None for e in episodes] == [True, True, False, False]
-    assert dict(os.environ) == before
 
 
 # Workers of a cluster
-
-LOCAL = ["--host", "127.0.0.1", "--no-dashboard"]
 
 
 class Cluster:
     """A scheduler of dask.distributed on a free port, with workers that can be killed."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        folder.mkdir()
-        self._processes: list[subprocess.Popen[bytes]] = []
-        self.scheduler = self._start(
-            "scheduler", *LOCAL, "--port=0", f"--scheduler-file={folder / 'address'}"
-        )
+        self.folder = folder
+        self.processes: list[subprocess.Popen[bytes]] = []
         self.address = ""
-
-    def wait_for_scheduler(self) -> None:
-        file = self._folder / "address"
+        folder.mkdir()
+        self.scheduler = self.start("scheduler", "--port=0", f"--scheduler-file={folder / 'address'}")
         while not self.address:
-            assert self.scheduler.poll() is None, (self._folder / "0.log").read_text()
+            assert self.scheduler.poll() is None, (folder / "0.log").read_text()
             time.sleep(0.05)
             with suppress(FileNotFoundError, json.JSONDecodeError):
-                self.address = json.loads(file.read_text())["address"]
+                self.address = json.loads((folder / "address").read_text())["address"]
 
     def add_worker(self, threads: int = 1, code: Path | None = None) -> subprocess.Popen[bytes]:
-        options = [*LOCAL, "--no-nanny", f"--nthreads={threads}"]
-        return self._start("worker", self.address, *options, code=code)
+        return self.start("worker", self.address, "--no-nanny", f"--nthreads={threads}", code=code)
+
+    def start(self, what: str, *options: str, code: Path | None = None) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--host=127.0.0.1", "--no-dashboard"]
+        paths = {"PYTHONPATH": str(code or Path(caryatid.__file__).parents[1])}
+        paths["DASK_TEMPORARY_DIRECTORY"] = str(self.folder)
+        with (self.folder / f"{len(self.processes)}.log").open("wb") as log:
+            process = subprocess.Popen(
+                [*command, *options], stdout=log, stderr=log, cwd=self.folder, env=os.environ | paths
+            )
+        self.processes.append(process)
+        return process
 
     def end(self) -> None:
-        for process in self._processes:
+        for process in self.processes:
             process.kill()
-        for process in self._processes:
             process.wait()
-
-    def _start(self, what: str, *options: str, code: Path | None = None) -> subprocess.Popen[bytes]:
-        source = code or Path(caryatid.__file__).parents[1]
-        environment = {"PYTHONPATH": str(source), "DASK_TEMPORARY_DIRECTORY": str(self._folder)}
-        with (self._folder / f"{len(self._processes)}.log").open("wb") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", f"distributed.cli.dask_{what}", *options],
-                stdout=log, stderr=log, cwd=self._folder, env={**os.environ, **environment},
-            )  # fmt: skip
-        self._processes.append(process)
-        return process
 
 
 @pytest.fixture
 def cluster(tmp_path):
     started = Cluster(tmp_path / "cluster")
-    try:
-        started.wait_for_scheduler()
-        yield started
-    finally:
-        started.end()
+    yield started
+    started.end()
 
 
 def test_a_run_that_loses_a_worker_is_complete_and_the_same(cluster, tmp_path, scene_file, monkeypatch):
@@ -315,16 +300,13 @@ def test_an_address_where_nobody_answers_says_what_to_do():
             connect(address, 0.5)
 
 
-def test_without_dask_the_remedy_is_told(monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r'needs dask\.distributed; pip install "caryatid\[cluster\]"'):
-        connect("tcp://127.0.0.1:1")
-
-
-def test_a_cluster_has_the_processes_it_has(tmp_path, capsys):
+def test_without_dask_or_with_jobs_the_remedy_is_told(tmp_path, capsys, monkeypatch):
     command = ["benchmark", "--suite", "smoke", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"]
     assert run_command(*command, "--out", tmp_path / "out") == 1
     assert "--jobs: a cluster has its own workers; leave --jobs or" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r'needs dask\.distributed; pip install "caryatid\[cluster\]"'):
+        connect("tcp://127.0.0.1:1")
 
 
 def test_a_scene_folder_must_be_the_same_on_the_worker(scene_file, tmp_path):

@@ -36,18 +36,17 @@ class Lift:
     """What came of a lift.
 
     Attributes:
-        state: State (N, 7) afterwards.
-        distance: Farthest (N,) [m] each object was from where it had been; 0 for what was lifted or gone.
-        angle: The most (N,) [rad] each was turned.
-        disturbed: Which objects (N,) were moved or turned beyond the limits.
+        disturbed: Which objects (N,) were moved or turned beyond the limits; not what was lifted or gone.
         film: States (T, N, 7) on the way, one each quarter of a second.
     """
 
-    state: Array
-    distance: Array
-    angle: Array
     disturbed: NDArray[np.bool_]
     film: Array
+
+    @property
+    def state(self) -> Array:
+        """State (N, 7) afterwards."""
+        return np.asarray(self.film[-1])
 
 
 class Lifting:
@@ -103,27 +102,24 @@ class Lifting:
         watched[index] = False
         data = self._data(state, [*held, index])
         lifted = self._rise(data, watched, index) / config.speed
-        distance, angle = np.zeros(len(state)), np.zeros(len(state))
+        disturbed = np.zeros(len(state), dtype=np.bool_)
         film: list[Array] = []
         for speed, seconds in ((config.speed, lifted), (0.0, config.watch)):
             segments = max(1, int(np.ceil(seconds / 0.25)))  # what falls is seen falling
             for _ in range(segments):
-                now = self._after(data, speed, seconds / segments, index)
-                moved, turned = displacement(state[watched], now[watched])
-                distance[watched] = np.maximum(distance[watched], moved)
-                angle[watched] = np.maximum(angle[watched], turned)
-                film.append(now)
-                disturbed = _beyond(distance, angle, config)
+                film.append(self._after(data, speed, seconds / segments, index))
+                disturbed |= watched & self.strayed(state, film[-1], config)
                 done = disturbed.any() or (speed == 0.0 and _at_rest(film))
                 if done and not to_the_end:
-                    return Lift(now, distance, angle, disturbed, np.array(film))
+                    return Lift(disturbed, np.array(film))
             if speed > 0.0:
                 self._put_aside(data, index)
-        return Lift(now, distance, angle, disturbed, np.array(film))
+        return Lift(disturbed, np.array(film))
 
     def strayed(self, before: Array, after: Array, config: LiftConfig) -> NDArray[np.bool_]:
         """Which objects (N,) moved or turned beyond the limits between two states (N, 7)."""
-        return _beyond(*displacement(before, after), config)
+        distance, angle = displacement(before, after)
+        return (distance > config.moved) | (angle > np.deg2rad(config.turned))
 
     def _data(self, state: Array, grasped: Collection[int]) -> Any:
         """MuJoCo's data for a state; what is grasped, or aside, is held where it is."""
@@ -198,7 +194,3 @@ def _at_rest(film: Sequence[Array]) -> bool:
     """Whether nothing lately moved by 0.2 mm or turned by 0.2°: contacts creep as slowly."""
     distance, angle = displacement(*film[-2:])
     return bool((distance < 2e-4).all() and (angle < np.deg2rad(0.2)).all())
-
-
-def _beyond(distance: Array, angle: Array, config: LiftConfig) -> NDArray[np.bool_]:
-    return (distance > config.moved) | (angle > np.deg2rad(config.turned))

@@ -19,12 +19,10 @@ class Simulation:
     """What `explore` needs of a simulation.
 
     Attributes:
-        scene: The scene in physics.
-        camera: Gives views of it.
+        camera: Gives views of the scene.
         robot: Stands where the first view is taken.
     """
 
-    scene: SimulatedScene
     camera: SimulatedCamera
     robot: Robot
 
@@ -56,4 +54,4 @@ def make_simulation(
     made = make(Surroundings(centre, floor, config))
     made.move_to(home_view(made, ViewSphere.around(centre, config.active), config.robot))
     camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor)
-    return Simulation(scene, camera, made)
+    return Simulation(camera, made)
