@@ -8,7 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from synthetic import box, cylinder, motion_about_vertical, sphere, surface_points
+from synthetic import box, cylinder, sphere, surface_points
 from test_fitting import BROKEN_POINTS as POINTS
 from test_fitting import UP as NORMALS
 
@@ -169,14 +169,6 @@ def test_a_view_that_is_off_leaves_a_layer_and_no_second_object():
     assert apart[0.007] <= 1
 
 
-def test_the_division_turns_with_the_scene():
-    points, normals, truth = points_of(STACKED)
-    T = motion_about_vertical(np.random.default_rng(5))
-    groups = divided(transforms.transform(T, points), transforms.rotate(T, normals))
-    assert groups is not None
-    assert agreement(groups, truth) > 0.9
-
-
 def cloud_of(shape, eye=EYE, seed=0):
     points, normals = surface_points(shape, np.random.default_rng(seed), eye=eye, spacing=0.006, sigma=0.001)
     return Cloud(points, normals)
@@ -226,13 +218,9 @@ def test_neighbours_that_touch_are_two_objects():
     assert pair_of({1: cloud_of(CRATE), 2: can, 3: beside}) is None
 
 
-def test_what_did_not_change_is_not_looked_at():
+def test_two_are_looked_at_again_when_they_have_changed_and_grown():
     left, right = halves(CRATE)
     assert pair_of({1: left, 2: right}, changed=set()) is None
-
-
-def test_two_are_looked_at_again_when_they_have_grown():
-    left, right = halves(CRATE)
     apart = {(1, 2): 10 * len(left)}
     assert pair_of({1: left, 2: right}, apart=apart) is None
     assert pair_of({1: left, 2: right}, apart={(1, 2): 10}) is not None

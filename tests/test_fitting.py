@@ -121,30 +121,6 @@ def test_that_points_come_in_rows_does_not_show(columns):
         np.testing.assert_allclose(np.sort(boxes[0].shape.extents)[1:], (0.1, 0.12), atol=0.002)
 
 
-def test_a_round_end_alone_makes_a_disc_more_often_than_not():
-    """A square slab costs hardly more: what tells them apart is in the twelfth of the points at the rim."""
-    shape = cylinder((0.0, 0.0, 0.0), 0.05, 0.1)
-    discs = []
-    for seed in range(12):
-        points, normals = surface_points(shape, np.random.default_rng(seed), spacing=0.003, sigma=0.001)
-        top = normals[:, 2] > 0.9
-        found = fit_of(points[top], normals[top], seed=seed).shape
-        assert found.extents[2] == pytest.approx(CONFIG.min_extent, abs=0.002)
-        if isinstance(found, Cylinder):
-            assert found.radius == pytest.approx(0.05, abs=0.003)
-            assert abs(found.T_world_object[2, 2]) > 0.999
-            discs.append(seed)
-    assert len(discs) > 6
-
-
-def test_the_candidates_are_one_of_each_kind_the_cheapest_first():
-    points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE, sigma=0.001)
-    fits = candidates_of(points, normals)
-    assert [f.cost for f in fits] == sorted(f.cost for f in fits)
-    assert len({f.shape.kind for f in fits}) == len(fits) >= 2
-    assert fits[0].shape.kind == "box"
-
-
 def test_what_is_no_single_shape_is_called_a_poor_fit():
     rng = np.random.default_rng(0)
     bars = [box((0.0, 0.0, 0.0), (0.2, 0.02, 0.02)), box((0.09, 0.09, 0.06), (0.02, 0.2, 0.02))]
@@ -163,6 +139,8 @@ def test_too_few_points_are_a_failure_that_says_so(count):
     result = fit(points[:count], normals[:count], config=CONFIG, rng=np.random.default_rng(0))
     assert isinstance(result, FitFailure)
     assert result.reason == f"{count} points are fewer than the {CONFIG.min_points} a shape needs"
+    points[count:] = np.nan
+    assert fit(points, normals, config=CONFIG, rng=np.random.default_rng(0)) == result
 
 
 def test_nothing_is_bigger_than_what_stands_on_a_table():
@@ -187,14 +165,6 @@ def test_the_same_seed_gives_the_same_shape_to_the_last_bit():
     np.testing.assert_array_equal(first.T_world_object, again.T_world_object)
     np.testing.assert_array_equal(first.extents, again.extents)
     assert not np.array_equal(first.extents, other.extents)
-
-
-def test_points_handed_in_stay_as_they_are():
-    points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE)
-    kept = points.copy(), normals.copy()
-    fit_of(points, normals)
-    np.testing.assert_array_equal(points, kept[0])
-    np.testing.assert_array_equal(normals, kept[1])
 
 
 def same(a, b):
@@ -223,13 +193,9 @@ def test_only_the_shapes_that_are_asked_for_are_tried(kind, shape):
     only = replace(CONFIG, shapes=(kind,))
     assert [f.shape.kind for f in candidates_of(points, normals, only)] == [kind]
     assert fit_of(points, normals, only).shape.kind == kind
-
-
-def test_the_order_in_which_shapes_are_named_decides_nothing_but_the_samples():
-    points, normals = surface_points(SHAPES[0], np.random.default_rng(0), eye=EYE, sigma=0.001)
-    two = replace(CONFIG, shapes=("sphere", "box"))
-    assert sorted(f.shape.kind for f in candidates_of(points, normals, two)) == ["box", "sphere"]
-    assert fit_of(points, normals, two).shape.kind == "box"
+    fits = candidates_of(points, normals)
+    assert [f.cost for f in fits] == sorted(f.cost for f in fits)
+    assert len({f.shape.kind for f in fits}) == len(fits) >= 2
 
 
 # Other frames and layouts
@@ -250,7 +216,7 @@ def test_a_kilometre_away_it_is_the_same_shape(shape):
 def test_arrays_of_any_layout_give_the_same_fit():
     points, normals = surface_points(SHAPES[2], np.random.default_rng(0), eye=EYE, sigma=0.001)
     expected = fit_of(points, normals)
-    points.flags.writeable = normals.flags.writeable = False
+    points.flags.writeable = normals.flags.writeable = False  # What is handed in stays as it is.
     strided = np.repeat(points, 2, axis=0)[::2]
     for p, n in (
         (points, normals),
@@ -319,14 +285,6 @@ def check(points, normals, least):
         assert np.isfinite(deviation).all()
 
 
-def test_a_failure_counts_the_points_that_are_numbers():
-    points, normals = surface_points(SHAPES[0], np.random.default_rng(0))
-    points[5:] = np.nan
-    result = fit(points, normals, config=CONFIG, rng=np.random.default_rng(0))
-    assert isinstance(result, FitFailure)
-    assert result.reason == f"5 points are fewer than the {CONFIG.min_points} a shape needs"
-
-
 INDEPENDENT = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
 """Every point has an error of its own."""
 BOX = box((0.0, 0.0, 0.0), (0.1, 0.14, 0.06), turn_deg=25.0)
@@ -370,14 +328,6 @@ def test_the_end_of_points_is_not_biased_by_their_noise(sigma):
     error, claimed = np.mean(ends, axis=0) - (0.1, 0.0)
     assert abs(error) < 3.0 * claimed / np.sqrt(60)
     assert np.std([e for e, _ in ends]) == pytest.approx(claimed, rel=0.35)
-
-
-def test_a_few_stray_points_do_not_move_the_end():
-    rng = np.random.default_rng(0)
-    points = rng.uniform(0.0, 0.1, 800) + 0.001 * rng.normal(size=800)
-    clean, _ = likeliest_end(points, 0.1, 0.001, 0.01, False)
-    spoilt, _ = likeliest_end(np.append(points, [0.112, 0.12, 0.13]), 0.1, 0.001, 0.01, False)
-    assert abs(spoilt - clean) < 0.0005
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, random_motion, table_object, thing
+from synthetic import box, cylinder, table_object, thing
 
-from caryatid.geometry import transforms
 from caryatid.graph import SUPPORT_SURFACE_ID, Stability, Support, SupportGraph, object_id
 
 CONTACT = np.array([0.01, 0.02, 0.85])
@@ -42,20 +41,6 @@ def test_edges_are_found_by_their_ends_and_have_a_direction():
     assert [s.supporter for s in GRAPH.supporters("o1")] == ["o0", "o2"]
     assert GRAPH.supporters("o0") == []
     assert GRAPH.supports[1].pair == ("o1", "o2")
-
-
-def test_a_moved_graph_is_the_same_graph_elsewhere():
-    T = random_motion(np.random.default_rng(0))
-    there = GRAPH.moved(T)
-    assert [o.id for o in there.objects] == [o.id for o in GRAPH.objects]
-    for before, after in zip(GRAPH.objects, there.objects, strict=True):
-        np.testing.assert_allclose(after.centre_world, transforms.transform(T, before.centre_world))
-    edge = there.support("o1", "o2")
-    np.testing.assert_allclose(edge.contact_world, transforms.transform(T, CONTACT))
-    np.testing.assert_allclose(edge.normal_world, T[:3, 2])
-    assert there.support("o0", "o1").contact_world is None
-    assert there.stability == GRAPH.stability
-    np.testing.assert_array_equal(GRAPH.supports[1].contact_world, CONTACT)
 
 
 def test_as_a_networkx_graph_it_points_from_supporter_to_supported():

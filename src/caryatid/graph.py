@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 from caryatid.fitting.uncertainty import Uncertainty
-from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
@@ -136,19 +135,6 @@ class SupportGraph(Pictured):
         """Edges that end at `object_id`."""
         return [s for s in self.supports if s.supported == object_id]
 
-    def moved(self, T: Array) -> SupportGraph:
-        """Return the graph moved by a rigid transform of the world (4, 4)."""
-        objects = tuple(replace(o, shape=o.shape.moved(T)) for o in self.objects)
-        supports = tuple(
-            replace(
-                s,
-                contact_world=None if s.contact_world is None else transforms.transform(T, s.contact_world),
-                normal_world=None if s.normal_world is None else transforms.rotate(T, s.normal_world),
-            )
-            for s in self.supports
-        )
-        return SupportGraph(objects, supports, self.stability)
-
     def to_networkx(self) -> nx.DiGraph:
         """Return a DiGraph, supporter → supported; nodes and edges carry `data`, the frozen objects here."""
         import networkx as nx
@@ -197,14 +183,3 @@ def object_id(label: int) -> str:
 
 SUPPORT_SURFACE_ID = "o0"
 """Id of the support surface."""
-
-__all__ = [
-    "SUPPORT_SURFACE_ID",
-    "Kind",
-    "Role",
-    "SceneObject",
-    "Stability",
-    "Support",
-    "SupportGraph",
-    "object_id",
-]

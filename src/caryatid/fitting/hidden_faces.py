@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_marquardt, normal_equations
@@ -21,11 +20,6 @@ from caryatid.geometry.transforms import Array, rigid
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
 """Which sides -x, +x, -y, +y, -z, +z of an object points bear out."""
-OPENING = 0.05
-"""How far unseen sides are moved out of the way [m]; beyond all noise."""
-FINAL_POINTS = 3500
-"""Points the last refinement looks at [1]; of 3 mm of noise, four points sharing an error, they leave 0.1 mm
-on a side: far less than the error of registration."""
 
 
 def close_hidden_faces(
@@ -48,17 +42,21 @@ def close_hidden_faces(
         The shape, the mean distance of its points truncated at the threshold [m], the share of them within
         it, and how far off the shape may be.
     """
-    points = points[np.linspace(0, len(points) - 1, min(len(points), FINAL_POINTS)).astype(np.intp)]
+    # Of 3 mm of noise, four points sharing an error, 3500 points leave 0.1 mm on a side: far less than the
+    # error of registration.
+    points = points[np.linspace(0, len(points) - 1, min(len(points), 3500)).astype(np.intp)]
     origin = points.mean(axis=0)
     kind, R, centre, half = Primitives.of([shape]).row(0)
     sides, centre, points = np.array(seen), centre - origin, points - origin
-    # Unseen sides are moved out of the way; a round side is seen as a whole, and a sphere stays.
+    # Unseen sides are moved out of the way, beyond all noise; a round side is seen as a whole, and a sphere
+    # stays.
+    opening = 0.05
     unseen_mantle = kind == CYLINDER and not sides[:4].any()
     flat = np.array([kind == BOX, kind == BOX, kind != SPHERE])
-    low, high = np.where(flat, OPENING * ~sides.reshape(3, 2).T, 0.0)
+    low, high = np.where(flat, opening * ~sides.reshape(3, 2).T, 0.0)
     opened = half + (low + high) / 2.0
     if unseen_mantle:
-        opened[:2] += OPENING
+        opened[:2] += opening
     turned, middle = R.copy(), centre + np.einsum("ab,b->a", R, (high - low) / 2.0)
     levenberg_marquardt(kind, turned, middle, opened, points, config.steps, config.min_extent, 0.0, CONVERGED)
     distance = np.abs(signed_distances(kind, turned, middle, opened, points))
@@ -124,21 +122,13 @@ def _end(
 
 
 @njit(cache=True, error_model="numpy")
-def likeliest_end(
-    coordinates: NDArray[np.float64], start: float, sigma: float, window: float, growing: bool
-) -> tuple[float, float]:
-    """Upper end [m] of points whose density is even up to it, and its standard deviation [m].
+def likeliest_end(coordinates, start, sigma, window, growing):  # type: ignore[no-untyped-def]
+    """Upper end [m] of points (N,) whose density is even up to it, and its standard deviation [m].
 
     With Gaussian noise the density near an end e is c·Φ((e − u)/σ). Its likelihood is greatest where
-    Σ φ(z)/Φ(z) = c·σ with z = (e − u)/σ; c and e are found in turn, c within a window below e. Stray points
-    beyond are taken to be a thousandth as dense.
-
-    Args:
-        coordinates: (N,) [m].
-        start: Where to begin [m], within a few σ of the end.
-        sigma: Standard deviation of the noise along the coordinate [m].
-        window: Length over which the density is measured [m].
-        growing: The density grows with the coordinate, as on a disc along its radius.
+    Σ φ(z)/Φ(z) = c·σ with z = (e − u)/σ; c, in a window [m] below e, and e are found in turn, from a start
+    within a few σ of the end. Stray points beyond are taken to be a thousandth as dense. Along the radius of
+    a disc the density is growing.
     """
     end, density = start, 0.0
     for _ in range(3):  # Both change by a hundredth of σ in the last round.

@@ -16,26 +16,17 @@ NOISE_FLOOR = 0.001
 faces that hold few of the points would be outliers of the others."""
 CONVERGED = 1e-4
 """Least squares end with a step that lowers the cost by less than this share; the rest is far below noise."""
-ROUGHLY = 1e-3
-"""The same where another refinement follows."""
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def levenberg_marquardt(  # type: ignore[no-untyped-def]
     kind, R, centre, half, points, steps, min_extent, shrink, converged
 ):
-    """Minimise the Geman–McClure cost of signed distances of points to a shape.
+    """Minimise the Geman–McClure cost of signed distances of points (N, 3) to a shape.
 
-    Args:
-        kind: Code of the shape.
-        R: Axes (3, 3) at the start; replaced by those of the least cost.
-        centre: (3,) [m] at the start; replaced.
-        half: Half extents (3,) [m] at the start; replaced.
-        points: (N, 3) [m].
-        steps: Maximum number of steps.
-        min_extent: Least extent [m].
-        shrink: Pull on the extents [m].
-        converged: Share of the cost that the last step lowers it by at the most.
+    Its axes (3, 3), centre (3,) and half extents (3,) [m] are replaced by those of the least cost. There is a
+    least extent [m] and a pull `shrink` on the extents [m]; the last step lowers the cost by no more than the
+    share `converged`.
     """
     columns, size = np.empty(9, np.intp), 0
     for a in range(9):
@@ -84,20 +75,11 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def normal_equations(kind, R, centre, half, points, scale, H, g):  # type: ignore[no-untyped-def]
-    """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over the points.
+    """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over points (N, 3).
 
     Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
-    x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6).
-
-    Args:
-        kind: Code of the shape.
-        R: Its axes (3, 3).
-        centre: Its centre (3,) [m].
-        half: Its half extents (3,) [m].
-        points: (N, 3) [m].
-        scale: Width of the cost [m]: a point at this distance weighs a quarter.
-        H: Written to (9, 9).
-        g: Written to (9,).
+    x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6). A point at
+    a distance of `scale` [m] weighs a quarter.
     """
     J = np.empty(9)
     H[:], g[:], J[:] = 0.0, 0.0, 0.0

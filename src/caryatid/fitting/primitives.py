@@ -10,7 +10,7 @@ from numba import njit
 
 from caryatid.config import FitConfig
 from caryatid.fitting.hidden_faces import Seen, close_hidden_faces
-from caryatid.fitting.least_squares import CONVERGED, ROUGHLY, levenberg_marquardt
+from caryatid.fitting.least_squares import CONVERGED, levenberg_marquardt
 from caryatid.fitting.scoring import bare_share, judge
 from caryatid.fitting.search import search
 from caryatid.fitting.uncertainty import Uncertainty
@@ -19,12 +19,6 @@ from caryatid.geometry.shapes import KINDS, Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
-SHRINK = 2e-5
-"""Pull on every extent in the search [m]: keeps sides that hold no points near; the last fit has none."""
-SIZE_PENALTY = 0.0125
-"""Cost [m] per square metre of mean squared extent: 1.25e-4·size² (size in dm)."""
-BARE_WEIGHT = 0.003
-"""Cost of seen sides without any point near them [m]; a share of them in proportion."""
 FREE_WEIGHT = 0.01
 """Cost of a shape whose whole inside was seen free [m]; a share of it in proportion."""
 
@@ -182,9 +176,9 @@ def _finite(points: Array, normals: Array) -> tuple[Array, Array]:
 
 
 def _with_bare(f: Fit, points: Array) -> Fit:
-    """A fit that has paid for sides that should have been seen whole but are bare of points (N, 3)."""
+    """A fit that has paid for the share of the sides seen that is bare of points (N, 3): 3 mm if all are."""
     bare = bare_share(*Primitives.of([f.shape]).row(0), np.array(f.seen), points)
-    return replace(f, cost=f.cost + BARE_WEIGHT * bare)
+    return replace(f, cost=f.cost + 0.003 * bare)
 
 
 def _ranked(
@@ -202,10 +196,13 @@ def _ranked(
     origin = points.mean(axis=0)
     kinds = [KINDS[kind] for kind in config.shapes]
     samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
-    best, score, seen, R, centre, half = _best_of_each(
-        np.array([kind.code for kind in kinds]), points - origin, normals, every, samples,
-        config.polish, config.steps, config.threshold, config.max_radius, config.max_extent,
-        config.min_extent, config.normal_weight, config.min_points,
+    rows = len(kinds), config.polish + 2
+    R, centre, half = np.empty((*rows, 3, 3)), np.empty((*rows, 3)), np.empty((*rows, 3))
+    score, seen = np.full((*rows, 3), np.inf), np.empty((*rows, 6), dtype=np.bool_)
+    best = _best_of_each(
+        np.array([kind.code for kind in kinds]), points - origin, normals, every, samples, config.steps,
+        config.threshold, config.max_radius, config.max_extent, config.min_extent, config.normal_weight,
+        config.min_points, R, centre, half, score, seen,
     )  # fmt: skip
     fits = []
     for number, (kind, row) in enumerate(zip(kinds, best.tolist(), strict=True)):
@@ -220,8 +217,8 @@ def _ranked(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
-    kinds, points, normals, every, samples, polish, steps, threshold, max_radius, max_extent, min_extent,
-    normal_weight, min_points,
+    kinds, points, normals, every, samples, steps, threshold, max_radius, max_extent, min_extent,
+    normal_weight, min_points, R, centre, half, score, seen,
 ):  # fmt: skip
     """Fit each kind of shape: search among every so many of the points, least squares, score by all of them.
 
@@ -230,16 +227,18 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
         points: (N, 3) [m], about the origin.
         normals: Unit normals (N, 3).
         every: Every so many of the points are searched.
-        samples: Pairs (K, B, 2) of those points that hypotheses are made from; what follows is as configured.
+        samples: Pairs (K, B, 2) of those points that hypotheses are made from; then settings as configured.
+        R: Axes (K, S, 3, 3) of S shapes of each kind; written to, and so are the rest. All but two of them
+            are hypotheses from the search, one is of a single face, one the last refinement of the best.
+        centre: (K, S, 3) [m].
+        half: Half extents (K, S, 3) [m].
+        score: Cost [m], infinite at first, mean distance [m] and share of inliers (K, S, 3).
+        seen: Which sides points bear out (K, S, 6).
 
     Returns:
-        Row (K,) of the best shape of each kind, −1 = none; and of all rows (K, S) the cost, the mean distance
-        and the share of inliers (3), the sides seen (6), axes (3, 3), centre (3) and half extents (3).
+        Which of its shapes is the best of each kind (K,); −1 = none.
     """
-    some, facing = points[::every].copy(), normals[::every].copy()
-    shape = len(kinds), polish + 2
-    R, centre, half = np.empty(shape + (3, 3)), np.empty(shape + (3,)), np.empty(shape + (3,))
-    score, seen = np.full(shape + (3,), np.inf), np.zeros(shape + (6,), np.bool_)
+    some, facing, polish = points[::every].copy(), normals[::every].copy(), R.shape[1] - 2
     best, found = np.zeros(len(kinds), np.intp), np.zeros(len(kinds), np.intp)
     within = np.zeros(len(kinds), np.bool_)
     least_seen = max(min_points / 3.0, 0.02 * len(points))  # Points that bear out a side.
@@ -272,20 +271,22 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
                         R[k, first, a, b] = R[k, best[k], a, b]
             elif turn == 3 and not within[k]:
                 best[k] = -1
+            # A small pull on the extents keeps sides that hold no points near; the last fit has none.
             for row in range(first, last):
                 levenberg_marquardt(
-                    kinds[k], R[k, row], centre[k, row], half[k, row], used, steps, min_extent, SHRINK,
-                    CONVERGED if turn == 2 else ROUGHLY,
+                    kinds[k], R[k, row], centre[k, row], half[k, row], used, steps, min_extent, 2e-5,
+                    CONVERGED if turn == 2 else 10.0 * CONVERGED,
                 )  # fmt: skip
                 residual, turned, inliers = judge(
                     kinds[k], R[k, row], centre[k, row], half[k, row], points, normals, threshold, least_seen,
                     min_extent, seen[k, row],
                 )  # fmt: skip
                 x, y, z = half[k, row]
+                # Of the mean squared extent a dm² costs 0.125 mm.
                 size = 4.0 * (x * x + y * y + z * z) / 3.0
-                cost = residual + normal_weight * turned + SIZE_PENALTY * size
+                cost = residual + normal_weight * turned + 0.0125 * size
                 score[k, row, 0] = cost if cost == cost else np.inf
                 score[k, row, 1], score[k, row, 2] = residual, inliers
                 if score[k, row, 0] < score[k, best[k], 0]:
                     best[k] = row
-    return best, score, seen, R, centre, half
+    return best

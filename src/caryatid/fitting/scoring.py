@@ -10,8 +10,6 @@ from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
 from caryatid.geometry.signed_distance import gradient, local
 
-FACING = 0.7
-"""A point bears out the side whose outward normal its own gradient follows with this cosine [1]; 45°."""
 BARE_SPACING = 0.008
 """Spacing of the samples that look for points near a side [m]; a point within twice that is near one."""
 
@@ -31,17 +29,9 @@ def judge(  # type: ignore[no-untyped-def]
 ):
     """Find the sides that points bear out, draw the others in to where the points end, and score the shape.
 
-    Args:
-        kind: Code of the shape.
-        R: Axes (3, 3).
-        centre: (3,) [m]; moved.
-        half: Half extents (3,) [m]; shortened.
-        points: (N, 3) [m].
-        normals: Unit normals (N, 3).
-        threshold: Points nearer to the surface are the shape's [m].
-        least: Points that bear out a side at the least.
-        min_extent: Least extent [m].
-        seen: Whether the sides -x, +x, -y, +y, -z, +z are (6,); written to.
+    Points and unit normals are (N, 3); those nearer than the threshold [m] are the shape's, and a side needs
+    at least `least` of them. Centre (3,) and half extents (3,) [m] change, down to a least extent [m]; `seen`
+    (6,) is written to: whether the sides -x, +x, -y, +y, -z, +z are.
 
     Returns:
         Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, 1 at the most;
@@ -58,8 +48,8 @@ def judge(  # type: ignore[no-untyped-def]
         count += 1
         if gx * facing[i, 0] + gy * facing[i, 1] + gz * facing[i, 2] > 0.5:
             for axis, g in enumerate((gx, gy, gz)):
-                counts[2 * axis] += g < -FACING
-                counts[2 * axis + 1] += g > FACING
+                # A point bears out the side that its own gradient follows within 45°.
+                counts[2 * axis + (g > 0.0)] += abs(g) > 0.7
     for side in range(6):
         seen[side] = counts[side] >= least
     if kind != SPHERE:

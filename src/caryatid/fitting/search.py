@@ -13,10 +13,6 @@ TRIM = 0.005
 """Share of the points beyond each end of an extent that count as noise [1]."""
 LEAST_EXTENT, LEAST_RADIUS = 1e-4, 1e-3
 """Extents of hypotheses are no shorter [m], points on one plane have none across it; no radius is smaller."""
-LEAST_SINE = (0.1, 0.3, 0.5)
-"""Least sine of the angle between two normals that determine a sphere, a cylinder and a box [1]."""
-AGREEING = float(np.cos(np.radians(25.0)))
-"""Least cosine between normals of one face [1]."""
 
 
 @njit(cache=True, error_model="numpy", inline="always")
@@ -25,20 +21,9 @@ def search(  # type: ignore[no-untyped-def]
 ):
     """Score hypotheses until a better one has become unlikely, and keep the best (MSAC).
 
-    Args:
-        kind: Code of the shape.
-        points: (N, 3) [m].
-        normals: Unit normals (N, 3).
-        samples: Indices (B, 2) of the two points each hypothesis is made from, in the order they are tried.
-        keep: How many of the best are kept.
-        threshold: Where distances are truncated [m].
-        max_radius: [m].
-        max_extent: [m].
-        min_extent: [m].
-        R: Axes (K, 3, 3), columns = x, y, z, with K > keep; written to: of the best hypotheses, the best
-            first, and of a shape for points of one face behind them.
-        centre: Centres (K, 3) [m]; written to.
-        half: Half extents (K, 3) [m]; written to.
+    Each is made from a pair of oriented points (N, 3), in the order of the samples (B, 2), and is to keep
+    within the limits [m]. Axes (K, 3, 3), columns = x, y, z, centres (K, 3) and half extents (K, 3) [m] are
+    written to: the best `keep` hypotheses, the best first, and a shape for points of one face behind them.
 
     Returns:
         How many there are; none where nothing is within the limits.
@@ -169,7 +154,7 @@ def _hypothesis(  # type: ignore[no-untyped-def]
         along = ax * bx + ay * by + az * bz
         ux, uy, uz = bx - along * ax, by - along * ay, bz - along * az
         sine = np.sqrt(ux * ux + uy * uy + uz * uz)
-        if sine <= LEAST_SINE[kind]:
+        if sine <= 0.5:
             return False
         _set_axes(R, ux / sine, uy / sine, uz / sine, ax, ay, az, 1)
         centre[:] = 0.0
@@ -181,7 +166,7 @@ def _hypothesis(  # type: ignore[no-untyped-def]
         return 2.0 * max(half[0], half[1], half[2]) <= max_extent
     x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
     sine = np.sqrt(x * x + y * y + z * z)
-    if sine <= LEAST_SINE[kind]:
+    if sine <= (0.3 if kind == CYLINDER else 0.1):
         return False
     x, y, z = x / sine, y / sine, z / sine
     gx, gy, gz = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
@@ -234,18 +219,18 @@ def _range(points, dx, dy, dz):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
 def _main_normal(normals):  # type: ignore[no-untyped-def]
     """The direction most normals (N, 3) agree on, their mean, and which do (N,)."""
-    count = len(normals)
+    count, agreed = len(normals), np.cos(np.radians(25.0))
     best, most = 0, 0
     for i in range(count):
         agreeing = 0
         for j in range(count):
-            agreeing += _cosine(normals, i, j) > AGREEING
+            agreeing += _cosine(normals, i, j) > agreed
         if agreeing > most:
             best, most = i, agreeing
     u = v = w = 0.0
     agree = np.empty(count, np.bool_)
     for j in range(count):
-        agree[j] = _cosine(normals, best, j) > AGREEING
+        agree[j] = _cosine(normals, best, j) > agreed
         if agree[j]:
             u, v, w = u + normals[j, 0], v + normals[j, 1], w + normals[j, 2]
     length = np.sqrt(u * u + v * v + w * w)

@@ -28,17 +28,6 @@ class Uncertainty:
     sizes: Array
     sides: Array
 
-    def along(self, point: Array, direction: Array) -> float:
-        """Standard deviation [m] of where the surface lies, at a point and along a direction.
-
-        Args:
-            point: On or near the surface (3,) [m], in the object's frame.
-            direction: Outward unit vector (3,) there, in the object's frame.
-        """
-        facing = np.where(direction > 0.0, self.sides[1::2], self.sides[0::2])
-        turned = np.cross(point, direction) * self.rotation
-        return float(np.sqrt(np.sum((direction * facing) ** 2) + np.sum(turned**2)))
-
 
 def estimate(
     kind: int,

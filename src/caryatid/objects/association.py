@@ -93,11 +93,8 @@ def _nearest_objects(
         found = np.isfinite(distance)
         nearest[found], gap[found] = owners[index[found]], distance[found]
     for number, shape in enumerate(shapes):
-        if shape is None:
-            continue
-        radius = float(np.linalg.norm(shape.extents)) / 2.0 + reach
-        near = np.flatnonzero(np.linalg.norm(points - shape.T_world_object[:3, 3], axis=1) < radius)
-        distance = np.abs(shape.signed_distance(points[near]))
-        nearer = distance < gap[near]
-        nearest[near[nearer]], gap[near[nearer]] = number, distance[nearer]
+        if shape is not None:
+            distance = np.abs(shape.signed_distance(points))
+            nearer = distance < gap
+            nearest[nearer], gap[nearer] = number, distance[nearer]
     return nearest

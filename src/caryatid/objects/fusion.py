@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import permutations, product
 from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
 from caryatid.config import FusionConfig
 from caryatid.geometry import transforms
@@ -18,17 +18,8 @@ from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGrap
 
 Pair = tuple[str, str]
 
-_TURNS = np.array(
-    [
-        matrix
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-        if np.linalg.det(matrix := np.diag(signs)[:, list(order)]) > 0.0
-    ]
-)
+_TURNS = np.rint(Rotation.create_group("O").as_matrix())
 """The 24 rotations (24, 3, 3) of a cube: ways to name the axes of a box."""
-SIGMAS = 2.0
-"""Standard deviations of centres and extents by which two sightings may differ beyond the tolerances [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -167,53 +158,38 @@ def match(
     if same_labels:
         by_label = {(k.role, k.label): k.id for k in known}
         return {s.id: by_label[s.role, s.label] for s in seen if (s.role, s.label) in by_label}
-    distances = _distances(known, seen, config)
-    cost = np.full(distances.shape, np.inf)
-    for r, c in np.argwhere(distances <= 1.0):
-        cost[r, c] = _difference(known[r], seen[c], float(distances[r, c]), config)
+    cost = np.array([[_difference(k, s, config) for s in seen] for k in known])
     rows, columns = linear_sum_assignment(np.where(np.isfinite(cost), cost, 1e6))
     return {seen[c].id: known[r].id for r, c in zip(rows, columns, strict=True) if np.isfinite(cost[r, c])}
 
 
-def _distances(known: list[SceneObject], seen: list[SceneObject], config: FusionConfig) -> Array:
-    """Distances (K, S) of the centres, as shares of what is tolerated; a table is only ever a table."""
-    (centres, half, sigma, table), other = (
-        (
-            np.array([o.centre_world for o in objects]),
-            np.array([o.shape.extents.min() / 2.0 for o in objects]),
-            np.array([np.linalg.norm(_deviations(o)[0]) for o in objects]),
-            np.array([o.role == "support_surface" for o in objects]),
-        )
-        for objects in (known, seen)
-    )
-    reach = np.maximum(config.max_distance, np.minimum(half[:, None], other[1]))
-    reach += SIGMAS * np.hypot(sigma[:, None], other[2])
-    distances = np.linalg.norm(centres[:, None] - other[0], axis=-1) / reach
-    distances[table[:, None] & other[3]] = 0.0
-    distances[table[:, None] != other[3]] = np.inf
-    return distances
-
-
-def _difference(known: SceneObject, seen: SceneObject, distance: float, config: FusionConfig) -> float:
+def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> float:
     """How different two sightings are: 0 the same, up to 4 within the tolerances, infinite beyond."""
-    if known.role == "support_surface":
-        return 0.0
+    if "support_surface" in (known.role, seen.role):
+        return 0.0 if known.role == seen.role else np.inf
     a, b = known.shape, seen.shape
+    (place, sizes), (other_place, other_sizes) = _unsure(known), _unsure(seen)
+    reach = max(config.max_distance, float(min(a.extents.min(), b.extents.min())) / 2.0)
+    reach += float(np.hypot(np.linalg.norm(place), np.linalg.norm(other_place)))
+    distance = float(np.linalg.norm(known.centre_world - seen.centre_world)) / reach
+    if distance > 1.0:
+        return np.inf
     # Largest ratio of the sorted extents, once what both fits' uncertainty explains is taken off.
     first, second = np.argsort(a.extents, kind="stable"), np.argsort(b.extents, kind="stable")
-    unsure = SIGMAS * np.hypot(_deviations(known)[1][first], _deviations(seen)[1][second])
+    unsure = np.hypot(sizes[first], other_sizes[second])
     excess = np.maximum(np.abs(a.extents[first] - b.extents[second]) - unsure, 0.0)
     ratio = np.max(1.0 + excess / np.minimum(a.extents[first], b.extents[second]))
     kind_differs = a.kind != b.kind
     angle = 0.0 if kind_differs or _is_round(a) else np.degrees(axes_rotation(b, a)[1]) / config.max_angle
     size = float(np.log(ratio) / np.log(config.max_ratio))
     total = distance + size + angle + float(kind_differs)
-    return total if max(distance, size, angle) <= 1.0 else np.inf
+    return total if max(size, angle) <= 1.0 else np.inf
 
 
-def _deviations(o: SceneObject) -> tuple[Array, Array]:
-    """Standard deviations (3,) [m] of the centre and of the extents; zero where they are not known."""
-    return (np.zeros(3),) * 2 if o.uncertainty is None else (o.uncertainty.position, o.uncertainty.sizes)
+def _unsure(o: SceneObject) -> tuple[Array, Array]:
+    """Two standard deviations (3,) [m] of the centre and of the extents; zero where they are not known."""
+    known = o.uncertainty
+    return (np.zeros(3),) * 2 if known is None else (2.0 * known.position, 2.0 * known.sizes)
 
 
 def _is_round(shape: Shape) -> bool:

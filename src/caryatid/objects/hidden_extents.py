@@ -9,7 +9,8 @@ import numpy as np
 
 from caryatid.config import CompletionConfig
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Cylinder, Shape, Sphere
+from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
+from caryatid.geometry.signed_distance import signed_distances
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
 from caryatid.segmentation.support_plane import SupportSurface
@@ -136,20 +137,18 @@ def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, 
 
 def _way_to_others(face: _Face, limit: float, others: Sequence[Shape], config: CompletionConfig) -> float:
     """How far [m] a face can move before it meets another shape, by sphere tracing."""
-    points, outward = face.points_world, face.outward_world
+    points, outward, shapes = face.points_world, face.outward_world, Primitives.of(others)
     middle = points.mean(axis=0)
-    radius = np.linalg.norm(points - middle, axis=1).max()
-    near = []
-    for shape in others:
-        # No ball around a shape that is further than the limit from the one around the face bounds a step.
-        to_centre = shape.T_world_object[:3, 3] - middle
-        ahead = np.clip(to_centre @ outward, 0.0, limit)
-        aside = np.linalg.norm(to_centre - ahead * outward)
-        if aside < limit + radius + np.linalg.norm(shape.extents) / 2.0:
-            near.append(shape)
+    # No ball around a shape that is further than the limit from the one around the face bounds a step.
+    to_centres = shapes.centres - middle
+    ahead = np.clip(to_centres @ outward, 0.0, limit)
+    aside = np.linalg.norm(to_centres - ahead[:, None] * outward, axis=1)
+    radius = np.linalg.norm(points - middle, axis=1).max() + limit
+    near = np.flatnonzero(aside < radius + np.linalg.norm(shapes.half, axis=1)).tolist()
     length = 0.0
     while near and length < limit:
-        gap = min(shape.signed_distance(points + length * outward).min() for shape in near) + config.overlap
+        moved = points + length * outward
+        gap = min(signed_distances(*shapes.row(k), moved).min() for k in near) + config.overlap
         if gap < LEAST:
             return max(length - config.overlap, 0.0)
         length += gap

@@ -32,8 +32,6 @@ Mask = NDArray[np.bool_]
 Hints = Callable[[], Sequence[Mask]]
 Pair = tuple[int, int]
 
-LAYER = 0.009
-"""Points within this of a surface may be of it [m]; a view that is off by 3σ leaves a layer of them."""
 GROWTH = 1.3
 """What was found to be one object, or two, is looked at again when its points have grown by this [1]."""
 
@@ -130,8 +128,9 @@ def _best_two(
 def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
     """Whether one side is only a layer of points on the other's surface, left by a view that is off."""
     sides = evidence.points[two.second], evidence.points[~two.second]
+    # 9 mm: a view that is off by 3σ leaves points that far from a surface.
     return any(
-        other.shape is not None and float((other.shape.signed_distance(side) < LAYER).mean()) >= 0.8
+        other.shape is not None and float((other.shape.signed_distance(side) < 0.009).mean()) >= 0.8
         for side, other in zip(sides, two.explanations, strict=True)
     )
 

@@ -337,8 +337,6 @@ class ObjectModels:
                 cloud.points_world, cloud.normals_world, config=self._config.fit, rng=rng, space=voxels
             )
 
-        if voxels is not None:
-            _ = voxels.states  # Found once, not on each thread.
         for label, result in zip(names, on_threads(fitted, len(names)), strict=True):
             self.fits.pop(label, None)
             if isinstance(result, Fit):

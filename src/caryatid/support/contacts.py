@@ -16,15 +16,12 @@ from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 
-_GEOM_TYPES = np.zeros(3, dtype=np.int32)
+_GEOM_TYPES = {
+    SPHERE: mujoco.mjtGeom.mjGEOM_SPHERE,
+    CYLINDER: mujoco.mjtGeom.mjGEOM_CYLINDER,
+    BOX: mujoco.mjtGeom.mjGEOM_BOX,
+}
 """MuJoCo's number of each kind of shape, by its code."""
-_GEOM_TYPES[[SPHERE, CYLINDER, BOX]] = [
-    mujoco.mjtGeom.mjGEOM_SPHERE,
-    mujoco.mjtGeom.mjGEOM_CYLINDER,
-    mujoco.mjtGeom.mjGEOM_BOX,
-]
-_LEAST_CAPACITY = 16
-"""Shapes that the smallest engine has room for; larger ones for twice as many each."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -70,27 +67,23 @@ def find_contacts(shapes: Sequence[Shape], margin: float | Sequence[float]) -> l
         raise InputError("margin", "is negative or NaN", "give the largest gap of a contact in metres")
     if len(shapes) < 2:
         return []
-    data = _collide(shapes, np.broadcast_to(margins, len(shapes)))
-    order = np.sort(data.contact.geom, axis=1)
-    if not len(order):
+    found = _collide(shapes, np.broadcast_to(margins, len(shapes))).contact
+    geoms = np.sort(found.geom, axis=1)
+    if not len(geoms):
         return []
-    rows = np.lexsort((order[:, 1], order[:, 0]))
-    order = order[rows]
-    starts = np.flatnonzero(np.append(True, (order[1:] != order[:-1]).any(axis=1)))
-    flipped = data.contact.geom[rows, 0] != order[:, 0]
-    normals_world = np.where(flipped, -1.0, 1.0)[:, None] * data.contact.frame[rows, :3]
-    counts = np.diff(starts, append=len(rows))
-    means_world = transforms.unit(np.add.reduceat(normals_world, starts) / counts[:, None])
-    points_world = data.contact.pos[rows]
-    middles_world = np.add.reduceat(points_world, starts) / counts[:, None]
-    gaps = np.minimum.reduceat(data.contact.dist[rows], starts).tolist()
-    pairs, parts = order[starts].tolist(), np.split(points_world, starts[1:])
-    return [
-        Contact(a, b, points, middle_world, normal_world, gap)
-        for (a, b), points, middle_world, normal_world, gap in zip(
-            pairs, parts, middles_world, means_world, gaps, strict=True
-        )
-    ]
+    rows = np.lexsort((geoms[:, 1], geoms[:, 0]))
+    geoms, points_world = geoms[rows], found.pos[rows]
+    starts = np.flatnonzero(np.append(True, (geoms[1:] != geoms[:-1]).any(axis=1)))
+    counts = np.diff(starts, append=len(rows))[:, None]
+    signs = np.where(found.geom[rows, 0] != geoms[:, 0], -1.0, 1.0)
+    normals_world = np.add.reduceat(signs[:, None] * found.frame[rows, :3], starts) / counts
+    columns = (
+        np.split(points_world, starts[1:]),
+        np.add.reduceat(points_world, starts) / counts,
+        transforms.unit(normals_world),
+        np.minimum.reduceat(found.dist[rows], starts).tolist(),
+    )
+    return [Contact(a, b, *rest) for (a, b), *rest in zip(geoms[starts].tolist(), *columns, strict=True)]
 
 
 def local_frames(
@@ -125,59 +118,40 @@ def find_gap(a: Shape, b: Shape) -> float:
     return float(mujoco.mj_geomDistance(data.model, data, 0, 1, apart, np.empty(6)))
 
 
-class _Engine:
-    """A MuJoCo model of free bodies with one geom each, whose shapes and poses are set before each use.
-
-    Args:
-        capacity: How many bodies it has.
-
-    Attributes:
-        model: The compiled model.
-        data: Its state; contacts are read off it.
-    """
-
-    def __init__(self, capacity: int) -> None:
-        spec = mujoco.MjSpec()
-        for _ in range(capacity):
-            body = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)
-            body.add_freejoint()
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=np.ones(3))
-        self.model = spec.compile()
-        self.data = mujoco.MjData(self.model)
-
-    def collide(self, shapes: Primitives, margins: Array) -> mujoco.MjData:
-        """Find all contacts of shapes with margins (N,) [m]; N is at most the capacity."""
-        model, data, count = self.model, self.data, len(shapes.kinds)
-        size = shapes.half.copy()
-        size[shapes.kinds == CYLINDER, 1] = shapes.half[shapes.kinds == CYLINDER, 2]
-        model.geom_type[:count], model.geom_size[:count] = _GEOM_TYPES[shapes.kinds], size
-        model.geom_rbound[:count] = np.linalg.norm(shapes.half, axis=1)
-        model.geom_aabb[:count, 3:] = shapes.half
-        # A pair's margin is the sum of its two geoms'.
-        model.geom_margin[:count] = model.body_margin[1 : count + 1] = margins / 2.0
-        taken = np.arange(model.ngeom) < count
-        model.geom_contype[:], model.geom_conaffinity[:] = taken, taken
-        model.body_contype[1:], model.body_conaffinity[1:] = taken, taken
-        poses = data.qpos[: 7 * count].reshape(count, 7)
-        poses[:, :3] = shapes.centres
-        for pose, R in zip(poses, shapes.R.reshape(count, 9), strict=True):
-            mujoco.mju_mat2Quat(pose[3:], R)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
-        return data
-
-
 def _collide(shapes: Sequence[Shape], margins: Array) -> mujoco.MjData:
     """Run MuJoCo's collision detection on shapes with margins (N,) [m].
 
     The result holds until the next call in the same thread.
     """
-    capacity = max(_LEAST_CAPACITY, 1 << (len(shapes) - 1).bit_length())
-    return _engine(capacity, threading.get_ident()).collide(Primitives.of(shapes), margins)
+    count, (kinds, R, centres, half) = len(shapes), Primitives.of(shapes)
+    model, data = _engine(max(16, 1 << (count - 1).bit_length()), threading.get_ident())
+    size = half.copy()
+    size[kinds == CYLINDER, 1] = half[kinds == CYLINDER, 2]
+    model.geom_type[:count], model.geom_size[:count] = [_GEOM_TYPES[kind] for kind in kinds.tolist()], size
+    model.geom_rbound[:count] = np.linalg.norm(half, axis=1)
+    model.geom_aabb[:count, 3:] = half
+    # A pair's margin is the sum of its two geoms'.
+    model.geom_margin[:count] = model.body_margin[1 : count + 1] = margins / 2.0
+    taken = np.arange(model.ngeom) < count
+    model.geom_contype[:], model.geom_conaffinity[:] = taken, taken
+    model.body_contype[1:], model.body_conaffinity[1:] = taken, taken
+    poses = data.qpos[: 7 * count].reshape(count, 7)
+    poses[:, :3] = centres
+    for pose, axes in zip(poses, R.reshape(count, 9), strict=True):
+        mujoco.mju_mat2Quat(pose[3:], axes)
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    return data
 
 
 @lru_cache(maxsize=8)
-def _engine(capacity: int, thread: int) -> _Engine:
-    """Engine of this size that belongs to one thread: two must not write into the same."""
-    return _Engine(capacity)
+def _engine(capacity: int, thread: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Free bodies with a geom each, set before each use; one per thread, as two must not write to it."""
+    spec = mujoco.MjSpec()
+    for _ in range(capacity):
+        body = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)
+        body.add_freejoint()
+        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=np.ones(3))
+    model = spec.compile()
+    return model, mujoco.MjData(model)

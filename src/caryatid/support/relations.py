@@ -22,11 +22,7 @@ from caryatid.support.stability import (
     contact_patch,
     drop_distance,
     find_tipping,
-    support_polygon,
 )
-
-_LEAN_ANGLE = 75.0
-"""Widest angle between a sideways push and the direction straight against an object's tipping [deg]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -89,7 +85,7 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
         raise InputError("objects", "two of them have the same id", "give every object an id of its own")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
     shapes = Primitives.of([o.shape for o in ordered])
-    touches = _find_touches(ordered, config)
+    touches = _find_touches(ordered, config.reach, config)
     supported = [o for o in ordered if o.role != "support_surface"]
     carried: dict[str, tuple[list[Support], Tipping]] = {}
     stability: dict[str, Stability] = {}
@@ -98,10 +94,9 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
         if not supports:
             near = [ordered[k] for k in beneath(shapes, ordered.index(o), config.max_drop)]
             supports, patches = _let_down(o, near, config)
-        polygon = support_polygon(patches)
-        tipping = find_tipping(o.shape, polygon)
+        tipping = find_tipping(o.shape, patches)
         carried[o.id] = supports, tipping
-        stability[o.id] = assess(o.shape, polygon, tipping, config)
+        stability[o.id] = assess(o.shape, tipping, config)
     edges: list[Support] = []
     for o in supported:
         supports, tipping = carried[o.id]
@@ -142,7 +137,7 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
     a, b = graph[supporter], graph[supported]
     if b.role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
-    touch = next(iter(_find_touches([a, b], config)[b.id]), None)
+    touch = next(iter(_find_touches([a, b], config.reach, config)[b.id]), None)
     head = f"{supporter} does not support {supported}: "
     if touch is None:
         gap = _gap(find_gap(a.shape, b.shape))
@@ -202,14 +197,14 @@ def _next_effect(
     config: SupportConfig,
 ) -> Effect | None:
     """One more object that moves once some are gone: for certain, or perhaps."""
-    losing = [o for o in graph.objects if o.id not in gone and o.id not in known and _lost(graph, o, gone)]
-    if not losing:
-        return None
-    left = infer([o for o in graph.objects if o.id not in gone], config)
-    for o in losing:
-        lost = _lost(graph, o, gone)
+    staying = [o for o in graph.objects if o.id not in gone]
+    losses = [(o, [s for s in graph.supporters(o.id) if s.supporter in gone]) for o in staying]
+    losses = [(o, lost) for o, lost in losses if lost and o.id not in known]
+    left = infer(staying, config) if losses else graph
+    for o, lost in losses:
         named = ", ".join(dict.fromkeys(s.supporter for s in lost))
-        slack = _slack(o)
+        # Two standard deviations by which the fit may be off sideways.
+        slack = 0.0 if o.uncertainty is None else 2.0 * float(np.max(o.uncertainty.position[:2]))
         if not any(s.certain and s.kind == "bottom-up" for s in left.supporters(o.id)):
             overhang, what = np.inf, "nothing else is below it"
         else:
@@ -222,30 +217,12 @@ def _next_effect(
     return None
 
 
-def _lost(graph: SupportGraph, o: SceneObject, gone: Collection[str]) -> list[Support]:
-    return [s for s in graph.supporters(o.id) if s.supporter in gone]
-
-
-def _slack(o: SceneObject) -> float:
-    """How far [m] the fits' uncertainty may shift an object over what carries it: two standard deviations."""
-    return 0.0 if o.uncertainty is None else 2.0 * float(np.max(o.uncertainty.position[:2]))
-
-
-def _find_touches(objects: Sequence[SceneObject], config: SupportConfig) -> dict[str, list[Touch]]:
-    """What touches each object, by id."""
-    touches: dict[str, list[Touch]] = {o.id: [] for o in objects}
-    for a, b, touch in _touching(objects, find_contacts([o.shape for o in objects], config.reach), config):
-        touches[b.id].append(touch)
-        touches[a.id].append(
-            replace(touch, other=b, normal_world=-touch.normal_world, tilt=180.0 - touch.tilt)
-        )
-    return touches
-
-
-def _touching(
-    objects: Sequence[SceneObject], contacts: Sequence[Contact], config: SupportConfig
-) -> list[tuple[SceneObject, SceneObject, Touch]]:
-    """Both objects of each contact, and the contact as the second of them feels it."""
+def _find_touches(
+    objects: Sequence[SceneObject], reach: float, config: SupportConfig
+) -> dict[str, list[Touch]]:
+    """What touches each object, or is nearer than a reach [m], by the object's id."""
+    shapes = [o.shape for o in objects]
+    contacts = find_contacts(shapes, reach)
     normals_world = np.array([_plane_normal(objects[c.a], objects[c.b], c) for c in contacts]).reshape(-1, 3)
     tilts = np.degrees(transforms.angle_between(normals_world, (0.0, 0.0, 1.0)))
     # Shapes touch up to gaps that their fits' uncertainty across the contact explains.
@@ -255,22 +232,19 @@ def _touching(
             sides[k], rotation[k] = o.uncertainty.sides.reshape(3, 2), o.uncertainty.rotation
     pairs = np.array([(c.a, c.b) for c in contacts], dtype=np.intp).reshape(-1, 2)
     points_world = np.array([c.point_world for c in contacts]).reshape(-1, 3)
-    shapes = Primitives.of([o.shape for o in objects])
-    points, outward = local_frames(shapes, pairs, points_world, normals_world)
+    points, outward = local_frames(Primitives.of(shapes), pairs, points_world, normals_world)
     facing = np.where(outward > 0.0, sides[pairs, :, 1], sides[pairs, :, 0])
     spread = (outward * facing) ** 2 + (np.cross(points, outward) * rotation[pairs]) ** 2
     margins = config.margin_sigma * np.sqrt(spread.sum(axis=(1, 2)))
     margins = np.clip(margins, config.contact_margin, config.max_margin)
-    return [
-        (
-            objects[c.a],
-            objects[c.b],
-            Touch(objects[c.a], normal_world, c.distance, tilt, c.points_world, c.point_world, margin),
-        )
-        for c, normal_world, tilt, margin in zip(
-            contacts, normals_world, tilts.tolist(), margins.tolist(), strict=True
-        )
-    ]
+    touches: dict[str, list[Touch]] = {o.id: [] for o in objects}
+    for c, normal_world, tilt, margin in zip(
+        contacts, normals_world, tilts.tolist(), margins.tolist(), strict=True
+    ):
+        a, b, place = objects[c.a], objects[c.b], (c.points_world, c.point_world, margin)
+        touches[b.id].append(Touch(a, normal_world, c.distance, tilt, *place))
+        touches[a.id].append(Touch(b, -normal_world, c.distance, 180.0 - tilt, *place))
+    return touches
 
 
 def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:
@@ -297,12 +271,12 @@ def _from_below(
     supports = [_support(t, o, "bottom-up", True, f"{_below_text(t, o)}.") for t in sure]
     patches = [_patch(t, o, config) for t in sure]
     doubtful = sorted((t for t in below if t not in sure), key=lambda t: t.gap)
-    overhang = find_tipping(o.shape, support_polygon(patches)).overhang if doubtful else 0.0
+    overhang = find_tipping(o.shape, patches).overhang if doubtful else 0.0
     for t in doubtful:
         if overhang <= config.overhang:
             break
         patch = _patch(t, o, config)
-        gained = find_tipping(o.shape, support_polygon([*patches, patch])).overhang
+        gained = find_tipping(o.shape, [*patches, patch]).overhang
         if gained < overhang:
             why = f"{_below_text(t, o)}; without it {_overhang_text(o.id, overhang)}."
             supports.append(_support(t, o, "bottom-up", t.gap <= t.margin, why))
@@ -320,11 +294,8 @@ def _let_down(
         drop = drop_distance(o.shape, other.shape, config.max_drop)
         if np.isfinite(drop):
             lowered = replace(o, shape=o.shape.moved(rigid(np.eye(3), (0.0, 0.0, -drop))))
-            contacts = find_contacts([other.shape, lowered.shape], config.contact_margin)
-            landings += [
-                (drop, lowered, touch) for _, _, touch in _touching([other, lowered], contacts, config)
-            ]
-    landings = [landing for landing in landings if landing[2].tilt <= config.max_tilt]
+            touches = _find_touches([other, lowered], config.contact_margin, config)[o.id]
+            landings += [(drop, lowered, t) for t in touches if t.tilt <= config.max_tilt]
     first = min((drop for drop, _, _ in landings), default=np.inf)
     landings = [landing for landing in landings if landing[0] <= first + config.contact_margin]
     head = f"{o.id} touches nothing below it; let down"
@@ -339,7 +310,7 @@ def _let_down(
 
 def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
     """Leaning supports of an object that tips: who pushes against it, the nearest one if none touches."""
-    push = np.cos(np.radians(_LEAN_ANGLE))
+    push = np.cos(np.radians(75.0))  # A push may come aslant, but not across the direction of tipping.
     aside = [t for t in touches if config.max_tilt < t.tilt < 180.0 - config.max_tilt]
     against = [t for t in aside if t.normal_world[:2] @ tipping.direction_xy < -push]
     against.sort(key=lambda t: t.gap)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -20,14 +21,10 @@ _NO_AREA = 1e-12
 """Contact areas below this are lines and points, blurred by rounding [m²]; a micrometre squared."""
 _HIT = 5e-4
 """A point this near to the other shape has met it [m]."""
-_RING = np.arange(24)
 _EDGES = {
     "box": np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]),
     "cylinder": np.concatenate(
-        [
-            np.stack(e, axis=-1)
-            for e in ((_RING, _RING + 24), (_RING, (_RING + 1) % 24), (_RING + 24, (_RING + 1) % 24 + 24))
-        ]
+        [[(i, i + 24), (i, (i + 1) % 24), (i + 24, (i + 1) % 24 + 24)] for i in range(24)]
     ),
 }
 """Edges (E, 2) between the points of the outline of a box, and of the prism that stands for a cylinder."""
@@ -38,11 +35,13 @@ class Tipping:
     """How the centre of mass lies to the support polygon, in the ground plane.
 
     Attributes:
+        polygon: P_s (M, 2) [m]: the convex hull of the contact areas.
         overhang: How far the centre of mass lies outside [m], negative inside; infinite without any support.
         pivot_xy: Point (2,) [m] of the polygon's border nearest to the centre of mass: what it tips over.
         direction_xy: Unit vector (2,) the object tips towards; zero without any support.
     """
 
+    polygon: Array
     overhang: float
     pivot_xy: Array
     direction_xy: Array
@@ -95,25 +94,21 @@ def beneath(shapes: Primitives, index: int, limit: float) -> list[int]:
     return [int(k) for k in np.flatnonzero(below & (apart <= near)) if k != index]
 
 
-def support_polygon(patches: Sequence[Array]) -> Array:
-    """P_s: the convex hull (M, 2) [m] of the contact areas."""
-    return polygons.hull(np.concatenate([np.empty((0, 2)), *patches]))
-
-
-def find_tipping(shape: Shape, polygon: Array) -> Tipping:
-    """Where the centre of mass (the shape's centre) projects against the support polygon (M, 2) [m]."""
+def find_tipping(shape: Shape, patches: Sequence[Array]) -> Tipping:
+    """Where the centre of mass (the shape's centre) projects against the contact areas, each (M, 2) [m]."""
+    polygon = polygons.hull(np.concatenate([np.empty((0, 2)), *patches]))
     centre_xy = shape.T_world_object[:2, 3]
     if not len(polygon):
-        return Tipping(np.inf, centre_xy, np.zeros(2))
+        return Tipping(polygon, np.inf, centre_xy, np.zeros(2))
     distance, x, y, inside = polygons.nearest_on_border(polygon, centre_xy[0], centre_xy[1])
     overhang, pivot_xy = -distance if inside else distance, np.array([x, y])
     direction_xy = (centre_xy - pivot_xy) / overhang if overhang else np.zeros(2)
-    return Tipping(overhang, pivot_xy, direction_xy)
+    return Tipping(polygon, overhang, pivot_xy, direction_xy)
 
 
-def assess(shape: Shape, polygon: Array, tipping: Tipping, config: SupportConfig) -> Stability:
-    """Both tests of an object on its support polygon (N, 2) [m]: r_s of eq. 1 and the centre of mass."""
-    ratio = min(1.0, polygons.area(polygon) / polygons.area(ground_outline(shape)))
+def assess(shape: Shape, tipping: Tipping, config: SupportConfig) -> Stability:
+    """Both tests of an object on its support polygon: r_s of eq. 1 and the centre of mass."""
+    ratio = min(1.0, polygons.area(tipping.polygon) / polygons.area(ground_outline(shape)))
     overhang = tipping.overhang
     return Stability(ratio, overhang, ratio < config.min_area_ratio, overhang > config.overhang)
 
@@ -161,7 +156,13 @@ def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
         return polygons.hull(_ball_cap(shape, direction_world, depth))
     if shape.kind not in _EDGES:
         shape = Box(shape.T_world_object, shape.extents)
-    return polygons.cap(shape.outline(), _EDGES[shape.kind], direction_world, depth)
+    return polygons.cap(_outline(shape), _EDGES[shape.kind], direction_world, depth)
+
+
+@lru_cache(maxsize=128)
+def _outline(shape: Shape) -> Array:
+    """The shape's outline (N, 3) [m], found once for all its contacts."""
+    return shape.outline()
 
 
 def _ball_cap(ball: Shape, direction_world: Array, depth: float) -> Array:
