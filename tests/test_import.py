@@ -95,18 +95,8 @@ def test_a_bag_that_does_not_say_how_messages_are_laid_out(tmp_path, views):
 
 
 def test_transforms_of_the_first_kind(tmp_path, views):
-    """As ROS 1 sent them before tf2."""
-    with BagFile(tmp_path / "one.bag") as bag:
-        layout = "geometry_msgs/TransformStamped[] transforms"
-        bag.store.register(get_types_from_msg(layout, "tf/msg/tfMessage"))
-        for index, view in enumerate(views):
-            time = START + index * SECOND
-            bag.write(INFO, bag.camera(time, view.K, (160, 120)), time)
-            depth = np.rint(view.depth * 1000.0).astype(np.uint16)
-            bag.write(DEPTH, bag.image(time, depth, "16UC1"), time)
-            pose = bag.transform(time, "/" + WORLD, "/" + LENS, view.T_world_camera)
-            bag.write("/tf", bag.type("tf/msg/tfMessage")(transforms=pose.transforms), time)
-    same_views(imported(tmp_path, tmp_path / "one.bag", *TOPICS, "--tf", WORLD), views, colour=False)
+    bag = plain_bag(tmp_path, views)
+    same_views(imported(tmp_path, bag, *TOPICS, "--tf", WORLD), views, colour=False)
 
 
 def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views, capsys):
@@ -122,16 +112,20 @@ def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views,
 # Encodings
 
 
-def one_frame(tmp_path, views, depth=None, colour=None, **camera):
-    """A bag of one frame; messages are made by functions of the bag and the time."""
-    view = views[0]
-    millimetres = np.rint(view.depth * 1000.0).astype(np.uint16)
+def plain_bag(tmp_path, views, depth=None, colour=None, **camera):
+    """A bag with transforms as ROS 1 sent them before tf2; images are made by functions of bag and time."""
     with BagFile(tmp_path / "one.bag") as bag:
-        bag.write(INFO, bag.camera(START, **{"K": view.K, "size": (160, 120)} | camera), START)
-        made = depth(bag, START) if depth else bag.image(START, millimetres, "16UC1")
-        bag.write(DEPTH, made, START)
-        if colour:
-            bag.write(RGB, colour(bag, START), START)
+        layout = "geometry_msgs/TransformStamped[] transforms"
+        bag.store.register(get_types_from_msg(layout, "tf/msg/tfMessage"))
+        for index, view in enumerate(views):
+            time = START + index * SECOND
+            bag.write(INFO, bag.camera(time, **{"K": view.K, "size": (160, 120)} | camera), time)
+            millimetres = np.rint(view.depth * 1000.0).astype(np.uint16)
+            bag.write(DEPTH, depth(bag, time) if depth else bag.image(time, millimetres, "16UC1"), time)
+            if colour:
+                bag.write(RGB, colour(bag, time), time)
+            pose = bag.transform(time, "/" + WORLD, "/" + LENS, view.T_world_camera)
+            bag.write("/tf", bag.type("tf/msg/tfMessage")(transforms=pose.transforms), time)
     return tmp_path / "one.bag"
 
 
@@ -146,7 +140,7 @@ def test_raw_depth_without_what_is_no_reading(tmp_path, views, encoding, big, pa
     else:
         pixels[:8] = 0.0
         pixels = np.rint(pixels * 1000.0).astype(np.uint16)
-    bag = one_frame(tmp_path, views, lambda b, t: b.image(t, pixels, encoding, padding=padding, big=big))
+    bag = plain_bag(tmp_path, views[:1], lambda b, t: b.image(t, pixels, encoding, padding=padding, big=big))
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert not view.depth[:8].any()
     metres = views[0].depth if encoding == "32FC1" else pixels * 0.001
@@ -161,7 +155,7 @@ def test_compressed_depth(tmp_path, views, form, atol):
     depth = views[0].depth
     millimetres = np.rint(depth * 1000.0).astype(np.uint16)
     data = compressed_depth(depth, form[:5]) if "compressedDepth" in form else png(millimetres)
-    bag = one_frame(tmp_path, views, lambda b, t: b.compressed(t, data, form))
+    bag = plain_bag(tmp_path, views[:1], lambda b, t: b.compressed(t, data, form))
     (view,) = imported(tmp_path, bag, *TOPICS)
     assert ((view.depth > 0.0) == (depth > 0.0)).all()
     assert np.allclose(view.depth, depth, atol=atol)
@@ -191,12 +185,12 @@ def test_colour(tmp_path, views, pack, encoding):
             return bag.compressed(time, packed, encoding)
         return bag.image(time, np.ascontiguousarray(packed), encoding, padding=5)
 
-    (view,) = imported(tmp_path, one_frame(tmp_path, views, colour=message), *TOPICS, "--rgb", RGB)
+    (view,) = imported(tmp_path, plain_bag(tmp_path, views[:1], colour=message), *TOPICS, "--rgb", RGB)
     assert np.abs(view.rgb.astype(int) - rgb).mean() < (3.0 if encoding == "jpeg" else 1e-9)
 
 
 def test_a_lens_that_distorts_is_told_of(tmp_path, views, capsys):
-    imported(tmp_path, one_frame(tmp_path, views, D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
+    imported(tmp_path, plain_bag(tmp_path, views[:1], D=(0.1, 0.0, 0.0, 0.0, 0.0)), *TOPICS)
     assert "the lens distorts" in capsys.readouterr().err
 
 
@@ -233,16 +227,13 @@ def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
 
 
 def test_a_broken_image_is_left_out(tmp_path, views, capsys):
-    with BagFile(tmp_path / "one.bag") as bag:
-        for index, view in enumerate(views):
-            time = START + index * SECOND
-            bag.write(INFO, bag.camera(time, view.K, (160, 120)), time)
-            data = compressed_depth(view.depth, "16UC1")
-            data = data[: len(data) // 2] if index == 1 else data
-            bag.write(DEPTH, bag.compressed(time, data, "16UC1; compressedDepth png"), time)
-            pose = bag.transform(time, WORLD, LENS, view.T_world_camera)
-            bag.write("/tf", pose, time)
-    document = summary(tmp_path, capsys, tmp_path / "one.bag", *TOPICS, "--tf", WORLD)
+    data = compressed_depth(views[0].depth, "16UC1")
+
+    def depth(bag, time):
+        broken = time == START + SECOND
+        return bag.compressed(time, data[:500] if broken else data, "16UC1; compressedDepth png")
+
+    document = summary(tmp_path, capsys, plain_bag(tmp_path, views, depth), *TOPICS, "--tf", WORLD)
     assert document["skipped"] == {"broken": 1}
 
 
@@ -253,8 +244,8 @@ def test_a_broken_image_is_left_out(tmp_path, views, capsys):
     ("options", "said"),
     [
         ((), "--depth TOPIC is needed; topics with images: /camera/depth/image, /camera/rgb/image; other"),
-        (("--depth", "/nothing", "--info", INFO), "there is no topic '/nothing'; topics with images:"),
-        (("--depth", DEPTH, "--info", "/cam"), "'/cam'; topics with cameras: /camera/depth/camera_info"),
+        (("--depth", "/no", "--info", INFO), "'/no' holds nothing, not images; topics with images:"),
+        (("--depth", DEPTH, "--info", "/cam"), "not cameras; topics with cameras: /camera/depth/camera_info"),
         (("--depth", DEPTH), "--info TOPIC is needed; topics with cameras: /camera/depth/camera_info; other"),
         (("--depth", "/chatter", "--info", INFO), "'/chatter' holds std_msgs/msg/String, not images"),
         ((*TOPICS, "--rgb", "/tf"), "--rgb: '/tf' holds tf2_msgs/msg/TFMessage, not images"),
@@ -284,7 +275,7 @@ def test_what_does_not_fit_the_bag_is_said(tmp_path, views, capsys, leftovers, o
 )
 def test_depth_that_is_not_registered(tmp_path, views, capsys, columns, frame, said):
     rgb = np.repeat(views[0].rgb, columns, axis=1)
-    bag = one_frame(tmp_path, views, colour=lambda b, t: b.image(t, rgb, "rgb8", frame=frame))
+    bag = plain_bag(tmp_path, views[:1], colour=lambda b, t: b.image(t, rgb, "rgb8", frame=frame))
     assert said in refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
 
 
@@ -300,7 +291,7 @@ def test_depth_that_is_not_registered(tmp_path, views, capsys, columns, frame, s
     ],
 )
 def test_a_camera_that_is_not_the_depth_images(tmp_path, views, capsys, camera, said):
-    bag = one_frame(tmp_path, views, **camera)
+    bag = plain_bag(tmp_path, views[:1], **camera)
     assert said in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
 
 
@@ -315,7 +306,7 @@ def test_a_camera_that_is_not_the_depth_images(tmp_path, views, capsys, camera, 
     ],
 )
 def test_depth_that_cannot_be_decoded(tmp_path, views, capsys, leftovers, make, said):
-    bag = one_frame(tmp_path, views, lambda b, t: make(b, t, views[0].depth.astype(np.uint8)))
+    bag = plain_bag(tmp_path, views[:1], lambda b, t: make(b, t, views[0].depth.astype(np.uint8)))
     assert said in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
     assert leftovers() == {"one.bag"}
 

@@ -119,12 +119,9 @@ class _Bag:
         fitting = self.topics(kind)
         if topic in fitting:
             return topic
+        reason = f"{option}: '{topic}' holds {self._types.get(topic or '', 'nothing')}, not {kind}"
         if topic is None:
             reason = f"{option} TOPIC is needed"
-        elif topic in self._types:
-            reason = f"{option}: '{topic}' holds {self._types[topic]}, not {kind}"
-        else:
-            reason = f"{option}: there is no topic '{topic}'"
         others = sorted(set(self._types) - set(fitting))
         listed = f"topics with {kind}: {', '.join(fitting) or 'none'}"
         raise InputError(self.path, reason, f"{listed}; other topics: {', '.join(others) or 'none'}")
