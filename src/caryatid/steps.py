@@ -110,14 +110,12 @@ class RunView:
     """One view of a run.
 
     Attributes:
-        index: 0 for the first.
         name: The view's name; a recording's frame is found again by it.
         graph: The fused graph after this view.
         record: All of view.json.
         folder: Its folder, `views/NN`.
     """
 
-    index: int
     name: str
     graph: SupportGraph
     record: dict[str, Any]
@@ -185,7 +183,7 @@ def read_run(folder: str | Path) -> Run:
     path = folder / "run.json"
     record = read_json(path, remedy)
     count = parse_json(_RunFile, record, path, AGAIN).views
-    views = tuple(_read_view(folder / _view_folder(index), index) for index in range(count))
+    views = tuple(_read_view(folder / _view_folder(index)) for index in range(count))
     return Run(folder, record, read_graph(folder / "graph.json"), views)
 
 
@@ -225,11 +223,11 @@ def _view_folder(index: int) -> str:
     return f"views/{index:02d}"
 
 
-def _read_view(folder: Path, index: int) -> RunView:
+def _read_view(folder: Path) -> RunView:
     path = folder / "view.json"
     record = read_json(path, AGAIN)
     name = parse_json(_ViewFile, record, path, AGAIN).name
-    return RunView(index, name, read_graph(folder / "graph.json"), record, folder)
+    return RunView(name, read_graph(folder / "graph.json"), record, folder)
 
 
 def _summary(step: Step) -> dict[str, Any]:

@@ -104,4 +104,4 @@ def evaluate_run(
     else:
         why = "has neither scene.xml nor scene_camera.json"
         raise InputError(folder, why, "give a scene folder or a recording")
-    return tuple(ViewScore(view.index, result) for view, result in zip(run.views, scores, strict=True))
+    return tuple(ViewScore(number, result) for number, result in enumerate(scores))

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
-from pydantic_core import core_schema
+from pydantic_core import core_schema, from_json
 
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
@@ -54,15 +54,17 @@ class Numbers:
             ValueError: They have another shape, hold something else than finite numbers, or are not rigid.
         """
         try:
-            array = np.array(value if _all_numbers(value) else np.nan, dtype=np.float64)
-        except (ValueError, OverflowError):
-            array = np.array(np.nan)
+            array = np.array(value)
+        except ValueError:
+            array = np.array("lists of different lengths")
         if array.size == 0 and self.shape[0] < 0:
             array = array.reshape(0, *self.shape[1:])
         shape = tuple(n if n < 0 else m for n, m in zip(self.shape, array.shape, strict=False))
-        if array.ndim != len(self.shape) or shape != self.shape or not np.isfinite(array).all():
+        fits = array.ndim == len(self.shape) and shape == self.shape and array.dtype.kind in "if"
+        if not fits or not np.isfinite(array).all():
             sizes = "×".join("N" if n < 0 else str(n) for n in self.shape)
             raise ValueError(f"must be {sizes} finite numbers")
+        array = array.astype(np.float64)
         try:
             return transforms.as_rigid(array, "") if self.rigid else array
         except InputError as error:
@@ -103,17 +105,11 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
         InputError: The file is missing, unreadable, no JSON, holds NaN or infinity, or is no object.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        document = from_json(path.read_bytes(), allow_inf_nan=False)
     except FileNotFoundError:
         raise InputError(path, "the file is missing", remedy) from None
     except OSError as error:
         raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
-    except UnicodeDecodeError as error:
-        raise InputError(path, "is no text in UTF-8", remedy) from error
-    try:
-        document = json.loads(text, parse_constant=_refuse_constant)
-    except RecursionError as error:
-        raise InputError(path, "is nested too deep", remedy) from error
     except ValueError as error:
         raise InputError(path, f"broken JSON: {error}", remedy) from error
     if not isinstance(document, dict):
@@ -165,16 +161,6 @@ def _sentence(error: Any) -> str:
     message = message.replace("Input should be", "must be")
     message = message.replace("a dictionary or an instance of", "the object")
     return f"{where}'{last}' is {_shown(error['input'])}: {message}"
-
-
-def _all_numbers(value: Any) -> bool:
-    if isinstance(value, list):
-        return all(_all_numbers(item) for item in value)
-    return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def _refuse_constant(constant: str) -> float:
-    raise ValueError(f"{constant} is no JSON number")
 
 
 def _shown(value: Any) -> str:
