@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,11 +36,6 @@ class _Camera:
 @dataclass(frozen=True, slots=True)
 class _Mask:
     obj_id: Annotated[int, Ge(1), Lt(SUPPORT_LABEL)]
-
-
-@dataclass(frozen=True, slots=True)
-class _Masks:
-    masks: list[_Mask]
 
 
 Masks = tuple[tuple[Path, int], ...]
@@ -81,24 +75,22 @@ def read_recording(folder: str | Path) -> Dataset:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(folder, "is not a folder", "give a scene folder of the BOP format")
-    camera_path = folder / "scene_camera.json"
-    cameras = _by_frame(camera_path, "a recording needs it: cam_K and depth_scale of each frame")
+    path = folder / "scene_camera.json"
+    remedy = "a recording needs it: cam_K and depth_scale of each frame"
+    cameras = parse_json(dict[int, _Camera], read_json(path, remedy), path, remedy)
     if not cameras:
         raise InputError(folder, "has no frames: scene_camera.json is empty", "give a recording with frames")
-    for path in sorted((folder / "depth").glob("*.png")):
-        if not path.stem.isdigit() or int(path.stem) not in cameras:
-            raise InputError(
-                path, "has no entry in scene_camera.json", "add its camera there, or take the image out"
-            )
+    for image in sorted((folder / "depth").glob("*.png")):
+        if image.stem not in {f"{number:06d}" for number in cameras}:
+            remedy = "add its camera there, or take the image out"
+            raise InputError(image, "has no entry in scene_camera.json", remedy)
     masks = _read_masks(folder, set(cameras))
-    frames = tuple(
-        _frame(folder, n, cameras[n], masks.get(n), f"{camera_path}: frame {n}") for n in sorted(cameras)
-    )
+    frames = tuple(_frame(folder, n, cameras[n], masks.get(n), f"{path}: frame {n}") for n in sorted(cameras))
     without = [f.number for f in frames if f.T_world_camera is None]
     if len(frames) > 1 and without:
         reason = f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c)"
         reason += f", the first is frame {without[0]}"
-        raise InputError(camera_path, reason, "several frames need poses; without them give a single frame")
+        raise InputError(path, reason, "several frames need poses; without them give a single frame")
     return Dataset(folder, frames)
 
 
@@ -155,8 +147,7 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
     folder.publish()
 
 
-def _frame(folder: Path, number: int, document: Any, masks: Masks | None, source: str) -> Frame:
-    camera = parse_json(_Camera, document, source)
+def _frame(folder: Path, number: int, camera: _Camera, masks: Masks | None, source: str) -> Frame:
     K = check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K")
     T_world_camera = _pose(camera, source)
     depth_path, rgb_path = folder / f"depth/{number:06d}.png", None
@@ -217,35 +208,22 @@ def _pose(camera: _Camera, name: str) -> Array | None:
 
 
 def _read_masks(folder: Path, known: set[int]) -> dict[int, Masks]:
-    mask_folder, gt_path = folder / "mask_visib", folder / "scene_gt.json"
+    mask_folder, path = folder / "mask_visib", folder / "scene_gt.json"
     if not mask_folder.is_dir():
         return {}
+    remedy = f'masks need it: one {{"obj_id": …}} for each, from 1 to {SUPPORT_LABEL - 1}'
     table: dict[int, Masks] = {}
-    for frame, entries in _by_frame(gt_path, "masks need it: the obj_id of each").items():
-        source = f"{gt_path}: frame {frame}"
+    for frame, masks in parse_json(dict[int, list[_Mask]], read_json(path, remedy), path, remedy).items():
+        source = f"{path}: frame {frame}"
         if frame not in known:
             raise InputError(source, "is not in scene_camera.json", "add its camera there")
-        remedy = f'give one {{"obj_id": …}} for each mask, from 1 to {SUPPORT_LABEL - 1}'
-        labels = [mask.obj_id for mask in parse_json(_Masks, {"masks": entries}, source, remedy).masks]
+        labels = [mask.obj_id for mask in masks]
         for twice in {label for label in labels if labels.count(label) > 1}:
             reason = f"two masks have obj_id {twice}"
             raise InputError(source, reason, "number each object of the scene by itself")
         names = (f"{frame:06d}_{index:06d}.png" for index in range(len(labels)))
         table[frame] = tuple((mask_folder / name, label) for name, label in zip(names, labels, strict=True))
-    expected = {path for masks in table.values() for path, _ in masks}
-    for path in sorted(set(mask_folder.glob("*.png")) - expected):
-        match = re.fullmatch(r"(\d{6})_(\d{6})", path.stem)
-        which = f"mask {int(match[2])} of frame {int(match[1])}" if match else "that name"
-        reason = f"names no object: scene_gt.json has no entry for {which}"
-        raise InputError(path, reason, "add its obj_id there")
+    expected = {image for masks_of_frame in table.values() for image, _ in masks_of_frame}
+    for image in sorted(set(mask_folder.glob("*.png")) - expected):
+        raise InputError(image, "names no object: scene_gt.json has no entry for it", "add its obj_id there")
     return table
-
-
-def _by_frame(path: Path, remedy: str) -> dict[int, Any]:
-    result: dict[int, Any] = {}
-    for key, item in read_json(path, remedy).items():
-        if not key.isascii() or not key.isdigit() or int(key) in result:
-            reason = f"'{key}' is no frame number, or is there twice"
-            raise InputError(path, reason, "number the frames 0, 1, …")
-        result[int(key)] = item
-    return result

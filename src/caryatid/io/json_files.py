@@ -74,10 +74,10 @@ class Numbers:
 def parse_json(
     kind: Callable[..., T], document: Mapping[str, Any], source: str | Path, remedy: str = "correct it"
 ) -> T:
-    """Read a JSON object into a dataclass; other keys are ignored.
+    """Read a JSON object into a dataclass or a dict; other keys of dataclasses are ignored.
 
     Args:
-        kind: A dataclass whose fields are the keys, with their types and defaults.
+        kind: A dataclass whose fields are the keys, with their types and defaults; or a type of dict.
         document: The parsed object.
         source: What to call it in the error.
         remedy: What the user can do about an error.
