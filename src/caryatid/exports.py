@@ -26,8 +26,6 @@ ENDINGS: Final[dict[str, ExportFormat]] = {
     ".gv": "dot",
 }
 """How a file's name ends → its format."""
-_ROOT = "world"
-"""Name of a URDF's root link."""
 
 
 def format_of(path: Path, wanted: ExportFormat | None = None) -> ExportFormat:
@@ -53,7 +51,8 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
         config: Density, friction and how fine meshes are.
 
     Raises:
-        InputError: The name ends in no format, there is nothing to export, or the file cannot be written.
+        InputError: The name ends in no format, there is nothing to export, the format does not take a name of
+            an object, or the file cannot be written.
     """
     path, config = Path(path), config or ExportConfig()
     chosen = format_of(path)
@@ -61,30 +60,22 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
         raise InputError("the scene model", "holds no objects", "nothing was written")
     match chosen:
         case "mjcf":
-            content = to_mjcf(graph, config).encode()
+            content = _mjcf(graph, config).encode()
         case "urdf":
-            content = to_urdf(graph, config).encode()
+            content = _urdf(graph, config).encode()
         case "gltf":
-            content = to_gltf(graph, config, binary=path.suffix.lower() == ".glb")
+            content = _gltf(graph, config, binary=path.suffix.lower() == ".glb")
         case "graphml":
-            content = to_graphml(graph).encode()
+            content = _graphml(graph).encode()
         case "dot":
             content = to_dot(graph).encode()
     write_file(path, content)
 
 
-def to_mjcf(graph: SupportGraph, config: ExportConfig) -> str:
-    """Write a scene model as MJCF: the static body `table`, and a free body for each object, named by its id.
+def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
+    """The static body `table`, and a free body for each object, called as its id: a scene to explore, too.
 
-    It is a scene caryatid explores, too. Shapes that were fitted may overlap or hover by millimetres: objects
-    settle by about as much when it is simulated.
-
-    Args:
-        graph: The scene model.
-        config: Density and friction.
-
-    Raises:
-        InputError: MuJoCo does not take the model, because of a name for example.
+    Fitted shapes may overlap or hover by millimetres: objects settle by about as much when it is simulated.
     """
     import mujoco
 
@@ -108,23 +99,15 @@ def to_mjcf(graph: SupportGraph, config: ExportConfig) -> str:
     return text
 
 
-def to_urdf(graph: SupportGraph, config: ExportConfig) -> str:
-    """Write a scene model as URDF: a link for each object, called as its id, fixed to the link `world`.
-
-    Args:
-        graph: The scene model.
-        config: Density.
-
-    Raises:
-        InputError: An object is called `world`.
-    """
+def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
+    """A link for each object, called as its id, fixed to the link `world`."""
     from scipy.spatial.transform import Rotation
 
     robot = Element("robot", name="caryatid")
-    SubElement(robot, "link", name=_ROOT)
+    SubElement(robot, "link", name="world")
     for item in graph.objects:
-        if item.id == _ROOT:
-            raise InputError("the scene model", f"an object is called '{_ROOT}'", "rename it in graph.json")
+        if item.id == "world":
+            raise InputError("the scene model", "an object is called 'world'", "rename it in graph.json")
         link = SubElement(robot, "link", name=item.id)
         mass, moments = config.density * item.shape.volume, item.shape.moments
         inertial = SubElement(link, "inertial")
@@ -142,8 +125,8 @@ def to_urdf(graph: SupportGraph, config: ExportConfig) -> str:
                     SubElement(geometry, "box", size=_numbers(*item.shape.extents))
         material = SubElement(link[1], "material", name=f"colour of {item.id}")
         SubElement(material, "color", rgba=_numbers(*_rgba(item)))
-        joint = SubElement(robot, "joint", name=f"{_ROOT}_to_{item.id}", type="fixed")
-        SubElement(joint, "parent", link=_ROOT)
+        joint = SubElement(robot, "joint", name=f"world_to_{item.id}", type="fixed")
+        SubElement(joint, "parent", link="world")
         SubElement(joint, "child", link=item.id)
         with warnings.catch_warnings():
             # Straight up or down there are many roll-pitch-yaw angles; SciPy warns and takes one.
@@ -164,15 +147,10 @@ def _numbers(*values: float) -> str:
     return " ".join(f"{value + 0.0:.9g}" for value in values)
 
 
-def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -> bytes:
-    """Write a scene model as glTF: under the node `z_up` a node for each object, called as its id.
+def _gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool) -> bytes:
+    """Under the node `z_up` a node for each object, called as its id, in the report's colour.
 
-    Objects have the report's colours. Shape, size and role are in each mesh's extras.
-
-    Args:
-        graph: The scene model.
-        config: How fine meshes are.
-        binary: As one binary file (`.glb`), not as JSON (`.gltf`).
+    Shape, size and role are in each mesh's extras.
     """
     import trimesh
     from trimesh.exchange.gltf import export_glb, export_gltf
@@ -194,15 +172,8 @@ def to_gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool = True) -
     return content
 
 
-def to_graphml(graph: SupportGraph) -> str:
-    """Write the support graph as GraphML; edges run from supporter to supported.
-
-    Vertices have role, label, shape, size [m], centre x, y, z [m] and in how many views they were found;
-    edges have kind, certain, and in how many views they were found.
-
-    Args:
-        graph: The graph.
-    """
+def _graphml(graph: SupportGraph) -> str:
+    """Edges run from supporter to supported; sizes and centres x, y, z of vertices are in metres."""
     import networkx as nx
 
     plain = nx.DiGraph()

@@ -167,25 +167,11 @@ def choose_views(
         soon = free & (times[candidates] <= times[candidates[first]] + config.sharp_window)
         best = candidates[soon][np.argmax(sharpness[candidates[soon]])]
         chosen.append(int(best))
-        free &= apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
+        free &= _apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
     kept = _farthest(T_world_camera[chosen], config)
     others = Counter({"blurred": len(times) - len(candidates), SPARE: len(chosen) - len(kept)})
     others["seen from where another view is"] = len(candidates) - len(chosen)
     return sorted(chosen[i] for i in kept), dict(+others)
-
-
-def apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
-    """How far poses (N, 4, 4) are from another one (4, 4), in units of what makes a view another one (N,).
-
-    Args:
-        T_world_camera: Poses (N, 4, 4).
-        T_world_other: The other one (4, 4).
-        config: Which distance and which angle make a view another one.
-    """
-    distance = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_other[:3, 3], axis=1)
-    cosine = (np.einsum("nij,ij->n", T_world_camera[:, :3, :3], T_world_other[:3, :3]) - 1.0) / 2.0
-    angle = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return np.maximum(distance / config.min_distance, angle / config.min_angle)
 
 
 def reasons(skipped: Mapping[str, int]) -> str:
@@ -223,11 +209,18 @@ def _most_around(times: Array, values: Array, window: float) -> Array:
     return np.array([values[a:b].max() for a, b in zip(first, stop, strict=True)])
 
 
+def _apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
+    """How far poses (N, 4, 4) are from another one (4, 4), in units of what makes a view another one (N,)."""
+    distance = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_other[:3, 3], axis=1)
+    turns = Rotation.from_matrix(T_world_other[:3, :3].T @ T_world_camera[:, :3, :3])
+    return np.maximum(distance / config.min_distance, np.degrees(turns.magnitude()) / config.min_angle)
+
+
 def _farthest(T_world_camera: Array, config: RecordingConfig) -> list[int]:
     """Indices of as many poses as are wanted: the first, then always the one farthest from those before."""
     kept = [0]
-    gap = apart(T_world_camera, T_world_camera[0], config)
+    gap = _apart(T_world_camera, T_world_camera[0], config)
     while len(kept) < min(config.max_views, len(T_world_camera)):
         kept.append(int(np.argmax(gap)))
-        gap = np.minimum(gap, apart(T_world_camera, T_world_camera[kept[-1]], config))
+        gap = np.minimum(gap, _apart(T_world_camera, T_world_camera[kept[-1]], config))
     return kept
