@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from caryatid.geometry import transforms
-from caryatid.io.video import SECOND, MissingTransform, TransformTree, is_pose
+from caryatid.io.video import SECOND, TransformTree, is_pose
 
 NOW = 1_700_000_000 * SECOND
 """Large enough that a float would lose the nanoseconds."""
@@ -75,11 +75,9 @@ def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
 def test_outside_what_was_said_and_across_a_gap_nothing_is_made_up(late):
     rng = np.random.default_rng(1)
     links = [("map", "eye", NOW + k * SECOND, random_pose(rng)) for k in (0, 1)]
-    with pytest.raises(MissingTransform, match="'eye' has no pose in 'map'"):
-        tree_with(*links).between("map", "eye", NOW + late)
+    assert tree_with(*links).between("map", "eye", NOW + late) is None
     assert tree_with(*links, gap=1.0).between("map", "eye", NOW + SECOND // 2).shape == (4, 4)
-    with pytest.raises(MissingTransform):
-        tree_with(*links, gap=0.9).between("map", "eye", NOW + SECOND // 2)
+    assert tree_with(*links, gap=0.9).between("map", "eye", NOW + SECOND // 2) is None
 
 
 def test_a_frame_that_changes_its_parent_has_no_pose_in_between():
@@ -87,15 +85,13 @@ def test_a_frame_that_changes_its_parent_has_no_pose_in_between():
     tree = tree_with(("map", "cup", NOW, random_pose(rng)), ("hand", "cup", NOW + SECOND, random_pose(rng)))
     assert tree.between("map", "cup", NOW).shape == (4, 4)
     for target in ("map", "hand"):
-        with pytest.raises(MissingTransform):
-            tree.between(target, "cup", NOW + 1)
+        assert tree.between(target, "cup", NOW + 1) is None
 
 
 def test_frames_in_a_circle_and_frames_apart_are_refused():
     tree = tree_with(("a", "b", NOW, np.eye(4)), ("b", "a", NOW, np.eye(4)), ("c", "d", NOW, np.eye(4)))
     for target in ("c", "nowhere"):
-        with pytest.raises(MissingTransform):
-            tree.between(target, "a", NOW)
+        assert tree.between(target, "a", NOW) is None
     assert tree.frames == ["a", "b", "c", "d"]
 
 

@@ -71,7 +71,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     cameras, distorts = _read_cameras(bag, info_topic)
     depths = bag.images(depth_topic, _depth)
     colours = None if rgb_topic is None else bag.images(rgb_topic, _colour)
-    tree, notes = None, []
+    pose_at, notes = None, []
     if options.world is None:
         notes.append("no --tf FRAME: poses are not known, a single frame is taken")
     else:
@@ -80,9 +80,10 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
             if frame not in tree.frames:
                 known = f"there are {', '.join(tree.frames)}"
                 raise InputError(path, f"there is no frame '{frame}' in its transforms", known)
+        pose_at = partial(tree.between, options.world)
     if distorts:
         notes.append("the lens distorts, and a pinhole is assumed: give rectified topics, unless these are")
-    return make_video(path, depths, colours, cameras, tree, options.world, config, notes)
+    return make_video(path, depths, colours, cameras, pose_at, config, notes)
 
 
 class _Bag:

@@ -65,12 +65,12 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     camera = TimedCamera(f"{path}: camera", 0, _CAMERA, check_intrinsics(K, str(options.camera_file)), size)
     depths = _read_list(path / "depth.txt", partial(images.read_depth, depth_scale=file.depth_scale))
     colours = _read_list(path / "rgb.txt", images.read_colour) if (path / "rgb.txt").is_file() else None
-    tree, notes = None, [note]
+    pose_at, notes = None, [note]
     if (path / "groundtruth.txt").is_file():
-        tree = _read_poses(path / "groundtruth.txt", config.pose_gap)
+        pose_at = partial(_read_poses(path / "groundtruth.txt", config.pose_gap).between, _WORLD)
     else:
         notes.append("no groundtruth.txt: poses are not known, a single frame is taken")
-    return make_video(path, depths, colours, [camera], tree, _WORLD, config, notes)
+    return make_video(path, depths, colours, [camera], pose_at, config, notes)
 
 
 def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, tuple[int, int] | None, str]:

@@ -72,8 +72,7 @@ def make_video(
     depths: Sequence[TimedImage],
     colours: Sequence[TimedImage] | None,
     cameras: Sequence[TimedCamera],
-    tree: TransformTree | None,
-    world: str | None,
+    pose_at: Callable[[str, int], Array | None] | None,
     config: RecordingConfig,
     notes: Sequence[str],
 ) -> Dataset:
@@ -84,8 +83,7 @@ def make_video(
         depths: Depth images; they are numbered in this order.
         colours: Colour images, or None to leave colour out.
         cameras: Cameras of the depth images, at least one.
-        tree: Where frames are over time, or None to leave poses out.
-        world: The frame of `tree` that is the world.
+        pose_at: Pose (4, 4) of a frame at a time [ns], or None where it is not known. None leaves poses out.
         config: How far apart in time depth and colour may be, and what is too far away.
         notes: What a person should know.
 
@@ -103,10 +101,9 @@ def make_video(
             if colour is None or abs(colour.time - depth.time) > config.colour_gap * SECOND:
                 skipped[NO_COLOUR] += 1
                 continue
-        if tree is not None and world is not None:
-            try:
-                T_world_camera = tree.between(world, depth.frame, depth.time)
-            except MissingTransform:
+        if pose_at is not None:
+            T_world_camera = pose_at(depth.frame, depth.time)
+            if T_world_camera is None:
                 skipped[NO_POSE] += 1
                 continue
         camera = _nearest(cameras, depth.time) or cameras[0]
@@ -144,17 +141,12 @@ def _load(
         if registered != shown:
             reason = f"depth ({shown}) is not registered to colour ({registered})"
             raise InputError(depth.name, reason, "give depth aligned to colour, or leave colour out")
-    return View(
-        np.where(metres <= far, metres, np.float32(0.0)), camera.K, T_world_camera, rgb, name=depth.name
-    )
+    near = np.where(metres <= far, metres, np.float32(0.0))
+    return View(near, camera.K, T_world_camera, rgb, name=depth.name)
 
 
 def _described(size: tuple[int, ...], frame: str) -> str:
     return f"{size[0]}×{size[1]} pixels, frame '{frame}'"
-
-
-class MissingTransform(Exception):  # noqa: N818
-    """There is no transform between two frames at a time."""
 
 
 @dataclass
@@ -215,19 +207,19 @@ class TransformTree:
         link.parents.append(parent)
         link.numbers.extend(pose)
 
-    def between(self, target: str, source: str, time: int) -> Array:
+    def between(self, target: str, source: str, time: int) -> Array | None:
         """`T_target_source` (4, 4): the pose of one frame in another at a time [ns].
 
         Between two poses the rotation is interpolated along the shortest arc and the translation linearly.
 
-        Raises:
-            MissingTransform: The frames are not connected, or a link has no pose around that time.
+        Returns:
+            None where the frames are not connected, or a link has no pose around that time.
         """
         T_up_source = dict(self._upwards(source, time))
         for frame, T_frame_target in self._upwards(target, time):
             if frame in T_up_source:
                 return transforms.invert(T_frame_target) @ T_up_source[frame]
-        raise MissingTransform(f"'{source}' has no pose in '{target}' at {time / SECOND:.3f} s")
+        return None
 
     def _upwards(self, frame: str, time: int) -> Iterator[tuple[str, Array]]:
         """The frame and those above it, each with the pose of `frame` in it, as far as is known."""
