@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -99,7 +99,7 @@ def open_recording(folder: str, config: Config, segmentation: SegmentationMethod
     """
     recording = open_dataset(folder, config.recording)
     if recording.is_video:
-        recording = replace(recording, frames=choose_frames(recording, config.recording)[0])
+        recording = choose_frames(recording, config.recording)
     if segmentation == "labels" and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()

@@ -59,17 +59,18 @@ class Import(options.Command):
         topics = OpenOptions(self.depth, self.info, self.rgb, self.tf, self.camera)
         with output.working(f"reading {self.source.name}"):
             imported = import_recording(self.source, self.out, topics, level=self.level, config=config)
+        read = len(imported) + sum(imported.skipped.values())
         if output.json:
             views = [
                 {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}
-                for n, f in enumerate(imported.chosen)
+                for n, f in enumerate(imported.frames)
             ]
-            document = {"recording": str(self.out), "frames": imported.read, "views": views}
+            document = {"recording": str(self.out), "frames": read, "views": views}
             output.result(document | {"skipped": imported.skipped, "notes": list(imported.notes)})
         for note in imported.notes:
             output.say(note)
         skipped = f"; skipped: {reasons(imported.skipped)}" if imported.skipped else ""
-        output.say(f"{self.source.name}: {len(imported.chosen)} views of {imported.read} frames{skipped}")
+        output.say(f"{self.source.name}: {len(imported)} views of {read} frames{skipped}")
         output.say(f"recording: {self.out}, try `caryatid extract {self.out} --out run`")
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -37,23 +37,6 @@ _REMEDIES: Final[Mapping[str, str]] = {
 _UP: Final = np.array([0.0, 0.0, 1.0])
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Imported:
-    """Result of an import.
-
-    Attributes:
-        read: Number of depth images.
-        chosen: The frames that became views, in order.
-        skipped: How many did not, by reason; together with the chosen ones all that were read.
-        notes: What a person should know.
-    """
-
-    read: int
-    chosen: tuple[Frame, ...]
-    skipped: dict[str, int]
-    notes: tuple[str, ...]
-
-
 def import_recording(
     source: str | Path,
     out: str | Path,
@@ -61,7 +44,7 @@ def import_recording(
     *,
     level: bool = False,
     config: Config | None = None,
-) -> Imported:
+) -> Dataset:
     """Choose sharp frames from different viewpoints and write them as a BOP scene folder.
 
     Args:
@@ -71,6 +54,9 @@ def import_recording(
         level: Turn the world so that the table is level: for poses whose z axis does not point up.
         config: What is sharp, what is different, and how many views there may be; and how a table is found.
 
+    Returns:
+        The source with the frames that became views.
+
     Raises:
         InputError: The recording is damaged or does not fit the options, no frame of it can become a view,
             there is no table to level the world by, or `out` cannot be written.
@@ -78,20 +64,19 @@ def import_recording(
     config = config or Config()
     dataset = open_dataset(source, config.recording, options)
     with StagedFolder(out) as folder:
-        chosen, skipped = choose_frames(dataset, config.recording)
-        T_level_world = np.eye(4)
-        views = (frame.load() for frame in chosen)
-        if level and chosen[0].T_world_camera is not None:
-            T_level_world = _level_rotation(dataset.path, chosen, config)
+        chosen = choose_frames(dataset, config.recording)
+        views = iter(chosen)
+        if level and chosen.has_poses:
+            T_level_world = _level_rotation(chosen, config)
+            turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
+            note = f"world: turned by {turn:.1f}°, so that the table is level"
+            chosen = replace(chosen, notes=(*chosen.notes, note))
             views = (view.with_pose(T_level_world @ view.pose) for view in views)
         write_views(folder, views)
-    turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
-    note = (f"world: turned by {turn:.1f}°, so that the table is level",) if turn > 0.0 else ()
-    read = len(chosen) + sum(skipped.values())
-    return Imported(read, tuple(chosen), skipped, (*dataset.notes, *note))
+    return chosen
 
 
-def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame], dict[str, int]]:
+def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
     """Choose sharp frames of a dataset, each from another viewpoint.
 
     Sharpness is the variance of the Laplacian of the brightness. Without colour the share of pixels with a
@@ -102,7 +87,7 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame
         config: What is sharp, what is another viewpoint, and how many frames are wanted.
 
     Returns:
-        The chosen frames in the order of time, and how many others there are by reason.
+        The dataset with the chosen frames, in the order of time; the others are counted among the skipped.
 
     Raises:
         InputError: No frame can become a view.
@@ -124,9 +109,8 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame
         grey = None if view.rgb is None else view.rgb.mean(axis=2, dtype=np.float32)
         sharpness.append(readings if grey is None else float(laplace(grey).var()))
     if not usable and not skipped:
-        raise InputError(
-            dataset.path, "holds no depth image", "record it again, or give another --depth TOPIC"
-        )
+        remedy = "record it again, or give another --depth TOPIC"
+        raise InputError(dataset.path, "holds no depth image", remedy)
     if not usable:
         reason = f"none of its {skipped.total()} depth images is usable: {reasons(skipped)}"
         remedy = _REMEDIES.get(skipped.most_common(1)[0][0], "record it again")
@@ -136,7 +120,7 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> tuple[list[Frame
     T_world_camera = np.stack(poses) if len(poses) == len(usable) else None
     kept, others = choose_views(times, np.array(sharpness), T_world_camera, config)
     skipped.update(others)
-    return [usable[index] for index in kept], dict(skipped)
+    return replace(dataset, frames=[usable[index] for index in kept], skipped=skipped)
 
 
 def choose_views(
@@ -179,25 +163,25 @@ def reasons(skipped: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in Counter(skipped).most_common())
 
 
-def _level_rotation(path: Path, frames: Sequence[Frame], config: Config) -> Array:
-    """Find the smallest turn of the world about its origin (4, 4) that makes the table of frames level.
+def _level_rotation(dataset: Dataset, config: Config) -> Array:
+    """Find the smallest turn of the world about its origin (4, 4) that makes the table of a dataset level.
 
     Each view says where up is as if it had no pose, by the largest plane that faces its camera and has the
     rest of the scene in front of it. Of these directions the one counts that is nearest to all the others.
     """
     rng, found = np.random.default_rng(0), []
-    for view in (frame.load() for frame in frames):
+    for view in dataset:
         with suppress(PerceptionError):
             T_level_camera = level_transform(replace(view, T_world_camera=None), config, rng)
             found.append(transforms.rotate(view.pose, T_level_camera[2, :3]))
     if not found:
-        raise InputError(path, "no view shows a table to level the world by", "leave --level out")
+        raise InputError(dataset.path, "no view shows a table to level the world by", "leave --level out")
     ups = np.stack(found)
     between = transforms.angle_between(ups[:, None], ups[None])
     near = between[int(np.argmin(between.sum(axis=1)))] <= np.deg2rad(config.surface.max_tilt)
     if 2 * int(near.sum()) < len(ups):
         reason = f"only {int(near.sum())} of {len(ups)} views agree on where up is"
-        raise InputError(path, reason, "leave --level out, and give a world that is level")
+        raise InputError(dataset.path, reason, "leave --level out, and give a world that is level")
     turn, _ = Rotation.align_vectors(_UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
 
