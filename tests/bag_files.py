@@ -86,7 +86,7 @@ class BagFile:
         kind = self.type("sensor_msgs/msg/CompressedImage")
         return kind(header=self.header(time, frame), format=form, data=data)
 
-    def camera(self, time, K, size, frame=LENS, D=(0.0,) * 5, binning=0):
+    def camera(self, time, K, size, frame=LENS, D=(0.0,) * 5):
         region = self.type("sensor_msgs/msg/RegionOfInterest")
         region = region(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
         P = np.column_stack([K, np.zeros(3)])
@@ -97,8 +97,8 @@ class BagFile:
             height=size[1],
             width=size[0],
             distortion_model="plumb_bob",
-            binning_x=binning,
-            binning_y=binning,
+            binning_x=0,
+            binning_y=0,
             roi=region,
             **dict(zip(names, matrices, strict=True)),
         )
