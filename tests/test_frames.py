@@ -22,6 +22,7 @@ def test_a_rigid_transform_is_taken_as_it_is_also_from_lists(T_a_b):
     taken = transforms.as_rigid(T_a_b.tolist())
     assert taken.dtype == np.float64
     np.testing.assert_array_equal(taken, T_a_b)
+    transforms.as_rigid(np.round(T_a_b, 6))  # A text file rounds.
 
 
 def broken(change):
@@ -47,10 +48,6 @@ def test_what_is_no_rigid_transform_is_refused_by_name_and_reason(T, reason):
         transforms.as_rigid(T, "frame 7")
     assert str(caught.value).startswith("frame 7: ")
     assert caught.value.remedy
-
-
-def test_rounding_of_a_text_file_is_no_reason_to_refuse(T_a_b):
-    transforms.as_rigid(np.round(T_a_b, 6))
 
 
 def test_inverting_a_transform_undoes_it_also_for_many_at_once(rng):
@@ -92,11 +89,6 @@ def test_rotation_vectors_follow_rodrigues(length, rng):
     np.testing.assert_allclose(transforms.rotation_from_vector(vector), expected, atol=1e-14)
 
 
-def test_the_cross_product_matrix_crosses(rng):
-    a, b = rng.normal(size=(2, 3))
-    np.testing.assert_allclose(transforms.skew(a) @ b, np.cross(a, b))
-
-
 def test_random_rotations_are_rotations_spread_over_all_of_them():
     rng = np.random.default_rng(0)
     many = np.array([transforms.random_rotation(rng) for _ in range(3000)])
@@ -124,16 +116,8 @@ def test_looking_straight_down_or_up_has_a_roll_all_the_same(target):
     T_world_camera = transforms.as_rigid(transforms.look_at((0.0, 0.0, 0.0), target))
     np.testing.assert_allclose(T_world_camera[:3, 2], target)
     np.testing.assert_allclose(-T_world_camera[:3, 1], (1.0, 0.0, 0.0), atol=1e-12)
-
-
-def test_looking_along_a_given_up_works_too():
-    T_world_camera = transforms.as_rigid(
-        transforms.look_at((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), up_world=(1.0, 0.0, 0.0))
-    )
-    np.testing.assert_allclose(T_world_camera[:3, 2], (1.0, 0.0, 0.0))
-
-
-def test_nothing_is_seen_of_where_one_stands():
+    along_up = transforms.as_rigid(transforms.look_at((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
+    np.testing.assert_allclose(along_up[:3, 2], (1.0, 0.0, 0.0))
     with pytest.raises(InputError, match="same point"):
         transforms.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
 
@@ -152,8 +136,5 @@ def test_a_level_world_has_the_plane_at_zero_below_the_camera(rng):
     assert abs(forward[1]) < 1e-12
     # Whichever point of the plane is given.
     np.testing.assert_allclose(transforms.level_world(normal, on_plane[1]), T_world_camera, atol=1e-12)
-
-
-def test_a_camera_that_looks_straight_down_gets_a_level_world_too():
-    T_world_camera = transforms.as_rigid(transforms.level_world((0.0, 0.0, -1.0), (0.0, 0.0, 2.0)))
-    np.testing.assert_allclose(T_world_camera[:3, 3], (0.0, 0.0, 2.0))
+    straight_down = transforms.as_rigid(transforms.level_world((0.0, 0.0, -1.0), (0.0, 0.0, 2.0)))
+    np.testing.assert_allclose(straight_down[:3, 3], (0.0, 0.0, 2.0))

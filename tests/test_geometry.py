@@ -83,12 +83,9 @@ def test_the_support_function_reaches_as_far_as_the_surface(shape):
     reach = ((points - shape.T_world_object[:3, 3]) @ directions.T).max(axis=0)
     np.testing.assert_allclose(shape.support(directions), reach, atol=0.0012)
     assert (shape.support(directions) >= reach - 1e-12).all()
-
-
-@each
-def test_the_extents_are_the_reach_along_its_own_axes(shape):
-    axes = shape.T_world_object[:3, :3].T
-    np.testing.assert_allclose(2.0 * shape.support(axes), shape.extents)
+    np.testing.assert_allclose(2.0 * shape.support(shape.T_world_object[:3, :3].T), shape.extents)
+    low, high = Primitives.of([shape]).bounds()
+    np.testing.assert_allclose(high[0] - low[0], 2.0 * shape.support(np.eye(3)))
 
 
 @each
@@ -133,9 +130,6 @@ def test_sizes_that_do_not_fit_the_shape_are_refused(kind, size):
     with pytest.raises(InputError, match=f"no shape '{kind}'") as caught:
         from_size(kind, np.eye(4), size, "graph.json")
     assert "a cylinder {radius, height}" in str(caught.value)
-
-
-def test_a_shape_is_not_put_at_a_pose_that_is_none():
     with pytest.raises(InputError, match="T_world_object"):
         from_size("sphere", 2.0 * np.eye(4), {"radius": 0.1}, "graph.json")
 
@@ -157,14 +151,6 @@ def test_gradients_point_away_from_the_surface(shape):
     np.testing.assert_allclose(distances, shape.signed_distance(points), atol=1e-12)
     steps = shape.signed_distance(points + 1e-7 * outward) - distances
     np.testing.assert_allclose(steps, 1e-7, atol=1e-9)
-
-
-def test_the_bounds_of_many_shapes_are_those_of_each():
-    low, high = Primitives.of(SOLIDS).bounds()
-    for k, shape in enumerate(SOLIDS):
-        reach = shape.support(np.eye(3))
-        np.testing.assert_allclose(high[k] - low[k], 2.0 * reach)
-    assert Primitives.of([]).bounds()[0].shape == (0, 3)
 
 
 @each
@@ -271,28 +257,21 @@ def test_the_hull_is_the_one_of_shapely(count):
     assert area(corners) == pytest.approx(expected.area)
     if count > 2:
         assert shapely.LinearRing(corners).is_ccw
+    above = np.column_stack([points, np.arange(len(points))])
+    np.testing.assert_array_equal(hull(above), corners)
+    np.testing.assert_array_equal(above[:, :2], points)
 
 
-def test_the_hull_looks_at_the_ground_only_and_leaves_the_points_alone():
-    points = np.random.default_rng(0).normal(size=(20, 3))
-    before = points.copy()
-    np.testing.assert_array_equal(hull(points), hull(points[:, :2].copy()))
-    np.testing.assert_array_equal(points, before)
-
-
-def test_hulls_without_area():
+def test_hulls_without_area_and_with_points_on_their_sides():
     line = np.arange(9)[:, None] * (0.5, 0.25)
     for often in (1, 2, 30):
         assert {tuple(c) for c in hull(np.tile(line, (often, 1)))} == {(0.0, 0.0), (4.0, 2.0)}
         assert hull(np.ones((5 * often, 2))).tolist() == [[1.0, 1.0]]
     assert hull(np.empty((0, 2))).shape == (0, 2)
-    assert area(hull(line)) == area(hull(np.ones((5, 2)))) == area(np.empty((0, 2))) == 0.0
-
-
-def test_the_hull_goes_round_a_square_with_points_on_its_sides():
     grid = np.stack(np.meshgrid(*[np.linspace(0.0, 1.0, 5)] * 2), axis=-1).reshape(-1, 2)
     assert {tuple(c) for c in hull(grid)} == {tuple(c) for c in SQUARE}
     assert len(hull(grid)) == 4
+    assert area(hull(line)) == area(hull(np.ones((5, 2)))) == area(np.empty((0, 2))) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -401,11 +380,6 @@ def test_a_ray_meets_the_voxels_of_the_reference_one_after_the_other(t_from: flo
     assert met > 2000 or t_from == t_to
 
 
-def test_a_ray_without_length_meets_nothing():
-    assert len(voxels(np.full(3, 4.5), np.zeros(3), 0.2, 0.2)) == 0
-    assert len(voxels(np.full(3, -4.5), np.zeros(3), 0.0, 1.0)) == 0
-
-
 def test_rays_out_of_the_far_corner_stay_within_the_grid():
     for ray in ([-13.0, -17.0, -11.0], [-13.0, -1.0, -1.0], [0.0, -17.0, 0.0], [-1e-9, -1.0, -11.0]):
         met = voxels(np.array(GRID, dtype=float), np.array(ray), 0.0, 2.0)
@@ -422,18 +396,12 @@ def points():
     return rng.uniform(-0.15, 0.15, size=(4000, 3)) * (1.0, 1.0, 0.2)
 
 
-def test_of_points_as_near_to_the_mean_the_first_is_kept():
+def test_points_are_thinned_by_voxels(points):
     twice = np.repeat([[0.005, 0.005, 0.005], [0.013, 0.005, 0.005]], [2, 2], axis=0)
     assert most_central(twice, np.ones(4, dtype=np.int32), EDGES).tolist() == [0]
-
-
-def test_nothing_is_kept_of_nothing():
-    assert len(most_central(np.zeros((0, 3)), np.zeros(0, dtype=np.int32), EDGES)) == 0
-    assert len(most_central(np.zeros((5, 3)), np.zeros(5, dtype=np.int32), EDGES)) == 0
+    for nothing in (np.zeros((0, 3)), np.zeros((5, 3))):
+        assert len(most_central(nothing, np.zeros(len(nothing), dtype=np.int32), EDGES)) == 0
     assert len(last_in_voxels(np.zeros((0, 3)), 0.02, 3)) == 0
-
-
-def test_the_last_points_of_each_voxel_stay(points):
     voxel = np.floor(points / 0.03).astype(int)
     later = [(voxel[i:] == voxel[i]).all(axis=1).sum() for i in range(len(points))]
     np.testing.assert_array_equal(last_in_voxels(points, 0.03, 4), np.flatnonzero(np.array(later) <= 4))

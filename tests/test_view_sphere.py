@@ -42,9 +42,5 @@ def test_spread_is_one_at_the_top_and_falls_to_exp_minus_a_half_at_sigma():
     far = -top
     value = spread(top[None], np.stack([top, ring, far]), sigma)
     np.testing.assert_allclose(value[:, 0], [1.0, np.exp(-0.5), 0.0], atol=1e-9)
+    np.testing.assert_allclose(direction(np.pi, np.pi / 6.0), [-np.cos(np.pi / 6), 0.0, 0.5], atol=1e-12)
     assert spread(SPHERE.directions[:3], SPHERE.directions[:5], sigma).shape == (5, 3)
-
-
-def test_direction_has_the_azimuth_and_elevation_asked_for():
-    d = direction(np.pi, np.deg2rad(30.0))
-    np.testing.assert_allclose(d, [-np.cos(np.pi / 6), 0.0, 0.5], atol=1e-12)

@@ -86,15 +86,12 @@ def test_a_view_clears_its_rays_and_fills_their_ends():
     assert (before.states == UNKNOWN).all(), "the map that was given has changed"
 
 
-def test_readings_beyond_the_range_are_free_space_up_to_it():
-    voxels = VoxelMap.around((0.0, 0.0, 0.0), CONFIG).integrate(wall_view(distance=1.3), 1.1)
+def test_readings_beyond_the_range_are_free_space_up_to_it_and_none_say_nothing():
+    empty = VoxelMap.around((0.0, 0.0, 0.0), CONFIG)
+    voxels = empty.integrate(wall_view(distance=1.3), 1.1)
     assert voxels.state_at(np.array([[0.05, 0.01, 0.01], [0.15, 0.01, 0.01]])).tolist() == [FREE, UNKNOWN]
     assert not (voxels.states == OCCUPIED).any()
-
-
-def test_pixels_without_a_reading_say_nothing():
-    voxels = VoxelMap.around((0.0, 0.0, 0.0), CONFIG).integrate(wall_view(distance=0.0), 3.0)
-    assert (voxels.states == UNKNOWN).all()
+    assert (empty.integrate(wall_view(distance=0.0), 3.0).states == UNKNOWN).all()
 
 
 def test_a_surface_survives_depth_noise_and_a_registration_error():
@@ -157,11 +154,3 @@ def test_what_was_never_hit_is_not_occupied_however_misses_count():
     voxels = VoxelMap(np.zeros(3), hits, passes, VoxelConfig(miss=0.5))
     assert voxels.states.ravel().tolist() == [UNKNOWN, FREE, OCCUPIED]
     assert voxels.solid().grid.shape == (1, 1, 1)
-
-
-def test_a_view_without_a_pose_is_refused():
-    from caryatid.errors import InputError
-
-    view = View(np.ones((12, 16), dtype=np.float32), K)
-    with pytest.raises(InputError, match="no camera pose"):
-        VoxelMap.around((0.0, 0.0, 0.0), CONFIG).integrate(view, 3.0)

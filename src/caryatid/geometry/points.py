@@ -132,11 +132,7 @@ def _mixed(x, y, z, group):  # type: ignore[no-untyped-def]
 def solve_positive(A: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
     """Solution x (N,) of A x = b for a symmetric positive definite A (N, N), by Cholesky's factors.
 
-    Where A is not positive definite x has NaN.
-
-    Args:
-        A: (N, N); overwritten by its factor.
-        b: Right side (N,).
+    They overwrite A. Where A is not positive definite x has NaN.
     """
     size = len(b)
     x = np.empty(size)

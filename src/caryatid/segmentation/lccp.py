@@ -20,20 +20,12 @@ Index = NDArray[np.intp]
 def grid_edges(
     places: NDArray[np.bool_], points: Array, normals: Array, edge_jump: float
 ) -> tuple[Index, Index]:
-    """Pairs of samples that are neighbours in the image: on one surface, and at a step.
+    """Pairs (E, 2) of samples that are neighbours on one surface, and pairs (F, 2) on either side of a step.
 
-    There is a step where neither sample's inverse depth lies near the other's tangent plane: unlike the bare
-    difference this does not grow on steep surfaces. Steps are also looked for across short gaps without
-    readings, which sensors leave there.
-
-    Args:
-        places: Which places of the grid hold a sample (H, W).
-        points: Samples (N, 3) [m] in the camera frame.
-        normals: Unit normals (N, 3).
-        edge_jump: Distance from the neighbour's plane beyond which a sample is another surface's [1/m].
-
-    Returns:
-        Pairs (E, 2) on one surface, and pairs (F, 2) at a step.
+    There is a step where neither sample's inverse depth lies near the other's tangent plane, by `edge_jump`
+    [1/m]: unlike the bare difference this does not grow on steep surfaces. Steps are also looked for across
+    short gaps without readings, which sensors leave there. Samples are the places set in a grid (H, W), with
+    points (N, 3) [m] in the camera frame and normals (N, 3).
     """
     number = np.where(places, np.cumsum(places).reshape(places.shape) - 1, -1)
     offset = np.einsum("ij,ij->i", normals, points)
@@ -97,16 +89,9 @@ def convex_parts(
     Stein et al., 2014). Surfels are then merged, the most attractive boundary first, each boundary between
     clusters weighing the mean over its length, so that one bad edge joins nothing.
 
-    Args:
-        points: Samples (N, 3) [m].
-        normals: Unit normals (N, 3), all on the sensor's side.
-        edges: Pairs of samples (E, 2) that are neighbours on one surface.
-        config: Sizes and angles.
-        steps: Pairs of samples (F, 2) that are neighbours in the image, one in front of the other: they
-            repel, for a convex body does not hide itself. None where there is no image.
-
-    Returns:
-        Part of each sample (N,), 1 … n in the order of their first samples, 0 = none.
+    Samples are points (N, 3) [m] with normals (N, 3), edges pairs (E, 2) of neighbours on one surface. Steps
+    are pairs (F, 2) of neighbours in the image, one in front of the other: they repel, for a convex body does
+    not hide itself. Parts (N,) are 1 … n in the order of their first samples, 0 = none.
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)

@@ -43,24 +43,17 @@ class SupportSurface:
         return (points_world - self.point_world) @ self.normal_world
 
     def over(self, points_world: Array, low: float, high: float, margin: float) -> Mask:
-        """Which points (N, 3) [m] are over the outline, or no further than the margin [m] outside it.
+        """Which points (N, 3) [m] are over the outline, or no further than a margin [m] outside its sides.
 
-        Args:
-            points_world: (N, 3) [m].
-            low: Least height [m].
-            high: Greatest height [m].
-            margin: Distance outside the lines of all sides within which points still count [m].
+        Their height is between low and high [m].
         """
         return _points_over(np.ascontiguousarray(points_world), self._planes(margin), low, high)
 
     def pixels_over(self, view: View, low: float, high: float, margin: float = np.inf) -> Mask:
-        """Which pixels (H, W) of a view show something over the surface.
+        """Which pixels (H, W) of a view show something between two heights [m] over the surface.
 
-        Args:
-            view: The view; without a pose, the surface is in the camera frame.
-            low: Least height [m].
-            high: Greatest height [m].
-            margin: As of `over`; infinite: what is anywhere above or below counts.
+        The margin is as of `over`; where it is infinite, what is anywhere above or below counts. Where the
+        view has no pose, the surface is in the camera frame.
         """
         surface = self if view.T_world_camera is None else self.moved(transforms.invert(view.T_world_camera))
         x, y = ((np.arange(n) - view.K[k, 2]) / view.K[k, k] for k, n in enumerate(view.depth.shape[::-1]))
@@ -143,14 +136,9 @@ def find_support_surface(
 def refitted(
     surface: SupportSurface, points: Array, normals: Array, up: Array, config: SurfaceConfig
 ) -> SupportSurface | None:
-    """Fit a support surface that is known well anew, to more points; None where too few are near it.
+    """Fit a support surface that is known within the tolerance to more points (N, 3) [m] with normals (N, 3).
 
-    Args:
-        surface: What is known: within the tolerance nearly everywhere.
-        points: (N, 3) [m].
-        normals: Unit normals (N, 3) towards the sensor.
-        up: Upward direction (3,).
-        config: Tolerances.
+    None where too few are near it.
     """
     normal = surface.normal_world
     offset = float(normal @ surface.point_world)

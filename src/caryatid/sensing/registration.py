@@ -283,13 +283,11 @@ class ViewRegistration:
 
 
 class _View(NamedTuple):
-    """A view as registration keeps it; patches are rows as of `surfels`.
+    """A view as registration keeps it.
 
-    Attributes:
-        patches: Its patches (P, 8), in the world as reported, sorted to be found.
-        starts: Where in them the list of each bucket begins (BUCKETS + 1,).
-        sample: Those (S, 8) that look for partners in other views.
-        information: Inverse covariance (6, 6) of the reported pose's error, as a twist about the pivot.
+    Its patches (P, 8) lie in the world as reported, sorted to be found, with where the list of each bucket
+    begins (BUCKETS + 1,). A sample of them (S, 8) looks for partners in other views. The information is the
+    inverse covariance (6, 6) of the reported pose's error, as a twist about the pivot.
     """
 
     patches: Array
@@ -348,19 +346,9 @@ def find_correspondences(samples, twist, patches, starts, other_twist, pivot, ed
     """Look for the patch of another view that is nearest in place and direction, and linearise the distance.
 
     Distance is along the mean of both normals, and its derivative by a move of either view that about the
-    middle between the two patches: a move of both views together changes nothing. Coordinates are about the
-    pivot (3,) [m].
-
-    Args:
-        samples: Patches (S, 8) that look for a partner.
-        twist: Where their view is, from where it was reported (6,).
-        patches: Those of the other view (P, 8), sorted by cells of this edge [m].
-        starts: Where the list of each bucket begins in them (BUCKETS + 1,).
-        other_twist: Where the other view is (6,).
-        pivot: What twists turn about (3,) [m].
-        edge: Edge of a cell [m].
-        reach: How far away a partner may be [m].
-        noise: Standard deviation of the distance beside what the patches bring [m].
+    middle between the two patches: a move of both views together changes nothing. Samples (S, 8) are of a
+    view that was moved by a twist (6,) about the pivot (3,) [m], patches (P, 8) of another one, as
+    `index_patches` gives them. Partners are within reach [m]; noise [m] comes on top of what patches bring.
 
     Returns:
         Rows (S, 8): derivative (6,) of the distance by the samples' twist, that by the other's being the
@@ -499,14 +487,9 @@ def normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
 def step_down(rows, twist, information, independent, outlier, steps, settled):  # type: ignore[no-untyped-def]
     """Move a view by Gauss–Newton on the robust distances and its pose as reported; partners stay the same.
 
-    Args:
-        rows: (N, 8) as of `find_correspondences`, found with the view where it is.
-        twist: Where it is, from where it was reported (6,).
-        information: Inverse covariance (6, 6) of the reported pose's twist.
-        independent: Share of the partners that err independently.
-        outlier: Distance beyond which partners lose their weight [m].
-        steps: Steps at the most.
-        settled: A smaller step is the last [m, rad].
+    Rows (N, 8) of `find_correspondences` are those of the view where it is, at a twist (6,) whose reported
+    error has this inverse covariance (6, 6). A share of the partners errs independently; those further off
+    than an outlier [m] lose their weight. A step smaller than settled [m, rad] is the last.
 
     Returns:
         By how much the twist changes (6,); how many partners there are and the sum of their distances [m],

@@ -75,12 +75,8 @@ def gather(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Sum up the readings of each voxel that are of one label and face roughly one way.
 
-    Args:
-        points: (N, 3) [m].
-        normals: Unit normals (N, 3).
-        labels: Label (N,) of each point; 0 counts nowhere.
-        spacing: Edge of a voxel [m].
-        spacing_far: Edge of a voxel of the support surface [m].
+    Points are (N, 3) [m], normals (N, 3); the label (N,) 0 counts nowhere. Voxels have this spacing [m],
+    those of the support surface the far one.
 
     Returns:
         Of each patch (P,), ascending: its voxel, three cell numbers of 21 bits; its kind, 6·label + (0, 1, 2
@@ -182,12 +178,9 @@ def _flattened(
 
 
 def fit_planes(points: Array, side: NDArray[np.intp], flat: float) -> tuple[Array, Array, Array]:
-    """Fit a plane to the points of each side, robustly: those that lie off it lose their weight.
+    """Fit a plane to the points (N, 3) [m] of each side 0 … S − 1, robustly: those off it lose their weight.
 
-    Args:
-        points: (N, 3) [m].
-        side: Side (N,) each point is of, from 0 to S − 1.
-        flat: Distance from the plane at which a point counts a quarter [m].
+    At the distance `flat` [m] from the plane a point counts a quarter.
 
     Returns:
         Of each side the plane's normal (S, 3) and the variance along the shorter direction in the plane (S,)
@@ -249,14 +242,8 @@ def _least_spreads(spreads):  # type: ignore[no-untyped-def]
 def even_sample(side: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """Pick patches evenly over labels and the directions they face: a small side counts as much as a table.
 
-    Normal-space sampling after Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm, 2001.
-
-    Args:
-        side: Side (P,) each patch is of.
-        count: How many at the most.
-
-    Returns:
-        Indices (M,), ascending.
+    Normal-space sampling after Rusinkiewicz and Levoy, Efficient variants of the ICP algorithm, 2001. Of the
+    patches, each of one side (P,), it gives ascending indices (M,), no more than `count`.
     """
     if len(side) <= count:
         return np.arange(len(side))

@@ -29,12 +29,7 @@ class ViewSphere:
 
     @classmethod
     def around(cls, centre_world: ArrayLike, config: ActiveVisionConfig) -> ViewSphere:
-        """Build the sphere of `config.sphere_points` views around a point.
-
-        Args:
-            centre_world: The centre (3,) [m].
-            config: Radius and number of views.
-        """
+        """Build the sphere of `config.sphere_points` views around a point (3,) [m]."""
         centre = np.array(centre_world, dtype=np.float64)
         return cls(centre, config.sphere_radius, fibonacci_sphere(config.sphere_points))
 
