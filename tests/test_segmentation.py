@@ -28,8 +28,9 @@ STACK = [
 BALL = (np.array([0.05, 0.18, TABLE + 0.06]), 0.06)
 
 
-def surface_of(view, up=UP, seed=0, stride=2):
-    points, normals, _ = oriented_points(view, CloudConfig(), stride)
+def surface_of(view, up=UP, seed=0):
+    points, normals, _ = oriented_points(view, CloudConfig())
+    points, normals = points[::4], normals[::4]
     return find_support_surface(points, normals, up, SurfaceConfig(), np.random.default_rng(seed))
 
 

@@ -21,7 +21,7 @@ ZERO = np.float32(0.0)
 
 
 def oriented_points(
-    view: View, config: CloudConfig, stride: int = 1, *, among: NDArray[np.bool_] | None = None
+    view: View, config: CloudConfig, *, among: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array, NDArray[np.intp]]:
     """Oriented points of a view: the readings in working range that have a normal, smoothed by local planes.
 
@@ -30,7 +30,6 @@ def oriented_points(
     Args:
         view: The view; without a pose, "world" below is the camera frame.
         config: Working range and normal estimation.
-        stride: Take every stride-th row and column [px].
         among: Which readings (H, W) to take, or None for all of them.
 
     Returns:
@@ -45,19 +44,14 @@ def oriented_points(
     else:
         taken &= np.einsum("hwi,hwi->hw", given, given) > 0.5
         taken &= True if among is None else among
-    sampled = np.zeros_like(taken)
-    sampled[::stride, ::stride] = taken[::stride, ::stride]
-    pixels = np.flatnonzero(sampled)
+    pixels = np.flatnonzero(taken)
     if given is None:
         points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
         for_each(_orient, SHARES, (pixels, planes, np.ascontiguousarray(view.K), T, points, normals))
         return points, normals, pixels
-    points_camera, normals_camera = view.points_camera.reshape(-1, 3), given.reshape(-1, 3).astype(np.float64)
-    return (
-        transforms.transform(T, points_camera[pixels]),
-        transforms.rotate(T, normals_camera[pixels]),
-        pixels,
-    )
+    points_camera, normals_camera = view.points_camera.reshape(-1, 3), given.reshape(-1, 3).astype(float)
+    points, normals = points_camera[pixels], normals_camera[pixels]
+    return transforms.transform(T, points), transforms.rotate(T, normals), pixels
 
 
 def _inverse_depth(
