@@ -337,7 +337,7 @@ def _with_points(graph: SupportGraph, sphere: ViewSphere, visited: Array, config
         return SupportGraph(tuple(objects[:count]), tuple(s for s in supports if {*s.pair} <= ids))
 
     def points(count: int) -> int:
-        return len(points_of_interest(part(count), sphere, visited, len(visited), config.active))
+        return len(points_of_interest(part(count), sphere, visited, config.active))
 
     while points(len(objects) - 1) >= POINTS:
         objects.pop()

@@ -154,19 +154,6 @@ def test_labels_that_are_demanded_and_missing_end_the_loop():
         next(explore(Playback(views), robot, config=CONFIG, segmentation="labels"))
 
 
-def test_an_explorer_driven_by_hand_does_what_explore_does(steps):
-    set_up = stage()
-    explorer = Explorer(set_up.camera, set_up.robot, config=CONFIG)
-    for step in steps:
-        explorer.look()
-        planned = explorer.plan()
-        assert graph_text(planned.graph) == graph_text(step.graph)
-        assert planned.path_travelled == step.path_travelled
-        if step.decision is not None:
-            assert repr(planned) == repr(step)
-            explorer.go()
-
-
 def test_a_person_may_choose_another_view_and_another_planner():
     set_up = stage()
     explorer = Explorer(set_up.camera, set_up.robot, config=CONFIG, planner="support")

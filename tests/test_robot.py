@@ -150,14 +150,24 @@ class TestHumanoidRobot:
         np.testing.assert_allclose(candidates.directions, SPHERE.directions[candidates.indices])
         np.testing.assert_allclose(SPHERE.direction_of(candidates.T_world_camera), candidates.directions)
 
-    def test_moving_changes_where_it_stands_and_returns_the_way(self):
-        robot = standing(floor(TABLE), pose(180.0, 35.0))
-        there = pose(90.0, 35.0)
-        length = robot.move_to(there)
-        assert 1.5 < length < 2.6
-        np.testing.assert_array_equal(robot.T_world_camera, there)
-        assert robot.move_to(there) == 0.0
-        assert robot.move_to(pose(180.0, 35.0)) == pytest.approx(length, abs=1e-9)
+    def test_a_robot_that_moved_is_offered_the_same_views_by_other_paths(self):
+        grid = floor(TABLE, box((0.0, 2.2, 1.0), (3.0, 0.05, 1.0)))
+        moved = standing(grid, pose(180.0, 35.0))
+        before = moved.candidates(SPHERE)
+        there = int(np.argmax(before.directions @ direction(0.0, 0.6)))
+        length = moved.move_to(before.T_world_camera[there])
+        assert length == before.path_length[there] > 2.0
+        np.testing.assert_array_equal(moved.T_world_camera, before.T_world_camera[there])
+        after, fresh = moved.candidates(SPHERE), standing(grid, moved.T_world_camera).candidates(SPHERE)
+        for field in ("T_world_camera", "directions", "path_length", "indices"):
+            np.testing.assert_array_equal(getattr(after, field), getattr(fresh, field))
+        assert after.rejected == fresh.rejected
+        assert after.looks(1000) is moved.candidates(SPHERE).looks(1000)
+        other = ViewSphere.around((0.1, 0.0, 0.85), ActiveVisionConfig())
+        offered = moved.candidates(other)
+        np.testing.assert_allclose(other.poses(offered.directions), offered.T_world_camera)
+        assert moved.move_to(moved.T_world_camera) == 0.0
+        assert moved.move_to(pose(180.0, 35.0)) == pytest.approx(length, abs=0.1)
 
     def test_home_is_the_reachable_view_nearest_to_the_minus_x_side(self):
         robot = HumanoidRobot(floor(TABLE), CONFIG)

@@ -228,7 +228,7 @@ class Explorer:
         if step.decision is None or step.candidates is None or not 0 <= index < len(step.candidates):
             raise PlanningError("there is no such view to choose")
         rated = step.decision.candidate_saliency
-        saliency = 0.0 if rated is None or index >= len(rated) else float(rated[index])
+        saliency = 0.0 if rated is None else float(rated[index])
         cost = float(path_cost(_state(self.scene, step.sphere, step.visited, step.candidates))[index])
         return replace(
             step.decision,
@@ -329,7 +329,6 @@ def next_best_view(
     *,
     candidates: Candidates | None = None,
     planner: Planner | str = "support",
-    seed: int = 0,
 ) -> Decision:
     """Choose where to look next (Algorithm 2).
 
@@ -340,7 +339,6 @@ def next_best_view(
             current one last; None = where the robot is.
         candidates: The views to choose from; None = those the robot reaches.
         planner: Chooses among them, or its name.
-        seed: Seed of random planners.
 
     Returns:
         The decision: `T_world_camera` is the view, `why` the reason.
@@ -357,7 +355,7 @@ def next_best_view(
         candidates = robot.candidates(sphere)
     if visited is None or candidates is None:
         raise PlanningError("there is no robot; give the views so far, and those to choose from")
-    return _decide(_state(scene, sphere, visited, candidates), robot, make_planner(planner), seed)[0]
+    return _decide(_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed)[0]
 
 
 @one_blas_thread

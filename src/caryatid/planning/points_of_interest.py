@@ -35,7 +35,7 @@ class PointOfInterest:
 
 
 def points_of_interest(
-    graph: SupportGraph, sphere: ViewSphere, visited: Array, views: int, config: ActiveVisionConfig
+    graph: SupportGraph, sphere: ViewSphere, visited: Array, config: ActiveVisionConfig
 ) -> list[PointOfInterest]:
     """Generate the points of interest of a support graph, Algorithm 1.
 
@@ -46,8 +46,7 @@ def points_of_interest(
     Args:
         graph: What is known.
         sphere: The view sphere.
-        visited: Unit directions (V, 3) of the earlier views.
-        views: How many views there have been, #views of eq. 2.
+        visited: Unit directions (V, 3) of the earlier views, #views of eq. 2.
         config: λ_s, the period of eq. 2 and where a relation's point lies.
     """
     middle = largest_arc(visited)
@@ -64,7 +63,7 @@ def points_of_interest(
             position = (centres[support.supporter] + centres[support.supported]) / 2.0
             if config.edge_point == "contact" and support.contact_world is not None:
                 position = support.contact_world
-            points.append(_relation(support, position, sphere, views, config))
+            points.append(_relation(support, position, sphere, len(visited), config))
     return points
 
 

@@ -90,7 +90,7 @@ def plan_next(
         sphere = view_sphere_of(robot, sphere)
         candidates = _reached(robot, T_world_cameras[-1], sphere, scene.sphere.centre_world)
     visited = sphere.direction_of(np.stack(T_world_cameras))
-    decision = next_best_view(scene, robot, visited, candidates=candidates, planner=planner, seed=scene.seed)
+    decision = next_best_view(scene, robot, visited, candidates=candidates, planner=planner)
     posture = None if robot is None else robot.solve(decision.T_world_camera)
     return decision, posture if isinstance(posture, Posture) else None
 

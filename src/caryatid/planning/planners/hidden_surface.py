@@ -54,7 +54,7 @@ class SupportPlanner:
         check_candidates(state)
         config, sphere, candidates = state.config, state.sphere, state.candidates
         looks = candidates.looks(config.look_directions)
-        relations = points_of_interest(state.graph, sphere, state.visited, len(state.visited), config)
+        relations = points_of_interest(state.graph, sphere, state.visited, config)
         relations += points_of_doubt(state.graph, sphere, state.visited)
         samples, gain = _expected_gain(state, relations, candidates.T_world_camera[looks.chosen])
         inhibition = inhibition_of_return(state.visited, candidates.directions[looks.chosen], config)

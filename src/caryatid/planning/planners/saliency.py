@@ -36,7 +36,7 @@ class AttentionPlanner:
         """
         check_candidates(state)
         config, directions, visited = state.config, state.candidates.directions, state.visited
-        points = points_of_interest(state.graph, state.sphere, visited, len(visited), config)
+        points = points_of_interest(state.graph, state.sphere, visited, config)
         saliency, strongest = _largest(points, directions, config, _hidden(points, state))
 
         def why(best: int) -> str:
