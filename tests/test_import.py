@@ -448,43 +448,37 @@ def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views,
 
 # Which frames become views
 
-CONFIG = RecordingConfig()
+
+def poses(positions=(), turns_deg=()):
+    """Cameras along a line [m], or turning on the spot [deg]."""
+    moved = [transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions]
+    turned = [Rotation.from_rotvec((0.0, turn, 0.0), degrees=True).as_matrix() for turn in turns_deg]
+    return np.stack([*moved, *(transforms.rigid(R, np.zeros(3)) for R in turned)])
 
 
-def along_a_line(positions):
-    return np.stack([transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions])
+@pytest.mark.parametrize(
+    ("T_world_camera", "most", "chosen", "skipped"),
+    [
+        (poses(turns_deg=[0.0, 4.0, 12.0, 4.0, 0.0]), 30, [0, 2], {"seen from where another view is": 3}),
+        (poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0]), 3, [0, 11, 12], {"more than are wanted": 10}),
+    ],
+    ids=["a turn without a step is another view", "those farthest apart stay"],
+)
+def test_equally_sharp_frames_are_chosen_by_where_they_are_seen_from(T_world_camera, most, chosen, skipped):
+    count = len(T_world_camera)
+    config = RecordingConfig(max_views=most)
+    assert choose_views(np.arange(count) * 1.0, np.ones(count), T_world_camera, config) == (chosen, skipped)
 
 
-def test_a_camera_at_rest_gives_one_view_the_sharpest():
-    times = np.arange(10) / 30.0
-    sharpness = np.full(10, 1.0)
-    sharpness[6] = 1.2
-    chosen = choose_views(times, sharpness, along_a_line(np.zeros(10)), CONFIG)
+def test_of_frames_from_one_place_the_sharpest_is_chosen_and_blurred_ones_never():
+    sharpness = np.where(np.arange(10) == 6, 1.2, 1.0)
+    chosen = choose_views(np.arange(10) / 30.0, sharpness, poses(np.zeros(10)), RecordingConfig())
     assert chosen == ([6], {"seen from where another view is": 9})
-
-
-def test_blurred_frames_are_left_out_and_sharp_ones_beside_them_taken():
-    times = np.arange(40) * 0.1
-    sharpness = np.where(np.arange(40) % 3 == 0, 10.0, 5.0)
-    kept, others = choose_views(times, sharpness, along_a_line(times), CONFIG)
+    times, sharpness = np.arange(40) * 0.1, np.where(np.arange(40) % 3 == 0, 10.0, 5.0)
+    kept, others = choose_views(times, sharpness, poses(times), RecordingConfig())
     assert len(kept) > 8
     assert all(k % 3 == 0 for k in kept)
     assert others["blurred"] == 26
-
-
-def test_a_turn_without_a_step_is_another_view_and_coming_back_is_not():
-    turns = np.radians([0.0, 4.0, 12.0, 4.0, 0.0])
-    poses = np.stack(
-        [transforms.rigid(transforms.rotation_from_vector((0.0, a, 0.0)), np.zeros(3)) for a in turns]
-    )
-    assert choose_views(np.arange(5) * 1.0, np.ones(5), poses, CONFIG)[0] == [0, 2]
-
-
-def test_of_too_many_those_farthest_apart_stay():
-    positions = np.concatenate([np.linspace(0.0, 2.0, 11), [10.0, 20.0]])
-    config = RecordingConfig(max_views=3)
-    chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along_a_line(positions), config)
-    assert chosen == ([0, 11, 12], {"more than are wanted": 10})
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 12))
