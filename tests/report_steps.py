@@ -57,13 +57,10 @@ def make_view(graph: SupportGraph, rgb: bool = True) -> View:
 
 
 def make_cloud(graph: SupportGraph) -> Cloud:
-    points, normals, labels = [], [], []
-    for item in graph.objects:
-        surface, outward = item.shape.surface(0.015)
-        points.append(surface)
-        normals.append(outward)
-        labels.append(np.full(len(surface), item.label or SUPPORT_LABEL, dtype=np.int32))
-    return Cloud(np.concatenate(points), np.concatenate(normals), np.concatenate(labels), name="fused")
+    surfaces = [item.shape.surface(0.015) for item in graph.objects]
+    labels = np.repeat([item.label or SUPPORT_LABEL for item in graph.objects], [len(p) for p, _ in surfaces])
+    points, normals = (np.concatenate(part) for part in zip(*surfaces, strict=True))
+    return Cloud(points, normals, labels.astype(np.int32), name="fused")
 
 
 def make_step(index: int = 0, *, rgb: bool = True, decide: bool = True) -> Step:

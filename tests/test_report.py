@@ -168,17 +168,15 @@ def test_a_chart_has_the_packages_own_style():
 @pytest.mark.slow
 def test_any_step_is_drawn():
     """Without colour, decision, pose, view, objects or points."""
-    step = make_step()
+    cloud = replace(make_step(), view=None, decision=None, candidates=None)
     empty = Cloud(np.empty((0, 3)), np.empty((0, 3)), name="nothing")
-    plain = make_step(rgb=False, decide=False)
-    cloud = replace(step, view=None, decision=None, candidates=None)
-    nothing = replace(step, view=None, graph=SupportGraph(), cloud=empty, decision=None)
-    report = make_report("t", [plain, cloud, nothing], config=SMALL)
+    nothing = replace(make_step(), view=None, graph=SupportGraph(), cloud=empty, decision=None)
+    report = make_report("t", [make_step(rgb=False, decide=False), cloud, nothing], config=SMALL)
     Page(render_html(report))
-    views = [section for section in report.sections if section.title.startswith("View")]
-    assert len(views[0].figures) == 4
-    assert "depth image" in views[0].figures[0].caption
-    assert [figure.heading[:9] for figure in views[1].figures] == ["What supp", "The cloud", "The cloud"]
+    first, second, _ = (section for section in report.sections if section.title.startswith("View"))
+    assert len(first.figures) == 4
+    assert "depth image" in first.figures[0].caption
+    assert [figure.heading[:9] for figure in second.figures] == ["What supp", "The cloud", "The cloud"]
     assert "Contact sheet" not in [section.title for section in report.sections]
     assert render_pdf(make_report("t", [nothing]))
 
@@ -310,31 +308,28 @@ def test_projection_agrees_with_the_view_and_knows_what_is_hidden():
 
 
 def test_tags_end_up_apart_and_inside():
-    anchors = np.random.default_rng(0).uniform((0.0, 0.0), (300.0, 200.0), (14, 2))
-    anchors[3] = anchors[4]
-    sizes = np.tile((34.0, 18.0), (14, 1))
+    anchors, room = np.random.default_rng(0).uniform(0.0, (300.0, 200.0), (14, 2)), np.array([300.0, 200.0])
+    anchors[3], sizes = anchors[4], np.tile((34.0, 18.0), (14, 1))
     centres = keep_apart(anchors, sizes, (300.0, 200.0))
     gaps = np.abs(centres[:, None] - centres[None, :]) - sizes
     assert not ((gaps < -0.5).all(axis=-1) & ~np.eye(14, dtype=bool)).any()
-    assert (centres >= sizes / 2 - 1e-9).all()
-    assert (centres <= np.array([300.0, 200.0]) - sizes / 2 + 1e-9).all()
+    assert ((centres >= sizes / 2 - 1e-9) & (centres <= room - sizes / 2 + 1e-9)).all()
 
 
 def test_drawing_is_reproducible_and_leaves_the_step_alone():
     step = make_step()
-    before = (step.cloud.points_world.copy(), step.labels.copy(), step.view.depth.copy())
+    arrays = step.cloud.points_world, step.labels, step.view.depth
+    before = [array.copy() for array in arrays]
     first, again = (render_html(make_report("t", [step], config=SMALL)) for _ in range(2))
     assert first == again
-    for array, copy in zip((step.cloud.points_world, step.labels, step.view.depth), before, strict=True):
-        assert np.array_equal(array, copy)
+    assert all(np.array_equal(array, copy) for array, copy in zip(arrays, before, strict=True))
 
 
 @pytest.mark.slow
 def test_ten_views_stay_small():
-    rng = np.random.default_rng(0)
+    rng, step = np.random.default_rng(0), make_step()
     noisy = rng.integers(0, 255, (480, 640, 3)).astype(np.uint8)
     K_vga = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
-    step = make_step()
     view = View(np.ones((480, 640), np.float32), K_vga, step.view.pose, noisy)
     labels = rng.integers(0, 8, (480, 640)).astype(np.int32)
     assert len(render_html(make_report("t", [replace(step, view=view, labels=labels)]))) < 8e5

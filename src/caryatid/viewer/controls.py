@@ -67,7 +67,7 @@ class Controls:
             self._dismantle = self._button("dismantle", self._play_order, hint)
         self._pause.disabled = True
         self._planner.on_update(lambda _: self._do("planning again", self._replan))
-        self._fusion.on_update(lambda _: self._do("taking the same views again", self._fuse_anew))
+        self._fusion.on_update(lambda _: self._do("taking the same views again", self._fuse_again))
         self._by_hand.on_update(lambda _: self._listen(self._by_hand.value))
 
     def _button(self, label: str, press: Callable[[], None], hint: str) -> Any:
@@ -129,8 +129,6 @@ class Controls:
         return "paused"
 
     def _replan(self) -> str | None:
-        if self._planner.value == self._loop.planner:
-            return None
         with self._page.working:
             moment = self._loop.use_planner(self._planner.value)
         if moment is None:
@@ -138,9 +136,7 @@ class Controls:
         self._page.add(moment)
         return f"{self._loop.planner} chose the next view"
 
-    def _fuse_anew(self) -> str | None:
-        if self._fusion.value == self._loop.fusion:
-            return None
+    def _fuse_again(self) -> str:
         self._page.stage(None)
         with self._page.working:
             for moment in self._loop.use_fusion(self._fusion.value):
@@ -164,8 +160,7 @@ class Controls:
             self._do("choosing", lambda: self._choose(index))
 
     def _choose(self, index: int) -> str:
-        planned = self._loop.planned
-        chosen = self._loop.choose(index)
+        chosen, planned = self._loop.choose(index), self._loop.planned
         self._page.add(chosen)
         if planned is None or chosen.step.decision is None:
             return "your view is next"
@@ -173,11 +168,10 @@ class Controls:
         return f"your view is next: score {yours:.2f}, the choice of {self._loop.planner} {planned.score:.2f}"
 
     def _take_apart(self) -> str:
-        moment, config = self._loop.moments[-1], self._loop.config
+        loop, moment, said = self._loop, self._loop.moments[-1], ""
         with self._page.working:
-            order = plan_order(moment.step.graph, config, seed=self._seed, threads=cores())
-        said = ""
-        for step, done in taken_apart(moment.step, order.steps, self._loop.source, config):
+            order = plan_order(moment.step.graph, loop.config, seed=self._seed, threads=cores())
+        for step, done in taken_apart(moment.step, order.steps, loop.source, loop.config):
             if not self._running.is_set() or self._closed:
                 return "paused"
             self._page.stage(replace(moment, step=step))

@@ -21,14 +21,12 @@ from caryatid.viz.drawings import image_of
 
 LAYERS = ("cloud", "shapes", "names", "supports", "sphere", "interest", "cameras", "robot")
 """What can be shown and hidden."""
-MOST_POINTS, PICTURE_WIDTH = 1_000_000, 240
-"""Points kept of a cloud at most, evenly picked, and width a camera's picture is reduced to [px]."""
 CERTAIN, UNCERTAIN = (26, 32, 40), (196, 78, 12)
 """Colours of supports; uncertain ones are dashed too."""
 EARLIER, NEXT, BY_HAND, ROBOT = (128, 136, 146), (11, 92, 148), (170, 30, 120), (120, 130, 142)
 """Colours of earlier views, the planner's choice, one by hand, and the robot."""
-SHAFT, HEAD_LENGTH, SIGN = 0.0035, 0.028, 0.011
-"""Radius of an arrow's shaft, length of its head, and size of the sign of its kind [m]."""
+ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.028}
+"""Sizes of an arrow [m]."""
 SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
 
 
@@ -47,16 +45,15 @@ class Moment:
     by_hand: bool = False
 
     def reduced(self) -> Moment:
-        """The same with no more of its cloud and image than is drawn, so that the page can keep every one."""
-        view, cloud = self.step.view, self.step.cloud
-        if len(cloud) > MOST_POINTS:
-            cloud = cloud.select(np.arange(0, len(cloud), -(-len(cloud) // MOST_POINTS)))
-        if view is not None:
-            k = max(1, view.depth.shape[1] // PICTURE_WIDTH)
-            small = None if view.rgb is None else view.rgb[::k, ::k].copy()
-            K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
-            view = View(view.depth[::k, ::k].copy(), K, view.T_world_camera, small, name=view.name)
-        return replace(self, step=replace(self.step, view=view, cloud=cloud))
+        """The same with an image no larger than it is drawn, so that the page can keep every one."""
+        view = self.step.view
+        if view is None:
+            return self
+        k = max(1, view.depth.shape[1] // 240)
+        rgb = None if view.rgb is None else view.rgb[::k, ::k].copy()
+        K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
+        small = View(view.depth[::k, ::k].copy(), K, view.T_world_camera, rgb, name=view.name)
+        return replace(self, step=replace(self.step, view=small))
 
 
 def moment_of_scene(scene: Scene) -> Moment:
@@ -84,7 +81,7 @@ class SceneDrawing:
     def __init__(self, server: Any, clicked: Callable[[str], None]) -> None:
         self._server, self._scene, self._clicked = server, server.scene, clicked
         self._frames = {name: self._scene.add_frame(f"/{name}", show_axes=False) for name in LAYERS}
-        self._keys: dict[str, tuple[object, ...]] = {}
+        self._shown: dict[str, tuple[object, ...]] = {}
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
 
     def show_layer(self, name: str, visible: bool) -> None:
@@ -109,24 +106,23 @@ class SceneDrawing:
             point_size: Diameter of the cloud's points [m].
             true_colours: Points as the camera saw them, not in their objects' colours.
         """
-        step = moment.step
-        graph, sphere, decision = step.graph, step.sphere, step.decision
-        layers: dict[str, tuple[Callable[..., list[Any]], tuple[Any, ...]]] = {
-            "cloud": (self._cloud, (step.cloud, point_size, true_colours)),
-            "shapes": (self._shapes, (graph, chosen)),
-            "names": (self._names, (graph,)),
-            "supports": (self._supports, (graph,)),
-            "sphere": (self._sphere, (sphere, step.candidates, decision)),
-            "interest": (self._interest, (sphere, decision)),
-            "cameras": (self._cameras, (decision, moment.by_hand, *steps)),
-            "robot": (self._robot, (step.robot,)),
+        step, decision = moment.step, moment.step.decision
+        layers: dict[str, tuple[object, ...]] = {
+            "cloud": (step.cloud, point_size, true_colours),
+            "shapes": (step.graph, chosen),
+            "names": (step.graph,),
+            "supports": (step.graph,),
+            "sphere": (step.sphere, step.candidates, decision),
+            "interest": (step.sphere, decision),
+            "cameras": (decision, moment.by_hand, *steps),
+            "robot": (step.robot,),
         }
         with self._server.atomic():
-            for name, (draw, key) in layers.items():
-                if self._keys.get(name) != key:
+            for name, shown in layers.items():
+                if self._shown.get(name) != shown:
                     for node in self.nodes[name]:
                         node.remove()
-                    self.nodes[name], self._keys[name] = draw(*key), key
+                    self.nodes[name], self._shown[name] = getattr(self, f"_{name}")(*shown), shown
 
     def _points(self, name: str, points: Array, colours: NDArray[np.uint8], size: float) -> Any:
         """Points (N, 3); they are sent as half floats, and so counted from their middle."""
@@ -182,35 +178,34 @@ class SceneDrawing:
         return [self._scene.add_line_segments(name, ends, colours, **look)] if len(ends) else []
 
     def _arrows(self, name: str, ends: Sequence[Array], colour: Colour) -> list[Any]:
-        size = {"shaft_radius": SHAFT, "head_radius": 0.0095, "head_length": HEAD_LENGTH}
-        return [self._scene.add_arrows(name, np.array(ends), colour, **size)] if ends else []
+        return [self._scene.add_arrows(name, np.array(ends), colour, **ARROW)] if ends else []
 
     def _supports(self, graph: SupportGraph) -> list[Any]:
         """Arrows from supporter to supported; a ball stands for leaning, a cube for weight from above."""
-        arrows: dict[bool, list[Array]] = {True: [], False: []}
+        arrows: dict[Colour, list[Array]] = {CERTAIN: [], UNCERTAIN: []}
         nodes, dashes = [], [np.zeros((0, 2, 3))]
         for number, support in enumerate(graph.supports):
             start, end = _ends(support, graph)
-            length = float(np.linalg.norm(end - start))
+            neck, length = start, float(np.linalg.norm(end - start))
             if length < 1e-6:
                 continue
-            neck = start
             if not support.certain:
-                neck = end - min(2.0 * HEAD_LENGTH, 0.5 * length) * (end - start) / length
+                neck = end - min(2.0 * ARROW["head_length"], 0.5 * length) * (end - start) / length
                 count = max(2, round(float(np.linalg.norm(neck - start)) / 0.016))
                 dashes.append(np.linspace(start, neck, 2 * count).reshape(-1, 2, 3))
-            arrows[support.certain].append(np.array([neck, end]))
-            name, colour = f"/supports/{support.kind} {number}", CERTAIN if support.certain else UNCERTAIN
-            place = {"color": colour, "position": (start + end) / 2.0}
+            colour = CERTAIN if support.certain else UNCERTAIN
+            arrows[colour].append(np.array([neck, end]))
+            name, look = (
+                f"/supports/{support.kind} {number}",
+                {"color": colour, "position": (start + end) / 2.0},
+            )
             if support.kind == "lean":
-                nodes.append(self._scene.add_icosphere(name, radius=SIGN, **place))
+                nodes.append(self._scene.add_icosphere(name, radius=0.011, **look))
             elif support.kind == "top-down":
-                nodes.append(self._scene.add_box(name, dimensions=(1.7 * SIGN,) * 3, **place))
-        nodes += self._arrows("/supports/certain", arrows[True], CERTAIN)
-        nodes += self._arrows("/supports/uncertain", arrows[False], UNCERTAIN)
-        return nodes + self._lines(
-            "/supports/dashes", np.concatenate(dashes), UNCERTAIN, thickness=2.0 * SHAFT
-        )
+                nodes.append(self._scene.add_box(name, dimensions=(0.019, 0.019, 0.019), **look))
+        nodes += self._arrows("/supports/certain", arrows[CERTAIN], CERTAIN)
+        nodes += self._arrows("/supports/uncertain", arrows[UNCERTAIN], UNCERTAIN)
+        return nodes + self._lines("/supports/dashes", np.concatenate(dashes), UNCERTAIN, thickness=0.007)
 
     def _sphere(self, sphere: ViewSphere, candidates: Any, decision: Any) -> list[Any]:
         """Where the camera can go, painted with saliency; where it cannot, pale and only above the table."""

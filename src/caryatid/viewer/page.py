@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
 from threading import RLock
@@ -13,6 +14,7 @@ import numpy as np
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
+from caryatid.exploration import Step
 from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.support.relations import predict_removal
@@ -61,14 +63,12 @@ class Page:
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
         self.moments: list[Moment] = []
         self.drawing = SceneDrawing(self.server, self.choose)
-        self._support = support or SupportConfig()
-        self._shown = -1
-        self._chosen = ""
+        self._support, self._small = support or SupportConfig(), small
+        self._shown, self._chosen = -1, ""
         self._staged: Moment | None = None
         self._graph_drawn: SupportGraph | None = None
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
-        self._small = small
         self._build()
 
     @property
@@ -88,7 +88,7 @@ class Page:
         if newest:
             self._shown = len(self.moments) - 1
         if len(self.moments) == 1:
-            self._look_at(moment)
+            self._look_at(moment.step)
         self.redraw()
 
     def update(self, scene: Scene) -> None:
@@ -172,39 +172,32 @@ class Page:
         with about.add_tab("object"):
             told = "Click an object in the scene to see what is known of it."
             self._about = gui.add_html(cell_html(Section("", told)))
-        if not self._small:
-            gui.main_panel.dock_right()
         panel.dock_left()
         panel.set_width(380)
         about.dock_below(panel)
         if self._small:
             panel.minimize()
+        else:
+            gui.main_panel.dock_right()
 
-    def _look_at(self, moment: Moment) -> None:
+    def _look_at(self, step: Step) -> None:
         """Have the eye begin over the shoulder of the first camera, or before the middle of what is there."""
-        camera = self.server.initial_camera
-        centre = moment.step.sphere.centre_world
-        backward = np.array([-1.0, -0.7, 0.0])
-        if len(moment.step.visited):
-            x, y = moment.step.visited[0][:2]
-            backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
+        x, y = step.visited[0][:2] if len(step.visited) else (-1.0, 0.0)
+        backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
         backward /= max(float(np.linalg.norm(backward)), 1e-9)
         distance = 1.7 if self._small else 3.2  # The table only, or all cameras in sight [m].
-        camera.look_at = centre
-        camera.position = centre + distance * (backward + [0.0, 0.0, 0.7])
+        camera = self.server.initial_camera
+        camera.look_at = step.sphere.centre_world
+        camera.position = step.sphere.centre_world + distance * (backward + [0.0, 0.0, 0.7])
         camera.fov = 0.72  # Narrow, so that what is near does not hide what is far [rad].
 
     def _draw(self) -> None:
         moment, chosen = self._staged or self.shown, self._chosen
         if moment is None:
             return
-        self.drawing.show(
-            moment,
-            [m.step for m in self.moments[: self._shown + 1]],
-            chosen=chosen,
-            point_size=self._size.value / 1000.0,
-            true_colours=self._true_colours.value,
-        )
+        steps = [m.step for m in self.moments[: self._shown + 1]]
+        look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
+        self.drawing.show(moment, steps, chosen=chosen, **look)
         last = len(self.moments) - 1
         self._slider.max = max(last, 1)
         self._slider.disabled = last == 0
@@ -257,7 +250,7 @@ def _serve(title: str, host: str, port: int) -> Any:
 
 
 @contextlib.contextmanager
-def _silent() -> Any:
+def _silent() -> Iterator[None]:
     """Keep viser from printing."""
     import rich
 

@@ -10,11 +10,11 @@ from caryatid.graph import SupportGraph
 from caryatid.support.relations import Effect
 from caryatid.viewer.drawing import Moment
 from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
+from caryatid.viz.drawings import draw_layers
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.notebook import cell_html
-from caryatid.viz.pictures import Picture, put_raster
 from caryatid.viz.report import Figure, Section
-from caryatid.viz.tables import census, object_table, support_table
+from caryatid.viz.tables import census, object_table
 
 SIGNS = (
     ("Arrow", "supporter → supported; dashed where uncertain"),
@@ -50,8 +50,7 @@ def describe_graph(graph: SupportGraph) -> str:
 
 def describe_signs() -> str:
     """Say what the signs in the scene mean."""
-    bar = scale(np.tile(np.linspace(-1.0, 1.0, 150), (2, 1)), SALIENCY_STOPS)
-    picture = Picture("saliency", 340.0, 10.0, lambda axes: put_raster(axes, bar, 0.0, 0.0, 340.0, 10.0))
+    picture = draw_layers("saliency", [scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)])
     caption = "Saliency: seen before, nothing, look here; the highest of each view is red."
     return cell_html(Section("Key", facts=SIGNS, figures=(Figure("", picture, caption),)))
 
@@ -73,13 +72,10 @@ def describe_object(graph: SupportGraph, object_id: str, effects: Sequence[Effec
     if effects is not None:
         falls = [f"{e.object_id} {'falls' if e.certain else 'may fall'}: {e.why}" for e in effects]
         facts += [(f"Without {object_id}", text) for text in falls or ["nothing falls"]]
-    edges = [
-        (
-            f"{below.text} → {above.text}",
-            f"{kind.text}{', uncertain' * certain.doubt}, {found.text}; {why.text}",
-        )
-        for below, above, kind, certain, found, why in support_table(graph).rows
-        if object_id in (below.text, above.text)
-    ]
+    edges = []
+    for s in graph.supports:
+        if object_id in s.pair:
+            evidence = f"{s.kind}{', uncertain' * (not s.certain)}, {s.occurrences} of {s.opportunities}"
+            edges.append((f"{s.supporter} → {s.supported}", f"{evidence}; {s.why}"))
     facts += edges or [("supports", "none of it is known, and it supports nothing")]
-    return cell_html(Section(item.id, item.shape.kind, facts=tuple(facts), colour=object_colour(item.label)))
+    return cell_html(Section(item.id, item.shape.kind, facts=facts, colour=object_colour(item.label)))

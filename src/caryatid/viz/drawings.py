@@ -149,12 +149,9 @@ def draw_image(
     strokes: list[Stroke] = []
     if shapes and view.T_world_camera is not None:
         K = np.array([[scale, 0.0, -scale * left], [0.0, scale, -scale * top], [0.0, 0.0, 1.0]]) @ view.K
-        projection, named = (
-            Projection(view.T_world_camera, K, resized(view.depth)),
-            {tag.text for tag in tags},
-        )
+        projection = Projection(view.T_world_camera, K, resized(view.depth))
         strokes = _strokes(graph.objects, projection)
-        unseen = [projection.tag(o)._replace(faint=True) for o in found if o.id not in named]
+        unseen = [projection.tag(o)._replace(faint=True) for o in found if o.label not in labels]
         tags += [tag for tag in unseen if np.isfinite(tag.x)]
     what = "segments and fitted shapes" if shapes else "segments"
     return draw_layers(f"{view.name} with its {what}", [image, _tint(image, labels)], strokes, tags)
@@ -183,10 +180,8 @@ def _window(labels: NDArray[np.int32]) -> tuple[int, int, int, int]:
 
     It has the image's proportions and is half as wide at least.
     """
-    size, found = (
-        np.array(labels.shape[::-1]),
-        np.argwhere((labels != 0) & (labels != SUPPORT_LABEL))[:, ::-1],
-    )
+    size = np.array(labels.shape[::-1])
+    found = np.argwhere((labels != 0) & (labels != SUPPORT_LABEL))[:, ::-1]
     low, high = (found.min(axis=0), found.max(axis=0)) if len(found) else (np.zeros(2), size)
     share = float(np.clip(1.35 * ((high - low) / size).max(), 0.5, 1.0))
     left, top = np.clip((low + high - share * size) / 2.0, 0.0, (1.0 - share) * size).astype(int)
@@ -295,18 +290,19 @@ def draw_sphere(step: Step) -> Picture:
     saliency, dots = _painted(step)
     strokes = _strokes(step.graph.objects, above)
     points = () if decision is None else sorted(decision.points_of_interest, key=lambda p: p.saliency)
-    around = np.linspace(-np.pi, np.pi, 121)
     look: dict[str, Any] = {"fontsize": 11.0, "color": SOFT, "ha": "center"}
     rim: dict[str, Any] = {"markeredgecolor": DARK, "markeredgewidth": 1.0}
 
     def draw(axes: Axes) -> None:
+        from matplotlib.patches import Circle
+
         put_raster(axes, saliency, side / 2.0 - radius, side / 2.0 - radius, 2.0 * radius, 2.0 * radius)
         for lines, stroke in strokes:
             axes.plot(*lines.T, **stroke)
         for name, elevation in (("y", 0.0), ("30°", 30.0), ("60°", 60.0)):
-            at = places(np.array([direction(azimuth, np.deg2rad(elevation)) for azimuth in around]))
-            axes.plot(*at.T, color=SOFT, linewidth=1.0, linestyle=":" if elevation else "-")
-            axes.text(at[90, 0], at[90, 1] - 5.0, name, **look)
+            wide = radius * np.cos(np.deg2rad(elevation))
+            axes.add_patch(Circle((side / 2.0, side / 2.0), wide, fill=False, color=SOFT, linestyle=":"))
+            axes.text(side / 2.0, side / 2.0 - wide - 5.0, name, **look)
         axes.text(side / 2.0 + radius + 10.0, side / 2.0 + 4.0, "x", **look)
         for point in points:
             ends = np.concatenate([above.project(point.position_world[None])[0], places(point.direction)])
@@ -319,10 +315,8 @@ def draw_sphere(step: Step) -> Picture:
         tags = [Tag(x, y - 15.0, str(k), VISITED) for k, (x, y) in enumerate(places(step.visited).tolist())]
         if decision is not None:
             ((x, y),) = places(sphere.direction_of(decision.T_world_camera)).tolist()
-            axes.plot(
-                x, y, "o", markersize=14.0, color="#8a8f96", zorder=6.5, **(rim | {"markeredgewidth": 2.0})
-            )
-            axes.plot(x, y, "o", markersize=5.0, color=DARK, zorder=6.6, gid="chosen|the next view")
+            axes.plot(x, y, "o", markersize=14.0, color="white", zorder=6.5, **rim)
+            axes.plot(x, y, "o", markersize=7.0, color=DARK, zorder=6.6, gid="chosen|the next view")
             tags.append(Tag(x, y - 20.0, "next", DARK))
         put_tags(axes, tags, 13.0)
         bar = colours.scale(np.tile(np.linspace(-1.0, 1.0, 150), (2, 1)), colours.SALIENCY_STOPS)
@@ -350,9 +344,7 @@ def _painted(step: Step) -> tuple[NDArray[np.uint8], Array]:
     elif candidates is not None:
         beyond = np.ones(len(colour), dtype=np.bool_)
         beyond[candidates.indices] = False
-        colour[beyond] = np.rint(
-            0.72 * colours.scale(np.zeros(1), colours.SALIENCY_STOPS) + 0.28 * colour[beyond]
-        )
+        colour[beyond] = 0.72 * colours.scale(np.zeros(1), colours.SALIENCY_STOPS) + 0.28 * colour[beyond]
     y, x = np.mgrid[1.0:-1.0:260j, -1.0:1.0:260j]
     inside = np.hypot(x, y) < 1.0
     x, y = x[inside], y[inside]
@@ -380,13 +372,9 @@ def draw_chart(title: str, y_name: str, lines: Mapping[str, Sequence[float]]) ->
         chart.xaxis.set_major_locator(MaxNLocator(10, integer=True))
         chart.tick_params(labelsize=11.0, pad=6.0)
         for k, (name, values) in enumerate(lines.items()):
-            look: dict[str, Any] = {
-                "linestyle": ("-", "--", ":", "-.")[k],
-                "marker": "osD^"[k],
-                "label": name,
-            }
-            look |= {"color": colours.PALETTE[k], "markersize": 5.0 + 2.0 * k, "zorder": 3.0 - 0.1 * k}
-            chart.plot(values, linewidth=2.0, clip_on=False, **look)
+            form = ("o-", "s--", "D:", "^-.")[k]
+            look: dict[str, Any] = {"color": colours.PALETTE[k], "label": name, "zorder": 3.0 - 0.1 * k}
+            chart.plot(values, form, linewidth=2.0, markersize=5.0 + 2.0 * k, clip_on=False, **look)
         chart.set_xlim(0.0, max(len(values) - 1, 1))
         chart.set_ylim(bottom=0.0)
         chart.set_xlabel("view", fontsize=11.0)

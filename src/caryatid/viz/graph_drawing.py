@@ -104,10 +104,8 @@ def _abscissae(
 
 # The drawing
 
-COLUMN, ROW = 78.0, 110.0
-"""Distance of vertices within a layer, and of layers [px]."""
-NODE = np.array([56.0, 40.0])
-"""Width and height of a vertex [px]."""
+PITCH, NODE = np.array([78.0, -110.0]), np.array([56.0, 40.0])
+"""From vertex to vertex within a layer, and from layer to layer; width and height of a vertex [px]."""
 
 
 def draw_graph(graph: SupportGraph) -> Picture:
@@ -121,18 +119,15 @@ def draw_graph(graph: SupportGraph) -> Picture:
         graph: What to draw.
     """
     places, routes = arrange(graph)
-    border, bottom = 46.0, 30.0
     passed = [*places.values(), *chain.from_iterable(routes.values()), (0.0, 0.0)]
-    across, layer = np.max(passed, axis=0)
-    span = across * COLUMN + 2.0 * border
+    span, tall = np.max(passed, axis=0) * PITCH * (1.0, -1.0) + (92.0, 76.0)
     width = max(span, 560.0)  # In less space the letters of small graphs grow too large.
-    tall = layer * ROW + border + bottom
     height = max(tall, 0.73 * min(width, 560.0))
-    corner = np.array([(width - span) / 2.0 + border, (height + tall) / 2.0 - bottom])
+    corner = np.array([(width - span) / 2.0 + 46.0, (height + tall) / 2.0 - 30.0])
     table = None if graph.support_surface is None else graph.support_surface.id
     edges, notes, words = [], [], []
     for support in graph.supports:
-        points = corner + np.array([COLUMN, -ROW]) * routes[support.pair]
+        points = corner + PITCH * routes[support.pair]
         if support.pair[::-1] in routes:
             points[:, 0] += 8.0 * np.sign(points[0, 1] - points[-1, 1])  # Beside the edge that leads back.
         edges.append(_from_rim_to_rim(points, support, table))
@@ -149,7 +144,7 @@ def draw_graph(graph: SupportGraph) -> Picture:
             if item.id == table:
                 _put_table(axes, item, width, corner[1])
             else:
-                _put_node(axes, item, corner + np.array([COLUMN, -ROW]) * places[item.id], graph)
+                _put_node(axes, item, corner + PITCH * places[item.id], graph)
 
     return Picture("support graph, from the support surface upwards", width, height, draw)
 
@@ -201,16 +196,17 @@ def _put_node(axes: Axes, item: SceneObject, at: Array, graph: SupportGraph) -> 
         axes.plot(*(at + lid - middle).T, color=INK, linewidth=1.2, zorder=3.5)
     elif item.shape.kind == "sphere":
         outline = half * np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], axis=-1)
-    unsupported = not graph.supporters(item.id)
-    title = f"{item.id}: {item.shape.kind}, found in {item.occurrences} of {item.opportunities} views"
-    rim: dict[str, Any] = {"edgecolor": INK, "linewidth": 1.2}
-    if unsupported:
-        rim = {"edgecolor": DOUBT, "linewidth": 2.4, "linestyle": (0, (2.1, 1.5))}
+    kind, rim = f"node {item.id}", {"edgecolor": INK, "linewidth": 1.2}
+    if not graph.supporters(item.id):
+        kind, rim = (
+            f"{kind} unsupported",
+            {"edgecolor": DOUBT, "linewidth": 2.4, "linestyle": (0, (2.1, 1.5))},
+        )
     colour = object_colour(item.label)
     stripes = "".join({1: "//", -1: "\\\\"}[turn] for turn in object_stripes(item.label))
     axes.fill(
         *(outline + at).T, facecolor=colour, hatch=stripes or None, hatchcolor=(1, 1, 1, 0.5), zorder=3.0,
-        gid=f"node {item.id}{' unsupported' if unsupported else ''}|{title}", **rim,
+        gid=f"{kind}|{item.id}: {item.shape.kind}", **rim,
     )  # fmt: skip
     text: dict[str, Any] = {"color": ink_on(colour), "ha": "center", "va": "center_baseline", "zorder": 4.0}
     axes.text(at[0], at[1] - 3.0, item.id, fontsize=13.0, fontweight="bold", **text)

@@ -61,8 +61,8 @@ class _Sheets:
         self._sheet.text(left / WIDTH, at / HEIGHT, text, fontsize=size, va="top", linespacing=1.3, **look)
 
     def section(self, section: Section) -> None:
-        """Write a section; one with pictures and tables begins on a new page, others where there is room."""
-        self._room(HEIGHT if section.figures and section.tables else 2.2)
+        """Write a section, where there is room for its heading and its first pictures."""
+        self._room(0.5 + (7.2 / section.figures[0].share if section.figures else 0.6))
         self._chapters.append((section.title, self._number - 1))
         self.text(section.title, 13.0, bold=True)
         if section.text:

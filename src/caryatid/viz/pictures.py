@@ -53,9 +53,6 @@ STYLE = {
 }
 """matplotlib's settings that differ from its defaults."""
 
-Rectangle = tuple[float, float, float, float]
-"""Left, bottom, width and height, in shares of a figure."""
-
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Picture:
@@ -73,13 +70,15 @@ class Picture:
     height: float
     draw: Callable[[Axes], None]
 
-    def put(self, figure: Any, where: Rectangle) -> None:
-        """Draw it into a rectangle of a figure, lines and letters scaled with it."""
+    def put(self, figure: Any, where: tuple[float, float, float, float]) -> None:
+        """Draw it into a figure, lines and letters scaled with it: left, bottom, width, height [shares]."""
         axes = figure.add_axes(where)
         axes.set_axis_off()
         axes.set(xlim=(0.0, self.width), ylim=(self.height, 0.0), autoscale_on=False)
         self.draw(axes)
         unit = where[2] * figure.get_size_inches()[0] * 72.0 / self.width
+        if unit == 1.0:
+            return
         artists = [*axes.texts, *axes.lines, *axes.patches]
         for artist in (*artists, *(part for inset in axes.child_axes for part in inset.findobj())):
             for size in ("fontsize", "linewidth", "markersize", "markeredgewidth", "mutation_scale"):
@@ -127,9 +126,9 @@ def picture_svg(picture: Picture) -> str:
     return text.strip()
 
 
-def picture_png(picture: Picture) -> bytes:
-    """Return a picture as the bytes of a PNG."""
-    return _saved(picture, "png", dpi=72, metadata={"Software": None})
+def picture_png(picture: Picture, **texts: str) -> bytes:
+    """Return a picture as the bytes of a PNG, with texts stored in it by their names."""
+    return _saved(picture, "png", dpi=72, metadata={"Software": None} | texts)
 
 
 def _saved(picture: Picture, kind: str, salt: str = "caryatid", **options: Any) -> bytes:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from caryatid.config import Config
 from caryatid.geometry.transforms import Array
@@ -62,14 +60,10 @@ def draw_lifts(
 
 def stored_figures(figures: Sequence[Figure]) -> dict[str, bytes]:
     """The pictures of lifts as files of a run folder: `lifts/NN.png`, with headings and captions in them."""
-    files = {}
-    for number, figure in enumerate(figures, start=1):
-        text, buffer = PngInfo(), io.BytesIO()
-        text.add_itxt("heading", figure.heading)
-        text.add_itxt("caption", figure.caption)
-        Image.open(io.BytesIO(picture_png(figure.picture))).save(buffer, "PNG", pnginfo=text)
-        files[f"lifts/{number:02d}.png"] = buffer.getvalue()
-    return files
+    return {
+        f"lifts/{number:02d}.png": picture_png(f.picture, heading=f.heading, caption=f.caption)
+        for number, f in enumerate(figures, start=1)
+    }
 
 
 def read_figures(folder: Path) -> tuple[Figure, ...]:
