@@ -74,12 +74,7 @@ def moved(cloud: Cloud, T: Array) -> Cloud:
 
 
 def surface_points(
-    shape: Shape,
-    rng: np.random.Generator,
-    *,
-    eye=None,
-    spacing: float = 0.005,
-    sigma: float = 1e-6,
+    shape: Shape, rng: np.random.Generator, *, eye=None, spacing: float = 0.005, sigma: float = 1e-6
 ) -> tuple[Array, Array]:
     """Points on a shape with noise along the normals [m], and the normals.
 

@@ -8,12 +8,7 @@ from raycast import K, from_the_side, table_scene
 
 from caryatid.config import CloudConfig
 from caryatid.geometry import transforms
-from caryatid.sensing.clouds import (
-    estimate_normals,
-    local_planes,
-    oriented_points,
-    thin,
-)
+from caryatid.sensing.clouds import estimate_normals, local_planes, oriented_points, thin
 from caryatid.sensing.views import View
 
 CONFIG = CloudConfig()

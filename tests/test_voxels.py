@@ -12,12 +12,7 @@ from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.sensing.views import View
-from caryatid.sensing.voxel_map import (
-    FREE,
-    OCCUPIED,
-    UNKNOWN,
-    VoxelMap,
-)
+from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
 K = np.array([[100.0, 0.0, 79.5], [0.0, 100.0, 59.5], [0.0, 0.0, 1.0]])
 CONFIG = VoxelConfig(size=0.02, extent=(0.8, 0.8, 0.6), below=0.2, stride=1, margin=0.02)

@@ -15,9 +15,7 @@ Masks = NDArray[np.bool_]
 
 
 def labels_from_masks(
-    masks: ArrayLike | Sequence[ArrayLike],
-    scores: ArrayLike | None = None,
-    config: MaskConfig | None = None,
+    masks: ArrayLike | Sequence[ArrayLike], scores: ArrayLike | None = None, config: MaskConfig | None = None
 ) -> NDArray[np.int32]:
     """Lay masks that may overlap over each other, the smallest on top, into one label image.
 

@@ -17,13 +17,7 @@ from caryatid.fitting.primitives import Fit, candidates
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import on_threads
-from caryatid.segmentation.lccp import (
-    convex_parts,
-    grid_edges,
-    hollowness,
-    number_by_appearance,
-    wide_parts,
-)
+from caryatid.segmentation.lccp import convex_parts, grid_edges, hollowness, number_by_appearance, wide_parts
 from caryatid.segmentation.samples import Samples, take_samples
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
