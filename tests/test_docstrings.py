@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import itertools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -53,18 +54,23 @@ def told(text: str) -> dict[str, str]:
     return found
 
 
+def shaped(annotation: ast.AST | None, text: str) -> bool:
+    """Whether a text says the shape of what has this annotation, or need not."""
+    array = annotation is not None and ARRAYS.search(ast.unparse(annotation))
+    return not array or bool(SHAPE.search(text))
+
+
 def test_arrays_in_parameters_and_results_have_shapes():
     missing = []
     for place, node, text in public(ast.FunctionDef):
-        if ELSEWHERE.search(text) or node.name in PROTOCOLS or node.name.endswith("_reference"):
+        if ELSEWHERE.search(text) or node.name in PROTOCOLS:
             continue
         known = told(text)
-        for argument in [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]:
-            annotation = ast.unparse(argument.annotation) if argument.annotation else ""
-            if ARRAYS.search(annotation) and not SHAPE.search(known.get(argument.arg, text)):
-                missing.append(f"{place}({argument.arg})")
-        if node.returns and ARRAYS.search(ast.unparse(node.returns)) and not SHAPE.search(text):
-            missing.append(f"{place} returns")
+        arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        missing += [
+            f"{place}({a.arg})" for a in arguments if not shaped(a.annotation, known.get(a.arg, text))
+        ]
+        missing += [] if shaped(node.returns, text) else [f"{place} returns"]
     assert not missing, "\n".join(missing)
 
 
@@ -72,14 +78,12 @@ def test_arrays_in_fields_have_shapes():
     missing = []
     for place, node, text in public(ast.ClassDef):
         known = told(text)
-        for field, below in zip(node.body, [*node.body[1:], None], strict=True):
+        for field, below in itertools.pairwise([*node.body, None]):
             if not isinstance(field, ast.AnnAssign) or field.target.id.startswith("_"):
                 continue
             own = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
             words = str(below.value.value) if own else known.get(field.target.id, text)
-            array = ARRAYS.search(ast.unparse(field.annotation))
-            if array and not SHAPE.search(words):
-                missing.append(f"{place}.{field.target.id}")
+            missing += [] if shaped(field.annotation, words) else [f"{place}.{field.target.id}"]
     assert not missing, "\n".join(missing)
 
 
@@ -88,11 +92,7 @@ def test_errors_of_ours_are_documented():
     for place, node, text in public(ast.FunctionDef):
         parsed = docstring_parser.parse(text, style=docstring_parser.DocstringStyle.GOOGLE)
         known = {entry.type_name for entry in parsed.raises}
-        raised = {
-            ast.unparse(n.exc.func)
-            for n in ast.walk(node)
-            if isinstance(n, ast.Raise) and isinstance(n.exc, ast.Call)
-        }
+        raises = [n.exc for n in ast.walk(node) if isinstance(n, ast.Raise) and isinstance(n.exc, ast.Call)]
         if "CaryatidError" not in known:
-            missing += [f"{place} raises {name}" for name in sorted((raised & OURS) - known)]
+            missing += [f"{place} raises {k}" for k in {ast.unparse(r.func) for r in raises} & OURS - known]
     assert not missing, "\n".join(missing)

@@ -127,46 +127,26 @@ def kept(tmp_path_factory, scene_file, views):
     return folder
 
 
-WORDS = {
-    "demo": "--scene tower --views 1 --out {out} {small}",
-    "explore": "{scene} --views 1 --out {out} {small}",
-    "extract": "{recording} --out {out}",
-    "evaluate": "{run} {scenes}",
-    "order": "{run} {quick}",
-    "dismantle": "{scene} --views 1 --out {out} {small} {quick}",
-    "import": "{kept}/tum --camera {kept}/tum.json --out {out}",
-    "report": "{run}",
-    "export": "{run} --out {out}.xml",
-    "benchmark": "--out {bench}",
-    "session new": "{out}",
-    "session add": "{session} --depth {kept}/depth.png {labels} --camera {kept}/camera.json",
-    "session next": "{session}",
-    "session graph": "{session}",
-    "session undo": "{session}",
-    "config": "",
-    "completion": "bash",
+WORKING = {
+    "demo": ("--scene tower --views 1 --out {out} {small}", {"run", "graph"}),
+    "explore": ("{scene} --views 1 --out {out} {small}", {"run", "graph"}),
+    "extract": ("{recording} --out {out}", {"run", "graph"}),
+    "evaluate": ("{run} {scenes}", {"views"}),
+    "order": ("{run} {quick}", {"steps", "safe", "refusal"}),
+    "dismantle": ("{scene} --views 1 --out {out} {small} {quick}", {"success", "steps", "left"}),
+    "import": ("{kept}/tum --camera {kept}/tum.json --out {out}", {"recording", "views", "frames"}),
+    "report": ("{run}", set()),
+    "export": ("{run} --out {out}.xml", {"file", "format"}),
+    "benchmark": ("--out {bench}", {"results", "suites"}),
+    "session new": ("{out}", {"session", "views"}),
+    "session add": ("{session} {view}", {"view", "changed", "graph"}),
+    "session next": ("{session}", {"T_world_camera", "why"}),
+    "session graph": ("{session}", {"objects", "supports"}),
+    "session undo": ("{session}", {"views", "graph"}),
+    "config": ("", {"fit", "fusion"}),
+    "completion": ("bash", {"shell", "script"}),
 }
-"""Of each command words that make it work; `serve` and `view` go on until they are stopped."""
-
-KEYS = {
-    "demo": {"run", "graph"},
-    "explore": {"run", "graph"},
-    "extract": {"run", "graph"},
-    "evaluate": {"views"},
-    "order": {"steps", "safe", "refusal"},
-    "dismantle": {"success", "steps", "left"},
-    "import": {"recording", "views", "frames"},
-    "export": {"file", "format"},
-    "benchmark": {"results", "suites"},
-    "session new": {"session", "views"},
-    "session add": {"view", "changed", "graph"},
-    "session next": {"T_world_camera", "why"},
-    "session graph": {"objects", "supports"},
-    "session undo": {"views", "graph"},
-    "config": {"fit", "fusion"},
-    "completion": {"shell", "script"},
-}
-"""What the documents hold, among other things."""
+"""Words that make each command work, and keys of its document; `serve` and `view` go on until stopped."""
 
 
 @pytest.fixture
@@ -180,9 +160,9 @@ def words(tmp_path, kept, scene_file, recording):
             "out": tmp_path / "out", "kept": kept, "run": kept / "run", "scene": scene_file,
             "scenes": scene_file.parent, "recording": recording, "session": tmp_path / "session",
             "bench": tmp_path / "bench", "small": shlex.join(SMALL), "quick": shlex.join(QUICK),
-            "labels": f"--labels {kept / 'labels.png'}",
+            "view": f"--depth {kept}/depth.png --labels {kept}/labels.png --camera {kept}/camera.json",
         }  # fmt: skip
-        return [*command.split(), *shlex.split(WORDS[command].format(**places))]
+        return [*command.split(), *shlex.split(WORKING[command][0].format(**places))]
 
     return spelled
 
@@ -194,7 +174,7 @@ def test_with_json_stdout_is_one_document_and_stderr_is_empty(command, words, ca
     assert run_command(*words(command), "--json") == 0
     said = capfd.readouterr()
     assert said.err == ""
-    assert json.loads(said.out).keys() >= KEYS.get(command, set())
+    assert json.loads(said.out).keys() >= WORKING[command][1]
     assert said.out.endswith("\n")
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -27,7 +26,9 @@ PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 
 @dataclass(slots=True, kw_only=True)
 class RunRecorder:
-    """Keeps and scores the steps of a run, and writes run.json.
+    """Keeps and scores the steps of a run, in a `with` block, and writes the run folder at its end.
+
+    Ctrl-C ends the block: the views so far are kept. Any other error leaves nothing behind.
 
     Attributes:
         command: Name of the command.
@@ -35,12 +36,13 @@ class RunRecorder:
         seed: Seed of every random choice.
         options: What run.json records of the options.
         config: All settings.
-        writer: Writes the run folder; None where none is wanted.
+        folder: The run folder; None where none is wanted.
         truth: What is really there, where known.
+        more: What else run.json is to hold.
+        files: Further files of the folder: path in it → content.
         steps: What run.json records of each view: its number, its timings [s], angle and path so far.
         graphs: The fused graph after each view.
         scores: The score of each view, where the truth is known.
-        interrupted: Whether Ctrl-C ended the run.
     """
 
     command: str
@@ -48,79 +50,69 @@ class RunRecorder:
     seed: int
     options: Mapping[str, object]
     config: Config
-    writer: RunWriter | None
+    folder: Path | None
     truth: TrueScene | None = None
+    more: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, bytes] = field(default_factory=dict)
     steps: list[dict[str, Any]] = field(default_factory=list)
     graphs: list[SupportGraph] = field(default_factory=list)
     scores: list[Score] = field(default_factory=list)
-    interrupted: bool = False
+    _writer: RunWriter | None = None
 
     @property
     def views(self) -> int:
         """Number of views that are kept; an interrupt may come before the newest one is written."""
-        return len(self.graphs) if self.writer is None else self.writer.views
+        return len(self.graphs) if self._writer is None else self._writer.views
 
     def keep(self, step: Step) -> Score | None:
         """Score a step and write it to the run folder; returns the score.
 
         Raises:
-            InputError: The disk is full or refuses; nothing is left behind.
+            InputError: The disk is full or refuses.
         """
         if self.truth is not None:
             self.scores.append(score(step.graph, self.truth, np.random.default_rng(0)))
         names = ("timings", "angle_travelled", "path_travelled", "stop")
         self.steps.append({"view": step.index} | {name: getattr(step, name) for name in names})
         self.graphs.append(step.graph)
-        if self.writer is not None:
-            self.writer.add(step)
+        if self._writer is not None:
+            self._writer.add(step)
         return self.scores[-1] if self.scores else None
 
-    @contextmanager
-    def interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C end the run after the views so far; before the first it leaves nothing."""
-        try:
-            yield
-        except KeyboardInterrupt:
-            self.interrupted = True
-            if self.views == 0:
-                raise
+    def __enter__(self) -> Self:
+        self._writer = None if self.folder is None else RunWriter(self.folder)
+        return self
 
-    def finish(
-        self, more: Mapping[str, object] | None = None, files: Mapping[str, bytes] | None = None
-    ) -> None:
-        """Put the run folder in its place.
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        interrupted = isinstance(error, KeyboardInterrupt) and self.views > 0
+        if self._writer is None:
+            return
+        with self._writer as writer:
+            if error is None or interrupted:
+                more = self.more | ({"interrupted": True} if interrupted else {})
+                writer.finish(self.graphs[self.views - 1], self._record() | more, self.files)
+        if interrupted:
+            count = "1 view is" if self.views == 1 else f"{self.views} views are"
+            reason = f"{count} kept in {self.folder}; `caryatid report {self.folder}` makes the report"
+            raise KeyboardInterrupt(reason) from None
 
-        Args:
-            more: What else run.json is to hold.
-            files: Further files by their paths in the folder.
-
-        Raises:
-            KeyboardInterrupt: The run was interrupted; says what was kept.
-        """
-        kept = ""
-        if self.writer is not None:
-            last = self.steps[self.views - 1]
-            record: dict[str, Any] = {
-                "command": self.command,
-                "source": self.source,
-                "seed": self.seed,
-                "options": dict(self.options),
-                "settings": asdict(self.config),
-                "versions": {"python": platform.python_version()}
-                | {name: version(name) for name in PACKAGES},
-                "angle_travelled": last["angle_travelled"],
-                "path_travelled": last["path_travelled"],
-                "steps": self.steps[: self.views],
-            }
-            if self.truth is not None:
-                record["scores"] = [asdict(score) for score in self.scores[: self.views]]
-            if self.interrupted:
-                record["interrupted"] = True
-            self.writer.finish(self.graphs[self.views - 1], record | dict(more or {}), files)
-            count, folder = "1 view is" if self.views == 1 else f"{self.views} views are", self.writer.folder
-            kept = f"{count} kept in {folder}; `caryatid report {folder}` makes the report"
-        if self.interrupted:
-            raise KeyboardInterrupt(*filter(None, [kept]))
+    def _record(self) -> dict[str, Any]:
+        """What run.json holds."""
+        last = self.steps[self.views - 1]
+        record: dict[str, Any] = {
+            "command": self.command,
+            "source": self.source,
+            "seed": self.seed,
+            "options": dict(self.options),
+            "settings": asdict(self.config),
+            "versions": {"python": platform.python_version()} | {name: version(name) for name in PACKAGES},
+            "angle_travelled": last["angle_travelled"],
+            "path_travelled": last["path_travelled"],
+            "steps": self.steps[: self.views],
+        }
+        if self.truth is not None:
+            record["scores"] = [asdict(score) for score in self.scores[: self.views]]
+        return record
 
 
 def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from caryatid.exploration import Step
     from caryatid.runs import RunRecorder
     from caryatid.sources import Source
-    from caryatid.steps import RunWriter
     from caryatid.viewer.process import PageProcess
 
 
@@ -83,14 +82,11 @@ class Explore(RunCommand, options.ExploringCommand):
     def run(self, config: Config) -> None:
         """Explore with these settings."""
         from caryatid.cli.view import watched
-        from caryatid.steps import RunWriter
 
         with watched(self.source, config, self.output) if self.view else nullcontext() as page:
-            with RunWriter(self.out) as writer:
-                source, recorder, steps = _open(self, config, writer)
-                with recorder.interruptible():
-                    _record(recorder, steps, self.output, page)
-                recorder.finish()
+            with _recorder(self, config) as recorder:
+                source, steps = _open(self, config, recorder)
+                _record(recorder, steps, self.output, page)
             self.conclude(recorder, source.name)
 
 
@@ -139,24 +135,12 @@ class Extract(RunCommand):
     """For clouds whose labels number parts of objects: object = label // N."""
 
     def __call__(self) -> None:
-        from caryatid.runs import RunRecorder
         from caryatid.sources import CLOUD_SUFFIXES
-        from caryatid.steps import RunWriter
 
         config = self.settings.read()
         is_cloud = Path(self.source).suffix.lower() in CLOUD_SUFFIXES
-        with RunWriter(self.out) as writer:
-            recorder = RunRecorder(
-                command="extract",
-                source=self.source,
-                seed=self.settings.seed,
-                options={"segmentation": self.segmentation, "label_divisor": self.label_divisor},
-                config=config,
-                writer=writer,
-            )
-            with recorder.interruptible():
-                _record(recorder, (self._of_cloud if is_cloud else self._of_recording)(config), self.output)
-            recorder.finish()
+        with _recorder(self, config) as recorder:
+            _record(recorder, (self._of_cloud if is_cloud else self._of_recording)(config), self.output)
         self.conclude(recorder, Path(self.source).name)
 
     def _of_recording(self, config: Config) -> Iterator[Step]:
@@ -220,33 +204,32 @@ class Dismantle(options.ExploringCommand):
         from caryatid.manipulation.order import Order, plan_order
         from caryatid.runtime.parallel import cores
         from caryatid.simulation.camera import SimulatedCamera
-        from caryatid.steps import RunWriter
         from caryatid.viz.strip import draw_lifts, stored_figures
 
-        config = self.config()
-        with RunWriter(self.out) if self.out is not None else nullcontext() as writer:
-            source, recorder, steps = _open(self, config, writer)
+        config, seed, taken = self.config(), self.settings.seed, []
+        order = Order((), "interrupted before an order was found")
+        with _recorder(self, config) as recorder:
+            source, steps = _open(self, config, recorder)
             if source.truth is None or not isinstance(source.camera, SimulatedCamera):
                 remedy = "give an MJCF scene; for a run, use `caryatid order`"
                 raise InputError(self.source, "cannot be simulated", remedy)
             scene = source.camera.scene
-            order, taken, files = Order((), "interrupted before an order was found"), [], {}
-            with recorder.interruptible():
+            try:
                 last = _record(recorder, steps, self.output)
                 with self.output.working("rehearsing"):
-                    seed = self.settings.seed
                     order = plan_order(last.graph, config, hands=self.hands, seed=seed, threads=cores())
                 for t in dismantle(scene, order.steps, bodies_of(last.graph, source.truth), config):
                     taken.append(t)
                     disturbed = ", ".join(t.disturbed)
                     self.output.say(f"{t.step.object_id}: {f'{disturbed} disturbed' if disturbed else 'ok'}")
-                if writer is not None:
+                if self.out is not None:
                     T_world_camera = last.sphere.poses(last.visited[:1])[0]
-                    files = stored_figures(draw_lifts(scene, taken, last.graph, T_world_camera, config))
-            bodies = {t.body for t in taken}
-            left = [name for name in scene.object_bodies.values() if name not in bodies]
-            record = dismantling_record(order, taken, left)
-            recorder.finish({"dismantling": record}, files)
+                    lifts = draw_lifts(scene, taken, last.graph, T_world_camera, config)
+                    recorder.files |= stored_figures(lifts)
+            finally:
+                bodies = {t.body for t in taken}
+                left = [name for name in scene.object_bodies.values() if name not in bodies]
+                recorder.more["dismantling"] = record = dismantling_record(order, taken, left)
         if self.out is not None:
             _draw_report(self.out, self.output)
         outcome = "all taken, nothing disturbed" if record["success"] else "not without harm"
@@ -262,32 +245,38 @@ class Dismantle(options.ExploringCommand):
         self.output.result(record, shown, f"{order.refusal}\n" if order.refusal else "")
 
 
+def _recorder(command: Explore | Extract | Dismantle, config: Config) -> RunRecorder:
+    from caryatid.runs import RunRecorder
+
+    names = ("planner", "robot", "segmentation", "noise", "label_divisor")
+    options = {name: getattr(command, name) for name in names if hasattr(command, name)}
+    if not isinstance(command, Extract):
+        options["early_stop"] = not command.no_early_stop
+    return RunRecorder(
+        command=type(command).__name__.lower(),
+        source=command.source,
+        seed=command.settings.seed,
+        options=options,
+        config=config,
+        folder=command.out,
+    )
+
+
 def _open(
-    command: Explore | Dismantle, config: Config, writer: RunWriter | None
-) -> tuple[Source, RunRecorder, Iterator[Step]]:
-    """Open what is to be explored; returns it, the record of its exploration, and its steps."""
+    command: Explore | Dismantle, config: Config, recorder: RunRecorder
+) -> tuple[Source, Iterator[Step]]:
+    """Open what is to be explored; returns it and the steps of its exploration."""
     from caryatid.evaluation.oracle import planner_for
     from caryatid.exploration import explore
-    from caryatid.runs import RunRecorder
     from caryatid.sources import open_source
 
     known: dict[str, Any] = {"segmentation": command.segmentation, "seed": command.settings.seed}
     with command.output.working("opening"):
         source = open_source(command.source, config, noise=command.noise, robot=command.robot, **known)
-    early_stop = not command.no_early_stop
-    names = ("planner", "robot", "segmentation", "noise")
-    recorder = RunRecorder(
-        command=type(command).__name__.lower(),
-        source=command.source,
-        seed=command.settings.seed,
-        options={name: getattr(command, name) for name in names} | {"early_stop": early_stop},
-        config=config,
-        writer=writer,
-        truth=source.truth,
-    )
+    recorder.truth = source.truth
     planner, camera = planner_for(command.planner, source.camera, source.truth, config, **known)
-    steps = explore(camera, source.robot, planner=planner, config=config, early_stop=early_stop, **known)
-    return source, recorder, steps
+    stop = not command.no_early_stop
+    return source, explore(camera, source.robot, planner=planner, config=config, early_stop=stop, **known)
 
 
 def _record(
