@@ -14,7 +14,7 @@ from caryatid.config.choices import ExportFormat
 
 Topic = Annotated[str | None, options.shown("TOPIC")]
 Format = Annotated[
-    ExportFormat | None, options.one_of(ExportFormat), options.shown(default="that of FILE's ending")
+    ExportFormat | None, options.one_of(ExportFormat), options.shown(default="by the ending of FILE")
 ]
 
 

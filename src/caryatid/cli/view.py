@@ -45,7 +45,7 @@ class View(options.ExploringCommand):
     source: options.SourceName
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at; at any other, programs on other machines can connect, without a password."""
+    """Address to listen at; at any but 127.0.0.1, other machines can connect without a password."""
     port: options.Port = PORT
     """Port to listen at, or else the next free one; 0 = any free one."""
     no_browser: options.Flag = False
