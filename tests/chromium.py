@@ -7,7 +7,6 @@ import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
@@ -17,23 +16,10 @@ from PIL import Image
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 """What the program is called, in order of preference; the environment's CHROMIUM goes before."""
-
 ARGUMENTS = [
-    "--headless",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-quic",
-    "--no-first-run",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--mute-audio",
-]
-
-PATIENCE = 60_000
-"""How long anything may take on a loaded machine [ms]."""
+    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync",
+]  # fmt: skip
 
 
 def chromium() -> str | None:
@@ -54,7 +40,7 @@ class Tab:
         self.page = page
         self.errors: list[str] = []
         self.hosts: set[str | None] = set()
-        page.set_default_timeout(PATIENCE)
+        page.set_default_timeout(60_000)  # Machines may be loaded [ms].
         page.on("console", lambda m: self.errors.append(m.text) if m.type == "error" else None)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.on("websocket", lambda socket: self.hosts.add(urlparse(socket.url).hostname))
@@ -62,30 +48,19 @@ class Tab:
 
     def _asked(self, route: Any) -> None:
         address = urlparse(route.request.url)
-        if address.scheme in ("blob", "data"):
-            route.continue_()
-            return
-        self.hosts.add(address.hostname)
-        if address.hostname == "127.0.0.1":
-            route.continue_()
-        else:
-            route.abort()
+        if address.scheme not in ("blob", "data"):
+            self.hosts.add(address.hostname)
+            if address.hostname != "127.0.0.1":
+                route.abort()
+                return
+        route.continue_()
 
-    def open(self, url: str, resolution: float = 0.5) -> None:
-        """Go to a viewer's page and wait for its scene.
-
-        Args:
-            url: Where it is.
-            resolution: Pixels drawn for each of the window along an axis [1]; drawing in software is slow.
-        """
-        self.page.goto(f"{url}?fixedDpr={resolution:g}")
+    def open(self, url: str) -> None:
+        """Go to a viewer's page, at half resolution since it is drawn in software, and wait for its scene."""
+        self.page.goto(f"{url}?fixedDpr=0.5")
         self.page.wait_for_selector("canvas")
         self.wait_for_node("/shapes/o1")
         self.page.locator("#webgl-software-rendering button").click()
-
-    def nodes(self) -> set[str]:
-        """Names in the scene the browser shows."""
-        return set(self.page.evaluate("Object.keys(window.__viserSceneTree?.getState() ?? {})"))
 
     def wait_for_node(self, name: str, there: bool = True) -> None:
         """Wait until the scene has, or has no longer, something of this name."""
@@ -102,9 +77,8 @@ class Tab:
 
     def settle(self) -> None:
         """Let two pictures be drawn."""
-        self.page.evaluate(
-            "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
-        )
+        drawn = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(() => done(1))))"
+        self.page.evaluate(drawn)
 
     def picture(self) -> NDArray[np.uint8]:
         """The scene as pixels (H, W, 3): what the canvas shows, without the panels."""
@@ -115,24 +89,13 @@ class Tab:
 
 
 @contextmanager
-def browser(folder: Path, size: tuple[int, int] = (1280, 720)) -> Iterator[Tab]:
-    """A tab in a Chromium that was never used before.
-
-    Args:
-        folder: For its user data.
-        size: Of the window [px].
-    """
+def opened() -> Iterator[Tab]:
+    """A tab in a Chromium that was never used before."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        context = playwright.chromium.launch_persistent_context(
-            folder,
-            executable_path=chromium(),
-            args=ARGUMENTS,
-            headless=True,
-            viewport={"width": size[0], "height": size[1]},
-        )
+        browser = playwright.chromium.launch(executable_path=chromium(), args=ARGUMENTS)
         try:
-            yield Tab(context.pages[0] if context.pages else context.new_page())
+            yield Tab(browser.new_page(viewport={"width": 1280, "height": 720}))
         finally:
-            context.close()
+            browser.close()
