@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 HEAVY = ("numpy", "scipy", "numba", "mujoco", "shapely", "networkx", "matplotlib", "trimesh", "PIL", "jinja2")
 
 TALK = (
-    "", "juggle", "--help", "--version", "demo --help", "explore --help", "extract --help", "evaluate --help",
+    "juggle", "--help", "--version", "demo --help", "explore --help", "extract --help", "evaluate --help",
     "import --help", "export --help", "benchmark --help", "session add --help", "serve --help",
     "completion --help", "completion sh", "benchmark --suite nothing", "explore --planner support", "config",
     "config --set fit.step=1",
@@ -29,19 +29,21 @@ IMPORTED = """
 import json, sys
 heavy, commands = map(json.loads, sys.argv[1:])
 
-def found():
-    return [name for name in heavy if name in sys.modules]
+def found(*more):
+    return [name for name in (*heavy, *more) if name in sys.modules]
 
-import caryatid
-caryatid.Config
-imported = {"import caryatid": found()}
-from caryatid.cli import main
-for command in commands:
+def said(command, *more):
     try:
         main(command.split())
     except SystemExit:
         pass
-    imported[command] = found()
+    return found(*more)
+
+import caryatid
+from caryatid.cli import main
+imported = {"": said("--help", "pydantic", "rich")}
+caryatid.Config
+imported |= {command: said(command) for command in commands}
 print("\\n" + json.dumps(imported))
 """
 

@@ -47,7 +47,9 @@ class Benchmark(options.Command):
     """What to compare."""
     scenes: Annotated[options.Words, options.shown("SCENE")] = ()
     """Scenes instead of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
-    planner: Annotated[tyro.conf.UseAppendAction[tuple[options.PlannerName, ...]], options.shown()] = ()
+    planner: Annotated[
+        tyro.conf.UseAppendAction[tuple[Annotated[str, options.planner_name()], ...]], options.shown()
+    ] = ()
     """Planner instead of the suite's methods; may be repeated. The others are compared with the first."""
     fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], options.shown()] = ()
     """Fusion instead of the suite's; may be repeated."""

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
-from caryatid.planning.planners import BUILT_IN, ORACLE, offered
+from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
-
-DEFAULTS = Config()
+    from caryatid.config import Config
 
 
 def shown(metavar: str | None = None, default: object = "") -> object:
@@ -30,6 +29,13 @@ def shown(metavar: str | None = None, default: object = "") -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
+def default_of(setting: str) -> object:
+    """An option for a setting, such as `active.max_views`, whose default applies when it is left out."""
+    from caryatid.config import Config
+
+    return shown(default=attrgetter(setting)(Config()))
+
+
 def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
     """One of a few words, or None when left out; anything else is a usage error that lists them.
 
@@ -38,6 +44,13 @@ def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
     """
     words: tuple[str, ...] = get_args(choice) or choice
     return _word("{" + ",".join(words) + "}", str, words)
+
+
+def planner_name() -> PrimitiveConstructorSpec[Any]:
+    """The name of a planner, other packages' included."""
+    from caryatid.planning.planners import BUILT_IN, ORACLE, offered
+
+    return one_of((*BUILT_IN, *sorted(offered()), ORACLE))
 
 
 def whole_number(least: int) -> PrimitiveConstructorSpec[Any]:
@@ -71,7 +84,6 @@ Port = Annotated[int, whole_number(0)]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="RUN")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-PlannerName = Annotated[str, one_of((*BUILT_IN, *sorted(offered()), ORACLE))]
 RobotName = Annotated[str, tyro.conf.arg(metavar="NAME")]
 Segmentation = Annotated[
     SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels where there are any")
@@ -120,7 +132,7 @@ class Settings:
 class Modelling(Settings):
     """How views become a scene model."""
 
-    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), shown(default=DEFAULTS.fusion.method)] = None
+    fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
     """What to fuse over views: points, graphs, or both."""
     seed: Annotated[int, whole_number(0)] = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""
@@ -149,9 +161,9 @@ class ExploringCommand(Command):
     """A command that explores a scene."""
 
     settings: Modelling = Modelling()
-    views: Annotated[OptionalCount, shown(default=DEFAULTS.active.max_views)] = None
+    views: Annotated[OptionalCount, default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
-    planner: PlannerName = "support"
+    planner: Annotated[str, planner_name()] = "support"
     """Planner of the next view; oracle knows the ground truth and needs a simulation."""
     robot: RobotName = "humanoid"
     """Robot that carries the simulated camera: humanoid, arm:FILE.npz (its reachability), module:callable."""

@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 import tyro
 
 from caryatid.cli import options
-from caryatid.cli.options import DEFAULTS
 from caryatid.config.choices import ExportFormat
 
 Topic = Annotated[str | None, options.shown("TOPIC")]
@@ -48,7 +47,7 @@ class Import(options.Command):
     """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. When left out: as published."""
     level: options.Flag = False
     """Rotate the world so that the table is level, for poses whose z is not up; most views must show it."""
-    views: Annotated[options.OptionalCount, options.shown(default=DEFAULTS.recording.max_views)] = None
+    views: Annotated[options.OptionalCount, options.default_of("recording.max_views")] = None
     """Maximum number of views."""
 
     def __call__(self) -> None:

@@ -45,7 +45,7 @@ class New(SessionStep):
     """Folder of the session; must be new or empty."""
     segmentation: options.Segmentation = None
     """Use the label images of the views, or segment automatically."""
-    planner: options.PlannerName = "support"
+    planner: Annotated[str, options.planner_name()] = "support"
     """Planner of the next view."""
     robot: options.RobotName = "humanoid"
     """Robot that carries the camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
