@@ -25,7 +25,7 @@ COLUMNS = ("condition", "family", "method", "quantity", "at", "value", "low", "h
 """Columns of a summary. `family` is empty for all scenes; `at` is the view, threshold or quantile."""
 CURVE = ["f1", "path"]
 
-Figure = tuple[str, float, float, float, float]
+Statistic = tuple[str, float, float, float, float]
 """Quantity, where it is taken, its value and the ends of its interval (NaN where there is none)."""
 
 
@@ -61,7 +61,7 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
 
 def _compare(
     group: pd.DataFrame, reference: str, gap: tuple[str, str] | None
-) -> Iterator[tuple[str, Figure]]:
+) -> Iterator[tuple[str, Statistic]]:
     """Figures of each method in a group of episodes that can be compared."""
     done = group[group["error"].isna()]
     wide = done.pivot(index=["method", "scene", "seed"], columns="view", values=list(MEASURES)).astype(float)
@@ -154,20 +154,20 @@ def area_over_path(f1: Array, path: Array, budget: float) -> Array:
     return np.sum(f1 * np.diff(begins, append=budget), axis=1) / budget
 
 
-def _plain(quantity: str, at: float, value: float) -> Figure:
+def _plain(quantity: str, at: float, value: float) -> Statistic:
     return quantity, at, float(value), np.nan, np.nan
 
 
-def _named(names: Iterable[tuple[str, float]], found: Array) -> list[Figure]:
+def _named(names: Iterable[tuple[str, float]], found: Array) -> list[Statistic]:
     return [(name, at, *row) for (name, at), row in zip(names, found.tolist(), strict=False)]
 
 
-def _counts(own: pd.DataFrame, prefix: str = "") -> Iterator[Figure]:
+def _counts(own: pd.DataFrame, prefix: str = "") -> Iterator[Statistic]:
     yield _plain(f"{prefix}scenes", 0.0, own.index.unique("scene").size)
     yield _plain(f"{prefix}episodes", 0.0, len(own))
 
 
-def _alone(own: pd.DataFrame, budget: float) -> Iterator[Figure]:
+def _alone(own: pd.DataFrame, budget: float) -> Iterator[Statistic]:
     """Curves of a method, its path to each threshold, the area under its F1, its times."""
     f1, path = (own[name].to_numpy() for name in CURVE)
     means = own.copy()
@@ -187,7 +187,7 @@ def _alone(own: pd.DataFrame, budget: float) -> Iterator[Figure]:
             yield _plain(name.removesuffix("_seconds"), quantile, np.quantile(seconds, quantile))
 
 
-def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Figure]:
+def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Statistic]:
     """Paired differences from another method, and the ratio of paths to each threshold."""
 
     def ratios(f1: Array, path: Array, other_f1: Array, other_path: Array) -> Array:
@@ -203,7 +203,7 @@ def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Figure]:
     yield from (row for row in _by_threshold("path ratio", found) if 0.0 < row[2] < np.inf)
 
 
-def _gap_closed(own: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> list[Figure]:
+def _gap_closed(own: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> list[Statistic]:
     """(F1 − that of low) / (F1 of high − that of low) after each view."""
 
     def closed(own: Array, low: Array, high: Array) -> Array:
@@ -218,5 +218,5 @@ def _paths(f1: Array, path: Array) -> Array:
     return np.stack([path_to(f1, path, threshold) for threshold in CONFIG.thresholds], axis=-1)
 
 
-def _by_threshold(quantity: str, found: Array) -> list[Figure]:
+def _by_threshold(quantity: str, found: Array) -> list[Statistic]:
     return _named([(quantity, threshold) for threshold in CONFIG.thresholds], found)

@@ -398,8 +398,12 @@ def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[
     """
     inside = np.zeros(len(points_world), dtype=bool)
     for geom in solid_geoms(scene, label):
-        T_geom_world = transforms.invert(_geom_pose(scene, geom))
-        inside |= _inside_geom(scene.model, geom, transforms.transform(T_geom_world, points_world))
+        shape = _primitive(scene, geom)
+        if shape is not None:
+            inside |= shape.signed_distance(points_world) <= 0.0
+        else:
+            T_geom_world = transforms.invert(_geom_pose(scene, geom))
+            inside |= _inside_geom(scene.model, geom, transforms.transform(T_geom_world, points_world))
     return inside
 
 
@@ -478,17 +482,11 @@ def _level(box: Box) -> Box:
 
 
 def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:
-    """Test points (N, 3) in the geom's own frame."""
+    """Test points (N, 3) in the own frame of a geom that is none of our shapes."""
     size = model.geom_size[geom]
     match model.geom_type[geom]:
-        case _GEOM.mjGEOM_BOX:
-            return (np.abs(points) <= size).all(axis=-1)
-        case _GEOM.mjGEOM_SPHERE:
-            return np.linalg.norm(points, axis=-1) <= size[0]
         case _GEOM.mjGEOM_ELLIPSOID:
             return np.linalg.norm(points / size, axis=-1) <= 1.0
-        case _GEOM.mjGEOM_CYLINDER:
-            return (np.hypot(points[:, 0], points[:, 1]) <= size[0]) & (np.abs(points[:, 2]) <= size[1])
         case _GEOM.mjGEOM_CAPSULE:
             along = np.clip(points[:, 2], -size[1], size[1])
             return np.linalg.norm(points - along[:, None] * (0.0, 0.0, 1.0), axis=-1) <= size[0]
