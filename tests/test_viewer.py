@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import urllib.request
 from dataclasses import replace
@@ -19,12 +20,10 @@ from caryatid.io.graph_json import graph_text
 from caryatid.manipulation.order import TakeStep
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.support.relations import Effect, predict_removal
-from caryatid.viewer import panels
+from caryatid.viewer.apart import taken_apart
 from caryatid.viewer.drawing import BY_HAND, LAYERS
-from caryatid.viewer.loop import Loop, candidate_under, taken_apart
-from caryatid.viewer.page import Page
-from caryatid.viewer.process import PageProcess
+from caryatid.viewer.loop import LoopPage, candidate_under
+from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
 
 pytest.importorskip("viser")
@@ -37,20 +36,24 @@ def opening(scene_file):
 
 @pytest.fixture
 def loop(opening, settings):
-    return Loop(opening, settings, segmentation="labels")
-
-
-@pytest.fixture(scope="module")
-def moment(opening, settings):
-    """What is known of the two objects after their first view."""
-    return Loop(opening, settings, segmentation="labels").turn()
-
-
-@pytest.fixture(scope="module")
-def page():
-    page = Page("test")
+    page = LoopPage(opening, settings, segmentation="labels")
     yield page
     page.close()
+
+
+@pytest.fixture(scope="module")
+def page(opening, settings):
+    """The page of two objects, seen once."""
+    page = LoopPage(opening, settings, segmentation="labels")
+    page.turn()
+    page.wait()
+    yield page
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def moment(page):
+    return page.shown
 
 
 @pytest.fixture
@@ -110,8 +113,10 @@ def test_the_sphere_is_painted_and_cameras_show_what_they_saw(moment, drawn):
     away = np.linalg.norm(painted.points + painted.position - sphere.centre_world, axis=1)
     np.testing.assert_allclose(away, sphere.radius, rtol=1e-2)
     assert nodes["/cameras/0"].image.shape[2] == 3
+    decision = replace(moment.step.decision, why="chosen by hand")
+    by_hand = replace(moment, step=replace(moment.step, decision=decision))
     planned = tuple(nodes["/cameras/next"].color)
-    assert planned != tuple(drawn(replace(moment, by_hand=True))["/cameras/next"].color) == BY_HAND
+    assert planned != tuple(drawn(by_hand)["/cameras/next"].color) == BY_HAND
 
 
 def test_what_is_kept_of_a_step_is_small(moment):
@@ -124,71 +129,67 @@ def test_what_is_kept_of_a_step_is_small(moment):
 
 
 def test_what_is_said_of_an_object(moment, settings):
-    graph = moment.step.graph
-    text = panels.describe_object(graph, "o1", predict_removal(graph, "o1", settings.support))
+    graph, config = moment.step.graph, settings.support
+    text = describe_object(graph, "o1", config)
     for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 falls:"):
         assert part in text
-    assert "nothing falls" in panels.describe_object(graph, "o2", ())
-    assert "may fall" in panels.describe_object(graph, "o1", [Effect("o2", False, "why")])
-    assert "not known" in panels.describe_object(graph, "o9", ())
+    assert "nothing falls" in describe_object(graph, "o2", config)
+    assert "Without" not in describe_object(graph, "o0", config)
+    doubtful = with_supports(moment, Support("o1", "o2", certain=False)).step.graph
+    assert "o1 → o2</dt><dd>bottom-up, uncertain, 1 of 1" in describe_object(doubtful, "o1", config)
+    assert "not known" in describe_object(graph, "o9", config)
     named = replace(moment, step=replace(moment.step, name="<img src=x onerror=alert(1)>"))
-    assert "<img" not in panels.describe_view(named, 1)
+    assert "<img" not in describe_view(named, 1)
 
 
-def test_the_loop_gives_the_views_that_explore_gives(loop, opening, settings):
-    source = opening(settings)
-    steps = explore(source.camera, source.robot, config=settings, segmentation="labels")
-    for step in (next(steps), next(steps)):
-        moment = loop.turn()
-        assert graph_text(moment.step.graph) == graph_text(step.graph)
-        np.testing.assert_array_equal(moment.step.decision.T_world_camera, step.decision.T_world_camera)
-        assert moment.score is not None
-
-
-def test_the_loop_says_when_it_would_stop_and_can_go_on(opening, settings):
+def test_the_loop_gives_the_views_that_explore_gives_and_says_when_it_would_stop(opening, settings):
     limited = replace(settings, active=replace(settings.active, max_views=2))
-    loop = Loop(opening, limited, segmentation="labels")
-    assert [(loop.turn().step.index, loop.pause) for _ in range(2)] == [
-        (0, None),
-        (1, "2 views were asked for"),
-    ]
-    assert loop.turn().step.index == 2
+    page, source = LoopPage(opening, limited, segmentation="labels"), opening(limited)
+    steps = explore(source.camera, source.robot, config=limited, segmentation="labels")
+    assert [page.turn() for _ in range(3)][:2] == [None, "2 views were asked for"]
+    page.close()
+    assert len(page.moments) == 3
+    for step, moment in zip(steps, page.moments, strict=False):
+        assert graph_text(moment.step.graph) == graph_text(step.graph)
+        np.testing.assert_array_equal(moment.step.visited, step.visited)
+        assert moment.score is not None
 
 
 def test_a_view_chosen_by_hand_is_taken_and_taken_again_with_another_fusion(loop):
     loop.turn()
-    index = len(loop.moments[0].step.candidates) // 3
-    wanted = loop.moments[0].step.candidates.T_world_camera[index]
-    moment = loop.choose(index)
-    assert moment.by_hand
-    assert moment.step.decision.score <= loop.planned.score
-    np.testing.assert_array_equal(loop.turn().step.view.T_world_camera, wanted)
+    step = loop.moments[0].step
+    index = len(step.candidates) // 3
+    said = loop.choose(index)
+    yours, planned = (float(number) for number in re.findall(r"\d\.\d+", said))
+    assert yours <= planned == pytest.approx(step.decision.score, abs=0.01)
+    loop.turn()
     poses = [m.step.view.T_world_camera for m in loop.moments]
-    again = list(loop.use_fusion("sg"))
-    assert loop.fusion == "sg"
-    assert [m.by_hand for m in again] == [True, False]
-    np.testing.assert_array_equal([m.step.view.T_world_camera for m in again], poses)
+    np.testing.assert_array_equal(poses[1], step.candidates.T_world_camera[index])
+    assert "sg" in loop.use_fusion("sg")
+    assert [m.step.decision.why == "chosen by hand" for m in loop.moments] == [True, False]
+    np.testing.assert_array_equal([m.step.view.T_world_camera for m in loop.moments], poses)
     with pytest.raises(PlanningError):
         loop.choose(10**6)
 
 
 def test_another_planner_chooses_the_next_view_at_once(loop):
-    before = loop.turn().step
-    after = loop.use_planner("farthest").step
+    loop.turn()
+    before = loop.moments[0].step
+    loop.use_planner("farthest")
+    after = loop.moments[0].step
     assert after.graph is before.graph
     assert not np.allclose(after.decision.T_world_camera, before.decision.T_world_camera)
-    np.testing.assert_array_equal(loop.turn().step.view.T_world_camera, after.decision.T_world_camera)
+    loop.turn()
+    np.testing.assert_array_equal(loop.moments[1].step.view.T_world_camera, after.decision.T_world_camera)
     with pytest.raises(InputError):
         loop.use_planner("nobody")
 
 
 def test_a_recording_ends_with_its_views(recording, settings):
-    opening = partial(open_source, str(recording), noise="none", segmentation=None, seed=0)
-    loop = Loop(opening, settings)
-    taken = [loop.turn() for _ in range(4)]
-    assert [m is not None for m in taken] == [True, True, True, False]
-    assert taken[0].step.robot is None
-    assert "no view is left" in loop.ended
+    page = LoopPage(partial(open_source, str(recording), noise="none", segmentation=None, seed=0), settings)
+    assert "no view is left" in [page.turn() for _ in range(4)][-1]
+    page.close()
+    assert [m.step.robot for m in page.moments] == [None] * 3
 
 
 def test_a_ray_points_at_the_view_it_first_meets(moment):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from caryatid.exploration import Step
     from caryatid.runs import RunRecorder
     from caryatid.sources import Source
-    from caryatid.viewer.process import PageProcess
+    from caryatid.viewer.page import PageProcess
 
 
 @dataclass(frozen=True, kw_only=True)

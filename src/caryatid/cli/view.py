@@ -19,8 +19,7 @@ from caryatid.cli import options
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
     from caryatid.config import Config
-    from caryatid.viewer.page import Page
-    from caryatid.viewer.process import PageProcess
+    from caryatid.viewer.page import Page, PageProcess
 
 PORT = 8770
 """Port of the page, or else the next free one."""
@@ -83,19 +82,15 @@ class View(options.ExploringCommand):
 
     def _open_loop(self, config: Config, stack: ExitStack) -> Page:
         from caryatid.sources import open_source
-        from caryatid.viewer.controls import Controls
-        from caryatid.viewer.loop import Loop
-        from caryatid.viewer.page import Page
+        from caryatid.viewer.loop import LoopPage
 
         shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         opening = partial(open_source, self.source, noise=self.noise, robot=self.robot, **shared)
+        served: dict[str, Any] = {"host": self.host, "port": self.port}
         with self.output.working("opening"):
-            loop = Loop(opening, config, planner=self.planner, **shared)
-        page = Page(f"caryatid: {loop.source.name}", config.support, host=self.host, port=self.port)
+            page = LoopPage(opening, config, planner=self.planner, **shared, **served)
         stack.callback(page.close)
-        controls = Controls(page, loop, seed=self.settings.seed)
-        stack.callback(controls.close)
-        controls.start()
+        page.start()
         return page
 
 
@@ -110,7 +105,7 @@ def wait_for_interrupt() -> None:
 @contextmanager
 def watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]:
     """Open a page for an exploration; when that ends by itself, keep the page until Ctrl-C."""
-    from caryatid.viewer.process import PageProcess
+    from caryatid.viewer.page import PageProcess
 
     page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
     output.say(f"{name} at {page.url}")

@@ -37,12 +37,10 @@ class Moment:
     Attributes:
         step: What is known.
         score: F1 of vertices and edges together, or None where the ground truth is not known.
-        by_hand: The next view was chosen by a person.
     """
 
     step: Step
     score: float | None = None
-    by_hand: bool = False
 
     def reduced(self) -> Moment:
         """The same with an image no larger than it is drawn, so that the page can keep every one."""
@@ -114,7 +112,7 @@ class SceneDrawing:
             "supports": (step.graph,),
             "sphere": (step.sphere, step.candidates, decision),
             "interest": (step.sphere, decision),
-            "cameras": (decision, moment.by_hand, *steps),
+            "cameras": (decision, *steps),
             "robot": (step.robot,),
         }
         with self._server.atomic():
@@ -238,7 +236,7 @@ class SceneDrawing:
         )
         return [self._points("/interest/points", at, colours, 0.02), *rays]
 
-    def _cameras(self, decision: Any, by_hand: bool, *steps: Step) -> list[Any]:
+    def _cameras(self, decision: Any, *steps: Step) -> list[Any]:
         nodes: list[Any] = []
         views = [(step.index, step.view) for step in steps if step.view is not None]
         for number, view in views:
@@ -248,7 +246,8 @@ class SceneDrawing:
                 look |= {"scale": 0.135, "color": CERTAIN} if newest else {"scale": 0.09, "color": EARLIER}
                 nodes += self._camera(str(number), view, view.T_world_camera, **look)
         if views and decision is not None:
-            look = {"variant": "filled", "scale": 0.09, "color": BY_HAND if by_hand else NEXT}
+            colour = BY_HAND if decision.why == "chosen by hand" else NEXT
+            look = {"variant": "filled", "scale": 0.09, "color": colour}
             nodes += self._camera("next", views[-1][1], decision.T_world_camera, **look)
         return nodes
 

@@ -1,28 +1,30 @@
-"""The active vision loop worked by a person, turn by turn, and an order of removal played."""
+"""A page that controls an exploration: turn by turn, with any planner and fusion, up to dismantling."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import contextlib
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from threading import Event
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from caryatid.config import Config, FusionMethod, SegmentationMethod
-from caryatid.errors import PlanningError
+from caryatid.errors import CaryatidError, PlanningError, in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
 from caryatid.exploration import Explorer, Step, reason_to_stop
-from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
-from caryatid.manipulation.order import TakeStep
-from caryatid.planning.decision import Decision, Planner
-from caryatid.simulation.camera import SimulatedCamera
-from caryatid.simulation.lifting import ASIDE
-from caryatid.simulation.world import SimulatedScene
+from caryatid.manipulation.order import plan_order
+from caryatid.planning.decision import Decision
+from caryatid.planning.planners import BUILT_IN, ORACLE, offered
+from caryatid.runtime.parallel import cores
+from caryatid.viewer.apart import taken_apart
 from caryatid.viewer.drawing import Moment
+from caryatid.viewer.page import Page
 
 if TYPE_CHECKING:
     from caryatid.planning.candidates import Candidates
@@ -30,27 +32,27 @@ if TYPE_CHECKING:
     from caryatid.sources import Source
 
 
-class Loop:
-    """An exploration that waits for its next turn to be asked for.
+class LoopPage(Page):
+    """A page with an exploration whose turns a person asks for, and the one thread that takes them.
 
-    It does not end by itself as `explore` does, but says when that would have: see `pause`.
+    The exploration does not end by itself as `explore` does, but the page says when that would have.
 
     Args:
         open_source: Opens what is explored, again each time, for some settings.
-        config: All settings; `config.active.max_views` is when it says that it would pause.
-        planner: Name of who chooses the next view.
+        config: All settings; `config.active.max_views` is when `run` pauses.
+        planner: Name of the planner.
         segmentation: Where segments come from.
         seed: Seed of every random choice.
+        host: Address to listen at.
+        port: Port to listen at, or the next free one; 0 = any that is free.
 
     Attributes:
         source: What is explored.
-        planned: What the planner chose, also where a person has chosen otherwise.
-        moments: What came of each view.
+        planner: Name of the planner.
         ended: Why no further view can be taken, or None.
-        pause: Why `explore` would have ended after the newest view, or None.
 
     Raises:
-        CaryatidError: The source cannot be opened, or there is no such planner.
+        CaryatidError: The source cannot be opened, there is no such planner, or the page cannot be served.
     """
 
     def __init__(
@@ -61,97 +63,210 @@ class Loop:
         planner: str = "support",
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
+        host: str = "127.0.0.1",
+        port: int = 0,
     ) -> None:
-        self._open_source, self._began_with = open_source, planner
+        self._open_source, self._config, self._began_with = open_source, config, planner
         self._options: dict[str, Any] = {"segmentation": segmentation, "seed": seed}
-        self.config, self.planner = config, planner
+        self.planner = planner
         self._begin()
+        super().__init__(f"caryatid: {self.source.name}", config.support, host=host, port=port)
+        self._worker = ThreadPoolExecutor(1, "loop")
+        self._running = Event()
+        self._add_controls()
 
     def _begin(self) -> None:
-        self.source = source = self._open_source(self.config)
-        options = self._options | {"config": self.config}
-        first, camera = planner_for(self._began_with, source.camera, source.truth, **options)
-        self._planners: dict[str, Planner] = {self._began_with: first}
-        chooser = self._planners.get(self.planner, self.planner)
-        self._explorer = Explorer(camera, source.robot, planner=chooser, **options)
-        self.moments: list[Moment] = []
-        self.planned: Decision | None = None
+        self.source = source = self._open_source(self._config)
+        options = self._options | {"config": self._config}
+        self._first, camera = planner_for(self._began_with, source.camera, source.truth, **options)
+        self._explorer = Explorer(camera, source.robot, planner=self._named(self.planner), **options)
+        self._planned: Decision | None = None
         self.ended: str | None = None
-        self.pause: str | None = None
 
-    @property
-    def fusion(self) -> FusionMethod:
-        """What is fused over views."""
-        return self.config.fusion.method
+    def _named(self, name: str) -> Any:
+        """The planner of this name; the oracle belongs to the source, and so only the first can be it."""
+        return self._first if name == self._began_with else name
 
-    def turn(self) -> Moment | None:
-        """Go to the next view, look and plan; return what came of it, or None where no view can be taken.
+    def turn(self) -> str | None:
+        """Go to the next view, look and plan; return why `explore` would have ended now, or None.
 
         Raises:
             CaryatidError: The view cannot be used.
         """
         if self.ended is not None:
-            return None
-        if self.moments:
-            self._explorer.go()
-        self._explorer.look()
-        step = self._explorer.plan()
-        f1 = None
-        if self.source.truth is not None:
-            f1 = score(step.graph, self.source.truth, np.random.default_rng(0)).f1
-        self.moments.append(Moment(step, f1))
-        self.planned, self.ended = step.decision, step.stop
-        self.pause = step.stop or reason_to_stop(
-            step.index + 1, self._explorer.scene.changed, self.config.active
-        )
-        return self.moments[-1]
+            return self.ended
+        self.stage(None)
+        explorer, truth, f1 = self._explorer, self.source.truth, None
+        with self.working:
+            if explorer.step is not None:
+                explorer.go()
+            explorer.look()
+            step = explorer.plan()
+            if truth is not None:
+                f1 = score(step.graph, truth, np.random.default_rng(0)).f1
+        self._planned, self.ended = step.decision, step.stop
+        self.add(Moment(step, f1))
+        return step.stop or reason_to_stop(step.index + 1, explorer.scene.changed, self._config.active)
 
-    def use_planner(self, name: str) -> Moment | None:
-        """Let another planner choose, already the next view; the newest moment, with its choice.
+    def use_planner(self, name: str) -> str:
+        """Let another planner choose, already the next view; return what to say about it.
 
         Raises:
             CaryatidError: There is no such planner, or it can choose no view.
         """
-        self._explorer.use_planner(self._planners.get(name, name))
-        self.planner = name
-        if not self.moments or self.ended is not None:
-            return None
-        step = self._explorer.plan()
+        with self.working:
+            self._explorer.use_planner(self._named(name))
+            self.planner = name
+            if self._explorer.step is None or self.ended is not None:
+                return ""
+            step = self._explorer.plan()
         if step.decision is None:
             raise PlanningError(step.stop or "no view can be chosen")
-        self.planned = step.decision
-        self.moments[-1] = replace(self.moments[-1], step=step, by_hand=False)
-        return self.moments[-1]
+        self._planned = step.decision
+        self._put(step)
+        return f"{name} chose the next view"
 
-    def use_fusion(self, method: FusionMethod) -> Iterator[Moment]:
-        """Begin again with another fusion and take the same views again.
+    def use_fusion(self, method: FusionMethod) -> str:
+        """Begin again with another fusion and take the same views again; return what to say about it."""
+        earlier = [moment.step.decision for moment in self.moments]
+        self._config = replace(self._config, fusion=replace(self._config.fusion, method=method))
+        with self.working:
+            self._begin()
+        for number, decision in enumerate(earlier, start=1):
+            self.turn()
+            if number < len(earlier) and decision is not None and self.ended is None:
+                self.choose(decision)
+        return f"the same views, fused by {method}"
 
-        Yields:
-            What came of each view.
-        """
-        earlier = self.moments
-        self.config = replace(self.config, fusion=replace(self.config.fusion, method=method))
-        self._begin()
-        for before in earlier:
-            moment = self.turn()
-            if moment is None:
-                return
-            if before is not earlier[-1] and before.step.decision is not None:
-                moment = self._go_to(before.step.decision, by_hand=before.by_hand)
-            yield moment
-
-    def choose(self, index: int) -> Moment:
-        """Go to this candidate next, whatever the planner says.
+    def choose(self, chosen: Decision | int) -> str:
+        """Take this view or candidate next, whatever the planner says; return what to say about it.
 
         Raises:
             PlanningError: There is no next view to choose, or the robot cannot take it.
         """
-        return self._go_to(index, by_hand=True)
+        with self.working:
+            step = self._explorer.choose(chosen)
+        self._put(step)
+        if self._planned is None or step.decision is None:
+            return "your view is next"
+        yours, planned = step.decision.score, self._planned.score
+        return f"your view is next: score {yours:.2f}, the choice of {self.planner} {planned:.2f}"
 
-    def _go_to(self, chosen: Decision | int, *, by_hand: bool) -> Moment:
-        step = self._explorer.choose(chosen)
-        self.moments[-1] = replace(self.moments[-1], step=step, by_hand=by_hand)
-        return self.moments[-1]
+    def _put(self, step: Step) -> None:
+        """Show the newest step with another next view."""
+        self.add(replace(self.moments[step.index], step=step))
+
+    def dismantle(self) -> str:
+        """Find a safe order and play it: in physics where there is a simulation, else as the order says."""
+        moment, config, said = self.moments[-1], self._config, ""
+        with self.working:
+            order = plan_order(moment.step.graph, config, seed=self._options["seed"], threads=cores())
+        for step, done in taken_apart(moment.step, order.steps, self.source, config):
+            if not self._running.is_set():
+                return "paused"
+            self.stage(replace(moment, step=step))
+            if done:
+                said = done
+                self.say(said)
+            time.sleep(0.12)  # Each picture of a lift stands for so long [s].
+        return f"{order.refusal or 'a safe order'}; {said}"
+
+    def start(self) -> None:
+        """Take the first view, or the next, in the page's own thread."""
+        self._running.clear()
+        self._do("taking a view", self.turn)
+
+    def wait(self) -> None:
+        """Wait until all that has been asked for is done and drawn."""
+        self._worker.submit(lambda: None).result()
+        super().wait()
+
+    def close(self) -> None:
+        """Stop, once the view that is being taken is there, and stop serving the page."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+        self._running.clear()
+        self._worker.shutdown()
+        super().close()
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        names = [*BUILT_IN, *sorted(offered()), *([ORACLE] if self.planner == ORACLE else [])]
+        with gui.add_folder("loop", order=-10):
+            self._next = gui.add_button("next view", hint="Take one turn of the loop")
+            self._go = gui.add_button("run", hint="Take turn after turn")
+            self._pause = gui.add_button("pause", hint="Stop after this turn", disabled=True)
+            planner = gui.add_dropdown("planner", names, initial_value=self.planner)
+            fusion = gui.add_dropdown(
+                "fusion", get_args(FusionMethod), initial_value=self._config.fusion.method
+            )
+            hint = "Then click the view sphere: the view you point at is taken next"
+            by_hand = gui.add_checkbox("choose the next view by hand", False, hint=hint)
+            hint = "Find a safe order to take everything away, and play it"
+            self._dismantle = gui.add_button("dismantle", hint=hint)
+        self._choices = planner, fusion
+        self._next.on_click(lambda _: self.start())
+        self._go.on_click(lambda _: self._keep_doing("running", self._run))
+        self._pause.on_click(lambda _: self._running.clear())
+        self._dismantle.on_click(lambda _: self._keep_doing("rehearsing lifts", self.dismantle))
+        planner.on_update(lambda _: self._do("planning again", lambda: self.use_planner(planner.value)))
+        fusion.on_update(
+            lambda _: self._do("taking the same views again", lambda: self.use_fusion(fusion.value))
+        )
+        by_hand.on_update(lambda _: self._listen(by_hand.value))
+
+    def _keep_doing(self, what: str, work: Callable[[], str | None]) -> None:
+        """Have work done that `pause` ends."""
+        if not self._running.is_set():
+            self._running.set()
+            self._do(what, work)
+
+    def _do(self, what: str, work: Callable[[], str | None]) -> None:
+        """Have work done, after what is being done, and say what it returns at its end."""
+
+        def done() -> None:
+            self._show_state(what + " …", busy=True)
+            try:
+                said = work()
+            except CaryatidError as error:
+                said = f"{error}"
+            except Exception as error:
+                said = in_one_line(error)
+            self._running.clear()
+            self._show_state(said or "", busy=False)
+
+        with contextlib.suppress(RuntimeError):  # The page is being closed.
+            self._worker.submit(done)
+
+    def _show_state(self, text: str, *, busy: bool) -> None:
+        self.say(text)
+        self._next.disabled = self._go.disabled = busy or self.ended is not None
+        self._pause.disabled = not busy
+        self._dismantle.disabled = busy or not self.moments
+        for choice in self._choices:
+            choice.disabled = busy
+
+    def _run(self) -> str | None:
+        while self._running.is_set():
+            said = self.turn()
+            if said is not None:
+                return said
+        return "paused"
+
+    def _listen(self, wanted: bool) -> None:
+        scene = self.server.scene
+        scene.remove_click_callback("all")
+        if wanted:
+            scene.on_click()(self._pointed)
+
+    def _pointed(self, event: Any) -> None:
+        """Take the candidate within 6° of a click next, whatever the planner says."""
+        step = self._explorer.step
+        if step is None or step.candidates is None:
+            return
+        origin, direction = np.array(event.ray_origin), np.array(event.ray_direction)
+        index = candidate_under(origin, direction, step.sphere, step.candidates, np.deg2rad(6.0))
+        if index is not None:
+            self._do("choosing", lambda: self.choose(index))
 
 
 def candidate_under(
@@ -174,86 +289,3 @@ def candidate_under(
     if not hit.any():
         return None
     return int(np.argmin(np.where(hit & (along < along[hit].min() + sphere.radius / 2.0), aside, np.inf)))
-
-
-def taken_apart(
-    step: Step, steps: Sequence[TakeStep], source: Source, config: Config
-) -> Iterator[tuple[Step, str]]:
-    """Play an order: in physics where the source is simulated, else as the order says.
-
-    Shapes that have moved leave their points behind, and so their points are not shown.
-
-    Args:
-        step: What is known.
-        steps: The order.
-        source: What was explored.
-        config: How lifts go.
-
-    Yields:
-        Several pictures of each lift, with what came of it where it is done, else an empty text.
-    """
-    gone: set[str] = set()
-    camera, lifts = source.camera, _lifts_as_ordered(steps)
-    if isinstance(camera, SimulatedCamera) and source.truth is not None:
-        lifts = _lifts_in_physics(camera.scene, steps, bodies_of(step.graph, source.truth), config)
-    for number, (taken, moves, disturbed) in enumerate(lifts, start=1):
-        for T_world_world in moves:
-            yield _without(step, gone, taken.object_id, T_world_world), ""
-        gone.add(taken.object_id)
-        harm = f", {', '.join(disturbed)} disturbed" if disturbed else ""
-        text = f"{number} of {len(steps)} taken: {taken.object_id}{harm}"
-        yield _without(step, gone, taken.object_id, moves[-1] if moves else {}), text
-
-
-Lift = tuple[TakeStep, list[dict[str, Array]], tuple[str, ...]]
-"""What is taken, how far each object has moved (4, 4) by id in each picture, and what was disturbed."""
-
-
-def _lifts_in_physics(
-    scene: SimulatedScene, steps: Sequence[TakeStep], bodies: Mapping[str, str], config: Config
-) -> Iterator[Lift]:
-    """Take the scene apart in physics; the extracted shapes move as the bodies they stand for do."""
-    names = list(scene.object_bodies.values())
-    began = transforms.invert(_transforms(poses_of(scene)))
-    for taken in dismantle(scene, steps, bodies, config):
-        film = taken.film
-        if taken.body is not None:
-            film = film[film[:, names.index(taken.body), 2] < ASIDE / 2.0]
-        moves = (_transforms(state) @ began for state in film)
-        yield taken.step, [{i: T[names.index(b)] for i, b in bodies.items()} for T in moves], taken.disturbed
-
-
-def _lifts_as_ordered(steps: Sequence[TakeStep]) -> Iterator[Lift]:
-    """Take objects straight up by half a metre, where there is no physics to ask."""
-    for step in steps:
-        heights = np.linspace(0.0, 0.5, 8)[1:]
-        yield step, [{step.object_id: transforms.rigid(np.eye(3), (0.0, 0.0, h))} for h in heights], ()
-
-
-def _without(step: Step, gone: set[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:
-    """A step as it looks while an object is being lifted and others are gone."""
-    graph, cloud = step.graph, step.cloud
-    objects = tuple(
-        replace(o, shape=o.shape.moved(T_world_world.get(o.id, np.eye(4))))
-        for o in graph.objects
-        if o.id not in gone
-    )
-    supports = tuple(
-        replace(s, contact_world=None, normal_world=None)
-        for s in graph.supports
-        if not {s.supporter, s.supported} & {lifted, *gone}
-    )
-    moved = {i for i, T in T_world_world.items() if np.abs(T - np.eye(4)).max() > 2e-3}
-    away = [o.label for o in graph.objects if o.id in gone | moved]
-    if away and cloud.labels is not None:
-        cloud = cloud.select(~np.isin(cloud.labels, away))
-    shown = replace(graph, objects=objects, supports=supports)
-    return replace(step, graph=shown, cloud=cloud, decision=None, candidates=None)
-
-
-def _transforms(state: Array) -> Array:
-    """Poses (N, 4, 4) of a state (N, 7): positions and quaternions, w first."""
-    T = np.tile(np.eye(4), (len(state), 1, 1))
-    T[:, :3, 3] = state[:, :3]
-    T[:, :3, :3] = Rotation.from_quat(state[:, [4, 5, 6, 3]]).as_matrix()
-    return T

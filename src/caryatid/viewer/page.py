@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
+import signal
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
+from importlib.util import find_spec
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from threading import RLock
 from typing import Any
 
@@ -18,11 +23,12 @@ from caryatid.exploration import Step
 from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.support.relations import predict_removal
-from caryatid.viewer import panels
 from caryatid.viewer.drawing import LAYERS, NEXT, Moment, SceneDrawing, moment_of_scene
-from caryatid.viz.colours import PALETTE
-from caryatid.viz.notebook import cell_html
-from caryatid.viz.report import Section
+from caryatid.viz.colours import PALETTE, SALIENCY_STOPS, object_colour, scale
+from caryatid.viz.drawings import draw_layers
+from caryatid.viz.notebook import cell_html, draw_cell
+from caryatid.viz.report import Figure, Section
+from caryatid.viz.tables import census, object_table, support_table
 
 
 class Page:
@@ -62,7 +68,7 @@ class Page:
         self.server: Any = _serve(title, host, port)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
         self.moments: list[Moment] = []
-        self.drawing = SceneDrawing(self.server, self.choose)
+        self.drawing = SceneDrawing(self.server, self.describe)
         self._support, self._small = support or SupportConfig(), small
         self._shown, self._chosen = -1, ""
         self._staged: Moment | None = None
@@ -104,7 +110,7 @@ class Page:
             self._staged = None
             self.redraw()
 
-    def choose(self, object_id: str) -> None:
+    def describe(self, object_id: str) -> None:
         """Show what is known of an object."""
         self._chosen = object_id
         self.redraw()
@@ -168,7 +174,7 @@ class Page:
                 visible=False,
             )
         with panel.add_tab("key"):
-            gui.add_html(panels.describe_signs())
+            gui.add_html(_describe_signs())
         with about.add_tab("object"):
             told = "Click an object in the scene to see what is known of it."
             self._about = gui.add_html(cell_html(Section("", told)))
@@ -202,21 +208,127 @@ class Page:
         self._slider.max = max(last, 1)
         self._slider.disabled = last == 0
         self._slider.value = self._shown
-        self._told.content = panels.describe_view(moment, len(self.moments))
+        self._told.content = describe_view(moment, len(self.moments))
         graph = moment.step.graph
         if graph is not self._graph_drawn:
             self._graph_drawn = graph
-            self._graph.content = panels.describe_graph(graph)
+            self._graph.content = draw_cell(graph)
         scores = np.array([np.nan if m.score is None else m.score for m in self.moments])
         if not np.isnan(scores).all():
             self._chart.data = np.arange(len(scores), dtype=np.float64), scores
             self._chart.visible, self._no_chart.visible = True, False
         if chosen:
-            effects = None
-            if any(o.id == chosen and o.role == "object" for o in graph.objects):
-                with self.working:
-                    effects = predict_removal(graph, chosen, self._support)
-            self._about.content = panels.describe_object(graph, chosen, effects)
+            with self.working:
+                self._about.content = describe_object(graph, chosen, self._support)
+
+
+# What is said beside the scene
+
+
+def describe_view(moment: Moment, views: int) -> str:
+    """Say what a view brought, and where to look next."""
+    step, decision = moment.step, moment.step.decision
+    facts = [("known", census(step.graph)), ("points", f"{len(step.cloud):,}")]
+    if moment.score is not None:
+        facts.append(("F1", f"{moment.score:.3f}"))
+    if decision is not None:
+        figures = f"saliency {decision.saliency:.2f} − cost {decision.cost:.2f} = {decision.score:.2f}"
+        facts += [("next", decision.why), ("score", figures)]
+    if step.stop is not None:
+        facts.append(("done", step.stop))
+    return cell_html(Section(f"View {step.index}", f"of {views - 1} · {step.name}", facts=facts))
+
+
+def _describe_signs() -> str:
+    """Say what the signs in the scene mean."""
+    signs = {
+        "Arrow": "supporter → supported; dashed where uncertain",
+        "Ball, cube on an arrow": "it leans; weight from above. Neither: supported from below",
+        "Dots on the sphere": "where the robot can bring its camera, coloured by saliency",
+        "Fine grey dots": "where it cannot",
+        "Balls with rays": "points of interest, and from where they are seen best",
+        "Grey cameras": "views so far, with what they saw; the newest is black and larger",
+        "Filled camera": "the next view: blue the planner's choice, pink one by hand",
+    }
+    picture = draw_layers("saliency", [scale(np.tile(np.linspace(-1.0, 1.0, 340), (10, 1)), SALIENCY_STOPS)])
+    caption = "Saliency: seen before, nothing, look here; the highest of each view is red."
+    return cell_html(Section("Key", facts=[*signs.items()], figures=[Figure("", picture, caption)]))
+
+
+def describe_object(graph: SupportGraph, object_id: str, config: SupportConfig) -> str:
+    """Say what an object is, how it is known, its edges, and what falls without it."""
+    item = next((o for o in graph.objects if o.id == object_id), None)
+    if item is None:
+        return cell_html(Section(object_id, "is not known after this view"))
+    table = object_table(graph)
+    (row,) = (row for row in table.rows if row[0].text == object_id)
+    facts = [(name, entry.text) for name, entry in zip(table.columns, row, strict=True)][2:]
+    if item.role == "object":
+        effects = predict_removal(graph, object_id, config)
+        falls = [f"{e.object_id} {'falls' if e.certain else 'may fall'}: {e.why}" for e in effects]
+        facts += [(f"Without {object_id}", text) for text in falls or ["nothing falls"]]
+    for supporter, supported, kind, certain, found, why in support_table(graph).rows:
+        if object_id in (supporter.text, supported.text):
+            evidence = f"{kind.text}{', uncertain' * certain.doubt}, {found.text}; {why.text}"
+            facts.append((f"{supporter.text} → {supported.text}", evidence))
+    return cell_html(Section(item.id, item.shape.kind, facts=facts, colour=object_colour(item.label)))
+
+
+# A page in a process of its own
+
+
+class PageProcess:
+    """A page like `Page`, to which moments can be added and no more.
+
+    Args:
+        title: What the page is of.
+        support: The numbers the graphs were inferred with.
+        port: Port to listen at, or the next free one; 0 = any that is free.
+
+    Attributes:
+        url: Where the page is.
+
+    Raises:
+        InputError: viser is not installed, or the page cannot be served.
+    """
+
+    def __init__(self, title: str, support: SupportConfig, port: int) -> None:
+        if find_spec("viser") is None:
+            raise _needs_viser()
+        context = get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_show_sent, args=(theirs, title, support, port), daemon=True)
+        self._process.start()
+        theirs.close()
+        try:
+            self.url: str = self._connection.recv()
+        except EOFError:
+            raise InputError("viewer", f"cannot be served at port {port}", "choose another one") from None
+        self._sender = ThreadPoolExecutor(1, "viewer")
+
+    def add(self, moment: Moment) -> None:
+        """Add a moment; it is sent as soon as those before it are, unless the page is gone."""
+        self._sender.submit(lambda: self._connection.send(moment.reduced()))
+
+    def close(self) -> None:
+        """Stop serving the page, once all that was added has been sent."""
+        self._sender.shutdown()
+        self._connection.close()
+        self._process.join()
+
+
+def _show_sent(connection: Connection, title: str, support: SupportConfig, port: int) -> None:
+    """Serve a page and show the moments that come, until there are no more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(os, "nice"):
+        os.nice(10)  # Where cores are scarce, the loop goes first.
+    page = Page(title, support, port=port)
+    connection.send(page.url)
+    try:
+        while True:
+            page.add(connection.recv())
+    except EOFError:
+        page.close()
 
 
 def _log_failure(drawn: Future[None]) -> None:
@@ -226,8 +338,7 @@ def _log_failure(drawn: Future[None]) -> None:
         logging.getLogger(__name__).error("a view could not be drawn", exc_info=error)
 
 
-def needs_viser() -> InputError:
-    """The error where viser is not installed."""
+def _needs_viser() -> InputError:
     return InputError("viewer", "needs viser", 'pip install "caryatid[view]"')
 
 
@@ -237,7 +348,7 @@ def _serve(title: str, host: str, port: int) -> Any:
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
-        raise needs_viser() from None
+        raise _needs_viser() from None
 
     class Server(viser.ViserServer):
         """A server whose page stays on this machine: nobody can ask for a public address."""

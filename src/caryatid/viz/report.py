@@ -142,7 +142,7 @@ def make_report(
         text = "Each object lifted straight up in physics, in the order found."
         sections.append(Section("Taken apart", text, strip))
     named = ((name, str(value)) for name, value in (settings or {}).items())
-    sections.append(Section("Settings", tables=[Table.of("Settings", ("name", "value"), named)]))
+    sections.append(Section("Settings", tables=[Table.of("Source and options", ("name", "value"), named)]))
     return Report(title, _cards(seen, scores), sections)
 
 
