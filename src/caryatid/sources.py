@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +13,13 @@ from caryatid.config import Config, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.exploration import Explorer, Step
 from caryatid.io.datasets import Dataset, format_of, open_dataset
 from caryatid.io.importing import choose_frames
+from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
+from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
@@ -108,21 +111,43 @@ def open_recording(folder: str, config: Config, segmentation: SegmentationMethod
         if view.labels is not None:
             points.update(view.labels[view.valid].tolist())
     if segmentation != "auto":
-        check_segments(folder, points, config)
+        _check_segments(folder, points, config)
     return recording
 
 
-def check_segments(source: str, points: Mapping[int, int], config: Config) -> None:
-    """Refuse given segments that can never become objects.
+def extract(
+    source: str, config: Config, *, segmentation: SegmentationMethod | None, seed: int, label_divisor: int = 1
+) -> Iterator[Step]:
+    """Open a recording or a cloud; returns the steps of looking at all it holds.
 
     Args:
         source: What the user gave.
-        points: Points with depth of each label, over all views; 0 is no object.
         config: All settings.
+        segmentation: Where parts are to come from.
+        seed: Seed of every random choice.
+        label_divisor: For a cloud whose labels number parts of objects: object = label // this.
 
     Raises:
-        InputError: A segment has fewer points than a shape needs.
+        InputError: It is neither, or broken, or has no labels where they are demanded.
     """
+    explorer = Explorer(config=config, segmentation=segmentation, seed=seed)
+    if Path(source).suffix.lower() not in CLOUD_SUFFIXES:
+        recording = open_recording(source, config, segmentation)
+        return (explorer.look(frame.load()) for frame in recording.frames)
+    stored, use_labels = read_stored_cloud(source, label_divisor), segmentation != "auto"
+    if segmentation == "labels" and stored.labels is None:
+        raise InputError(source, "has no field label", "use --segmentation auto")
+    if use_labels and stored.labels is not None:
+        _check_segments(source, Counter(stored.labels[stored.kept].tolist()), config)
+    cloud = stored.to_cloud(config.cloud)
+    rng = np.random.default_rng(seed)
+    cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
+    steps = map(explorer.look, [cloud])
+    return (replace(step, labels=stored.spread(step.labels)) for step in steps)
+
+
+def _check_segments(source: str, points: Mapping[int, int], config: Config) -> None:
+    """Refuse a segment with fewer points than a shape needs; 0 is no object."""
     least = config.fit.min_points
     small = sorted(label for label, count in points.items() if label != 0 and count < least)
     if small:

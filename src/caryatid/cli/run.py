@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
 class RunCommand(options.Command):
     """A command that writes a run folder."""
 
+    source: str
     settings: options.Modelling = options.Modelling()
     out: options.OutPath
     """Run folder to write; replaces an earlier run."""
@@ -35,12 +35,19 @@ class RunCommand(options.Command):
     profile: options.Flag = False
     """Print the time of each stage at the end; with --json as part of the document."""
 
-    def conclude(self, recorder: RunRecorder, name: str) -> None:
-        """Write the report and print what came of the run."""
+    def open(self, config: Config, recorder: RunRecorder) -> tuple[str, Iterator[Step]]:
+        """Open the source; returns its name and the steps of the run."""
+        raise NotImplementedError
+
+    def run(self, config: Config, page: PageProcess | None = None) -> None:
+        """Keep all steps, write the report and print what came of the run."""
         from caryatid.cli.output import counted, profile, summary
         from caryatid.io.graph_json import graph_to_json
 
-        output, graph = self.output, recorder.graphs[-1]
+        output = self.output
+        with _recorder(self, config) as recorder:
+            name, steps = self.open(config, recorder)
+            graph = _record(recorder, steps, output, page).graph
         if not self.no_report:
             _draw_report(self.out, output)
         output.say(f"{name}: {summary(graph)} after {counted(recorder.views, 'view')}")
@@ -54,7 +61,30 @@ class RunCommand(options.Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explore(RunCommand, options.ExploringCommand):
+class Exploring(options.ExploringCommand):
+    """A command that explores a source and keeps the steps."""
+
+    source: str
+    no_early_stop: options.Flag = False
+    """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
+
+    def explore(self, config: Config, recorder: RunRecorder) -> tuple[Source, Iterator[Step]]:
+        """Open the source; returns it and the steps of its exploration."""
+        from caryatid.evaluation.oracle import planner_for
+        from caryatid.exploration import explore
+        from caryatid.sources import open_source
+
+        known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
+        with self.output.working("opening"):
+            source = open_source(self.source, config, noise=self.noise, robot=self.robot, **known)
+        recorder.truth = source.truth
+        planner, camera = planner_for(self.planner, source.camera, source.truth, config, **known)
+        known |= {"planner": planner, "config": config, "early_stop": not self.no_early_stop}
+        return source, explore(camera, source.robot, **known)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explore(RunCommand, Exploring):
     """Explore a scene until it is known which object supports which.
 
     SOURCE is one of
@@ -71,23 +101,19 @@ class Explore(RunCommand, options.ExploringCommand):
 
     source: options.SourceName
     """Scene or recording."""
-    no_early_stop: options.Flag = False
-    """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
     view: options.Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
 
-    def __call__(self) -> None:
-        self.run(self.config())
+    def open(self, config: Config, recorder: RunRecorder) -> tuple[str, Iterator[Step]]:
+        source, steps = self.explore(config, recorder)
+        return source.name, steps
 
-    def run(self, config: Config) -> None:
-        """Explore with these settings."""
+    def __call__(self, config: Config | None = None) -> None:
         from caryatid.cli.view import watched
 
+        config = config or self.config()
         with watched(self.source, config, self.output) if self.view else nullcontext() as page:
-            with _recorder(self, config) as recorder:
-                source, steps = _open(self, config, recorder)
-                _record(recorder, steps, self.output, page)
-            self.conclude(recorder, source.name)
+            self.run(config, page)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +141,7 @@ class Demo(RunCommand):
         )
         names = ("out", "no_report", "view", "profile", "settings", "general")
         shared = {name: getattr(self, name) for name in names}
-        Explore(source=self.scene, noise="carmine", **shared).run(config)
+        Explore(source=self.scene, noise="carmine", **shared)(config)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,51 +160,25 @@ class Extract(RunCommand):
     label_divisor: options.Count = 1
     """For clouds whose labels number parts of objects: object = label // N."""
 
+    def open(self, config: Config, recorder: RunRecorder) -> tuple[str, Iterator[Step]]:
+        from caryatid.sources import extract
+
+        with self.output.working("opening"):
+            steps = extract(
+                self.source,
+                config,
+                segmentation=self.segmentation,
+                seed=self.settings.seed,
+                label_divisor=self.label_divisor,
+            )
+        return Path(self.source).name, steps
+
     def __call__(self) -> None:
-        from caryatid.sources import CLOUD_SUFFIXES
-
-        config = self.settings.read()
-        is_cloud = Path(self.source).suffix.lower() in CLOUD_SUFFIXES
-        with _recorder(self, config) as recorder:
-            _record(recorder, (self._of_cloud if is_cloud else self._of_recording)(config), self.output)
-        self.conclude(recorder, Path(self.source).name)
-
-    def _of_recording(self, config: Config) -> Iterator[Step]:
-        from caryatid.exploration import Explorer
-        from caryatid.sources import open_recording
-
-        with self.output.working("reading the recording"):
-            recording = open_recording(self.source, config, self.segmentation)
-        explorer = Explorer(config=config, segmentation=self.segmentation, seed=self.settings.seed)
-        for frame in recording.frames:
-            yield explorer.look(frame.load())
-
-    def _of_cloud(self, config: Config) -> Iterator[Step]:
-        import numpy as np
-
-        from caryatid.exploration import Explorer
-        from caryatid.io.point_clouds import read_stored_cloud
-        from caryatid.segmentation.observation import level_transform
-        from caryatid.sources import check_segments
-
-        with self.output.working("reading the cloud"):
-            stored = read_stored_cloud(self.source, self.label_divisor)
-            if self.segmentation == "labels" and stored.labels is None:
-                raise InputError(self.source, "has no field label", "use --segmentation auto")
-            if self.segmentation != "auto" and stored.labels is not None:
-                check_segments(self.source, Counter(stored.labels[stored.kept].tolist()), config)
-        explorer = Explorer(config=config, segmentation=self.segmentation, seed=self.settings.seed)
-        with self.output.working("extracting"):
-            rng = np.random.default_rng(self.settings.seed)
-            cloud = stored.to_cloud(config.cloud)
-            use_labels = self.segmentation != "auto"
-            cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
-            step = explorer.look(cloud)
-        yield replace(step, labels=stored.spread(step.labels))
+        self.run(self.settings.read())
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dismantle(options.ExploringCommand):
+class Dismantle(Exploring):
     """Explore a scene, find a safe order to take it apart, and try it in physics.
 
     Objects are lifted straight up, one by one. A step fails when any other object moves by more than 2 cm
@@ -195,8 +195,6 @@ class Dismantle(options.ExploringCommand):
     """Run folder to write, its report with pictures of every lift. When left out: nothing is written."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
-    no_early_stop: options.Flag = False
-    """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
@@ -209,7 +207,7 @@ class Dismantle(options.ExploringCommand):
         config, seed, taken = self.config(), self.settings.seed, []
         order = Order((), "interrupted before an order was found")
         with _recorder(self, config) as recorder:
-            source, steps = _open(self, config, recorder)
+            source, steps = self.explore(config, recorder)
             if source.truth is None or not isinstance(source.camera, SimulatedCamera):
                 remedy = "give an MJCF scene; for a run, use `caryatid order`"
                 raise InputError(self.source, "cannot be simulated", remedy)
@@ -245,12 +243,12 @@ class Dismantle(options.ExploringCommand):
         self.output.result(record, shown, f"{order.refusal}\n" if order.refusal else "")
 
 
-def _recorder(command: Explore | Extract | Dismantle, config: Config) -> RunRecorder:
+def _recorder(command: RunCommand | Dismantle, config: Config) -> RunRecorder:
     from caryatid.runs import RunRecorder
 
     names = ("planner", "robot", "segmentation", "noise", "label_divisor")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
-    if not isinstance(command, Extract):
+    if isinstance(command, Exploring):
         options["early_stop"] = not command.no_early_stop
     return RunRecorder(
         command=type(command).__name__.lower(),
@@ -260,23 +258,6 @@ def _recorder(command: Explore | Extract | Dismantle, config: Config) -> RunReco
         config=config,
         folder=command.out,
     )
-
-
-def _open(
-    command: Explore | Dismantle, config: Config, recorder: RunRecorder
-) -> tuple[Source, Iterator[Step]]:
-    """Open what is to be explored; returns it and the steps of its exploration."""
-    from caryatid.evaluation.oracle import planner_for
-    from caryatid.exploration import explore
-    from caryatid.sources import open_source
-
-    known: dict[str, Any] = {"segmentation": command.segmentation, "seed": command.settings.seed}
-    with command.output.working("opening"):
-        source = open_source(command.source, config, noise=command.noise, robot=command.robot, **known)
-    recorder.truth = source.truth
-    planner, camera = planner_for(command.planner, source.camera, source.truth, config, **known)
-    stop = not command.no_early_stop
-    return source, explore(camera, source.robot, planner=planner, config=config, early_stop=stop, **known)
 
 
 def _record(
