@@ -6,10 +6,13 @@ import base64
 import gzip
 import io
 import json
+import logging
 import math
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import shlex
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -108,6 +111,36 @@ class SuiteResult:
         }
 
 
+def write_report(
+    store: ResultStore, folder: Path, *, reference: str | None = None, document: Path | None = None
+) -> list[SuiteResult]:
+    """Write tables, figures and a page of all results.
+
+    Args:
+        store: The results.
+        folder: Where to write.
+        reference: Method the others are compared with, in place of the suites' own.
+        document: Markdown document to write as well.
+
+    Returns:
+        The suites of which something is done.
+
+    Raises:
+        InputError: No suite has such a method, or pandas is not installed.
+    """
+    results = summarise_store(store, reference)
+    _write_tables(store, folder)
+    if results:
+        command = f"caryatid benchmark --out {folder.name}"
+        if reference is not None:
+            command += f" --reference {shlex.quote(reference)}"
+        write_results(results, store.about, folder / "summary.json.gz")
+        _write_page(results, store.about, folder, command)
+        if document is not None:
+            write_document(results, store.about, document, f"{command} --docs {document.name}")
+    return results
+
+
 def summarise_store(store: ResultStore, reference: str | None = None) -> list[SuiteResult]:
     """Summarise every suite of which something is done.
 
@@ -119,7 +152,7 @@ def summarise_store(store: ResultStore, reference: str | None = None) -> list[Su
         InputError: No suite has such a method, or pandas is not installed.
     """
     tables = {name: store.table(name) for name in sorted(store.suites, key=[*SUITES, *store.suites].index)}
-    check_reference(reference, {m: None for table in tables.values() for m in table["method"]})
+    check_reference(reference, store)
     results = []
     for name, table in tables.items():
         if table.empty:
@@ -147,32 +180,27 @@ def summarise_store(store: ResultStore, reference: str | None = None) -> list[Su
     return results
 
 
-def check_reference(reference: str | None, methods: Collection[str]) -> None:
-    """Refuse to compare with a method that is not there.
+def check_reference(reference: str | None, store: ResultStore) -> None:
+    """Refuse to compare with a method that no planned suite has.
 
     Raises:
         InputError: The reference is none of the methods.
     """
+    methods = {member.method: None for members in store.suites.values() for member in members}
     if reference is not None and reference not in methods:
         names = ", ".join(methods) or "none yet"
         raise InputError(f"--reference {reference}", "there is no such method", f"choose one of {names}")
 
 
-def write_tables(store: ResultStore, folder: Path) -> list[str]:
-    """Write the rows of each suite as `SUITE.csv` and, where pyarrow is installed, `SUITE.parquet`.
-
-    Returns:
-        What the user should know: how to get what was left out.
-    """
-    missing = []
+def _write_tables(store: ResultStore, folder: Path) -> None:
+    """Write the rows of each suite as `SUITE.csv` and, where pyarrow is installed, `SUITE.parquet`."""
     for name in store.suites:
         table = store.table(name)
         table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
-        try:
+        if find_spec("pyarrow") is not None:
             table.to_parquet(folder / f"{name}.parquet", index=False)
-        except ImportError:
-            missing = ['no Parquet without pyarrow: pip install "caryatid[benchmark]"']
-    return missing
+    if find_spec("pyarrow") is None:
+        logging.getLogger(__name__).info('no Parquet without pyarrow: pip install "caryatid[benchmark]"')
 
 
 def write_results(results: Sequence[SuiteResult], about: dict[str, str], path: Path) -> None:
@@ -199,7 +227,7 @@ def read_results(path: Path) -> tuple[list[SuiteResult], dict[str, str]]:
     return suites, known["about"]
 
 
-def write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: Path, command: str) -> Path:
+def _write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: Path, command: str) -> None:
     """Write `index.html`, which loads nothing from anywhere, and each suite's figures as SVG and PNG."""
     from markdown_it import MarkdownIt
 
@@ -212,10 +240,8 @@ def write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: Pa
 
     reader = MarkdownIt("commonmark", {"html": False}).enable("table")
     reader.validateLink = lambda url: url.startswith("data:image/svg+xml;")  # type: ignore[method-assign]
-    page = folder / "index.html"
     text = reader.render(_markdown(results, about, command, keep))
-    page.write_text(PAGE.format(body=text), encoding="utf-8")
-    return page
+    (folder / "index.html").write_text(PAGE.format(body=text), encoding="utf-8")
 
 
 def write_document(results: Sequence[SuiteResult], about: dict[str, str], path: Path, command: str) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
-from caryatid.benchmark.episodes import ORDERS, Episode, content_of, family, plugin_of
+from caryatid.benchmark.episodes import ORDERS, Episode, content_of, family, find_scenes, plugin_of
 from caryatid.benchmark.store import Member
 from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.config.settings import read_settings
@@ -82,8 +82,11 @@ def change_suite(
     segmentations: Sequence[SegmentationMethod] = (),
     noises: Sequence[NoiseModel] = (),
     settings: Sequence[str] = (),
+    scenes: Sequence[str] = (),
+    seeds: int | None = None,
+    views: int | None = None,
 ) -> Suite:
-    """Return a suite with other methods, conditions or settings; what is not given stays.
+    """Return a suite with other methods, conditions, settings or scenes; what is not given stays.
 
     Args:
         suite: What is changed.
@@ -92,9 +95,13 @@ def change_suite(
         segmentations: Take the place of its conditions, together with every noise.
         noises: Of the camera.
         settings: Changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
+        scenes: Built-in names, scene folders and folders of them.
+        seeds: Number of seeds.
+        views: Views of every episode.
 
     Raises:
-        InputError: A setting does not exist, its value is not valid, or an option changes it.
+        InputError: A setting does not exist, its value is not valid, or an option changes it; or a scene is
+            not there.
     """
     methods, conditions = suite.methods, suite.conditions
     if planners:
@@ -121,7 +128,14 @@ def change_suite(
         ", ".join((label, *settings)): {**given, "settings": (*given.get("settings", ()), *settings)}
         for label, given in conditions.items()
     }
-    return replace(suite, methods=methods, conditions=conditions)
+    return replace(
+        suite,
+        methods=methods,
+        conditions=conditions,
+        scenes=tuple(find_scenes(scenes)) or suite.scenes,
+        seeds=seeds or suite.seeds,
+        views=views or suite.views,
+    )
 
 
 def _name(method: Mapping[str, Any]) -> str:

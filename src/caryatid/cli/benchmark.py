@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import shlex
 import time
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,8 +16,8 @@ from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
+    from caryatid.benchmark.episodes import Episode
     from caryatid.benchmark.store import ResultStore
-    from caryatid.benchmark.suites import Suite
 
 SUITES = (
     "smoke", "fig5", "planners", "path", "ablation", "ablation-attention", "poses", "noise", "dismantle",
@@ -47,15 +46,13 @@ class Benchmark(options.Command):
     """What to compare."""
     scenes: Annotated[options.Words, options.shown("SCENE")] = ()
     """Scenes instead of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
-    planner: Annotated[
-        tyro.conf.UseAppendAction[tuple[Annotated[str, options.planner_name()], ...]], options.shown()
-    ] = ()
+    planner: options.Several[Annotated[str, options.planner_name()]] = ()
     """Planner instead of the suite's methods; may be repeated. The others are compared with the first."""
-    fusion: Annotated[tyro.conf.UseAppendAction[tuple[FusionMethod, ...]], options.shown()] = ()
+    fusion: options.Several[FusionMethod] = ()
     """Fusion instead of the suite's; may be repeated."""
-    segmentation: Annotated[tyro.conf.UseAppendAction[tuple[SegmentationMethod, ...]], options.shown()] = ()
+    segmentation: options.Several[SegmentationMethod] = ()
     """Segmentation instead of the suite's conditions; may be repeated. Default: labels."""
-    noise: Annotated[tyro.conf.UseAppendAction[tuple[NoiseModel, ...]], options.shown()] = ()
+    noise: options.Several[NoiseModel] = ()
     """Noise of the camera, instead of the suite's conditions; may be repeated. Default: carmine."""
     set: Annotated[options.Words, options.shown("STAGE.NAME=VALUE")] = ()
     """One setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
@@ -75,57 +72,41 @@ class Benchmark(options.Command):
     """Write the figures as a Markdown document too."""
 
     def __call__(self) -> None:
+        from caryatid.benchmark.report import check_reference
         from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
+        from caryatid.benchmark.suites import SUITES, change_suite
         from caryatid.runtime.fingerprint import fingerprint
 
         import_pandas()
-        path = self.out / RESULTS
         if self.scheduler is not None and self.jobs is not None:
             raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
-        suite = None if self.suite is None else self._suite(self.suite)
-        if suite is not None:
-            self._check(suite, path)
-        code = None if suite is None else fingerprint()
-        with ResultStore(path, code, collect_provenance()) as store:
+        suite = (
+            None
+            if self.suite is None
+            else change_suite(
+                SUITES[self.suite],
+                planners=self.planner,
+                fusions=self.fusion,
+                segmentations=self.segmentation,
+                noises=self.noise,
+                settings=self.set,
+                scenes=self.scenes,
+                seeds=self.seeds,
+                views=self.views,
+            )
+        )
+        code = fingerprint() if suite else None
+        with ResultStore(self.out / RESULTS, code, collect_provenance()) as store:
             try:
-                if suite is not None:
-                    self._run(suite, store)
+                missing = store.plan(suite.name, suite.members(), retry=self.retry) if suite else []
+                check_reference(self.reference, store)
+                if suite and missing:
+                    self._run(suite.name, missing, store)
                 self._report(store)
             except KeyboardInterrupt:
                 raise KeyboardInterrupt("what is done is kept, start again to continue") from None
 
-    def _suite(self, name: str) -> Suite:
-        """The suite with what the options change."""
-        from caryatid.benchmark import suites
-        from caryatid.benchmark.episodes import find_scenes
-
-        suite = suites.change_suite(
-            suites.SUITES[name],
-            planners=self.planner,
-            fusions=self.fusion,
-            segmentations=self.segmentation,
-            noises=self.noise,
-            settings=self.set,
-        )
-        scenes = tuple(find_scenes(self.scenes)) if self.scenes else suite.scenes
-        seeds, views = self.seeds or suite.seeds, self.views or suite.views
-        return replace(suite, scenes=scenes, seeds=seeds, views=views)
-
-    def _check(self, suite: Suite, path: Path) -> None:
-        """Refuse an unknown reference, or a cluster that does not answer, before anything is written."""
-        from caryatid.benchmark.report import check_reference
-        from caryatid.benchmark.running import connect
-        from caryatid.benchmark.store import ResultStore
-
-        methods = {member.method: None for member in suite.members()}
-        if path.is_file() and path.stat().st_size:
-            with ResultStore(path) as store:
-                methods |= {member.method: None for members in store.suites.values() for member in members}
-        elif self.scheduler is not None:
-            connect(self.scheduler).close()
-        check_reference(self.reference, methods)
-
-    def _run(self, suite: Suite, store: ResultStore) -> None:
+    def _run(self, suite: str, missing: list[Episode], store: ResultStore) -> None:
         """Run the missing episodes with a progress bar; without a terminal, print a line every minute."""
         from rich.progress import MofNCompleteColumn, Progress
 
@@ -133,20 +114,17 @@ class Benchmark(options.Command):
         from caryatid.benchmark.running import run_locally, run_on_cluster
         from caryatid.runtime.compiling import compile_kernels
 
-        missing = store.plan(suite.name, suite.members(), retry=self.retry)
-        if not missing:
-            return
         if self.scheduler is not None:
             episodes = run_on_cluster(missing, self.scheduler, self.output.say)
         else:
             compile_kernels()
             episodes = run_locally(missing, self.jobs or os.cpu_count() or 1)
-        total = len({member.episode for member in store.suites[suite.name]})
+        total = len({member.episode for member in store.suites[suite]})
         console = self.output.progress
         hidden = console.quiet or not console.is_interactive
         columns = (*Progress.get_default_columns(), MofNCompleteColumn())
         bar = Progress(*columns, console=console, disable=hidden, speed_estimate_period=600.0)
-        task = bar.add_task(suite.name, total=total, completed=total - len(missing))
+        task = bar.add_task(suite, total=total, completed=total - len(missing))
         printed = time.monotonic()
         with bar, closing(episodes) as outcomes:
             for done, (episode, outcome) in enumerate(outcomes, start=total - len(missing) + 1):
@@ -157,35 +135,25 @@ class Benchmark(options.Command):
                     self.output.say(f"failed: {name}: {outcome.error}")
                 if hidden and time.monotonic() - printed >= 60.0:
                     printed = time.monotonic()
-                    self.output.say(f"{suite.name}: {done} of {total} episodes")
+                    self.output.say(f"{suite}: {done} of {total} episodes")
 
     def _report(self, store: ResultStore) -> None:
         """Write tables, figures and pages, and print what there is."""
-        from caryatid.benchmark import report
+        from caryatid.benchmark.report import write_report
 
-        results = report.summarise_store(store, self.reference)
+        results = write_report(store, self.out, reference=self.reference, document=self.docs)
         for result in results:
             failed = f", {len(result.failures)} failed" if result.failures else ""
             self.output.say(f"{result.name}: {result.episodes} of {result.planned} episodes{failed}")
-        for line in report.write_tables(store, self.out):
-            self.output.say(line)
         if results:
-            command = f"caryatid benchmark --out {self.out.name}"
-            if self.reference is not None:
-                command += f" --reference {shlex.quote(self.reference)}"
-            report.write_results(results, store.about, self.out / "summary.json.gz")
-            page = report.write_page(results, store.about, self.out, command)
-            self.output.say(f"figures: {page}")
-            if self.docs is not None:
-                report.write_document(results, store.about, self.docs, f"{command} --docs {self.docs.name}")
-        if self.output.json:
-            suites = {
-                result.name: {
-                    "planned": result.planned,
-                    "done": result.episodes,
-                    "failed": len(result.failures),
-                    "f1": result.f1(),
-                }
-                for result in results
+            self.output.say(f"figures: {self.out / 'index.html'}")
+        suites = {
+            each.name: {
+                "planned": each.planned,
+                "done": each.episodes,
+                "failed": len(each.failures),
+                "f1": each.f1(),
             }
-            self.output.result({"results": str(self.out), "suites": suites})
+            for each in results
+        }
+        self.output.result({"results": str(self.out), "suites": suites}, "")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
@@ -84,11 +84,9 @@ Port = Annotated[int, whole_number(0)]
 OutPath = Annotated[Path, tyro.conf.arg(metavar="RUN")]
 RunPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 SourceName = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-RobotName = Annotated[str, tyro.conf.arg(metavar="NAME")]
-Segmentation = Annotated[
-    SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels where there are any")
-]
 Words = tyro.conf.UseAppendAction[tuple[str, ...]]
+_Value = TypeVar("_Value")
+Several = Annotated[tyro.conf.UseAppendAction[tuple[_Value, ...]], shown()]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,18 +155,32 @@ class Command:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ExploringCommand(Command):
-    """A command that explores a scene."""
+class LookingCommand(Command):
+    """A command that looks at views."""
 
     settings: Modelling = Modelling()
-    views: Annotated[OptionalCount, default_of("active.max_views")] = None
-    """Maximum number of views, including the first."""
+    segmentation: Annotated[
+        SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels where there are any")
+    ] = None
+    """Use the masks or labels of the views, or segment automatically."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanningCommand(LookingCommand):
+    """A command that plans where to look next."""
+
     planner: Annotated[str, planner_name()] = "support"
     """Planner of the next view; oracle knows the ground truth and needs a simulation."""
-    robot: RobotName = "humanoid"
-    """Robot that carries the simulated camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
-    segmentation: Segmentation = None
-    """Use the masks of the source, or segment automatically."""
+    robot: Annotated[str, tyro.conf.arg(metavar="NAME")] = "humanoid"
+    """Robot that carries the camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExploringCommand(PlanningCommand):
+    """A command that explores a scene."""
+
+    views: Annotated[OptionalCount, default_of("active.max_views")] = None
+    """Maximum number of views, including the first."""
     noise: NoiseModel = "none"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 

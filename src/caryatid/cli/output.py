@@ -133,22 +133,18 @@ def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], T
         steps: Number and timings [s] of each view, as in run.json.
     """
     stages = [*dict.fromkeys(stage for step in steps for stage in step["timings"]), "turn"]
-    times = [step["timings"] | {"turn": turn(step["timings"])} for step in steps]
-    names = [f"{step['view']:02d}" for step in steps]
+    views = [{"view": s["view"]} | s["timings"] | {"turn": turn(s["timings"])} for s in steps]
+    times = {f"{view['view']:02d}": view for view in views}
+    times["median"] = {stage: median(view[stage] for view in views if stage in view) for stage in stages}
     rows = [
-        [name, *(_milliseconds(view.get(s)) for s in stages)] for name, view in zip(names, times, strict=True)
+        [name, *(f"{1000.0 * view[stage]:.1f}" if stage in view else "" for stage in stages)]
+        for name, view in times.items()
     ]
-    medians = [median(view[s] for view in times if s in view) for s in stages]
-    rows.append(["median", *map(_milliseconds, medians)])
     made = table("time by view [ms]", ["view", *stages], rows, figures=True)
     made.box, made.padding, made.pad_edge = box.SIMPLE_HEAD, (0, 0, 0, 0), False
-    return [{"view": step["view"], **view} for step, view in zip(steps, times, strict=True)], made
+    return views, made
 
 
 def turn(timings: Mapping[str, float]) -> float:
     """Time of a turn of the loop [s]: all stages but waiting for the camera."""
     return sum(seconds for stage, seconds in timings.items() if stage != "capture")
-
-
-def _milliseconds(seconds: float | None) -> str:
-    return "" if seconds is None else f"{1000.0 * seconds:.1f}"

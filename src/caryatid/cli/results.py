@@ -12,9 +12,6 @@ from caryatid.cli import options
 from caryatid.config.choices import ExportFormat
 
 Topic = Annotated[str | None, options.shown("TOPIC")]
-Format = Annotated[
-    ExportFormat | None, options.one_of(ExportFormat), options.shown(default="by the ending of FILE")
-]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,13 +56,12 @@ class Import(options.Command):
         with output.working(f"reading {self.source.name}"):
             imported = import_recording(self.source, self.out, topics, level=self.level, config=config)
         read = len(imported) + sum(imported.skipped.values())
-        if output.json:
-            views = [
-                {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}
-                for n, f in enumerate(imported.frames)
-            ]
-            document = {"recording": str(self.out), "frames": read, "views": views}
-            output.result(document | {"skipped": imported.skipped, "notes": list(imported.notes)})
+        views = [
+            {"view": n, "frame": f.number, "time": f.time, "posed": f.T_world_camera is not None}
+            for n, f in enumerate(imported.frames)
+        ]
+        document = {"recording": str(self.out), "frames": read, "views": views}
+        output.result(document | {"skipped": imported.skipped, "notes": list(imported.notes)}, "")
         for note in imported.notes:
             output.say(note)
         skipped = f"; skipped: {reasons(imported.skipped)}" if imported.skipped else ""
@@ -156,8 +152,7 @@ class ReportCommand(options.Command):
 
         for path in write_report(self.run, self.pdf):
             self.output.say(f"report: {path}")
-        if self.output.json:
-            self.output.result({"html": self.run / "report.html", "pdf": self.pdf})
+        self.output.result({"html": self.run / "report.html", "pdf": self.pdf}, "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +183,5 @@ class Export(options.Command):
         config, format_ = self.settings.read(), format_of(self.out, self.format)
         graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
         export_graph(graph, self.out, config.export)
-        if self.output.json:
-            self.output.result({"file": str(self.out), "format": format_})
+        self.output.result({"file": str(self.out), "format": format_}, "")
         self.output.say(f"{self.out}: {format_}, {summary(graph)}")

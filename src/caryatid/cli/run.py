@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -56,8 +56,8 @@ class RunCommand(options.Command):
         if self.profile:
             document["profile"], shown = profile(recorder.steps)
             output.result(document, shown)
-        elif output.json:
-            output.result(document)
+        else:
+            output.result(document, "")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,7 +126,7 @@ class Demo(RunCommand):
 
     out: options.OutPath = Path("demo-run")
     """Run folder to write; replaces an earlier run."""
-    scene: Annotated[str, tyro.conf.arg(metavar="NAME")] = "clutter"
+    source: Annotated[str, tyro.conf.arg(name="scene", metavar="NAME")] = "clutter"
     """A built-in scene, such as tower, bridge or dense-12-0."""
     views: Annotated[options.OptionalCount, options.shown(default=5)] = None
     """Maximum number of views, including the first."""
@@ -139,13 +139,12 @@ class Demo(RunCommand):
         config = self.settings.read(
             {"active.max_views": self.views}, Config(active=ActiveVisionConfig(max_views=5))
         )
-        names = ("out", "no_report", "view", "profile", "settings", "general")
-        shared = {name: getattr(self, name) for name in names}
-        Explore(source=self.scene, noise="carmine", **shared)(config)
+        shared = {field.name: getattr(self, field.name) for field in fields(self)}
+        Explore(**shared | {"noise": "carmine"})(config)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Extract(RunCommand):
+class Extract(RunCommand, options.LookingCommand):
     """Extract shapes and support graph from all views of a recording, or from one cloud.
 
     To try:
@@ -155,8 +154,6 @@ class Extract(RunCommand):
 
     source: options.SourceName
     """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
-    segmentation: options.Segmentation = None
-    """Use the masks or labels of the source, or segment automatically."""
     label_divisor: options.Count = 1
     """For clouds whose labels number parts of objects: object = label // N."""
 

@@ -31,7 +31,7 @@ class SessionStep(options.Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class New(SessionStep):
+class New(SessionStep, options.PlanningCommand):
     """Begin a session in a new folder.
 
     To try:
@@ -40,15 +40,8 @@ class New(SessionStep):
       caryatid session new table --robot arm:arm.npz
     """
 
-    settings: options.Modelling = options.Modelling()
     folder: Folder
     """Folder of the session; must be new or empty."""
-    segmentation: options.Segmentation = None
-    """Use the label images of the views, or segment automatically."""
-    planner: Annotated[str, options.planner_name()] = "support"
-    """Planner of the next view."""
-    robot: options.RobotName = "humanoid"
-    """Robot that carries the camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
 
     def __call__(self) -> None:
         from caryatid.robots import located

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import webbrowser
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -56,16 +56,14 @@ class View(options.ExploringCommand):
         config, output = self.config(), self.output
         # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
         sys.setswitchinterval(0.0005)
-        with ExitStack() as stack:
-            page = self._open_run(stack) if is_run(Path(self.source)) else self._open_loop(config, stack)
-            if output.json:
-                output.result({"address": page.url, "source": self.source})
+        with closing(self._open_run() if is_run(Path(self.source)) else self._open_loop(config)) as page:
+            output.result({"address": page.url, "source": self.source}, "")
             output.say(f"{self.source} at {page.url}; Ctrl-C ends")
             if not self.no_browser:
                 webbrowser.open(page.url)
             wait_for_interrupt()
 
-    def _open_run(self, stack: ExitStack) -> Page:
+    def _open_run(self) -> Page:
         from caryatid.steps import read_config, read_run, read_steps
         from caryatid.viewer.drawing import Moment
         from caryatid.viewer.page import Page
@@ -74,22 +72,20 @@ class View(options.ExploringCommand):
         steps = read_steps(run)
         title = f"caryatid: {run.folder.name}"
         page = Page(title, read_config(run).support, host=self.host, port=self.port)
-        stack.callback(page.close)
         scores = [score["f1"] for score in run.record.get("scores", ())]
         for step in steps:
             page.add(Moment(step, scores[step.index] if scores else None))
         return page
 
-    def _open_loop(self, config: Config, stack: ExitStack) -> Page:
+    def _open_loop(self, config: Config) -> Page:
         from caryatid.sources import open_source
         from caryatid.viewer.loop import LoopPage
 
         shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         opening = partial(open_source, self.source, noise=self.noise, robot=self.robot, **shared)
-        served: dict[str, Any] = {"host": self.host, "port": self.port}
+        shared |= {"planner": self.planner, "host": self.host, "port": self.port}
         with self.output.working("opening"):
-            page = LoopPage(opening, config, planner=self.planner, **shared, **served)
-        stack.callback(page.close)
+            page = LoopPage(opening, config, **shared)
         page.start()
         return page
 
