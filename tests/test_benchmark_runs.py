@@ -300,13 +300,10 @@ def test_an_address_where_nobody_answers_says_what_to_do():
             connect(address, 0.5)
 
 
-def test_without_dask_or_with_jobs_the_remedy_is_told(tmp_path, capsys, monkeypatch):
+def test_a_cluster_takes_no_number_of_jobs(tmp_path, capsys):
     command = ["benchmark", "--suite", "smoke", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"]
     assert run_command(*command, "--out", tmp_path / "out") == 1
     assert "--jobs: a cluster has its own workers; leave --jobs or" in capsys.readouterr().err
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r'needs dask\.distributed; pip install "caryatid\[cluster\]"'):
-        connect("tcp://127.0.0.1:1")
 
 
 def test_a_scene_folder_must_be_the_same_on_the_worker(scene_file, tmp_path):

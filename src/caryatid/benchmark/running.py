@@ -62,6 +62,18 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
         pool.shutdown(cancel_futures=True)
 
 
+def import_distributed() -> None:
+    """Import dask.distributed, or say that it is missing before anything is written.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import distributed  # noqa: F401
+    except ImportError:
+        raise InputError("--scheduler", "needs dask.distributed", 'pip install "caryatid[cluster]"') from None
+
+
 def run_on_cluster(
     episodes: Sequence[Episode],
     address: str,
@@ -103,13 +115,11 @@ def connect(address: str, patience: float = 10.0) -> Client:
     """Connect to a scheduler of dask.distributed that answers within a time [s].
 
     Raises:
-        InputError: dask.distributed is not installed, or no scheduler answers.
+        InputError: No scheduler answers.
     """
-    try:
-        from distributed import Client, Security
-        from distributed.comm import connect as open_connection
-    except ImportError:
-        raise InputError("--scheduler", "needs dask.distributed", 'pip install "caryatid[cluster]"') from None
+    from distributed import Client, Security
+    from distributed.comm import connect as open_connection
+
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are reported here
 
     async def greet() -> None:

@@ -73,13 +73,16 @@ class Benchmark(options.Command):
 
     def __call__(self) -> None:
         from caryatid.benchmark.report import check_reference
+        from caryatid.benchmark.running import import_distributed
         from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
         from caryatid.benchmark.suites import SUITES, change_suite
         from caryatid.runtime.fingerprint import fingerprint
 
         import_pandas()
-        if self.scheduler is not None and self.jobs is not None:
-            raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
+        if self.scheduler is not None:
+            import_distributed()
+            if self.jobs is not None:
+                raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
         suite = (
             None
             if self.suite is None
