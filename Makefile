@@ -69,10 +69,10 @@ docs: $(VENV)/.docs
 	@echo "open docs/_build/html/index.html"
 
 pictures: install
-	$(BIN)/python benchmarks/pictures.py concepts
+	$(BIN)/python docs/pictures/draw.py concepts
 
 gif: install
-	$(BIN)/python benchmarks/pictures.py film
+	$(BIN)/python docs/pictures/draw.py film
 
 format: install
 	$(BIN)/ruff check --fix-only .

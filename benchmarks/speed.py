@@ -59,7 +59,7 @@ SEGMENTATIONS: tuple[SegmentationMethod, ...] = ("auto", "labels")
 SEGMENTS = {"auto": "automatic segments", "labels": "labels given"}
 TARGETS = {"turn.auto": 0.5, "turn.labels": 0.5, "perceive.labels": 0.25}
 OBJECTS, POINTS = 36, 30
-"""Objects on the table and points of interest of Algorithm 1 that a decision is about [1]."""
+"""Objects on the table; of so many are left that a decision is about no more points of interest [1]."""
 PATIENCE = 90.0
 """How long the views of growth with views may take [s]; those that were done by then count."""
 AXES = {
@@ -284,7 +284,12 @@ def measure_decision(effort: Effort) -> list[Row]:
     assert voxels is not None
     robot.move_to(recording.poses[-1])
     visited = sphere.direction_of(recording.poses)
-    graph = _with_points(scene.graph, sphere, visited, config)
+    objects, points = list(scene.graph.objects), POINTS + 1
+    while points > POINTS:  # an object has as many as it has supporters, and at least one
+        objects.pop()
+        ids = {o.id for o in objects}
+        graph = SupportGraph(tuple(objects), tuple(s for s in scene.graph.supports if ids.issuperset(s.pair)))
+        points = len(points_of_interest(graph, sphere, visited, config.active))
     unasked = copy.copy(robot)
     state = PlanningState(graph, sphere, voxels, visited, robot.candidates(sphere), config.active)
     every = replace(state, config=replace(config.active, look_directions=1_000_000))
@@ -302,7 +307,7 @@ def measure_decision(effort: Effort) -> list[Row]:
         },
         effort.runs,
     )
-    what = f"one decision, {POINTS} points of interest"
+    what = f"one decision, {points} points of interest"
     limit = plan_limit(voxels.hits.size, len(state.candidates), config)
     note = (
         f"{len(sphere.directions):,} views, {len(state.candidates):,} within reach; the planner beside it "
@@ -322,32 +327,6 @@ def measure_decision(effort: Effort) -> list[Row]:
             limit=(152.0 * len(sphere.directions), 0.0),
         ),
     ]  # fmt: skip
-
-
-def _with_points(graph: SupportGraph, sphere: ViewSphere, visited: Array, config: Config) -> SupportGraph:
-    """The part of a graph that has exactly `POINTS` points of interest of Algorithm 1.
-
-    An object has as many as it has supporters, and at least one. Objects are left out from the last one on,
-    supports of what is left where that is too much.
-    """
-    objects, supports = list(graph.objects), list(graph.supports)
-
-    def part(count: int) -> SupportGraph:
-        ids = {o.id for o in objects[:count]}
-        return SupportGraph(tuple(objects[:count]), tuple(s for s in supports if {*s.pair} <= ids))
-
-    def points(count: int) -> int:
-        return len(points_of_interest(part(count), sphere, visited, config.active))
-
-    while points(len(objects) - 1) >= POINTS:
-        objects.pop()
-    while (count := points(len(objects))) > POINTS:
-        ends = [s.supported for s in part(len(objects)).supports]
-        again = next(e for e in reversed(ends) if ends.count(e) > 1)
-        supports.remove(next(s for s in reversed(supports) if s.supported == again))
-    if count < POINTS:
-        raise ValueError(f"the graph has {count} points of interest, fewer than {POINTS}")
-    return part(len(objects))
 
 
 def measure_map(effort: Effort) -> list[Row]:

@@ -1,7 +1,7 @@
 """The documentation's pictures: each stage of the loop on one scene, and the film of README.md.
 
-    python benchmarks/pictures.py concepts [--names shapes graph]
-    python benchmarks/pictures.py film
+    python docs/pictures/draw.py concepts
+    python docs/pictures/draw.py film
 
 The same command draws the same pictures, byte for byte, with the drawings of reports (`caryatid.viz`).
 """
@@ -9,7 +9,6 @@ The same command draws the same pictures, byte for byte, with the drawings of re
 from __future__ import annotations
 
 import io
-import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,13 +36,13 @@ from caryatid.sensing.views import View
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
-from caryatid.simulation.world import SimulatedScene, box, build_spec, cylinder, scene_from_spec, sphere
+from caryatid.simulation.world import box, build_spec, cylinder, scene_from_spec, sphere
 from caryatid.viz.drawings import Projection, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, own_style
 from caryatid.viz.strip import draw_lifts
 
-PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+PICTURES = Path(__file__).parent
 TITLE = 24.0
 """Height of a line of text above a picture [px]."""
 PLANE, NORMAL = 0.042, 0.05
@@ -86,16 +85,6 @@ def sheet(pictures: Sequence[Titled], width: int, columns: int, heading: str = "
     return Image.open(content).convert("RGB")
 
 
-def story() -> tuple[SimulatedScene, Config, tuple[Step, ...]]:
-    """The concepts' scene and its four views."""
-    config = Config()
-    config = replace(config, active=replace(config.active, max_views=4))
-    scene = scene_from_spec(build_spec(SOLIDS, "concepts"), "concepts", "concepts", least=1.0)
-    simulation = make_simulation(scene, config, noise="carmine", seed=0)
-    steps = explore(simulation.camera, simulation.robot, config=config, segmentation="auto", early_stop=False)
-    return scene, config, tuple(steps)
-
-
 def plain(view: View, labels: NDArray[np.int32] | None = None, graph: SupportGraph | None = None) -> Picture:
     """A view, and its segments where labels are given, without the shapes."""
     none = np.zeros(view.depth.shape, np.int32)
@@ -133,7 +122,12 @@ def azimuth_of(view: View) -> float:
 
 def concepts() -> dict[str, Image.Image]:
     """A picture of each stage of the loop."""
-    scene, config, steps = story()
+    config = replace(Config(), active=replace(Config().active, max_views=4))
+    scene = scene_from_spec(build_spec(SOLIDS, "concepts"), "concepts", "concepts", least=1.0)
+    simulation = make_simulation(scene, config, noise="carmine", seed=0)
+    steps = list(
+        explore(simulation.camera, simulation.robot, config=config, segmentation="auto", early_stop=False)
+    )
     first, last = steps[0], steps[-1]
     views = [step.view for step in steps if step.view is not None]
     empty, side = SupportGraph(), azimuth_of(views[0]) - 0.5
@@ -218,26 +212,17 @@ def film() -> tuple[list[Image.Image], list[int]]:
     return [ImageOps.pad(image, size, color="white", centering=(0, 0)) for image in images], times
 
 
-def main(
-    what: Annotated[Literal["concepts", "film"], tyro.conf.Positional], names: tuple[str, ...] = ()
-) -> None:
-    """Draw the pictures of docs/concepts.md or the film of README.md.
-
-    Args:
-        what: Which of the two.
-        names: Of the concepts, only these.
-    """
+def main(what: Annotated[Literal["concepts", "film"], tyro.conf.Positional]) -> None:
+    """Draw the pictures of docs/concepts.md or the film of README.md."""
     known: dict[str, Any] = {"method": Image.Quantize.MEDIANCUT, "dither": Image.Dither.NONE}
     if what == "film":
         images, times = film()
         first, *others = [image.quantize(256, **known) for image in images]
         file = PICTURES / "explore.gif"
         first.save(file, save_all=True, append_images=others, duration=times, loop=0, optimize=False)
-        sys.stdout.write(f"{file.name}: {len(images)} frames, {file.stat().st_size / 1e6:.2f} MB\n")
         return
-    drawn = concepts()
-    for name in names or drawn:
-        drawn[name].quantize(256, **known).save(PICTURES / "concepts" / f"{name}.png", optimize=True)
+    for name, image in concepts().items():
+        image.quantize(256, **known).save(PICTURES / "concepts" / f"{name}.png", optimize=True)
 
 
 if __name__ == "__main__":
