@@ -50,7 +50,7 @@ SENSOR = SensorConfig(width=160, height=120, focal=131.25)
 """Small images: a view takes a tenth of a second, so that much happens in little time."""
 
 FORKS = multiprocessing.get_context("forkserver")  # processes that have imported everything, begun nothing
-FORKS.set_forkserver_preload(["caryatid.sessions.session", "caryatid.cli.sessions", "caryatid.service.app"])
+FORKS.set_forkserver_preload(["caryatid.sessions.session", "caryatid.cli.sessions", "caryatid.service"])
 
 
 def start(arguments: Sequence[object], said: Path) -> BaseProcess:

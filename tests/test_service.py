@@ -23,9 +23,7 @@ from caryatid.config import Config
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import png
 from caryatid.scene import Scene
-from caryatid.service.app import make_app
-from caryatid.service.pool import SessionPool
-from caryatid.service.serving import check_token
+from caryatid.service import SessionPool, check_token, make_app
 from caryatid.sessions import Session
 
 TOKEN = "a-token-nobody-guesses"
@@ -259,7 +257,7 @@ def test_this_machine_needs_no_token_and_every_other_address_demands_one(tmp_pat
 
 def test_without_the_extra_one_sentence_says_so(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "uvicorn", None)
-    monkeypatch.delitem(sys.modules, "caryatid.service.serving")
+    monkeypatch.delitem(sys.modules, "caryatid.service")
     assert run_command("serve", tmp_path / "s") == 1
     assert capsys.readouterr().err == 'error: serve: needs uvicorn; pip install "caryatid[serve]"\n'
 

@@ -18,8 +18,7 @@ from schemathesis.specs.openapi.checks import (
 from test_service import TOKEN, body, serving, text
 
 from caryatid.config import Config
-from caryatid.service.app import make_app
-from caryatid.service.pool import SessionPool
+from caryatid.service import SessionPool, make_app
 from caryatid.sessions import Session
 
 pytestmark = pytest.mark.slow

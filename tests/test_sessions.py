@@ -176,7 +176,7 @@ def test_a_snapshot_of_other_views_does_not_count(begun, views, graph_after):
 @pytest.mark.parametrize(("code", "processed"), [("the same", 0), ("other", 2)])
 def test_opening_processes_views_again_only_with_other_code(begun, monkeypatch, code, processed):
     if code == "other":
-        monkeypatch.setattr("caryatid.sessions.snapshots.fingerprint", lambda: "other")
+        monkeypatch.setattr("caryatid.sessions.session.fingerprint", lambda: "other")
     updates, original = [], Scene.update
     monkeypatch.setattr(Scene, "update", lambda scene, view: updates.append(1) or original(scene, view))
     with Session.open(begun) as session:
@@ -213,7 +213,7 @@ def test_without_a_usable_snapshot_no_view_is_lost(begun, views, tmp_path, monke
     """The disk takes no snapshots, or one came from elsewhere: it runs no code."""
     payload = pickle.dumps(Intruder(tmp_path / "touched"))
     instead = full if place == "write_file" else lambda *_, **__: payload
-    monkeypatch.setattr(f"caryatid.sessions.snapshots.{place}", instead)
+    monkeypatch.setattr(f"caryatid.sessions.session.{place}", instead)
     with Session.open(begun) as session:
         session.add(views[2])
     monkeypatch.undo()

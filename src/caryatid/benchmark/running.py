@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import Callable, Generator, Sequence
+import signal
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -16,16 +17,15 @@ from concurrent.futures import (
     as_completed,
     wait,
 )
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from multiprocessing import active_children, get_context, parent_process
-from threading import Lock, Thread
+from threading import Lock, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING
 
 from caryatid.benchmark.episodes import Episode, Outcome, plugin_of, run_episode
 from caryatid.errors import CaryatidError, InputError
 from caryatid.runtime.fingerprint import fingerprint
-from caryatid.runtime.interrupts import interrupts_held
 from caryatid.runtime.parallel import one_blas_thread
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
     others = set(active_children())
     pool = ProcessPoolExecutor(min(jobs, len(episodes)), get_context("spawn"), initializer=_end_with_parent)
     try:
-        with interrupts_held():
+        with _interrupts_held():
             futures = {pool.submit(run_on_worker, episode, fingerprint()): episode for episode in episodes}
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
@@ -201,3 +201,26 @@ def _end_with_parent() -> None:
             os._exit(1)
 
     Thread(target=follow, daemon=True).start()
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Hold Ctrl-C back while processes are started; they never get it, so that they leave quietly.
+
+    The mask is what the processes inherit. It does not hold Ctrl-C back here, where another thread may take
+    it and half-started processes would be left behind: the handler does. Where Ctrl-C is ignored, as in the
+    background of a shell, it stays so.
+    """
+    if current_thread() is not main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        yield
+        return
+    held: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, frame: held.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+    if held:
+        raise KeyboardInterrupt

@@ -206,9 +206,7 @@ class Serve(SessionStep):
     def __call__(self) -> None:
         config = self.settings.read()
         try:
-            from caryatid.service.app import make_app
-            from caryatid.service.pool import SessionPool
-            from caryatid.service.serving import check_token, run_service
+            from caryatid.service import SessionPool, check_token, make_app, run_service
         except ModuleNotFoundError as error:
             if error.name not in ("fastapi", "starlette", "uvicorn"):
                 raise

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from caryatid.config.choices import ExportFormat, FusionMethod, NoiseModel, SegmentationMethod, ShapeKind
-from caryatid.runtime.late import imported_late
+from caryatid.runtime import imported_late
 
 __all__ = [
     "ActiveVisionConfig", "ArmConfig", "CloudConfig", "CompletionConfig", "Config", "EvaluationConfig",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caryatid.runtime.late import imported_late
+from caryatid.runtime import imported_late
 
 if TYPE_CHECKING:
     from caryatid.io.bop import read_recording, write_recording

@@ -10,8 +10,12 @@ A view's folder appears whole, once it is on the disk, by a rename, and goes by 
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
+import pickle
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from os import PathLike
@@ -32,15 +36,25 @@ from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, find_robot
+from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import CameraRecord, Capture
-from caryatid.sessions.checks import check_view
+from caryatid.sessions.captures import CameraRecord, Capture, check_view
 from caryatid.sessions.next_view import NextView, Reachable, plan_next
-from caryatid.sessions.snapshots import read_snapshot, write_snapshot
 
 FORMAT: Final = {"format": "caryatid/session", "version": 1}
 """How session.json begins."""
+
+KNOWN: Final = {
+    ("builtins", "set"),
+    ("collections", "Counter"),
+    ("numpy", "dtype"),
+    ("numpy", "ndarray"),
+    ("numpy._core.multiarray", "_reconstruct"),
+    ("numpy._core.multiarray", "scalar"),
+    ("numpy._core.numeric", "_frombuffer"),
+}
+"""What a snapshot may name besides classes of caryatid: a session that came from elsewhere runs no code."""
 
 
 class SessionConflictError(InputError):
@@ -251,7 +265,7 @@ class Session:
         self._records.append(record)
         self._first = self._first or decoded
         self.scene = scene
-        write_snapshot(self.path / "state", self._history(self._records), scene)
+        self._write_snapshot(scene, self._records)
         return Added(self.views - 1, self.graph, scene.changed)
 
     def next(self, candidates: ArrayLike | None = None, path_length: ArrayLike | None = None) -> NextView:
@@ -316,17 +330,44 @@ class Session:
 
     def _after(self, records: Sequence[CameraRecord]) -> Scene:
         """The scene after some views, from the newest usable snapshot and the views after it."""
-        folder, b = self.path / "state", self.beginning
-        scene = read_snapshot(folder, self._history(records))
-        scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        b = self.beginning
+        scene = self._read_snapshot(records) or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
         while scene.views < len(records):
             scene.update(self._decoded(scene.views))
             if self._lock is not None:
-                write_snapshot(folder, self._history(records[: scene.views]), scene)
+                self._write_snapshot(scene, records[: scene.views])
         return scene
 
-    def _history(self, records: Sequence[CameraRecord]) -> list[str]:
-        return [json.dumps(asdict(self.beginning)), *(record.digest for record in records)]
+    def _read_snapshot(self, records: Sequence[CameraRecord]) -> Scene | None:
+        """The newest scene that this code made of the first of these views."""
+        for views in range(len(records), 0, -1):
+            with suppress(Exception):  # whatever a damaged file leads to: the views are still there
+                content = self._snapshot(views).read_bytes()
+                if content[:32] == self._seal(records[:views], content[32:]):
+                    scene = _Unpickler(io.BytesIO(content[32:])).load()
+                    if isinstance(scene, Scene) and scene.views == views:
+                        return scene
+        return None
+
+    def _write_snapshot(self, scene: Scene, records: Sequence[CameraRecord]) -> None:
+        """Keep the scene of all views, and those of the seven views before; a failure costs only time."""
+        with suppress(Exception):
+            path = self._snapshot(scene.views)
+            path.parent.mkdir(exist_ok=True)
+            payload = pickle.dumps(scene, protocol=5)
+            write_file(path, self._seal(records, payload) + payload)
+            kept = {self._snapshot(scene.views - back) for back in range(8)}
+            for older in set(path.parent.iterdir()) - kept:
+                older.unlink()
+
+    def _snapshot(self, views: int) -> Path:
+        return self.path / "state" / f"{views:06d}.pickle"
+
+    def _seal(self, records: Sequence[CameraRecord], payload: bytes) -> bytes:
+        """Digest of the code and the views that made a snapshot, and of the snapshot itself."""
+        views = (record.digest for record in records)
+        made_of = " ".join((fingerprint(), json.dumps(asdict(self.beginning)), *views))
+        return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
 
 
 def _locked(path: Path) -> FileLock:
@@ -339,3 +380,15 @@ def _locked(path: Path) -> FileLock:
             remedy = "wait until it is done, or stop it"
             raise SessionBusyError(path.parent, "another writer has this session open", remedy) from None
     return lock
+
+
+class _Unpickler(pickle.Unpickler):
+    """Makes nothing but arrays and objects of caryatid."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = (module, name) in KNOWN
+        if known or (module.split(".")[0] == "caryatid" and "." not in name):
+            found = super().find_class(module, name)
+            if known or isinstance(found, type):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is not part of a scene")

@@ -1,30 +1,51 @@
-"""The service over HTTP: sessions, their views, graph and next view."""
+"""Sessions over HTTP, for robot software that lives elsewhere: `caryatid serve`.
+
+One thread works on the sessions, one request after the other. A view takes all cores in compiled loops, and
+not every threading layer of numba may be entered by two threads at once: more threads would gain nothing.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import ipaddress
 import secrets
+import signal
+import socket
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial, wraps
 from importlib.metadata import version
+from math import prod
+from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import Depends, FastAPI, HTTPException, Path, Request, Response
+import uvicorn
+from fastapi import Depends, FastAPI, HTTPException, Request, Response
+from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from pydantic import Base64Bytes, BaseModel, ConfigDict, Field
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from caryatid.config import SegmentationMethod
+from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import changed_settings
-from caryatid.errors import CaryatidError, PlanningError
+from caryatid.errors import CaryatidError, InputError, PlanningError
 from caryatid.io.graph_json import graph_to_json
-from caryatid.service.pool import FullError, MissingError, SessionPool
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import Reachable
 from caryatid.sessions.session import SessionConflictError
+
+
+class FullError(CaryatidError):
+    """Too many requests are waiting."""
+
+
+class MissingError(CaryatidError):
+    """There is no session of that name."""
+
 
 STATUS: dict[type[CaryatidError], int] = {
     MissingError: 404,
@@ -35,7 +56,7 @@ STATUS: dict[type[CaryatidError], int] = {
 """Statuses of errors; of all others 422: what was given cannot be used."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
-SessionName = Annotated[Name, Path(description="Name of the session")]
+SessionName = Annotated[Name, PathParameter(description="Name of the session")]
 
 
 class Document(BaseModel):
@@ -132,6 +153,87 @@ class NextAnswer(Document):
     score: float = Field(description="c = s − h, eq. 3")
     why: str = Field(description="One sentence for a person to read")
     stop: str | None = Field(description="Why looking on may not pay, or null")
+
+
+class SessionPool:
+    """The sessions in one folder. Of its methods only `do` is called by others than the thread of the pool.
+
+    Args:
+        folder: Holds the sessions, each in a folder of its name.
+        config: Settings of new sessions.
+        open_sessions: Maximum number kept open; of more, the one used longest ago is closed.
+        waiting: Maximum number of requests waiting, including the one in work.
+    """
+
+    def __init__(self, folder: Path, config: Config, open_sessions: int, waiting: int) -> None:
+        self.folder = folder
+        self.config = config
+        self._max_open = open_sessions
+        self._max_waiting = waiting
+        self._waiting = 0
+        self._open: dict[str, Session] = {}
+
+    async def __aenter__(self) -> None:
+        self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="sessions")
+
+    async def __aexit__(self, *error: object) -> None:
+        """Finish what is waiting, and close the sessions."""
+        self._worker.shutdown()
+        self._close_all_but(0)
+
+    async def do(self, work: Callable[[], Any]) -> Any:
+        """Run some work on the sessions, in the thread of the pool, after everything that is waiting already.
+
+        Raises:
+            FullError: Too many requests are waiting.
+        """
+        if self._waiting >= self._max_waiting:
+            raise FullError(f"{self._waiting} requests wait already; try again")
+        self._waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._worker, work)
+        finally:
+            self._waiting -= 1
+
+    def names(self) -> list[str]:
+        """Names of all sessions."""
+        return sorted(path.parent.name for path in self.folder.glob("*/session.json"))
+
+    def begin(self, name: str, config: Config, **options: Any) -> Session:
+        """Begin a session; the options are those of `Session.begin`.
+
+        Raises:
+            InputError: There is one of that name, or a setting asks for more memory than a session may have.
+        """
+        # 25 times the defaults: 128 MB of voxels.
+        if prod(length / config.voxels.size for length in config.voxels.extent) > 64e6:
+            raise InputError("voxels.size", "makes too many voxels", "64 million are allowed")
+        if config.active.sphere_points > 1_000_000:
+            raise InputError("active.sphere_points", "is too large", "1 million are allowed")
+        return self._opened(name, Session.begin(self.folder / name, config, **options))
+
+    def session(self, name: str) -> Session:
+        """Return a session, opened from disk where it is not open.
+
+        Raises:
+            MissingError: There is none of that name.
+            SessionBusyError: Another process has it open.
+        """
+        if name in self._open:
+            return self._opened(name, self._open.pop(name))
+        if not (self.folder / name / "session.json").is_file():
+            raise MissingError(f"there is no session '{name}'; begin it first")
+        return self._opened(name, Session.open(self.folder / name))
+
+    def _opened(self, name: str, session: Session) -> Session:
+        """Keep a session open, as the one used last."""
+        self._open[name] = session
+        self._close_all_but(self._max_open)
+        return session
+
+    def _close_all_but(self, most: int) -> None:
+        while len(self._open) > most:
+            self._open.pop(next(iter(self._open))).close()
 
 
 PROBLEMS: dict[int | str, dict[str, Any]] = {
@@ -258,3 +360,53 @@ async def _refuse(request: Request, error: Exception) -> Response:
     # Names that were sent may hold halves of characters, which no answer can.
     detail = " ".join(text.encode("utf-8", "replace").decode().splitlines())
     return JSONResponse({"detail": detail}, status, {"Retry-After": "1"} if status == 503 else None)
+
+
+def check_token(host: str, token: str | None) -> None:
+    """Refuse to serve others than this machine without a token.
+
+    Raises:
+        InputError: There is none, or it is too short to keep anybody out.
+    """
+    if token is not None and len(token) < 16:
+        raise InputError("--token", "has fewer than 16 characters", "give a longer one that nobody can guess")
+    try:
+        local = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        local = host == "localhost"
+    if token is None and not local:
+        reason = f"{host} can be reached from elsewhere, and there is no token"
+        raise InputError("--host", reason, "set CARYATID_TOKEN, or serve at 127.0.0.1")
+
+
+def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], None]) -> None:
+    """Serve until Ctrl-C or SIGTERM, at any free port for 0; what has been asked by then is answered.
+
+    `listening` is called with the address.
+
+    Raises:
+        InputError: The address is taken.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        listener = socket.create_server((host, port), family=family)
+    except (OSError, OverflowError) as error:
+        reason = f"cannot be listened at ({(getattr(error, 'strerror', None) or str(error)).lower()})"
+        raise InputError(f"{host}:{port}", reason, "choose another --port or --host") from None
+    server = uvicorn.Server(
+        uvicorn.Config(
+            app,
+            log_level="warning",
+            access_log=False,
+            limit_concurrency=64,  # with the size of a request this bounds what is held in memory
+        )
+    )
+
+    def stop(number: int, frame: object) -> None:
+        server.should_exit = True
+
+    # The server hears signals itself as soon as it runs, and hands them on once it has stopped.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
+    listening(f"http://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}")
+    server.run(sockets=[listener])
