@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,7 +19,6 @@ from caryatid.geometry import transforms
 from caryatid.geometry.points import solve_positive
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import on_threads
-from caryatid.sensing.pose_graph import EDGE, Edges, among, change, mean_misfit, partners, solve
 from caryatid.sensing.surfels import MIN_COSINE, even_sample, surfels_of
 from caryatid.sensing.views import Cloud
 
@@ -29,6 +28,21 @@ OUTLIER = 0.3
 """Share of the reach beyond which distances lose their weight [1]."""
 INDEPENDENT = 0.1
 """Share of the partners that err independently [1]: neighbouring patches err alike."""
+
+EDGE = np.dtype(
+    [
+        ("still", np.intp),  # The view in which partners were looked for,
+        ("moving", np.intp),  # and the one whose patches looked for them.
+        ("apart", np.float64, 6),  # Twist of the moving view less that of the still one when they did.
+        ("asked", np.float64),  # How many patches looked for a partner,
+        ("found", np.float64),  # and how many found one.
+        ("misfit", np.float64),  # Sum of their distances [m], none counting more than an outlier.
+        ("gradient", np.float64, 6),  # Of half the sum of squares by the moving view's twist.
+        ("information", np.float64, (6, 6)),  # Inverse covariance of one view's twist against the other.
+    ]
+)
+"""What a pair of views says of their poses: half the sum of the partners' squared distances over their
+variance is quadratic in the twist of one view against the other as long as partners keep their weight."""
 
 Outcome = Literal[
     "reference", "fits as reported", "aligned", "too few partners", "beyond the limits", "no better"
@@ -57,9 +71,11 @@ class ViewRegistration:
         self.outcomes: list[Outcome] = []
         self._pivot = pivot_world
         self._config = config
+        # The widest search spans two cells on either side.
+        self._edge = max(config.reaches) / 2.0
         self._views: dict[int, _View] = {}
         self._now = np.zeros((0, 6))
-        self._edges: Edges = np.zeros(0, EDGE)
+        self._edges: NDArray[Any] = np.zeros(0, EDGE)
 
     def copy(self) -> ViewRegistration:
         """Return a registration that knows the same and goes on by itself; the views so far are shared."""
@@ -103,9 +119,11 @@ class ViewRegistration:
         sigma = np.repeat([config.translation, np.radians(config.rotation)], 3)
         information = at_camera.T @ (at_camera / sigma[:, None] ** 2)
         patches, side = surfels_of(cloud, config, same_labels=same_labels)
-        return _View(
-            *index_patches(patches, _edge(config)), patches[even_sample(side, config.sample)], information
-        )
+        cells = np.floor(patches[:, :3] / self._edge).astype(np.int64)
+        bucket = _bucket.py_func(patches[:, 7].astype(np.int64), *cells.T)
+        starts = np.cumsum(np.bincount(bucket + 1, minlength=BUCKETS + 1))
+        found, sample = patches[np.argsort(bucket, kind="stable")], patches[even_sample(side, config.sample)]
+        return _View(found, starts, sample, information)
 
     def _lay(self) -> Outcome:
         """Lay the newest view onto those that are kept, from where it was reported and coarse to fine."""
@@ -148,15 +166,13 @@ class ViewRegistration:
         self._edges = np.concatenate([self._edges, edges])
         return outcome
 
-    def _matched(self, pairs: Iterable[tuple[int, int]]) -> Edges:
+    def _matched(self, pairs: Iterable[tuple[int, int]]) -> NDArray[Any]:
         """What pairs (still, moving) say of each other where they are, from the whole of their samples."""
         pairs, reach = list(pairs), self._config.reaches[-1]
-        edges = np.zeros(len(pairs), EDGE)
-        upper, nowhere = np.triu_indices(6), np.zeros(6)
-        for edge, rows, (still, moving) in zip(
-            edges, self._correspondences(pairs, self._now, reach), pairs, strict=True
-        ):
-            sums = normal_equations(rows, nowhere, OUTLIER * reach)
+        edges, upper = np.zeros(len(pairs), EDGE), np.triu_indices(6)
+        found = self._correspondences(pairs, self._now, reach)
+        for edge, rows, (still, moving) in zip(edges, found, pairs, strict=True):
+            sums = _normal_equations(rows, np.zeros(6), OUTLIER * reach)
             edge["still"], edge["moving"], edge["asked"] = still, moving, len(rows)
             edge["apart"] = self._now[moving] - self._now[still]
             edge["found"], edge["misfit"] = sums[:2]
@@ -185,7 +201,7 @@ class ViewRegistration:
         twists, misfits = twists.copy(), []
         for _ in range(3):
             rows = np.concatenate(self._correspondences(pairs, twists, reach, stride))
-            step, ends = step_down(rows, twists[new], view.information, independent, outlier, 4, settled)
+            step, ends = _step_down(rows, twists[new], view.information, independent, outlier, 4, settled)
             twists[new] += step
             misfits += [(far + (len(rows) - found) * outlier) / max(len(rows), 1) for found, far in ends]
             if np.abs(step).max() < settled:
@@ -195,22 +211,17 @@ class ViewRegistration:
     def _correspondences(
         self, pairs: Sequence[tuple[int, int]], twists: Array, reach: float, stride: int = 1
     ) -> list[Array]:
-        """Rows (S, 8) of `find_correspondences` of each pair (still, moving), for every stride-th patch."""
-        samples = [np.ascontiguousarray(self._views[moving].sample[::stride]) for _, moving in pairs]
-        # Who does which chunk changes no result.
-        chunks = [(pair, k) for pair, sample in enumerate(samples) for k in range(0, len(sample), 100)]
+        """Rows (S, 8) of `_find_correspondences` of each pair (still, moving), for every stride-th patch."""
 
-        def work(chunk: int) -> Array:
-            pair, first = chunks[chunk]
-            still, moving = pairs[pair]
-            other, sample = self._views[still], samples[pair][first : first + 100]
-            return find_correspondences(
+        def work(number: int) -> Array:
+            still, moving = pairs[number]
+            other, sample = self._views[still], np.ascontiguousarray(self._views[moving].sample[::stride])
+            return _find_correspondences(
                 *(sample, twists[moving], other.patches, other.starts, twists[still]),
-                *(self._pivot, _edge(self._config), reach, self._config.noise),
+                *(self._pivot, self._edge, reach, self._config.noise),
             )
 
-        rows = np.concatenate([np.zeros((0, 8)), *on_threads(work, len(chunks))])
-        return np.split(rows, np.cumsum([len(sample) for sample in samples])[:-1]) if pairs else []
+        return on_threads(work, len(pairs))
 
     def _too_far(self, twist: Array) -> bool:
         turn, move = np.linalg.norm(twist[3:]), np.linalg.norm(twist[:3])
@@ -221,33 +232,72 @@ class ViewRegistration:
 
         Views that few partners tie to the others stay where they are.
         """
-        config, outlier = self._config, OUTLIER * self._config.reaches[-1]
         before, edges_before = self._now, self._edges
         for _ in range(3):
             if not self._solve():
                 return
             # A quarter of the distance at which partners lose their weight.
-            moved = np.abs(change(self._edges, self._now)).max(axis=1, initial=0.0) > 2.0 * config.noise
+            moved = np.abs(self._change()).max(axis=1, initial=0.0) > 2.0 * self._config.noise
             if not moved.any():
                 break
             stale = self._edges[moved]
             anew = self._matched(zip(stale["still"].tolist(), stale["moving"].tolist(), strict=True))
             self._edges = np.concatenate([self._edges[~moved], anew])
-        if mean_misfit(self._edges, outlier) > mean_misfit(edges_before, outlier) + 0.3 * config.noise:
-            self._now, self._edges = before, among(edges_before, list(self._views))
+        if self._mean_misfit(self._edges) > self._mean_misfit(edges_before) + 0.3 * self._config.noise:
+            self._now, self._edges = before, edges_before
+            self._let_go([])
+
+    def _change(self) -> Array:
+        """By how much (E, 6) pairs moved since partners were looked for."""
+        moving, still = (self._now[self._edges[end]] for end in ("moving", "still"))
+        return np.asarray(moving - still - self._edges["apart"], dtype=np.float64)
+
+    def _mean_misfit(self, edges: NDArray[Any]) -> float:
+        """Mean distance [m] over the patches that looked for a partner; one without is an outlier."""
+        asked, found = edges["asked"].sum(), edges["found"].sum()
+        missing = (asked - found) * OUTLIER * self._config.reaches[-1]
+        return float((edges["misfit"].sum() + missing) / max(asked, 1))
+
+    def _enough(self) -> NDArray[np.bool_]:
+        """Which views (V,) have enough partners in all others, or they in them, to determine a pose."""
+        number = np.zeros(len(self._now))
+        for end in ("still", "moving"):
+            np.add.at(number, self._edges[end], self._edges["found"])
+        return number >= self._config.min_points
 
     def _solve(self) -> bool:
         """Move all views to where the pairs want them, if any is free; let go of what would go too far."""
         while True:
-            enough = partners(self._edges, len(self._now)) >= self._config.min_points
+            enough = self._enough()
             free = [v for v in self._views if enough[v] and self.outcomes[v] not in EXACT]
-            informations = np.array([self._views[v].information for v in free]).reshape(-1, 6, 6)
-            now, _ = solve(self._edges, self._now, np.array(free, dtype=np.intp), informations)
+            now = self._solution(free)
             far = [v for v in free if self._too_far(now[v])]
             if not far:
                 self._now = now
                 return bool(free)
             self._let_go(far)
+
+    def _solution(self, free: Sequence[int]) -> Array:
+        """Where all views are (V, 6) once the pairs and the reported poses moved the free ones together."""
+        information, count, each = self._edges["information"], len(free), np.arange(len(free))
+        gradient = self._edges["gradient"] + np.einsum("eij,ej->ei", information, self._change())
+        reported = np.array([self._views[v].information for v in free]).reshape(-1, 6, 6)
+        moved, views = self._now.copy(), np.array(free, dtype=np.intp)
+        column = np.full(len(moved), -1)
+        column[views] = each
+        i, j = column[self._edges["moving"]], column[self._edges["still"]]
+        H = np.zeros((count, count, 6, 6))
+        H[each, each] = reported
+        g = np.einsum("fij,fj->fi", reported, moved[views])
+        for end, sign in ((i, 1.0), (j, -1.0)):
+            np.add.at(H, (end[end >= 0], end[end >= 0]), information[end >= 0])
+            np.add.at(g, end[end >= 0], sign * gradient[end >= 0])
+        both = (i >= 0) & (j >= 0)
+        np.subtract.at(H, (i[both], j[both]), information[both])
+        np.subtract.at(H, (j[both], i[both]), information[both])
+        hessian = H.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count)
+        moved[views] -= np.linalg.solve(hessian, g.ravel()).reshape(-1, 6)
+        return moved
 
     def _moves(self, views: dict[int, _View]) -> dict[int, Array]:
         """How views are to be moved now: the newest, and those whose points moved since they last were."""
@@ -266,13 +316,13 @@ class ViewRegistration:
         """Let views stay where they are from now on, and lay no others onto them."""
         for v in views:
             del self._views[v]
-        self._edges = among(self._edges, list(self._views))
+        kept = [np.isin(self._edges[end], list(self._views)) for end in ("still", "moving")]
+        self._edges = self._edges[np.logical_and(*kept)]
 
     def _least_missed(self) -> int:
         """The kept view whose surfaces another one shows best; the first that nothing ties to any, if any."""
-        kept, edges = list(self._views), self._edges
-        number = partners(edges, len(self._now))
-        loose = [v for v in kept[1:] if number[v] < self._config.min_points]
+        kept, edges, enough = list(self._views), self._edges, self._enough()
+        loose = [v for v in kept[1:] if not enough[v]]
         if loose:
             return loose[0]
         shared = np.zeros((len(kept), len(kept)))
@@ -317,23 +367,6 @@ def twist_transform(twist: Array, pivot_world: Array) -> Array:
     return T
 
 
-def _edge(config: RegistrationConfig) -> float:
-    """Edge of the cells partners are looked for in [m]: the widest search spans two on either side."""
-    return max(config.reaches) / 2.0
-
-
-def index_patches(patches: Array, edge: float) -> tuple[Array, NDArray[np.intp]]:
-    """Sort patches (P, 8) such that those of one label and cell of this edge [m] lie together.
-
-    Returns:
-        The patches in another order, and where the list of each bucket begins (BUCKETS + 1,).
-    """
-    cells = np.floor(patches[:, :3] / edge).astype(np.int64)
-    bucket = _bucket.py_func(patches[:, 7].astype(np.int64), *cells.T)
-    starts = np.cumsum(np.bincount(bucket + 1, minlength=BUCKETS + 1))
-    return patches[np.argsort(bucket, kind="stable")], starts
-
-
 @njit(cache=True, inline="always")
 def _bucket(label, x, y, z):  # type: ignore[no-untyped-def]
     """Number of the bucket of a label and a cell, all integers."""
@@ -342,17 +375,13 @@ def _bucket(label, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def find_correspondences(samples, twist, patches, starts, other_twist, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
+def _find_correspondences(samples, twist, patches, starts, other_twist, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
     """Look for the patch of another view that is nearest in place and direction, and linearise the distance.
 
     Distance is along the mean of both normals, and its derivative by a move of either view that about the
-    middle between the two patches: a move of both views together changes nothing. Samples (S, 8) are of a
-    view that was moved by a twist (6,) about the pivot (3,) [m], patches (P, 8) of another one, as
-    `index_patches` gives them. Partners are within reach [m]; noise [m] comes on top of what patches bring.
-
-    Returns:
-        Rows (S, 8): derivative (6,) of the distance by the samples' twist, that by the other's being the
-        opposite; the distance [m]; its inverse variance [1/m²]; zero where there is no partner.
+    middle between the two patches: a move of both views together changes nothing. Both views' patches (S, 8)
+    and (P, 8) were moved by their twists (6,). Rows (S, 8) are the derivative by the samples' twist; the
+    distance [m]; its inverse variance [1/m²]; zero where there is no partner within reach [m].
     """
     rows = np.zeros((len(samples), 8))
     R = _rotation(twist[3], twist[4], twist[5])
@@ -453,13 +482,11 @@ def _turned_back(R, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
+def _normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
     """Sum up the robust normal equations of rows (N, 8) after a step (6,) of the moving view.
 
-    Returns:
-        (29,): how many partners there are; the sum of their distances [m], none counting more than an
-        outlier [m], beyond which they lose their weight; the gradient (6,); the upper half of the matrix
-        (6, 6), row by row.
+    They are (29,): how many partners there are; the sum of their distances [m], none counting more than an
+    outlier [m], beyond which they lose their weight; the gradient (6,); the upper half of the matrix (6, 6).
     """
     sums = np.zeros(29)
     for i in range(len(rows)):
@@ -484,21 +511,17 @@ def normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def step_down(rows, twist, information, independent, outlier, steps, settled):  # type: ignore[no-untyped-def]
+def _step_down(rows, twist, information, independent, outlier, steps, settled):  # type: ignore[no-untyped-def]
     """Move a view by Gauss–Newton on the robust distances and its pose as reported; partners stay the same.
 
-    Rows (N, 8) of `find_correspondences` are those of the view where it is, at a twist (6,) whose reported
-    error has this inverse covariance (6, 6). A share of the partners errs independently; those further off
-    than an outlier [m] lose their weight. A step smaller than settled [m, rad] is the last.
-
-    Returns:
-        By how much the twist changes (6,); how many partners there are and the sum of their distances [m],
-        none counting more than an outlier, before and after (2, 2).
+    Rows (N, 8) are those of the view where it is. A share of the partners errs independently; a step smaller
+    than settled [m, rad] is the last. It gives the change of the twist (6,), and the number of partners and
+    the sum of their distances [m] before and after (2, 2).
     """
     step, gradient, hessian, ends = np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((2, 2))
     largest = np.inf
     for number in range(steps + 1):
-        sums = normal_equations(rows, step, outlier)
+        sums = _normal_equations(rows, step, outlier)
         ends[min(number, 1), 0], ends[min(number, 1), 1] = sums[0], sums[1]
         if number == steps or largest < settled:
             break

@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import RegistrationConfig
+from caryatid.geometry.points import quantile
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, on_threads
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
@@ -40,16 +41,14 @@ def surfels_of(
     """
     if cloud.labels is None:
         raise ValueError("surfels are made of labelled points")
-    voxels, kinds, sums = gather(
-        cloud.points_world, cloud.normals_world, cloud.labels, config.spacing, config.spacing_far
-    )
+    voxels, kinds, sums = _gathered(cloud.points_world, cloud.normals_world, cloud.labels, config)
     far = kinds // 6 == SUPPORT_LABEL
     count = sums[:, 0]
     # Rims, and sides at a grazing angle, have few readings; in coarse images all patches have.
     enough = np.full(len(far), 4.0)
     for alike in (far, ~far):
         if alike.any():
-            enough[alike] = min(4, 0.33 * np.percentile(count[alike], 90.0))
+            enough[alike] = min(4, 0.33 * quantile(count[alike], 0.9))
     full = np.flatnonzero(count >= enough)
     count = count[full]
     x, y, z, u, v, w, xx, xy, xz, yy, yz, zz = means = np.ascontiguousarray(sums[full, 1:].T) / count
@@ -70,26 +69,22 @@ def surfels_of(
     return _flattened(patches, np.unique(kinds, return_inverse=True)[1], config)
 
 
-def gather(
-    points: Array, normals: Array, labels: NDArray[np.int32], spacing: float, spacing_far: float
+def _gathered(
+    points: Array, normals: Array, labels: NDArray[np.int32], config: RegistrationConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Sum up the readings of each voxel that are of one label and face roughly one way.
+    """Sum up the readings of each voxel that are of one label, not 0, and face roughly one way.
 
-    Points are (N, 3) [m], normals (N, 3); the label (N,) 0 counts nowhere. Voxels have this spacing [m],
-    those of the support surface the far one.
-
-    Returns:
-        Of each patch (P,), ascending: its voxel, three cell numbers of 21 bits; its kind, 6·label + (0, 1, 2
-        for +x, +y, +z, 3, 4, 5 for −x, −y, −z); and a row (P, 13): how many readings, the sums of their
-        offsets from the voxel's corner, of their normals, and of the products xx, xy, xz, yy, yz, zz of the
-        offsets.
+    Of each patch (P,), ascending, it gives its voxel, three cell numbers of 21 bits; its kind, 6·label + (0,
+    1, 2 for +x, +y, +z, 3, 4, 5 for −x, −y, −z); and a row (P, 13): how many readings, the sums of their
+    offsets from the voxel's corner, of their normals, and of the products xx, xy, xz, yy, yz, zz of the
+    offsets.
     """
     points, normals = np.ascontiguousarray(points, np.float64), np.ascontiguousarray(normals, np.float64)
     labels = np.ascontiguousarray(labels, np.int32)
 
     def part(share: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
         mine = slice(share * len(points) // SHARES, (share + 1) * len(points) // SHARES)
-        return _gather(points[mine], normals[mine], labels[mine], spacing, spacing_far)
+        return _gather(points[mine], normals[mine], labels[mine], config.spacing, config.spacing_far)
 
     voxels, kinds, sums = (np.concatenate(parts) for parts in zip(*on_threads(part, SHARES), strict=True))
     order = np.lexsort((kinds, voxels))
@@ -104,7 +99,7 @@ def gather(
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _gather(points, normals, labels, spacing, spacing_far):  # type: ignore[no-untyped-def]
-    """Do as `gather` does with a part of the readings, patches in the order of their first readings."""
+    """Do as `_gathered` does with a part of the readings, patches in the order of their first readings."""
     counted, size = 0, 64
     for label in labels:
         counted += label != 0
@@ -164,7 +159,7 @@ def _flattened(
     """
     sizes = np.bincount(side)
     tolerance = 1.5 * config.noise
-    planes, widths, heights = fit_planes(patches[:, :3], side, tolerance)
+    planes, widths, heights = _fit_planes(np.ascontiguousarray(patches[:, :3]), side, len(sizes), tolerance)
     plane = planes[side]
     agreement = np.sum(plane * patches[:, 3:6], axis=1)
     lies_in = (np.abs(heights) < 2.0 * tolerance) & (np.abs(agreement) > MIN_COSINE)
@@ -177,26 +172,35 @@ def _flattened(
     return patches[keep], side[keep]
 
 
-def fit_planes(points: Array, side: NDArray[np.intp], flat: float) -> tuple[Array, Array, Array]:
-    """Fit a plane to the points (N, 3) [m] of each side 0 … S − 1, robustly: those off it lose their weight.
+@njit(cache=True, error_model="numpy")
+def _fit_planes(points, side, sides, flat):  # type: ignore[no-untyped-def]
+    """Fit a plane to the points (N, 3) [m] of each side, robustly: those off it lose their weight.
 
-    At the distance `flat` [m] from the plane a point counts a quarter.
-
-    Returns:
-        Of each side the plane's normal (S, 3) and the variance along the shorter direction in the plane (S,)
-        [m²]; of each point its height over its side's plane (N,) [m].
+    At the distance `flat` [m] from the plane a point counts a quarter. It gives each plane's normal (S, 3),
+    the variance along the shorter direction in the plane (S,) [m²], and each point's height (N,) [m].
     """
-    columns, weights = np.ascontiguousarray(points.T), np.ones(len(points))
+    weights, heights = np.ones(len(points)), np.empty(len(points))
     for _ in range(4):
-        total = np.maximum(np.bincount(side, weights), 1e-9)
-        centres = [np.bincount(side, weights * axis) / total for axis in columns]
-        x, y, z = (axis - centre[side] for axis, centre in zip(columns, centres, strict=True))
-        products = ((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))
-        spreads = np.stack([np.bincount(side, weights * a * b) for a, b in products], axis=1)
+        total, centres, spreads = np.zeros(sides), np.zeros((sides, 3)), np.zeros((sides, 6))
+        for i in range(len(points)):
+            total[side[i]] += weights[i]
+            for a in range(3):
+                centres[side[i], a] += weights[i] * points[i, a]
+        for s in range(sides):
+            total[s] = max(total[s], 1e-9)
+            for a in range(3):
+                centres[s, a] /= total[s]
+        for i in range(len(points)):
+            weight, centre, spread = weights[i], centres[side[i]], spreads[side[i]]
+            x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+            for n, (a, b) in enumerate(((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))):
+                spread[n] += weight * a * b
         normals, widths = _least_spreads(spreads)
-        u, v, w = normals.T
-        heights = x * u[side] + y * v[side] + z * w[side]
-        weights = 1.0 / (1.0 + (heights / flat) ** 2) ** 2
+        for i in range(len(points)):
+            centre, normal = centres[side[i]], normals[side[i]]
+            x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+            heights[i] = x * normal[0] + y * normal[1] + z * normal[2]
+            weights[i] = 1.0 / (1.0 + (heights[i] / flat) ** 2) ** 2
     return normals, widths / total, heights
 
 
