@@ -20,9 +20,8 @@ from caryatid.io.graph_json import graph_text
 from caryatid.manipulation.order import TakeStep
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.viewer.apart import taken_apart
-from caryatid.viewer.drawing import BY_HAND, LAYERS
-from caryatid.viewer.loop import LoopPage, candidate_under
+from caryatid.viewer.drawing import BY_HAND, LAYERS, reduced
+from caryatid.viewer.loop import LoopPage, candidate_under, taken_apart
 from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
 
@@ -52,94 +51,94 @@ def page(opening, settings):
 
 
 @pytest.fixture(scope="module")
-def moment(page):
-    return page.shown
+def step(page):
+    return page.steps[0]
 
 
 @pytest.fixture
 def drawn(page):
-    """Draw a moment and return the nodes of the scene by name."""
+    """Draw a step and return the nodes of the scene by name."""
 
-    def draw(moment, **look):
-        page.drawing.show(moment, [moment.step], **look)
+    def draw(step, **look):
+        page.drawing.show(step, [step], **look)
         return {node.name: node for nodes in page.drawing.nodes.values() for node in nodes}
 
     return draw
 
 
-def with_supports(moment, *supports):
-    return replace(moment, step=replace(moment.step, graph=SupportGraph(moment.step.graph.objects, supports)))
+def with_supports(step, *supports):
+    return replace(step, graph=SupportGraph(step.graph.objects, supports))
 
 
-def test_shapes_and_points_have_their_objects_colours_and_places(moment, drawn):
-    nodes = drawn(moment, chosen="o1")
+def test_shapes_and_points_have_their_objects_colours_and_places(step, drawn):
+    nodes = drawn(step, chosen="o1")
     assert {name.split("/")[1] for name in nodes} == set(LAYERS)
-    for item in moment.step.graph.objects:
+    for item in step.graph.objects:
         body = nodes[f"/shapes/{item.id}"]
         assert tuple(body.color) == rgb(object_colour(item.label))
         np.testing.assert_allclose(body.position, item.centre_world)
     assert nodes["/shapes/o1"].opacity > nodes["/shapes/o2"].opacity
-    cloud, points = moment.step.cloud, nodes["/cloud/points"]
+    cloud, points = step.cloud, nodes["/cloud/points"]
     sent = points.points.astype(np.float64) + points.position
     assert np.abs(sent - cloud.points_world).max() < 1e-3
     for label in np.unique(cloud.labels):
         assert (points.colors[cloud.labels == label] == rgb(object_colour(int(label)))).all()
-    np.testing.assert_array_equal(drawn(moment, true_colours=True)["/cloud/points"].colors, cloud.rgb)
+    np.testing.assert_array_equal(drawn(step, true_colours=True)["/cloud/points"].colors, cloud.rgb)
 
 
-def test_only_layers_that_changed_are_sent_again(moment, drawn):
-    first = drawn(moment)
-    again = drawn(moment, point_size=0.01)
+def test_only_layers_that_changed_are_sent_again(step, drawn):
+    first = drawn(step)
+    again = drawn(step, point_size=0.01)
     assert [name for name in first if first[name] is not again[name]] == ["/cloud/points"]
 
 
-def test_arrows_tell_direction_doubt_and_kind(moment, drawn):
-    objects = moment.step.graph
-    certain = drawn(with_supports(moment, Support("o1", "o2")))
+def test_arrows_tell_direction_doubt_and_kind(step, drawn):
+    objects = step.graph
+    certain = drawn(with_supports(step, Support("o1", "o2")))
     (arrow,) = certain["/supports/certain"].points
     np.testing.assert_allclose(arrow, [objects["o1"].centre_world, objects["o2"].centre_world], atol=1e-6)
     assert "/supports/dashes" not in certain
-    doubtful = drawn(with_supports(moment, Support("o1", "o2", certain=False)))
+    doubtful = drawn(with_supports(step, Support("o1", "o2", certain=False)))
     assert len(doubtful["/supports/dashes"].points) > 1
     assert "/supports/certain" not in doubtful
-    assert "/supports/lean 0" in drawn(with_supports(moment, Support("o1", "o2", "lean")))
-    assert "/supports/top-down 0" in drawn(with_supports(moment, Support("o1", "o2", "top-down")))
+    assert "/supports/lean 0" in drawn(with_supports(step, Support("o1", "o2", "lean")))
+    assert "/supports/top-down 0" in drawn(with_supports(step, Support("o1", "o2", "top-down")))
 
 
-def test_the_sphere_is_painted_and_cameras_show_what_they_saw(moment, drawn):
-    nodes = drawn(moment)
-    painted, sphere = nodes["/sphere/reachable"], moment.step.sphere
+def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
+    nodes = drawn(step)
+    painted, sphere = nodes["/sphere/reachable"], step.sphere
     assert len(np.unique(painted.colors, axis=0)) > 10
     away = np.linalg.norm(painted.points + painted.position - sphere.centre_world, axis=1)
     np.testing.assert_allclose(away, sphere.radius, rtol=1e-2)
     assert nodes["/cameras/0"].image.shape[2] == 3
-    decision = replace(moment.step.decision, why="chosen by hand")
-    by_hand = replace(moment, step=replace(moment.step, decision=decision))
+    decision = replace(step.decision, why="chosen by hand")
+    by_hand = replace(step, decision=decision)
     planned = tuple(nodes["/cameras/next"].color)
     assert planned != tuple(drawn(by_hand)["/cameras/next"].color) == BY_HAND
 
 
-def test_what_is_kept_of_a_step_is_small(moment):
-    view = moment.step.view
+def test_what_is_kept_of_a_step_is_small(step):
+    view = step.view
     depth, rgb = np.tile(view.depth, (8, 8)), np.tile(view.rgb, (8, 8, 1))
     large = replace(view, depth=depth, rgb=rgb, labels=None, normals_camera=None)
-    kept = replace(moment, step=replace(moment.step, view=large)).reduced().step.view
+    kept = reduced(replace(step, view=large)).view
     assert kept.depth.shape[1] < 480
     assert kept.depth.shape[1] / kept.K[0, 0] == pytest.approx(depth.shape[1] / large.K[0, 0], 0.02)
 
 
-def test_what_is_said_of_an_object(moment, settings):
-    graph, config = moment.step.graph, settings.support
+def test_what_is_said_of_an_object(step, settings):
+    graph, config = step.graph, settings.support
     text = describe_object(graph, "o1", config)
     for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 falls:"):
         assert part in text
     assert "nothing falls" in describe_object(graph, "o2", config)
     assert "Without" not in describe_object(graph, "o0", config)
-    doubtful = with_supports(moment, Support("o1", "o2", certain=False)).step.graph
+    doubtful = with_supports(step, Support("o1", "o2", certain=False)).graph
     assert "o1 → o2</dt><dd>bottom-up, uncertain, 1 of 1" in describe_object(doubtful, "o1", config)
     assert "not known" in describe_object(graph, "o9", config)
-    named = replace(moment, step=replace(moment.step, name="<img src=x onerror=alert(1)>"))
-    assert "<img" not in describe_view(named, 1)
+    named = replace(step, name="<img src=x onerror=alert(1)>")
+    assert "<img" not in describe_view(named, None, 1)
 
 
 def test_the_loop_gives_the_views_that_explore_gives_and_says_when_it_would_stop(opening, settings):
@@ -148,39 +147,39 @@ def test_the_loop_gives_the_views_that_explore_gives_and_says_when_it_would_stop
     steps = explore(source.camera, source.robot, config=limited, segmentation="labels")
     assert [page.turn() for _ in range(3)][:2] == [None, "2 views were asked for"]
     page.close()
-    assert len(page.moments) == 3
-    for step, moment in zip(steps, page.moments, strict=False):
-        assert graph_text(moment.step.graph) == graph_text(step.graph)
-        np.testing.assert_array_equal(moment.step.visited, step.visited)
-        assert moment.score is not None
+    assert len(page.steps) == len(page.scores) == 3
+    for step, shown, f1 in zip(steps, page.steps, page.scores, strict=False):
+        assert graph_text(shown.graph) == graph_text(step.graph)
+        np.testing.assert_array_equal(shown.visited, step.visited)
+        assert f1 is not None
 
 
 def test_a_view_chosen_by_hand_is_taken_and_taken_again_with_another_fusion(loop):
     loop.turn()
-    step = loop.moments[0].step
+    step = loop.steps[0]
     index = len(step.candidates) // 3
     said = loop.choose(index)
     yours, planned = (float(number) for number in re.findall(r"\d\.\d+", said))
     assert yours <= planned == pytest.approx(step.decision.score, abs=0.01)
     loop.turn()
-    poses = [m.step.view.T_world_camera for m in loop.moments]
+    poses = [step.view.T_world_camera for step in loop.steps]
     np.testing.assert_array_equal(poses[1], step.candidates.T_world_camera[index])
     assert "sg" in loop.use_fusion("sg")
-    assert [m.step.decision.why == "chosen by hand" for m in loop.moments] == [True, False]
-    np.testing.assert_array_equal([m.step.view.T_world_camera for m in loop.moments], poses)
+    assert [step.decision.why == "chosen by hand" for step in loop.steps] == [True, False]
+    np.testing.assert_array_equal([step.view.T_world_camera for step in loop.steps], poses)
     with pytest.raises(PlanningError):
         loop.choose(10**6)
 
 
 def test_another_planner_chooses_the_next_view_at_once(loop):
     loop.turn()
-    before = loop.moments[0].step
+    before = loop.steps[0]
     loop.use_planner("farthest")
-    after = loop.moments[0].step
+    after = loop.steps[0]
     assert after.graph is before.graph
     assert not np.allclose(after.decision.T_world_camera, before.decision.T_world_camera)
     loop.turn()
-    np.testing.assert_array_equal(loop.moments[1].step.view.T_world_camera, after.decision.T_world_camera)
+    np.testing.assert_array_equal(loop.steps[1].view.T_world_camera, after.decision.T_world_camera)
     with pytest.raises(InputError):
         loop.use_planner("nobody")
 
@@ -189,11 +188,11 @@ def test_a_recording_ends_with_its_views(recording, settings):
     page = LoopPage(partial(open_source, str(recording), noise="none", segmentation=None, seed=0), settings)
     assert "no view is left" in [page.turn() for _ in range(4)][-1]
     page.close()
-    assert [m.step.robot for m in page.moments] == [None] * 3
+    assert [step.robot for step in page.steps] == [None] * 3
 
 
-def test_a_ray_points_at_the_view_it_first_meets(moment):
-    sphere, candidates = moment.step.sphere, moment.step.candidates
+def test_a_ray_points_at_the_view_it_first_meets(step):
+    sphere, candidates = step.sphere, step.candidates
     wanted, centre = candidates.directions[7], sphere.centre_world
     outside = centre + 3.0 * sphere.radius * wanted
     for origin, direction in ((outside, -wanted), (centre, wanted)):
@@ -204,12 +203,12 @@ def test_a_ray_points_at_the_view_it_first_meets(moment):
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(moment, opening, settings, simulated):
-    source, step = opening(settings), moment.step
+def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(step, opening, settings, simulated):
+    source = opening(settings)
     if not simulated:
         source = replace(source, truth=None)
-    steps = [TakeStep("o2", (), True, 0.0, "why"), TakeStep("o1", (), True, 0.0, "why")]
-    pictures = list(taken_apart(step, steps, source, settings))
+    order = [TakeStep(name, (), True, 0.0, "why") for name in ("o2", "o1")]
+    pictures = list(taken_apart(step, order, source, settings))
     rising = next(
         p for p, _ in pictures if p.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
     )
@@ -233,7 +232,7 @@ def test_view_serves_a_run_to_this_machine_until_it_is_stopped(scene_file, tmp_p
     options = ("--views", 3, "--no-report", "--quiet", "--noise", "carmine", *SMALL)
     assert run_command("explore", scene_file, "--out", folder, *options) == 0
     add = Page.add
-    monkeypatch.setattr(Page, "add", lambda page, moment: (shown.append(moment), add(page, moment)))
+    monkeypatch.setattr(Page, "add", lambda page, *step: (shown.append(step), add(page, *step)))
 
     def meanwhile():
         address = capsys.readouterr().err.split(" at ")[-1].split(";")[0]
@@ -245,7 +244,7 @@ def test_view_serves_a_run_to_this_machine_until_it_is_stopped(scene_file, tmp_p
     assert address.startswith("http://127.0.0.1:")
     assert b"<html" in content
     assert len(shown) == len(read_run(folder).views) > 1
-    assert all(len(m.step.cloud) and m.score is not None for m in shown)
+    assert all(len(step.cloud) and f1 is not None for step, f1 in shown)
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(address)
 
@@ -277,10 +276,10 @@ def test_an_exploration_that_is_interrupted_is_kept_and_its_page_closed(scene_fi
     _waiting(monkeypatch, lambda: waited.append(True))
     whole = PageProcess.add
 
-    def interrupted(page, moment):
-        whole(page, moment)
-        shown.append(moment.step.index)
-        if moment.step.index == 1:
+    def interrupted(page, step, f1):
+        whole(page, step, f1)
+        shown.append(step.index)
+        if step.index == 1:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(PageProcess, "add", interrupted)
@@ -299,7 +298,7 @@ def test_a_scene_shows_itself_in_a_notebook_if_viser_is_there(views, monkeypatch
             scene.update(view)
             shown.update(scene)
         shown.wait()
-        assert [m.step.index for m in shown.moments] == [0, 1]
+        assert [step.index for step in shown.steps] == [0, 1]
         assert "/shapes/o1" in [node.name for node in shown.drawing.nodes["shapes"]]
         assert f'<iframe src="{shown.url}"' in shown._repr_html_()
     finally:

@@ -261,14 +261,12 @@ def _record(
     recorder: RunRecorder, steps: Iterable[Step], output: Output, page: PageProcess | None = None
 ) -> Step:
     """Keep, print and show every step; returns the last."""
-    from caryatid.viewer.drawing import Moment
-
     last = None
     for step in steps:
         score = recorder.keep(step)
         output.step(step, None if last is None else last.graph, score)
         if page is not None:
-            page.add(Moment(step, None if score is None else score.f1))
+            page.add(step, None if score is None else score.f1)
         last = step
     assert last is not None, "the first view is always taken"
     return last

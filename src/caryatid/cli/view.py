@@ -65,7 +65,6 @@ class View(options.ExploringCommand):
 
     def _open_run(self) -> Page:
         from caryatid.steps import read_config, read_run, read_steps
-        from caryatid.viewer.drawing import Moment
         from caryatid.viewer.page import Page
 
         run = read_run(self.source)
@@ -74,7 +73,7 @@ class View(options.ExploringCommand):
         page = Page(title, read_config(run).support, host=self.host, port=self.port)
         scores = [score["f1"] for score in run.record.get("scores", ())]
         for step in steps:
-            page.add(Moment(step, scores[step.index] if scores else None))
+            page.add(step, scores[step.index] if scores else None)
         return page
 
     def _open_loop(self, config: Config) -> Page:

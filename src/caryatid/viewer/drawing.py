@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
 from caryatid.viz.colours import SALIENCY_STOPS, Colour, label_colours, object_colour, rgb, scale
 from caryatid.viz.drawings import image_of
+from caryatid.viz.tables import count_of
 
 LAYERS = ("cloud", "shapes", "names", "supports", "sphere", "interest", "cameras", "robot")
 """What can be shown and hidden."""
@@ -30,39 +31,26 @@ ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.028}
 SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Moment:
-    """What there is to see after one view.
-
-    Attributes:
-        step: What is known.
-        score: F1 of vertices and edges together, or None where the ground truth is not known.
-    """
-
-    step: Step
-    score: float | None = None
-
-    def reduced(self) -> Moment:
-        """The same with an image no larger than it is drawn, so that the page can keep every one."""
-        view = self.step.view
-        if view is None:
-            return self
-        k = max(1, view.depth.shape[1] // 240)
-        rgb = None if view.rgb is None else view.rgb[::k, ::k].copy()
-        K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
-        small = View(view.depth[::k, ::k].copy(), K, view.T_world_camera, rgb, name=view.name)
-        return replace(self, step=replace(self.step, view=small))
+def reduced(step: Step) -> Step:
+    """The step with an image no larger than it is drawn, so that the page can keep every one."""
+    view = step.view
+    if view is None:
+        return step
+    k = max(1, view.depth.shape[1] // 240)
+    rgb = None if view.rgb is None else view.rgb[::k, ::k].copy()
+    K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
+    return replace(step, view=View(view.depth[::k, ::k].copy(), K, view.T_world_camera, rgb, name=view.name))
 
 
-def moment_of_scene(scene: Scene) -> Moment:
+def step_of_scene(scene: Scene) -> Step:
     """What a scene of at least one view knows now; it need not have been explored."""
     sphere = scene.sphere or ViewSphere.around(np.zeros(3), scene.config.active)
     labels = np.zeros(0, dtype=np.int32) if scene.labels is None else scene.labels
     seen_from = scene.T_world_camera
     visited = np.zeros((0, 3)) if seen_from is None else sphere.direction_of(seen_from)[None]
-    name = f"after {scene.views} view{'s' * (scene.views > 1)}"
+    name = f"after {count_of(scene.views, 'view')}"
     known = (scene.graph, scene.cloud, sphere, visited)
-    return Moment(Step(scene.views - 1, name, None, labels, *known, None, None, {}, 0.0, 0.0, None))
+    return Step(scene.views - 1, name, None, labels, *known, None, None, {}, 0.0, 0.0, None)
 
 
 class SceneDrawing:
@@ -88,23 +76,23 @@ class SceneDrawing:
 
     def show(
         self,
-        moment: Moment,
+        step: Step,
         steps: Sequence[Step],
         *,
         chosen: str = "",
         point_size: float = 0.003,
         true_colours: bool = False,
     ) -> None:
-        """Show a moment in place of the one before.
+        """Show a step in place of the one before.
 
         Args:
-            moment: What is known.
+            step: What is known.
             steps: The steps so far, the newest last.
             chosen: Id of the object that stands out.
             point_size: Diameter of the cloud's points [m].
             true_colours: Points as the camera saw them, not in their objects' colours.
         """
-        step, decision = moment.step, moment.step.decision
+        decision = step.decision
         layers: dict[str, tuple[object, ...]] = {
             "cloud": (step.cloud, point_size, true_colours),
             "shapes": (step.graph, chosen),
@@ -193,10 +181,8 @@ class SceneDrawing:
                 dashes.append(np.linspace(start, neck, 2 * count).reshape(-1, 2, 3))
             colour = CERTAIN if support.certain else UNCERTAIN
             arrows[colour].append(np.array([neck, end]))
-            name, look = (
-                f"/supports/{support.kind} {number}",
-                {"color": colour, "position": (start + end) / 2.0},
-            )
+            name = f"/supports/{support.kind} {number}"
+            look: dict[str, Any] = {"color": colour, "position": (start + end) / 2.0}
             if support.kind == "lean":
                 nodes.append(self._scene.add_icosphere(name, radius=0.011, **look))
             elif support.kind == "top-down":

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from caryatid.config import Config, FusionMethod, SegmentationMethod
 from caryatid.errors import CaryatidError, PlanningError, in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
 from caryatid.exploration import Explorer, Step, reason_to_stop
+from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.manipulation.order import plan_order
+from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
+from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.planning.decision import Decision
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 from caryatid.runtime.parallel import cores
-from caryatid.viewer.apart import taken_apart
-from caryatid.viewer.drawing import Moment
+from caryatid.simulation.camera import SimulatedCamera
+from caryatid.simulation.lifting import ASIDE
+from caryatid.simulation.world import SimulatedScene
 from caryatid.viewer.page import Page
 
 if TYPE_CHECKING:
@@ -105,7 +109,7 @@ class LoopPage(Page):
             if truth is not None:
                 f1 = score(step.graph, truth, np.random.default_rng(0)).f1
         self._planned, self.ended = step.decision, step.stop
-        self.add(Moment(step, f1))
+        self.add(step, f1)
         return step.stop or reason_to_stop(step.index + 1, explorer.scene.changed, self._config.active)
 
     def use_planner(self, name: str) -> str:
@@ -128,7 +132,7 @@ class LoopPage(Page):
 
     def use_fusion(self, method: FusionMethod) -> str:
         """Begin again with another fusion and take the same views again; return what to say about it."""
-        earlier = [moment.step.decision for moment in self.moments]
+        earlier = [step.decision for step in self.steps]
         self._config = replace(self._config, fusion=replace(self._config.fusion, method=method))
         with self.working:
             self._begin()
@@ -154,17 +158,17 @@ class LoopPage(Page):
 
     def _put(self, step: Step) -> None:
         """Show the newest step with another next view."""
-        self.add(replace(self.moments[step.index], step=step))
+        self.add(step, self.scores[step.index])
 
     def dismantle(self) -> str:
         """Find a safe order and play it: in physics where there is a simulation, else as the order says."""
-        moment, config, said = self.moments[-1], self._config, ""
+        newest, config, said = self.steps[-1], self._config, ""
         with self.working:
-            order = plan_order(moment.step.graph, config, seed=self._options["seed"], threads=cores())
-        for step, done in taken_apart(moment.step, order.steps, self.source, config):
+            order = plan_order(newest.graph, config, seed=self._options["seed"], threads=cores())
+        for step, done in taken_apart(newest, order.steps, self.source, config):
             if not self._running.is_set():
                 return "paused"
-            self.stage(replace(moment, step=step))
+            self.stage(step)
             if done:
                 said = done
                 self.say(said)
@@ -241,7 +245,7 @@ class LoopPage(Page):
         self.say(text)
         self._next.disabled = self._go.disabled = busy or self.ended is not None
         self._pause.disabled = not busy
-        self._dismantle.disabled = busy or not self.moments
+        self._dismantle.disabled = busy or not self.steps
         for choice in self._choices:
             choice.disabled = busy
 
@@ -289,3 +293,89 @@ def candidate_under(
     if not hit.any():
         return None
     return int(np.argmin(np.where(hit & (along < along[hit].min() + sphere.radius / 2.0), aside, np.inf)))
+
+
+# An order of removal played, picture by picture
+
+
+def taken_apart(
+    step: Step, order: Sequence[TakeStep], source: Source, config: Config
+) -> Iterator[tuple[Step, str]]:
+    """Play an order: in physics where the source is simulated, else as the order says.
+
+    Shapes that have moved leave their points behind, and so their points are not shown.
+
+    Args:
+        step: What is known.
+        order: What to take.
+        source: What was explored.
+        config: How lifts go.
+
+    Yields:
+        Several pictures of each lift, with what came of it where it is done, else an empty text.
+    """
+    gone: set[str] = set()
+    camera, lifts = source.camera, _lifts_as_ordered(order)
+    if isinstance(camera, SimulatedCamera) and source.truth is not None:
+        lifts = _lifts_in_physics(camera.scene, order, bodies_of(step.graph, source.truth), config)
+    for number, (taken, moves, disturbed) in enumerate(lifts, start=1):
+        for T_world_world in moves:
+            yield _without(step, gone, taken, T_world_world), ""
+        gone.add(taken)
+        harm = f", {', '.join(disturbed)} disturbed" if disturbed else ""
+        text = f"{number} of {len(order)} taken: {taken}{harm}"
+        yield _without(step, gone, taken, moves[-1] if moves else {}), text
+
+
+Lift = tuple[str, list[dict[str, Array]], tuple[str, ...]]
+"""What is taken, how far each object has moved (4, 4) by id in each picture, and what was disturbed."""
+
+
+def _lifts_in_physics(
+    scene: SimulatedScene, order: Sequence[TakeStep], bodies: Mapping[str, str], config: Config
+) -> Iterator[Lift]:
+    """Take the scene apart in physics; the extracted shapes move as the bodies they stand for do."""
+    names = list(scene.object_bodies.values())
+    began = transforms.invert(_transforms(poses_of(scene)))
+    for taken in dismantle(scene, order, bodies, config):
+        film = taken.film
+        if taken.body is not None:
+            film = film[film[:, names.index(taken.body), 2] < ASIDE / 2.0]
+        moves = [_transforms(state) @ began for state in film]
+        moves_by_id = [{i: T[names.index(body)] for i, body in bodies.items()} for T in moves]
+        yield taken.step.object_id, moves_by_id, taken.disturbed
+
+
+def _lifts_as_ordered(order: Sequence[TakeStep]) -> Iterator[Lift]:
+    """Take objects straight up by half a metre, where there is no physics to ask."""
+    rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
+    for taken in order:
+        yield taken.object_id, [{taken.object_id: T} for T in rising], ()
+
+
+def _transforms(state: Array) -> Array:
+    """Poses (N, 4, 4) of a state (N, 7): positions and quaternions, w first."""
+    return np.stack(
+        [transforms.rigid(Rotation.from_quat(s[3:], scalar_first=True).as_matrix(), s[:3]) for s in state]
+    )
+
+
+def _without(step: Step, gone: set[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:
+    """A step as it looks while an object is being lifted and others are gone."""
+    graph, cloud, still = step.graph, step.cloud, np.eye(4)
+    objects = tuple(
+        replace(o, shape=o.shape.moved(T_world_world.get(o.id, still)))
+        for o in graph.objects
+        if o.id not in gone
+    )
+    supports = tuple(
+        replace(s, contact_world=None, normal_world=None)
+        for s in graph.supports
+        if not {s.supporter, s.supported} & {lifted, *gone}
+    )
+    moved = {i for i, T in T_world_world.items() if np.abs(T - still).max() > 2e-3}
+    away = [o.label for o in graph.objects if o.id in gone | moved]
+    if away and cloud.labels is not None:
+        cloud = cloud.select(~np.isin(cloud.labels, away))
+    shown = replace(graph, objects=objects, supports=supports)
+    return replace(step, graph=shown, cloud=cloud, decision=None, candidates=None)

@@ -23,7 +23,7 @@ from caryatid.exploration import Step
 from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.support.relations import predict_removal
-from caryatid.viewer.drawing import LAYERS, NEXT, Moment, SceneDrawing, moment_of_scene
+from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene
 from caryatid.viz.colours import PALETTE, SALIENCY_STOPS, object_colour, scale
 from caryatid.viz.drawings import draw_layers
 from caryatid.viz.notebook import cell_html, draw_cell
@@ -34,7 +34,7 @@ from caryatid.viz.tables import census, object_table, support_table
 class Page:
     """A viewer in the browser, served by this process.
 
-    Moments are added as they come, from any thread; they are drawn in a thread of the page's own, and where
+    Steps are added as they come, from any thread; they are drawn in a thread of the page's own, and where
     they come faster than they are drawn the newest is.
 
     Args:
@@ -48,7 +48,8 @@ class Page:
         url: Where the page is.
         server: The `viser.ViserServer`, for controls of one's own.
         drawing: The scene in the page.
-        moments: What has been added so far.
+        steps: What has been added so far.
+        scores: F1 after each, of vertices and edges together, or None where the ground truth is not known.
         working: Held by whoever runs compiled kernels, which not every threading layer lets two threads do.
 
     Raises:
@@ -67,44 +68,41 @@ class Page:
         self.working = RLock()
         self.server: Any = _serve(title, host, port)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
-        self.moments: list[Moment] = []
+        self.steps: list[Step] = []
+        self.scores: list[float | None] = []
         self.drawing = SceneDrawing(self.server, self.describe)
         self._support, self._small = support or SupportConfig(), small
         self._shown, self._chosen = -1, ""
-        self._staged: Moment | None = None
+        self._staged: Step | None = None
         self._graph_drawn: SupportGraph | None = None
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
         self._build()
-
-    @property
-    def shown(self) -> Moment | None:
-        """The moment on display."""
-        return self.moments[self._shown] if self.moments else None
 
     def say(self, text: str) -> None:
         """Say something at the top of the page, in place of what was said before."""
         self._notice.content = cell_html(Section("", text))
         self._notice.visible = bool(text)
 
-    def add(self, moment: Moment) -> None:
-        """Add a moment, or put it in place of that of the same view; who looks at the newest goes along."""
-        newest = self._shown == len(self.moments) - 1
-        self.moments[moment.step.index : moment.step.index + 1] = [moment.reduced()]
+    def add(self, step: Step, f1: float | None = None) -> None:
+        """Add a step, or put it in place of that of the same view; who looks at the newest goes along."""
+        newest = self._shown == len(self.steps) - 1
+        self.steps[step.index : step.index + 1] = [reduced(step)]
+        self.scores[step.index : step.index + 1] = [f1]
         if newest:
-            self._shown = len(self.moments) - 1
-        if len(self.moments) == 1:
-            self._look_at(moment.step)
+            self._shown = len(self.steps) - 1
+        if len(self.steps) == 1:
+            self._look_at(step)
         self.redraw()
 
     def update(self, scene: Scene) -> None:
         """Add what a scene knows by now; the slider goes back to what it knew before."""
         if scene.views:
-            self.add(moment_of_scene(scene))
+            self.add(step_of_scene(scene))
 
     def go_to(self, index: int) -> None:
-        """Show the moment after a view."""
-        index = min(max(index, 0), len(self.moments) - 1)
+        """Show what was known after a view."""
+        index = min(max(index, 0), len(self.steps) - 1)
         if index != self._shown:
             self._shown = index
             self._staged = None
@@ -115,10 +113,10 @@ class Page:
         self._chosen = object_id
         self.redraw()
 
-    def stage(self, moment: Moment | None) -> None:
-        """Show a moment that is none of those after a view; None goes back to those."""
-        if moment is not self._staged:
-            self._staged = moment
+    def stage(self, step: Step | None) -> None:
+        """Show a step that is none of those added; None goes back to those."""
+        if step is not self._staged:
+            self._staged = step
             self.redraw()
 
     def redraw(self) -> None:
@@ -198,24 +196,25 @@ class Page:
         camera.fov = 0.72  # Narrow, so that what is near does not hide what is far [rad].
 
     def _draw(self) -> None:
-        moment, chosen = self._staged or self.shown, self._chosen
-        if moment is None:
+        steps, scores, chosen = self.steps[: self._shown + 1], self.scores, self._chosen
+        if not steps:
             return
-        steps = [m.step for m in self.moments[: self._shown + 1]]
+        step, f1 = steps[-1], scores[self._shown]
+        if self._staged is not None:
+            step, f1 = self._staged, scores[-1]
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
-        self.drawing.show(moment, steps, chosen=chosen, **look)
-        last = len(self.moments) - 1
+        self.drawing.show(step, steps, chosen=chosen, **look)
+        last = len(self.steps) - 1
         self._slider.max = max(last, 1)
         self._slider.disabled = last == 0
         self._slider.value = self._shown
-        self._told.content = describe_view(moment, len(self.moments))
-        graph = moment.step.graph
+        self._told.content = describe_view(step, f1, last)
+        graph = step.graph
         if graph is not self._graph_drawn:
             self._graph_drawn = graph
             self._graph.content = draw_cell(graph)
-        scores = np.array([np.nan if m.score is None else m.score for m in self.moments])
-        if not np.isnan(scores).all():
-            self._chart.data = np.arange(len(scores), dtype=np.float64), scores
+        if any(f1 is not None for f1 in scores):
+            self._chart.data = np.arange(len(scores), dtype=np.float64), np.array(scores, dtype=np.float64)
             self._chart.visible, self._no_chart.visible = True, False
         if chosen:
             with self.working:
@@ -225,18 +224,18 @@ class Page:
 # What is said beside the scene
 
 
-def describe_view(moment: Moment, views: int) -> str:
+def describe_view(step: Step, f1: float | None, last: int) -> str:
     """Say what a view brought, and where to look next."""
-    step, decision = moment.step, moment.step.decision
+    decision = step.decision
     facts = [("known", census(step.graph)), ("points", f"{len(step.cloud):,}")]
-    if moment.score is not None:
-        facts.append(("F1", f"{moment.score:.3f}"))
+    if f1 is not None:
+        facts.append(("F1", f"{f1:.3f}"))
     if decision is not None:
         figures = f"saliency {decision.saliency:.2f} − cost {decision.cost:.2f} = {decision.score:.2f}"
         facts += [("next", decision.why), ("score", figures)]
     if step.stop is not None:
         facts.append(("done", step.stop))
-    return cell_html(Section(f"View {step.index}", f"of {views - 1} · {step.name}", facts=facts))
+    return cell_html(Section(f"View {step.index}", f"of {last} · {step.name}", facts=facts))
 
 
 def _describe_signs() -> str:
@@ -278,7 +277,7 @@ def describe_object(graph: SupportGraph, object_id: str, config: SupportConfig) 
 
 
 class PageProcess:
-    """A page like `Page`, to which moments can be added and no more.
+    """A page like `Page`, to which steps can be added and no more.
 
     Args:
         title: What the page is of.
@@ -306,9 +305,9 @@ class PageProcess:
             raise InputError("viewer", f"cannot be served at port {port}", "choose another one") from None
         self._sender = ThreadPoolExecutor(1, "viewer")
 
-    def add(self, moment: Moment) -> None:
-        """Add a moment; it is sent as soon as those before it are, unless the page is gone."""
-        self._sender.submit(lambda: self._connection.send(moment.reduced()))
+    def add(self, step: Step, f1: float | None = None) -> None:
+        """Add a step; it is sent as soon as those before it are, unless the page is gone."""
+        self._sender.submit(lambda: self._connection.send((reduced(step), f1)))
 
     def close(self) -> None:
         """Stop serving the page, once all that was added has been sent."""
@@ -318,7 +317,7 @@ class PageProcess:
 
 
 def _show_sent(connection: Connection, title: str, support: SupportConfig, port: int) -> None:
-    """Serve a page and show the moments that come, until there are no more."""
+    """Serve a page and show the steps that come, until there are no more."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(10)  # Where cores are scarce, the loop goes first.
@@ -326,7 +325,7 @@ def _show_sent(connection: Connection, title: str, support: SupportConfig, port:
     connection.send(page.url)
     try:
         while True:
-            page.add(connection.recv())
+            page.add(*connection.recv())
     except EOFError:
         page.close()
 
