@@ -164,9 +164,9 @@ def record_frame(scene: str, folder: Path, config: Config, seed: int) -> None:
     write_recording(folder, [replace(view, labels=labels, T_world_camera=None)])
     names = {simulated.object_bodies[k]: f"object{k}" for k in kept} | {simulated.table: "table"}
     edges = tuple(
-        TrueEdge(supporter=names[e["supporter"]], supported=names[e["supported"]], kind=e["kind"])
+        TrueEdge(names[e.supporter], names[e.supported], e.kind)
         for e in ground_truth(simulated).edges
-        if e["supporter"] in names and e["supported"] in names
+        if e.supporter in names and e.supported in names
     )
     write_truth(GroundTruth(("table", *(f"object{k}" for k in kept)), edges), folder / "gt.json")
 

@@ -67,8 +67,8 @@ def test_the_baseline_is_of_what_is_measured_and_every_scene_is_built_in():
 
 def test_a_recording_is_scored_frame_by_frame(recording):
     edges = (
-        TrueEdge(supporter="table", supported="object1", kind="bottom-up"),
-        TrueEdge(supporter="object1", supported="object2", kind="bottom-up"),
+        TrueEdge("table", "object1"),
+        TrueEdge("object1", "object2"),
     )
     write_truth(GroundTruth(("table", "object1", "object2"), edges), recording / "gt.json")
     scored = accuracy.run(accuracy.Task(accuracy.Episode(str(recording)), frames=True))

@@ -106,7 +106,7 @@ def test_a_built_in_scene_is_explored_by_name(tmp_path):
 
     scene = load_scene("tower")
     labels = {"table": "o0"} | {body: f"o{k}" for k, body in scene.object_bodies.items()}
-    truth = {(labels[e["supporter"]], labels[e["supported"]]) for e in ground_truth(scene).edges}
+    truth = {(labels[a], labels[b]) for a, b in ground_truth(scene).pairs}
     assert {(a, b) for a, b, _ in found} == truth
 
 

@@ -17,8 +17,7 @@ from caryatid.geometry.shapes import Box
 from caryatid.simulation import (
     GroundTruth,
     SimulatedScene,
-    bounds,
-    contains,
+    TrueEdge,
     generate,
     ground_truth,
     list_scenes,
@@ -32,7 +31,7 @@ from caryatid.simulation import (
 )
 from caryatid.simulation.scenes import DESIGNED, is_builtin
 from caryatid.simulation.truth import mean_contact_forces
-from caryatid.simulation.world import scene_from_spec, settle, state_of
+from caryatid.simulation.world import bounds, contains, scene_from_spec, state_of
 
 SHARED = Path(__file__).parents[2] / "shared" / "scenes"
 NEEDS_SHARED = pytest.mark.skipif(not SHARED.is_dir(), reason="../shared is absent")
@@ -164,6 +163,7 @@ def test_a_table_laid_on_its_side_axis_is_still_level():
         (mjcf(TABLE + CUBE.replace(' name="cube"', "")), "has no name"),
         (mjcf(TABLE + SHAPELESS), "body 'a' has no geom"),
         (mjcf(TABLE + CUBE.replace('pos="0 0 0.78"', 'pos="0 nan 0.78"')), "NaN"),
+        (mjcf(TABLE + CUBE).replace("<asset>", '<option gravity="0 0 -1e15"/><asset>'), "unstable"),
     ],
 )  # fmt: skip
 def test_bad_scenes_say_what_is_wrong_in_one_line(
@@ -176,16 +176,6 @@ def test_bad_scenes_say_what_is_wrong_in_one_line(
     assert str(path) in str(error.value)
     assert "\n" not in str(error.value)
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_an_unstable_simulation_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(tmp_path)
-    scene = scene_of(TABLE + CUBE)
-    data = state_of(scene)
-    data.qpos[0] = np.nan
-    with pytest.raises(InputError, match="unstable"):
-        settle(scene.model, data, "test.xml", PhysicsConfig())
-    assert list(tmp_path.iterdir()) == []
 
 
 @NEEDS_SHARED
@@ -203,7 +193,7 @@ def test_scanned_objects():
 
 
 def edges_of(scene: SimulatedScene) -> set[tuple[str, str, str]]:
-    return {(e["supporter"], e["supported"], e["kind"]) for e in ground_truth(scene).edges}
+    return {(e.supporter, e.supported, e.kind) for e in ground_truth(scene).edges}
 
 
 def named(supporter, supported, kind="bottom-up") -> tuple[str, str, str]:
@@ -298,19 +288,16 @@ def test_names():
 @NEEDS_SHARED
 @pytest.mark.slow
 def test_physics_agrees_with_the_given_ground_truth():
-    given, found, common, same_kind = 0, 0, 0, 0
+    given, found, common = 0, 0, 0
     for folder in sorted(SHARED.iterdir()):
         reference, computed = read_truth(folder / "gt.json"), ground_truth(load_scene(folder))
         assert computed.vertices == reference.vertices
-        kinds = {(e["supporter"], e["supported"]): e["kind"] for e in reference.edges}
-        given += len(reference.pairs)
-        found += len(computed.pairs)
-        common += len(reference.pairs & computed.pairs)
-        same_kind += sum(kinds.get((e["supporter"], e["supported"])) == e["kind"] for e in computed.edges)
+        given += len(reference.edges)
+        found += len(computed.edges)
+        common += len({*reference.edges} & {*computed.edges})
     assert given > 100
     assert common >= 0.98 * given
     assert found - common <= 0.02 * given
-    assert same_kind >= 0.98 * given
 
 
 def test_forces_carry_the_weight():
@@ -338,7 +325,7 @@ def test_truth_files_come_back_and_the_kind_may_be_missing(tmp_path: Path):
     edge = {"supporter": "table", "supported": "object0", "kind": "bottom-up"}
     assert json.loads(path.read_text())["edges"][0] == edge
     easy = read_truth(write(path, json.dumps(EASY)))
-    assert easy == GroundTruth(("table", "a"), (edge | {"supported": "a"},))
+    assert easy == GroundTruth(("table", "a"), (TrueEdge("table", "a"),))
     assert easy.pairs == {("table", "a")}
 
 

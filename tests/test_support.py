@@ -509,7 +509,7 @@ def test_true_shapes_of_the_shared_primitive_scenes_give_their_edges():
             SceneObject(names[k], k, shape, "object" if k else "support_surface")
             for k, shape in {0: static_boxes(loaded)[0], **true_shapes(loaded)}.items()
         ]
-        truth = {(e["supporter"], e["supported"]) for e in read_truth(folder / "gt.json").edges}
+        truth = read_truth(folder / "gt.json").pairs
         found = set(edges(infer(objects, CONFIG)))
         right += len(found & truth)
         wrong += len(found - truth)

@@ -23,7 +23,6 @@ from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.simulation.truth import ground_truth, read_truth
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
 """Endings of files that are clouds."""
@@ -86,10 +85,9 @@ def open_source(
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
     make = find_robot(robot)
     scene = load_scene(source)
-    truth_file = Path(scene.source).parent / "gt.json"
-    truth = read_truth(truth_file) if truth_file.is_file() else ground_truth(scene)
+    truth = true_scene_from_simulation(scene)
     stage = make_simulation(scene, config, noise=noise, seed=seed, robot=make)
-    return Source(scene.name, stage.camera, stage.robot, true_scene_from_simulation(scene, truth))
+    return Source(scene.name, stage.camera, stage.robot, truth)
 
 
 def open_recording(folder: str, config: Config, segmentation: SegmentationMethod | None) -> Dataset:

@@ -27,7 +27,6 @@ from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.planning.planners import offered
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, list_scenes, load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.simulation.truth import ground_truth, read_truth
 from caryatid.simulation.world import SimulatedScene
 
 OrderName = Literal["", "one hand", "two hands", "highest first", "random", "true graph"]
@@ -185,8 +184,7 @@ def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene
     if content and Path(scene).is_dir() and content_of(scene) != content:
         raise InputError(scene, "its files are not those this run was planned with", "start again")
     simulated = load_scene(scene)
-    truth = ground_truth(simulated) if is_builtin(scene) else read_truth(Path(scene) / TRUTH_FILE)
-    return simulated, true_scene_from_simulation(simulated, truth)
+    return simulated, true_scene_from_simulation(simulated)
 
 
 def take_apart(

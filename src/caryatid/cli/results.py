@@ -86,7 +86,7 @@ class Evaluate(options.Command):
         from caryatid.cli.output import table
         from caryatid.evaluation.truths import evaluate_run
 
-        views = [view.to_json() for view in evaluate_run(self.run, self.truth)]
+        views = [{"view": n} | score.to_json() for n, score in enumerate(evaluate_run(self.run, self.truth))]
         names = ("precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou")
         rows = [[f"{view['view']:02d}", *(f"{view[name]:.3f}" for name in names)] for view in views]
         columns = ("view", "precision", "recall", "F1", "edge precision", "edge recall", "mean IoU")

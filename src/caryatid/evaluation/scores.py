@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Final
 
 import numpy as np
@@ -65,10 +65,10 @@ class Score:
         precision: Eq. 4, vertices and edges together [1].
         recall: Eq. 5, vertices and edges together [1].
         f1: Their harmonic mean [1].
-        vertex_precision: Vertices alone, the table included [1].
-        vertex_recall: Vertices alone [1].
         edge_precision: Edges alone [1].
         edge_recall: Edges alone [1].
+        vertex_precision: Vertices alone, the table included [1].
+        vertex_recall: Vertices alone [1].
         mean_iou: Mean IoU of the matched objects, the table left out; 0 where none is matched [1].
         matches: Extracted vertex to the true vertex it is.
         ious: IoU of each matched object [1].
@@ -77,10 +77,10 @@ class Score:
     precision: float
     recall: float
     f1: float
-    vertex_precision: float
-    vertex_recall: float
     edge_precision: float
     edge_recall: float
+    vertex_precision: float
+    vertex_recall: float
     mean_iou: float
     matches: Mapping[str, str] = field(default_factory=dict)
     ious: Mapping[str, float] = field(default_factory=dict)
@@ -94,6 +94,10 @@ class Score:
     def edge_f1(self) -> float:
         """F1 of edges alone [1]."""
         return _harmonic_mean(self.edge_precision, self.edge_recall)
+
+    def to_json(self) -> dict[str, float]:
+        """What `caryatid evaluate --json` writes of a view."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("matches", "ious")}
 
 
 def score(
@@ -185,7 +189,7 @@ def _score_matches(
     of_edges = _ratios(e, len(found_edges), len(edges))
     mean_iou = float(np.mean(list(ious.values()))) if ious else 0.0
     f1 = _harmonic_mean(precision, recall)
-    return Score(precision, recall, f1, *of_vertices, *of_edges, mean_iou, matches, ious)
+    return Score(precision, recall, f1, *of_edges, *of_vertices, mean_iou, matches, ious)
 
 
 def volume_ious(

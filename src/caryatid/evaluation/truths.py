@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -13,37 +12,26 @@ from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueObject, TrueScene, score, score_masks
 from caryatid.io.bop import read_recording
 from caryatid.simulation import world
-from caryatid.simulation.scenes import load_scene
-from caryatid.simulation.truth import GroundTruth, read_truth
+from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, load_scene
+from caryatid.simulation.truth import GroundTruth, ground_truth, read_truth
 from caryatid.simulation.world import SimulatedScene
 from caryatid.steps import read_run
 
 
-@dataclass(frozen=True, slots=True)
-class ViewScore:
-    """Score of the fused graph after one view.
+def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None = None) -> TrueScene:
+    """Build the truth of a simulated scene: its solids, and edges from gt.json.
 
-    Attributes:
-        view: Its number, 0 for the first.
-        score: How it compares with the truth.
-    """
-
-    view: int
-    score: Score
-
-    def to_json(self) -> dict[str, int | float]:
-        """One entry of `views` in what `caryatid evaluate --json` writes."""
-        figures = ["precision", "recall", "f1", "edge_precision", "edge_recall"]
-        figures += ["vertex_precision", "vertex_recall", "mean_iou"]
-        return {"view": self.view} | {name: getattr(self.score, name) for name in figures}
-
-
-def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth) -> TrueScene:
-    """Build the truth of a simulated scene: solids from the model, edges from gt.json.
+    Args:
+        scene: The scene.
+        truth: What gt.json holds; None = read it beside the scene's file, or ask physics where there is none.
 
     Raises:
         InputError: The truth names a body the scene does not have.
     """
+    if truth is None:
+        file = Path(scene.source).parent / TRUTH_FILE
+        known = file.is_file() and not is_builtin(scene.source)
+        truth = read_truth(file) if known else ground_truth(scene)
     labels = {body: label for label, body in scene.object_bodies.items()}
     objects = []
     for name in truth.vertices:
@@ -61,20 +49,10 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth) -> Tru
     return TrueScene(truth.vertices, frozenset(truth.pairs), tuple(objects), table, height)
 
 
-def read_true_scene(folder: Path) -> TrueScene:
-    """Read a scene folder, `scene.xml` with `gt.json`, as a truth.
-
-    Raises:
-        InputError: A file is missing or broken, or the two do not fit each other.
-    """
-    truth = read_truth(folder / "gt.json")
-    return true_scene_from_simulation(load_scene(folder / "scene.xml"), truth)
-
-
 def evaluate_run(
     run_folder: str | Path, truth_folder: str | Path, config: EvaluationConfig | None = None
-) -> tuple[ViewScore, ...]:
-    """Score every view of a run: what `caryatid evaluate RUN GT` does.
+) -> tuple[Score, ...]:
+    """Score every view of a run, in their order: what `caryatid evaluate RUN GT` does.
 
     Args:
         run_folder: A run.
@@ -88,11 +66,12 @@ def evaluate_run(
     run = read_run(run_folder)
     if not folder.is_dir():
         raise InputError(folder, "is not a folder", "give a scene folder or a recording with gt.json")
-    if (folder / "scene.xml").is_file():
-        scene = read_true_scene(folder)
+    if (folder / SCENE_FILE).is_file():
+        truth = read_truth(folder / TRUTH_FILE)
+        scene = true_scene_from_simulation(load_scene(folder / SCENE_FILE), truth)
         scores = [score(view.graph, scene, config=config) for view in run.views]
     elif (folder / "scene_camera.json").is_file():
-        truth, recording = read_truth(folder / "gt.json"), read_recording(folder)
+        truth, recording = read_truth(folder / TRUTH_FILE), read_recording(folder)
         # A recording of one frame needs no names.
         lone = recording.frames[0] if len(recording) == 1 else None
         true_labels = [(lone or recording.frame(view.name)).load_labels() for view in run.views]
@@ -104,4 +83,4 @@ def evaluate_run(
     else:
         why = "has neither scene.xml nor scene_camera.json"
         raise InputError(folder, why, "give a scene folder or a recording")
-    return tuple(ViewScore(number, result) for number, result in enumerate(scores))
+    return tuple(scores)

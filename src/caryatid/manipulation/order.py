@@ -1,19 +1,31 @@
-"""A safe order to take objects away: each step rehearsed in physics before it is chosen."""
+"""A safe order to take objects away: each step rehearsed in physics before it is chosen.
+
+What has been extracted is not at rest in physics to the millimetre, and friction and weights are not known.
+So a lift is rehearsed in several scenes, drawn by the shapes' uncertainty, each of which is let come to rest
+first. An object that does not, though the real one was seen at rest, is wrongly shaped or rests on what was
+not seen: there it is held, and the support graph alone says what it needs.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
+import mujoco
 import networkx as nx
 import numpy as np
+from numpy.typing import NDArray
 
 from caryatid.config import Config
 from caryatid.errors import InputError
-from caryatid.graph import SupportGraph
-from caryatid.manipulation.rehearsal import Rehearsal, Trial
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject, SupportGraph
 from caryatid.runtime.display import Pictured
+from caryatid.simulation.lifting import ASIDE, Lift, Lifting
+from caryatid.simulation.world import TABLE, Solid, add_solid, empty_spec, quaternion, strayed
+from caryatid.support.plausibility import drawn, reconcile
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +107,7 @@ def plan_order(
         InputError: There is no support surface, or no object to take, or no such goal.
     """
     config = config or Config()
-    rehearsal = Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
+    rehearsal = _Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
     if goal is not None and goal not in rehearsal.ids:
         raise InputError(goal, "is not an object of the graph", f"there are {', '.join(rehearsal.ids)}")
     steps: list[TakeStep] = []
@@ -117,7 +129,7 @@ def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:
     return sorted(left, key=lambda i: (i in carrying, -height[i], i))
 
 
-def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: Rehearsal) -> list[str]:
+def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: _Rehearsal) -> list[str]:
     """The goal if it can be lifted; else what its lift disturbs, and what theirs do, the nearest first."""
     found = [goal]
     for object_id in found:
@@ -128,9 +140,9 @@ def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: 
     return found
 
 
-def _safest(rehearsal: Rehearsal, wanted: Sequence[str], hands: int) -> tuple[Trial, list[Trial]]:
+def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_Trial, list[_Trial]]:
     """The first lift that is safe, with one hand before two; else the least risky; and those tried before."""
-    tried: list[Trial] = []
+    tried: list[_Trial] = []
     for object_id in wanted:
         trial = rehearsal.try_lift(object_id)
         if trial.risk == 0.0:
@@ -146,14 +158,14 @@ def _safest(rehearsal: Rehearsal, wanted: Sequence[str], hands: int) -> tuple[Tr
     return best, tried
 
 
-def _with_hold(rehearsal: Rehearsal, tried: Sequence[Trial]) -> Iterator[Trial]:
+def _with_hold(rehearsal: _Rehearsal, tried: Sequence[_Trial]) -> Iterator[_Trial]:
     """The same lifts while the other hand holds one of those that were disturbed, the most often first."""
     for trial in tried:
         for held in sorted(trial.harmed, key=lambda i: (-trial.harmed[i], i)):
             yield rehearsal.try_lift(trial.object_id, [held])
 
 
-def _step(graph: SupportGraph, trial: Trial, left: Sequence[str], draws: int) -> TakeStep:
+def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], draws: int) -> TakeStep:
     carried = [s.supported for s in graph.supports if s.supporter == trial.object_id and s.supported in left]
     what = f"supports {', '.join(carried)}" if carried else "supports nothing that is left"
     with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
@@ -163,7 +175,7 @@ def _step(graph: SupportGraph, trial: Trial, left: Sequence[str], draws: int) ->
     return TakeStep(trial.object_id, trial.hold, trial.risk == 0.0, trial.risk, why)
 
 
-def _refusal(trial: Trial, tried: Sequence[Trial]) -> str:
+def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
     """Say which objects stand in one another's way."""
     blocked = nx.DiGraph((t.object_id, i) for t in tried for i in t.harmed)
     try:
@@ -172,3 +184,126 @@ def _refusal(trial: Trial, tried: Sequence[Trial]) -> str:
         return f"no safe order: lifting {trial.object_id} disturbs {', '.join(trial.harmed)}"
     cycle = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
     return f"no safe order: {cycle}; whichever goes first"
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Trial:
+    """A lift rehearsed in every drawn scene: share in which others were disturbed, and share of each."""
+
+    object_id: str
+    hold: tuple[str, ...]
+    risk: float
+    harmed: dict[str, float]
+    lifts: tuple[Lift, ...]
+
+
+class _Rehearsal:
+    """Scenes in which to try lifts, and where their objects are once some have been taken."""
+
+    def __init__(
+        self, graph: SupportGraph, config: Config, rng: np.random.Generator, *, threads: int = 1
+    ) -> None:
+        if graph.support_surface is None:
+            raise InputError("graph", "has no support surface", "extract one; lifts need a table")
+        self.ids = tuple(o.id for o in graph.objects if o.role == "object")
+        if not self.ids:
+            raise InputError("graph", "has no objects", "there is nothing to take away")
+        self._graph, self._config, self._threads = graph, config, threads
+        self._trials: dict[tuple[str, ...], _Trial] = {}
+        specs = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
+        settled = self._each(lambda k: _settled(specs[k], self.ids, config))
+        self._liftings: list[Lifting] = [lifting for lifting, _, _ in settled]
+        # Of D scenes with N objects: which do not stay where they were seen (D, N), and all states (D, N, 7).
+        self._restless = np.stack([restless for _, restless, _ in settled])
+        self._states = np.stack([state for _, _, state in settled])
+
+    def left(self) -> list[str]:
+        """Ids of the objects that have not been taken yet."""
+        return [i for i, height in zip(self.ids, self._states[0, :, 2], strict=True) if height < ASIDE / 2.0]
+
+    def try_lift(self, object_id: str, hold: Collection[str] = ()) -> _Trial:
+        """Lift an object in every scene, others being held; nothing changes, and it is done only once."""
+        asked = (object_id, *sorted(hold))
+        if asked not in self._trials:
+            lifts = self._each(lambda k: self._lift(k, object_id, hold))
+            harm = np.stack([lift.disturbed for lift in lifts])
+            # What is held in a scene, because it does not stay there, must not lose a support of the graph.
+            needs = {s.supported for s in self._graph.supports if s.supporter == object_id} - set(hold)
+            harm |= self._restless & np.isin(self.ids, list(needs.intersection(self.left())))
+            shares = zip(self.ids, harm.mean(axis=0).tolist(), strict=True)
+            harmed = {i: share for i, share in shares if share > 0.0}
+            risk = float(harm.any(axis=1).mean())
+            self._trials[asked] = _Trial(object_id, tuple(hold), risk, harmed, tuple(lifts))
+        return self._trials[asked]
+
+    def take(self, trial: _Trial) -> None:
+        """Go on without an object whose lift was tried: where others moved, they are put back."""
+        index = self.ids.index(trial.object_id)
+        self._trials.clear()
+        moved = np.array([lift.disturbed.any() for lift in trial.lifts])
+        stays = self._restless | moved[:, None]
+        after = np.stack([lift.state for lift in trial.lifts])
+        self._states = np.where(stays[..., None], self._states, after)
+        self._states[:, index, :3] = (0.0, 0.0, ASIDE + index)
+
+    def _lift(self, k: int, object_id: str, hold: Collection[str]) -> Lift:
+        index = self.ids.index(object_id)
+        held = {self.ids.index(i) for i in hold} | set(np.flatnonzero(self._restless[k]).tolist())
+        return self._liftings[k].lift(
+            self._states[k], index, self._config.lift, held=held - {index}, to_the_end=False
+        )
+
+    def _each(self, do: Callable[[int], Any]) -> list[Any]:
+        """Do something for every scene, in order."""
+        with ThreadPoolExecutor(self._threads) as pool:
+            return list(pool.map(do, range(self._config.rehearsal.draws)))
+
+
+def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
+    """A `mujoco.MjSpec` of the extracted shapes, or of others as likely for a number above 0."""
+    objects = list(graph.objects)
+    if number > 0:
+        objects = [drawn(o, rng, config.plausibility) for o in objects]
+        objects = reconcile(objects, config.plausibility)
+    settings = config.rehearsal
+    frictions = rng.uniform(*settings.friction, len(objects))
+    densities = rng.uniform(*settings.density, len(objects))
+    if number == 0:
+        frictions[:], densities[:] = np.mean(settings.friction), np.mean(settings.density)
+    spec = empty_spec("rehearsal")
+    # Twice MuJoCo's own time step, which the implicit integrator bears, for half the time.
+    spec.option.timestep = 0.004
+    for o, friction, density in zip(objects, frictions, densities, strict=True):
+        if o.role == "support_surface":
+            _add_table(spec, o)
+        else:
+            add_solid(spec, o.id, Solid(o.shape, density, friction))
+    return spec
+
+
+def _add_table(spec: Any, table: SceneObject) -> None:
+    """The table, 10 cm larger on each side than what was seen of it.
+
+    It is slippery: contacts take the larger friction of two, and it is not to hide how slippery objects are.
+    """
+    T, extents = table.shape.T_world_object, table.shape.extents
+    up = int(np.argmax(np.abs(T[2, :3])))
+    half = extents / 2.0 + np.where(np.arange(3) == up, 0.0, 0.1)
+    body = spec.worldbody.add_body(name=TABLE, pos=T[:3, 3], quat=quaternion(T[:3, :3]))
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
+
+
+def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[Lifting, NDArray[np.bool_], Array]:
+    """Let a scene come to rest: what moves too far is put back and held, until nothing else does.
+
+    Returns:
+        The scene, which objects (N,) had to be held, and the state (N, 7) of all.
+    """
+    lifting = Lifting(spec, ids)
+    seen, restless = lifting.start, np.zeros(len(ids), dtype=np.bool_)
+    while True:
+        state = lifting.rest(seen, np.flatnonzero(restless).tolist(), config.rehearsal.settling)
+        moved = strayed(seen, state, config.lift.moved, config.lift.turned) & ~restless
+        if not moved.any():
+            return lifting, restless, np.where(restless[:, None], seen, state)
+        restless |= moved

@@ -23,9 +23,9 @@ from caryatid.simulation.world import (
     body_poses,
     bounds,
     build_spec,
-    displacement,
     scene_from_spec,
     state_of,
+    strayed,
     true_shapes,
 )
 
@@ -190,8 +190,8 @@ def _stands(scene: SimulatedScene, firm: Sequence[Solid], plan: _Plan, physics: 
     # Nothing moves by itself, not even slowly, while one would watch what taking an object away does.
     data = state_of(scene)
     mujoco.mj_step(scene.model, data, nstep=round(physics.removal_time / scene.model.opt.timestep))
-    distance, angle = displacement(body_poses(scene.data), body_poses(data))
-    return bool(distance.max() < physics.moved / 2.0 and angle.max() < np.deg2rad(physics.turned) / 2.0)
+    limits = physics.moved / 2.0, physics.turned / 2.0
+    return not strayed(body_poses(scene.data), body_poses(data), *limits).any()
 
 
 def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Solid:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import LiftConfig
 from caryatid.geometry.transforms import Array
-from caryatid.simulation.world import displacement, mujoco_warnings_ignored
+from caryatid.simulation.world import mujoco_warnings_ignored, strayed
 
 ASIDE = 50.0
 """How far up an object is put when it has been lifted [m]; nothing meets it there."""
@@ -108,18 +108,14 @@ class Lifting:
             segments = max(1, int(np.ceil(seconds / 0.25)))  # what falls is seen falling
             for _ in range(segments):
                 film.append(self._after(data, speed, seconds / segments, index))
-                disturbed |= watched & self.strayed(state, film[-1], config)
-                done = disturbed.any() or (speed == 0.0 and _at_rest(film))
-                if done and not to_the_end:
+                disturbed |= watched & strayed(state, film[-1], config.moved, config.turned)
+                # Contacts creep as slowly as by 0.2 mm or 0.2°.
+                at_rest = speed == 0.0 and not strayed(film[-2], film[-1], 2e-4, 0.2).any()
+                if not to_the_end and (at_rest or disturbed.any()):
                     return Lift(disturbed, np.array(film))
             if speed > 0.0:
                 self._put_aside(data, index)
         return Lift(disturbed, np.array(film))
-
-    def strayed(self, before: Array, after: Array, config: LiftConfig) -> NDArray[np.bool_]:
-        """Which objects (N,) moved or turned beyond the limits between two states (N, 7)."""
-        distance, angle = displacement(before, after)
-        return (distance > config.moved) | (angle > np.deg2rad(config.turned))
 
     def _data(self, state: Array, grasped: Collection[int]) -> Any:
         """MuJoCo's data for a state; what is grasped, or aside, is held where it is."""
@@ -188,9 +184,3 @@ def _with_hands(spec: Any, bodies: Sequence[str]) -> Any:
         weld.data = [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
     with mujoco_warnings_ignored():
         return spec.compile()
-
-
-def _at_rest(film: Sequence[Array]) -> bool:
-    """Whether nothing lately moved by 0.2 mm or turned by 0.2°: contacts creep as slowly."""
-    distance, angle = displacement(*film[-2:])
-    return bool((distance < 2e-4).all() and (angle < np.deg2rad(0.2)).all())

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict
 
 import mujoco
 import numpy as np
@@ -14,12 +13,14 @@ from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind
 from caryatid.io.json_files import json_text, parse_json, read_json
-from caryatid.simulation.world import SimulatedScene, body_poses, displacement, state_of
+from caryatid.io.staging import write_file
+from caryatid.simulation.world import SimulatedScene, body_poses, state_of, strayed
 
 _REMEDY = 'write {"vertices": […], "edges": [{"supporter", "supported", "kind"}, …]}'
 
 
-class TrueEdge(TypedDict):
+@dataclass(frozen=True, slots=True)
+class TrueEdge:
     """An edge of gt.json.
 
     Attributes:
@@ -30,7 +31,7 @@ class TrueEdge(TypedDict):
 
     supporter: str
     supported: str
-    kind: Kind
+    kind: Kind = "bottom-up"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class GroundTruth:
     @property
     def pairs(self) -> set[tuple[str, str]]:
         """The directed pairs (supporter, supported)."""
-        return {(edge["supporter"], edge["supported"]) for edge in self.edges}
+        return {(edge.supporter, edge.supported) for edge in self.edges}
 
 
 def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> GroundTruth:
@@ -66,20 +67,18 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
     config = config or PhysicsConfig()
     names = {0: scene.table, **scene.object_bodies}
     forces = mean_contact_forces(scene)
-    removals = {a: displaced_without(scene, a, config) for a in {a for a, _ in forces} - {0}}
+    falling = {a: _displaced_without(scene, a, config) for a in {a for a, _ in forces} - {0}}
     gravity = np.linalg.norm(scene.model.opt.gravity)
     weights = {a: scene.model.body_subtreemass[scene.body_id(a)] * gravity for a in names}
     kinds: dict[tuple[int, int], Kind] = {}
     for (a, b), force in forces.items():
         if b != 0 and force[2] > config.force_share * weights[b]:
             kinds[a, b] = "bottom-up"
-        elif a != 0 and b != 0:
-            distance, angle = removals[a][b]
-            if distance > config.moved or angle > np.deg2rad(config.turned):
-                # A force nearer to the horizontal than 30° leans, a steeper one that points down presses.
-                steep = -force[2] > np.sin(np.deg2rad(30.0)) * np.linalg.norm(force)
-                kinds[a, b] = "top-down" if steep else "lean"
-    edges = [TrueEdge(supporter=names[a], supported=names[b], kind=kinds[a, b]) for a, b in sorted(kinds)]
+        elif a != 0 and b in falling[a]:
+            # A force nearer to the horizontal than 30° leans, a steeper one that points down presses.
+            steep = -force[2] > np.sin(np.deg2rad(30.0)) * np.linalg.norm(force)
+            kinds[a, b] = "top-down" if steep else "lean"
+    edges = [TrueEdge(names[a], names[b], kinds[a, b]) for a, b in sorted(kinds)]
     return GroundTruth(tuple(names.values()), tuple(edges))
 
 
@@ -110,19 +109,8 @@ def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
     return {pair: total / steps for pair, total in sums.items()}
 
 
-def displaced_without(
-    scene: SimulatedScene, label: int, config: PhysicsConfig
-) -> dict[int, tuple[float, float]]:
-    """Take one object away and measure how far the others have moved when the time is over.
-
-    Args:
-        scene: The scene; its state is not changed.
-        label: The object to take away.
-        config: How long to watch.
-
-    Returns:
-        Distance [m] and angle [rad] of each other object, by label.
-    """
+def _displaced_without(scene: SimulatedScene, label: int, config: PhysicsConfig) -> set[int]:
+    """Which other objects have moved beyond the limits a while after one is taken away."""
     data = state_of(scene)
     joint = int(scene.model.body_jntadr[scene.body_id(label)])
     # 100 m up it falls 5 m in the second the others are watched.
@@ -133,21 +121,8 @@ def displaced_without(
     before = body_poses(data)[bodies]
     mujoco.mj_step(scene.model, data, nstep=max(1, round(config.removal_time / scene.model.opt.timestep)))
     mujoco.mj_kinematics(scene.model, data)
-    distance, angle = displacement(before, body_poses(data)[bodies])
-    return dict(zip(others, zip(distance.tolist(), angle.tolist(), strict=True), strict=True))
-
-
-@dataclass(frozen=True)
-class _Edge:
-    supporter: str
-    supported: str
-    kind: Kind = "bottom-up"
-
-
-@dataclass(frozen=True)
-class _Document:
-    vertices: tuple[str, ...]
-    edges: tuple[_Edge, ...]
+    moved = strayed(before, body_poses(data)[bodies], config.moved, config.turned)
+    return {other for other, far in zip(others, moved, strict=True) if far}
 
 
 def read_truth(path: Path) -> GroundTruth:
@@ -156,16 +131,15 @@ def read_truth(path: Path) -> GroundTruth:
     Raises:
         InputError: The file is missing, is no JSON, or its edges do not fit its vertices.
     """
-    read = parse_json(_Document, read_json(path, _REMEDY), path, _REMEDY)
-    if not read.vertices:
+    truth = parse_json(GroundTruth, read_json(path, _REMEDY), path, _REMEDY)
+    if not truth.vertices:
         raise InputError(path, "'vertices' is empty", _REMEDY)
-    if len(set(read.vertices)) != len(read.vertices):
+    if len(set(truth.vertices)) != len(truth.vertices):
         raise InputError(path, "'vertices' names a body twice", "name each body once")
-    for name in [name for edge in read.edges for name in (edge.supporter, edge.supported)]:
-        if name not in read.vertices:
+    for name in [name for edge in truth.edges for name in (edge.supporter, edge.supported)]:
+        if name not in truth.vertices:
             raise InputError(path, f"names {name!r}, which is no vertex", "name one of the vertices")
-    edges = [TrueEdge(supporter=e.supporter, supported=e.supported, kind=e.kind) for e in read.edges]
-    return GroundTruth(read.vertices, tuple(edges))
+    return truth
 
 
 def write_truth(truth: GroundTruth, path: Path) -> None:
@@ -174,7 +148,4 @@ def write_truth(truth: GroundTruth, path: Path) -> None:
     Raises:
         InputError: The file cannot be written.
     """
-    try:
-        path.write_text(json_text(asdict(truth)), encoding="utf-8")
-    except OSError as error:
-        raise InputError(path, f"cannot be written ({error.strerror})", "choose another place") from None
+    write_file(path, json_text({"vertices": truth.vertices, "edges": truth.edges}).encode())

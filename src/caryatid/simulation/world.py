@@ -56,23 +56,11 @@ class SimulatedScene:
     at_rest: bool
 
     def body_id(self, label: int) -> int:
-        """MuJoCo's number of the body with this label; 0 is the table.
-
-        Raises:
-            InputError: No object carries the label.
-        """
-        if label != 0 and label not in self.object_bodies:
-            raise InputError(
-                self.source, f"has no object with label {label}", f"labels are 1…{len(self.object_bodies)}"
-            )
-        return int(self.model.body(self.object_bodies.get(label, self.table)).id)
+        """MuJoCo's number of the body with this label; 0 is the table."""
+        return int(self.model.body(self.object_bodies[label] if label else self.table).id)
 
     def geoms(self, label: int) -> list[int]:
-        """Geoms of the object with this label, or of the table with 0, bodies welded to it included.
-
-        Raises:
-            InputError: No object carries the label.
-        """
+        """Geoms of the object with this label, or of the table with 0, bodies welded to it included."""
         inside = np.isin(self.model.geom_bodyid, _subtree(self.model, self.body_id(label)))
         return np.flatnonzero(inside if label == 0 else self.geom_labels == label).tolist()
 
@@ -122,27 +110,16 @@ def scene_from_spec(
     if unseen := set(names) - set(geom_labels.tolist()):
         raise InputError(source, f"body '{names[min(unseen)]}' has no geom", "give every object a shape")
     data = mujoco.MjData(model)
-    at_rest = settle(model, data, source, config or PhysicsConfig(), least=least)
+    at_rest = _settle(model, data, source, config or PhysicsConfig(), least=least)
     return SimulatedScene(
         model, data, spec, name, source, names, TABLE, geom_labels.astype(np.int32), at_rest
     )
 
 
-def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float = 0.0) -> bool:
-    """Simulate until nothing moves, in place; leave a state that is at rest exactly as it is.
+def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float) -> bool:
+    """Simulate in place until nothing moves, and say whether that was in time.
 
-    Args:
-        model: MuJoCo model.
-        data: Its state, changed to the settled one, velocities zero.
-        source: What to call it in the error.
-        config: When an object is at rest, and how long to wait for it.
-        least: Time simulated in any case [s].
-
-    Returns:
-        Whether rest was reached in time.
-
-    Raises:
-        InputError: The simulation blew up.
+    A state that is at rest stays exactly as it is, unless a time `least` [s] is to be simulated in any case.
     """
     window = max(1, round(config.rest_window / model.opt.timestep))
     kinds = mujoco.mjtWarning
@@ -160,8 +137,7 @@ def settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: 
                 raise InputError(
                     source, "its simulation is unstable", "shorten the time step or mend overlapping bodies"
                 )
-            distance, angle = displacement(poses, body_poses(data))
-            if distance.max() <= config.rest_distance and angle.max() <= np.deg2rad(config.rest_angle):
+            if not strayed(poses, body_poses(data), config.rest_distance, config.rest_angle).any():
                 data.qpos[:] = before
                 at_rest = True
                 break
@@ -177,11 +153,11 @@ def body_poses(data: Any) -> Array:
     return np.hstack([data.xpos, data.xquat])
 
 
-def displacement(before: Array, after: Array) -> tuple[Array, Array]:
-    """Distances (N,) [m] and angles (N,) [rad] between poses (N, 7): positions and quaternions."""
+def strayed(before: Array, after: Array, moved: float, turned: float) -> NDArray[np.bool_]:
+    """Which (N,) of poses (N, 7), positions and quaternions, moved [m] or turned [deg] by more than that."""
     cosine = np.abs(np.einsum("ni,ni->n", before[:, 3:], after[:, 3:]))
     angle = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
-    return np.linalg.norm(after[:, :3] - before[:, :3], axis=1), angle
+    return (np.linalg.norm(after[:, :3] - before[:, :3], axis=1) > moved) | (angle > np.deg2rad(turned))
 
 
 def state_of(scene: SimulatedScene) -> Any:
