@@ -75,26 +75,24 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
 
 def draw_conditions(summary: pd.DataFrame, measure: str, heading: str) -> Figure:
     """Draw a measure under each condition, the methods below each other."""
-    whole = summary[summary["family"] == ""]
     curves = {
         f"{condition}: {method}": curve
-        for condition, group in whole.groupby("condition", sort=False)
+        for condition, group in conditions_of(summary)
         for method, curve in curves_of(group, measure).items()
     }
     caption = f"{heading} under each condition: mean over scenes, with intervals."
     return _figure(f"{measure} by condition", caption, len(curves), _rows(curves, heading))
 
 
+def conditions_of(summary: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Each condition, and the rows of all its scenes together."""
+    yield from summary[summary["family"] == ""].groupby("condition", sort=False)
+
+
 def curves_of(group: pd.DataFrame, quantity: str) -> Curves:
     """Value, low and high by view of each method that has this quantity."""
     rows = group[group["quantity"] == quantity]
     return {str(method): own.set_index("at") for method, own in rows.groupby("method", sort=False)}
-
-
-def told_views(group: pd.DataFrame, quantity: str) -> list[float]:
-    """Views that tables and figures tell of: 1, 2, 3, 5 and 10 as far as they exist, and the last."""
-    last = max(group["at"][group["quantity"] == quantity], default=0)
-    return sorted({v for v in (1, 2, 3, 5, 10, last) if 0 < v <= last})
 
 
 def _figure(name: str, caption: str, rows: int, plot: Callable[[Any], None]) -> Figure:

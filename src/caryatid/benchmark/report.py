@@ -10,13 +10,13 @@ import logging
 import math
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from caryatid.benchmark.figures import Figure, curves_of, draw_conditions, draw_group, told_views
+from caryatid.benchmark.figures import Figure, conditions_of, curves_of, draw_conditions, draw_group
 from caryatid.benchmark.statistics import CONFIG, summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES
@@ -104,10 +104,9 @@ class SuiteResult:
 
     def f1(self) -> dict[str, dict[str, list[float]]]:
         """Mean F1 after each view of each method under each condition."""
-        whole = self.summary[self.summary["family"] == ""]
         return {
-            str(condition): {name: own["value"].tolist() for name, own in curves_of(rows, "f1").items()}
-            for condition, rows in whole.groupby("condition", sort=False)
+            condition: {name: own["value"].tolist() for name, own in curves_of(rows, "f1").items()}
+            for condition, rows in conditions_of(self.summary)
         }
 
 
@@ -151,20 +150,21 @@ def summarise_store(store: ResultStore, reference: str | None = None) -> list[Su
     Raises:
         InputError: No suite has such a method, or pandas is not installed.
     """
-    tables = {name: store.table(name) for name in sorted(store.suites, key=[*SUITES, *store.suites].index)}
     check_reference(reference, store)
     results = []
-    for name, table in tables.items():
-        if table.empty:
+    for name in sorted(store.suites, key=[*SUITES, *store.suites].index):
+        table, known = store.table(name), SUITES.get(name)
+        methods = list(table["method"].unique())
+        if not methods:
             continue
-        known, methods = SUITES.get(name), set(table["method"])
-        wanted = (reference, known.reference if known else None, table["method"].iloc[0])
-        chosen = str(next(method for method in wanted if method in methods))
+        wanted = (reference, known.reference if known else None, *methods)
+        chosen = next(method for method in wanted if method in methods)
         failures = []
         for row in table[table["error"].notna()].itertuples():
             scene = Path(row.scene).name
-            error = row.error.replace(row.scene, scene)
-            failures.append([row.method, row.condition, scene, str(row.seed), error])
+            failures.append(
+                [row.method, row.condition, scene, str(row.seed), row.error.replace(row.scene, scene)]
+            )
         results.append(
             SuiteResult(
                 name,
@@ -206,9 +206,8 @@ def _write_tables(store: ResultStore, folder: Path) -> None:
 def write_results(results: Sequence[SuiteResult], about: dict[str, str], path: Path) -> None:
     """Write what tables and figures are made of as compressed JSON, small enough to be committed."""
     suites = [
-        {name: getattr(result, name) for name in SuiteResult.__slots__ if name != "summary"}
-        | {"summary": result.summary.to_csv(index=False, float_format="%.7g", lineterminator="\n")}
-        for result in results
+        asdict(each) | {"summary": each.summary.to_csv(index=False, float_format="%.7g", lineterminator="\n")}
+        for each in results
     ]
     text = json.dumps({"about": about, "suites": suites}, ensure_ascii=False)
     path.write_bytes(gzip.compress(text.encode(), mtime=0))
@@ -307,15 +306,15 @@ def _suite(result: SuiteResult) -> Iterator[str | Figure]:
 
 def _tables(group: pd.DataFrame, measures: Mapping[str, str], reference: str) -> Iterator[str]:
     """Tables of the methods under one condition, each a part of the summary."""
-    cells: dict[str, dict[Column, str]] = {}
-    for row in group.itertuples():
-        text = _text(row.quantity, row.value, row.low, row.high)
-        cells.setdefault(row.method, {})[row.quantity, row.at] = text
-
+    texts = [_text(*row) for row in group[["quantity", "value", "low", "high"]].itertuples(index=False)]
+    cells = group.assign(text=texts).pivot(index="method", columns=["quantity", "at"], values="text")
+    cells = cells.reindex(group["method"].unique())
     main = next(iter(measures))
+    last = max(group["at"][group["quantity"] == main], default=0)
 
     def by_view(quantity: str) -> dict[Column, str]:
-        return {(quantity, view): f"view {view:.0f}" for view in told_views(group, main)}
+        views = sorted({view for view in (1, 2, 3, 5, 10, last) if 0 < view <= last})
+        return {(quantity, view): f"view {view:.0f}" for view in views}
 
     tables: dict[str, Mapping[Column, str]] = {
         f"{heading}: mean and interval after so many views": by_view(measure) | COUNTS
@@ -331,18 +330,13 @@ def _tables(group: pd.DataFrame, measures: Mapping[str, str], reference: str) ->
         title = f"F1 along the path, over {budget:.2f} m; quantiles of the times to choose and to see a view"
         tables[title] = {("area", 0.0): "F1 along the path"} | TIMES
     for title, columns in tables.items():
-        first = next(iter(columns), None)
-        used = [column for column in columns if any(column in own for own in cells.values())]
-        lines = [
-            [method, *(own.get(column, "–") for column in used)]
-            for method, own in cells.items()
-            if first in own
-        ]
-        if lines:
+        used = [column for column in columns if column in cells]
+        if used and used[0] == next(iter(columns)):
+            lines = cells[used].dropna(subset=used[:1]).fillna("–").itertuples(name=None)
             yield _table(title, ("method", *(columns[column] for column in used)), lines)
 
 
-def _table(title: str, head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+def _table(title: str, head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     rows = ["| " + " | ".join(_plain(cell) for cell in line) + " |" for line in (head, *lines)]
     rows.insert(1, "| --- " * len(head) + "|")
     return "\n".join([f"**{_plain(title)}.**", "", *rows])

@@ -8,16 +8,14 @@ import os
 import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
-    FIRST_COMPLETED,
     BrokenExecutor,
     CancelledError,
     Future,
     ProcessPoolExecutor,
     ThreadPoolExecutor,
     as_completed,
-    wait,
 )
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from multiprocessing import active_children, get_context, parent_process
 from threading import Lock, Thread, current_thread, main_thread
@@ -99,16 +97,10 @@ def run_on_cluster(
         for episode in episodes:  # workers have other current folders
             placed = replace(episode, scene=os.path.abspath(episode.scene)) if episode.content else episode
             futures[pool.submit(run_on_worker, placed, code)] = episode
-        waiting, told = set(futures), False
-        while waiting:
-            done, waiting = wait(waiting, timeout=patience, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield futures.pop(future), _cluster_outcome(future, address)
-            if done or told:
-                continue
-            with suppress(OSError):
-                if told := not client.nthreads():
-                    tell(f"no workers; waiting for some: dask worker {address} --nthreads 1 --nworkers N")
+        if not client.nthreads():
+            tell(f"no workers; waiting for some: dask worker {address} --nthreads 1 --nworkers N")
+        for future in as_completed(futures):
+            yield futures.pop(future), _cluster_outcome(future, address)
 
 
 def connect(address: str, patience: float = 10.0) -> Client:
