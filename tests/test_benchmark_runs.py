@@ -142,14 +142,6 @@ def test_however_a_run_ends_the_next_one_goes_on(started, tmp_path):
             assert without_times(stored) == without_times(run_episode(member.episode))
 
 
-def test_a_run_interrupted_as_it_starts_leaves_quietly(started):
-    run = started()
-    while len(workers(run)) < 2:
-        assert run.poll() is None
-        time.sleep(0.01)
-    interrupt(run, psutil.Process(run.pid).children(recursive=True))
-
-
 def test_a_second_run_on_a_folder_is_refused_and_reading_is_not(started, tmp_path, capsys):
     out = tmp_path / "out"
     run = started(seeds=200)

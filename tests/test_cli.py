@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 import tomllib
 from dataclasses import asdict
 from pathlib import Path
@@ -17,9 +15,7 @@ from PIL import Image
 
 from caryatid.config import Config
 from caryatid.io.bop import read_recording
-from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth
 from caryatid.steps import read_run
@@ -142,9 +138,9 @@ def test_a_single_frame_without_a_pose_gets_its_world_from_the_table(tmp_path, s
     assert run.views[0].record["T_world_camera"][2][3] > 0.5
 
 
-def test_a_cloud_with_labels_is_extracted(tmp_path, points, write_pcd):
-    cloud = write_pcd(*points)
-    assert run_command("extract", cloud, "--out", tmp_path / "run") == 0
+def test_a_cloud_is_extracted_by_labels_that_number_parts(tmp_path, points, write_pcd):
+    cloud = write_pcd(points[0], points[1] * 10 + (points[1] > 0) * 3)
+    assert run_command("extract", cloud, "--label-divisor", 10, "--out", tmp_path / "run") == 0
     run = read_run(tmp_path / "run")
     labels = run.views[0].load_labels()
     assert (run.views[0].folder / "labels.npy").is_file()
@@ -152,12 +148,6 @@ def test_a_cloud_with_labels_is_extracted(tmp_path, points, write_pcd):
     assert (labels[points[1] > 0] == points[1][points[1] > 0]).all()
     assert (labels == SUPPORT_LABEL).sum() > 1000
     assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
-
-
-def test_labels_that_number_parts_are_divided(tmp_path, points, write_pcd):
-    cloud = write_pcd(points[0], points[1] * 10 + (points[1] > 0) * 3)
-    assert run_command("extract", cloud, "--label-divisor", 10, "--out", tmp_path / "run") == 0
-    assert {o.id for o in read_run(tmp_path / "run").graph.objects} == {"o0", "o1", "o2"}
 
 
 # evaluate, demo, config
@@ -227,9 +217,6 @@ def test_config_writes_settings_that_read_back_as_they_are(tmp_path, capsys):
     assert (settings["fusion"]["method"], settings["fit"]["hypotheses"]) == ("sg", 78)
 
 
-# How often it looks
-
-
 def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recording):
     stops, goes_on = (
         explored(recording, tmp_path / name, "--no-report", "--set=fusion.settled=0.1", *options)
@@ -282,65 +269,6 @@ def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, c
         assert view == {"view": number, "turn": pytest.approx(thought), **timing}
 
 
-def test_options_that_do_not_exist_are_usage_errors(tmp_path, capsys, scene_file, leftovers):
-    for wrong in (
-        ["--planner", "clever"],
-        ["--fusion", "cloud"],
-        ["--segmentation", "magic"],
-        ["--noise", "loud"],
-        ["--views", "0"],
-        ["--views", "many"],
-        ["--seed", "-1"],
-        ["--colour"],
-    ):
-        assert run_command("explore", scene_file, "--out", tmp_path / "run", *wrong) == 2
-        said = capsys.readouterr()
-        assert said.out == ""
-        assert wrong[-1].lstrip("-") in said.err
-    assert run_command("explore", scene_file) == 2
-    assert run_command("juggle") == 2
-    assert run_command() == 2
-    assert not leftovers()
-
-
-# Interrupts and older runs
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("at", ["camera", "planner"])
-def test_an_interrupt_keeps_a_whole_run_of_the_views_done(tmp_path, scene_file, capsys, monkeypatch, at):
-    owner, name = {"camera": (SimulatedCamera, "capture"), "planner": (SupportPlanner, "plan")}[at]
-    work, calls = getattr(owner, name), []
-
-    def interrupted(self, *arguments):
-        calls.append(name)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return work(self, *arguments)
-
-    monkeypatch.setattr(owner, name, interrupted)
-    words = ["explore", scene_file, "--out", tmp_path / "run", "--no-early-stop", *SMALL]
-    assert run_command(*words) == 130
-    run = read_run(tmp_path / "run")
-    assert run.record["interrupted"] is True
-    assert len(run.views) == len(run.record["steps"]) == len(run.record["scores"]) == 1
-    assert (tmp_path / "run/graph.json").read_bytes() == (tmp_path / "run/views/00/graph.json").read_bytes()
-    out = tmp_path / "run"
-    said = capsys.readouterr().err.splitlines()[-1]
-    assert said == f"interrupted: 1 view is kept in {out}; `caryatid report {out}` makes the report"
-    assert run_command("report", out) == 0
-    assert (out / "report.html").is_file()
-
-
-def test_an_interrupt_before_the_first_view_leaves_nothing(tmp_path, scene_file, monkeypatch, leftovers):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(SimulatedCamera, "capture", interrupted)
-    assert run_command("explore", scene_file, "--out", tmp_path / "new/run", *SMALL) == 130
-    assert not leftovers()
-
-
 def test_an_older_run_is_replaced_and_other_folders_are_not(tmp_path, scene_file, capsys):
     explored(scene_file, tmp_path / "run", "--views", 2, "--no-report")
     explored(scene_file, tmp_path / "run", "--views", 1, "--no-report")
@@ -351,15 +279,3 @@ def test_an_older_run_is_replaced_and_other_folders_are_not(tmp_path, scene_file
     assert run_command("explore", scene_file, "--out", tmp_path / "notes", *SMALL) == 1
     assert "holds other files" in capsys.readouterr().err
     assert (tmp_path / "notes/dear.txt").read_text() == "mine"
-
-
-# As the shell runs it
-
-
-@pytest.mark.slow
-def test_the_command_runs_from_a_shell(tmp_path, scene_file):
-    words = ["explore", scene_file, "--out", tmp_path / "run", "--views", 1, *SMALL, "--json"]
-    command = [sys.executable, "-m", "caryatid", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert json.loads(done.stdout)["graph"]["format"] == "caryatid/graph"
-    assert done.stderr == ""

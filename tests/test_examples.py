@@ -21,12 +21,6 @@ def run_example(path, monkeypatch, *arguments):
     runpy.run_path(str(path), run_name="__main__")
 
 
-def test_each_has_a_number_of_its_own():
-    numbers = [path.name[:2] for path in EXAMPLES]
-    assert numbers == sorted(set(numbers))
-    assert len(numbers) >= 7
-
-
 def test_the_client_is_one_small_file_that_needs_nothing_but_python():
     text = (ROOT / "examples/robot_client.py").read_text()
     imported = re.findall(r"^ *(?:import|from) (\w+)", text, re.M)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -69,26 +68,6 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     count = "1 view is" if len(run.views) == 1 else f"{len(run.views)} views are"
     assert told == f"interrupted: {count} kept in {folder}; `caryatid report {folder}` makes the report"
     assert len(run.record["scores"]) == len(run.views)
-
-
-def test_an_extraction_keeps_its_views(tmp_path, recording):
-    frames = json.loads((recording / "scene_camera.json").read_text())
-    masks = json.loads((recording / "scene_gt.json").read_text())
-    for number in range(3, 40):
-        for kind in ("depth", "rgb"):
-            (first,) = (recording / kind).glob(f"{number % 3:06d}.*")
-            (recording / kind / f"{number:06d}{first.suffix}").hardlink_to(first)
-        for mask in (recording / "mask_visib").glob(f"{number % 3:06d}_*"):
-            mask.with_name(mask.name.replace(f"{number % 3:06d}_", f"{number:06d}_", 1)).hardlink_to(mask)
-        frames[str(number)], masks[str(number)] = frames[str(number % 3)], masks[str(number % 3)]
-    (recording / "scene_camera.json").write_text(json.dumps(frames))
-    (recording / "scene_gt.json").write_text(json.dumps(masks))
-    folder = tmp_path / "runs" / "run"
-    folder.parent.mkdir()
-    command = Command("extract", recording, "--out", folder)
-    command.wait_for("view 01")
-    assert command.interrupt()[:2] == (130, "")
-    assert len(whole(folder, 2).views) < 40
 
 
 @pytest.mark.parametrize("moments", [["view 01"], ["view 01", "done: ", "o"]], ids=["views", "lifts"])

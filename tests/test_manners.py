@@ -88,6 +88,12 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
         ("session new x --segmentation k", "Expected one of ('labels', 'auto')"),
         ("explore tower --out x --planner k", "Expected one of ('support', 'attention', 'paper', 'random'"),
         ("export x --out x --format k", "Expected one of ('mjcf', 'urdf', 'gltf', 'graphml', 'dot')"),
+        ("explore tower --out x --noise k", "none"),
+        ("explore tower --out x --views 0", "0 is not a whole number of at least 1"),
+        ("explore tower --out x --seed -1", "-1 is not a whole number of at least 0"),
+        ("explore tower --out x --colour", "--colour"),
+        ("juggle", "juggle"),
+        ("", "explore"),
     ],
 )
 def test_a_usage_error_says_what_would_do_and_is_no_wall_of_text(words, said, capsys, monkeypatch):

@@ -72,14 +72,3 @@ def test_a_real_frame_goes_the_same_way(executing):
     notebook = executing.execute(path, QUICK[path.stem] | {"RECORDING": str(folder)})
     assert folder.name in html(notebook)[0]
     assert html(notebook)[1].count("<svg") == 2
-
-
-def test_a_failing_cell_is_not_stored(tmp_path, executing, monkeypatch):
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell("1 / 0")])
-    path = tmp_path / "failing.ipynb"
-    nbformat.write(notebook, path)
-    before = path.read_bytes()
-    monkeypatch.setattr(executing, "FOLDER", tmp_path)
-    with pytest.raises(executing.CellExecutionError, match="ZeroDivisionError"):
-        executing.main()
-    assert path.read_bytes() == before

@@ -70,8 +70,3 @@ def test_every_shell_gets_a_script_it_can_read(shell, tmp_path, capsys):
 
 def test_the_suites_are_those_of_the_benchmark():
     assert tuple(SUITES) == benchmark.SUITES
-
-
-def test_an_unknown_shell_is_a_usage_error(capsys):
-    assert run_command("completion", "sh") == 2
-    assert "bash" in capsys.readouterr().err
