@@ -120,6 +120,8 @@ T_BASE_LENS = transforms.rigid(transforms.rotation_from_vector((-1.2, 0.9, -0.4)
 def write_bag(path, views, storage="sqlite3", *, without_pose=(), without_colour=()):
     """Write views as a robot would: depth in mm, colour, camera, poses of the base before and after."""
     with BagFile(path, storage) as bag:
+        if not views:
+            return
         bag.write("/tf_static", bag.transform(START, BASE, LENS, T_BASE_LENS), START)
         bag.write("/chatter", bag.type("std_msgs/msg/String")(data="hello"), START)
         for index, view in enumerate(views):

@@ -15,6 +15,7 @@ os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 import numba
 import numpy as np
 import pytest
+from pypcd4 import Encoding, PointCloud
 
 from caryatid import cli
 from caryatid.config import Config, SensorConfig
@@ -156,20 +157,15 @@ def points(views):
 
 @pytest.fixture
 def write_pcd(tmp_path):
-    """Write an ascii PCD, `count` points promised in its header."""
+    """Write an ascii PCD."""
 
-    def write(points, labels=None, name="cloud.pcd", count=None):
-        table = points if labels is None else np.column_stack([points, labels])
-        count = len(points) if count is None else count
-        label = "" if labels is None else " label"
-        header = (
-            f"VERSION .7\nFIELDS x y z{label}\nSIZE 4 4 4{' 4' if label else ''}\n"
-            f"TYPE F F F{' U' if label else ''}\nCOUNT 1 1 1{' 1' if label else ''}\n"
-            f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA ascii\n"
-        )
-        path = tmp_path / name
-        path.write_text(header + "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in table))
-        return path
+    def write(points, labels=None, name="cloud.pcd"):
+        columns = [*points.T] if labels is None else [*points.T, labels]
+        types = (np.float32, np.float32, np.float32, np.uint32)
+        names = ("x", "y", "z", "label")
+        cloud = PointCloud.from_points(columns, names[: len(columns)], types[: len(columns)])
+        cloud.save(tmp_path / name, encoding=Encoding.ASCII)
+        return tmp_path / name
 
     return write
 
@@ -179,6 +175,29 @@ def leftovers(tmp_path):
     """Names in the test's folder, hidden ones too, that were not there when this was asked for."""
     before = set(os.listdir(tmp_path))
     return lambda: set(os.listdir(tmp_path)) - before
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    """Run a command that must fail in one line that names its source, and leave nothing behind."""
+
+    def listed():
+        return {p: os.listdir(p) for p in [tmp_path, *tmp_path.rglob("*")] if p.is_dir()}
+
+    def run(command, source, *options, says, names=None):
+        before = listed()
+        capsys.readouterr()
+        assert run_command(command, source, "--out", tmp_path / "runs/run", *options) == 1
+        said = capsys.readouterr()
+        assert (said.out, said.err.count("\n")) == ("", 1)
+        assert said.err.startswith("error: ")
+        assert "fault in caryatid" not in said.err
+        assert str(source if names is None else names) in said.err
+        assert says in said.err
+        assert listed() == before, "something was left behind"
+        return said.err
+
+    return run
 
 
 @pytest.fixture(scope="session")

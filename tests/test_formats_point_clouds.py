@@ -153,7 +153,6 @@ def test_a_number_of_points_that_is_not_there_is_refused(tmp_path, encoding):
 
 
 GIGABYTES = struct.pack("<II", 100, 10**8 * DTYPE.itemsize) + bytes(100)
-TWO_ROWS = {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}
 
 
 @pytest.mark.parametrize(
@@ -162,24 +161,12 @@ TWO_ROWS = {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}
         (None, {"WIDTH": 30}, "WIDTH 30 × HEIGHT 1, POINTS 60"),
         (None, {"FIELDS": "x y z rgba"}, "do not agree"),
         (None, {"FIELDS": "a b c d e"}, "no fields x y z"),
-        (None, {"FIELDS": None}, "FIELDS"),
-        (None, {"SIZE": "4 4 4 4"}, "the header lies: "),
-        (None, {"SIZE": "4 4 4 4 3"}, "the header lies: "),
-        (None, {"TYPE": "F F F U X"}, "TYPE"),
         (None, {"TYPE": "U F F U U"}, "floating point"),
-        (None, {"COUNT": "1 1 1 1 5"}, "the header lies: "),
-        (None, {"POINTS": None}, "POINTS"),
         (None, {"POINTS": 0, "WIDTH": 0}, "POINTS 0"),
         (None, {"VIEWPOINT": "0 0 0"}, "VIEWPOINT"),
-        (None, {"DATA": "zip"}, "DATA"),
         (None, {"DATA": None}, "no DATA line"),
-        (
-            GIGABYTES,
-            {"DATA": "binary_compressed", "POINTS": 200_000_000, "WIDTH": 200_000_000},
-            "header lies",
-        ),
+        (GIGABYTES, {"DATA": "binary_compressed", "POINTS": 10**8, "WIDTH": 10**8}, "header lies"),
         (b"1 2 3 4 5\n1 2\n", {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}, "2 were found"),
-        (b"1 2 3 4 5\n1 2 3 4 5 6\n", {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}, "6 were found"),
         (b"1 2 3 4 5\na b c 1 2\n", {"DATA": "ascii", "POINTS": 2, "WIDTH": 2}, "'a'"),
     ],
 )
@@ -247,10 +234,8 @@ def test_the_vertices_of_a_mesh_are_a_cloud(tmp_path):
     "content",
     [
         b"",
-        b"no ply at all",
         b"ply\nformat ascii 1.0\nend_header\n",
         b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float a\nend_header\n1\n",
-        b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n",
     ],
 )
 def test_what_is_no_ply_is_refused(tmp_path, content):

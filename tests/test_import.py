@@ -40,16 +40,13 @@ from caryatid.io.importing import choose_views
 TOPICS = ("--depth", DEPTH, "--info", INFO)
 ALL = (*TOPICS, "--rgb", RGB, "--tf", WORLD)
 KINDS = [("one.bag", "sqlite3"), ("two", "sqlite3"), ("three", "mcap")]
+EACH_KIND = pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
 
 
 def bag_of(tmp_path, views, kind=KINDS[0], **options):
     """A bag of some views, or an empty one."""
     name, storage = kind
-    if views is None:
-        with BagFile(tmp_path / name, storage):
-            pass
-    else:
-        write_bag(tmp_path / name, views, storage, **options)
+    write_bag(tmp_path / name, views, storage, **options)
     return tmp_path / name
 
 
@@ -58,14 +55,10 @@ def imported(tmp_path, source, *options, name="out"):
     return read_recording(tmp_path / name)
 
 
-def refused(capsys, *arguments):
-    """The one line a command ends with."""
-    capsys.readouterr()
-    assert run_command("import", *arguments) == 1
-    told = capsys.readouterr().err
-    assert told.startswith("error: ")
-    assert told.count("\n") == 1
-    return told
+@pytest.fixture
+def unfit(refused):
+    """Import what cannot be imported."""
+    return lambda source, *options, says: refused("import", source, *options, names="", says=says)
 
 
 def same_views(recording, views, atol=0.00051, colour=True):
@@ -80,7 +73,7 @@ def same_views(recording, views, atol=0.00051, colour=True):
 # What is in a bag comes out
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
+@EACH_KIND
 def test_a_bag_becomes_the_views_it_holds(tmp_path, views, kind):
     recording = imported(tmp_path, bag_of(tmp_path, views, kind), *ALL)
     same_views(recording, views)
@@ -257,72 +250,54 @@ def test_a_broken_image_is_left_out(tmp_path, views, capsys):
         ((*TOPICS, "--tf", WORLD, "--set", "recording.pose_gap=0.01"), "3 no pose; record its poses"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_the_bag_is_said(tmp_path, views, capsys, leftovers, options, said):
-    bag = bag_of(tmp_path, views)
-    assert said in refused(capsys, bag, *options, "--out", tmp_path / "out")
-    assert leftovers() == {"one.bag"}
+def test_what_does_not_fit_the_bag_is_said(tmp_path, views, unfit, options, said):
+    unfit(bag_of(tmp_path, views), *options, says=said)
+
+
+def depth_of(make):
+    return {"depth": lambda bag, time: make(bag, time, np.full((120, 160), 90, np.uint8))}
+
+
+def colour_of(columns, frame):
+    rgb = np.zeros((120, 160 * columns, 3), np.uint8)
+    return {"colour": lambda bag, time: bag.image(time, rgb, "rgb8", frame=frame)}
 
 
 @pytest.mark.parametrize(
-    ("columns", "frame", "said"),
+    ("odd", "said"),
     [
-        (
-            2,
-            LENS,
-            "(160×120 pixels, frame 'optical') is not registered to colour (320×120 pixels, frame 'optical')",
-        ),
-        (1, "other", "is not registered to colour (160×120 pixels, frame 'other')"),
-    ],
-)
-def test_depth_that_is_not_registered(tmp_path, views, capsys, columns, frame, said):
-    rgb = np.repeat(views[0].rgb, columns, axis=1)
-    bag = plain_bag(tmp_path, views[:1], colour=lambda b, t: b.image(t, rgb, "rgb8", frame=frame))
-    assert said in refused(capsys, bag, *TOPICS, "--rgb", RGB, "--out", tmp_path / "out")
-
-
-@pytest.mark.parametrize(
-    ("camera", "said"),
-    [
+        (colour_of(2, LENS), "is not registered to colour (320×120 pixels, frame 'optical')"),
+        (colour_of(1, "other"), "is not registered to colour (160×120 pixels, frame 'other')"),
         ({"K": np.zeros((3, 3))}, "K has focal lengths 0, 0"),
-        (
-            {"size": (320, 240)},
-            "its images (320×240 pixels, frame 'optical') are not the depth images (160×120",
-        ),
-        ({"frame": "infra"}, "its images (160×120 pixels, frame 'infra') are not the depth images (160×120"),
+        ({"size": (320, 240)}, "(320×240 pixels, frame 'optical') are not the depth images (160×120"),
+        ({"frame": "infra"}, "(160×120 pixels, frame 'infra') are not the depth images (160×120"),
+        (depth_of(lambda b, t, d: b.image(t, d, "mono8")), "encoding 'mono8' is not supported"),
+        (depth_of(lambda b, t, d: b.compressed(t, jpeg(d), "jpeg")), "its depth is compressed as 'jpeg'"),
+        (depth_of(lambda b, t, d: b.compressed(t, b"", "16UC1; compressedDepth rvl")), "compressedDepth rvl"),
+        (depth_of(lambda b, t, d: b.compressed(t, b"", "16UC1; compressedDepth png")), "usable: 1 broken"),
+        (depth_of(lambda b, t, d: b.compressed(t, jpeg(d), "16UC1")), "images is usable: 1 broken"),
     ],
 )
-def test_a_camera_that_is_not_the_depth_images(tmp_path, views, capsys, camera, said):
-    bag = plain_bag(tmp_path, views[:1], **camera)
-    assert said in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
+def test_images_and_cameras_that_do_not_fit_or_cannot_be_decoded(tmp_path, views, unfit, odd, said):
+    colour = ("--rgb", RGB) if "colour" in odd else ()
+    unfit(plain_bag(tmp_path, views[:1], **odd), *TOPICS, *colour, says=said)
 
 
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda b, t, d: b.image(t, d, "mono8"), "encoding 'mono8' is not supported"),
-        (lambda b, t, d: b.compressed(t, jpeg(d), "jpeg"), "its depth is compressed as 'jpeg'"),
-        (lambda b, t, d: b.compressed(t, b"\0" * 99, "16UC1; compressedDepth rvl"), "compressedDepth rvl"),
-        (lambda b, t, d: b.compressed(t, b"\0" * 5, "16UC1; compressedDepth png"), "is usable: 1 broken"),
-        (lambda b, t, d: b.compressed(t, jpeg(d), "16UC1"), "images is usable: 1 broken"),
-    ],
-)
-def test_depth_that_cannot_be_decoded(tmp_path, views, capsys, leftovers, make, said):
-    bag = plain_bag(tmp_path, views[:1], lambda b, t: make(b, t, views[0].depth.astype(np.uint8)))
-    assert said in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
-    assert leftovers() == {"one.bag"}
+@EACH_KIND
+def test_an_empty_bag(tmp_path, kind, unfit):
+    unfit(bag_of(tmp_path, [], kind), *TOPICS, says="the bag is empty")
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
+@EACH_KIND
 def test_a_bag_that_was_cut_off_or_has_wrong_bytes_is_read_or_refused_in_one_line(
-    tmp_path, views, kind, capsys, leftovers
+    tmp_path, views, kind, capsys, unfit
 ):
     bag = bag_of(tmp_path, views, kind)
     (file,) = [bag] if bag.is_file() else [p for p in bag.iterdir() if p.suffix in (".db3", ".mcap")]
-    whole, there = file.read_bytes(), leftovers()
+    whole = file.read_bytes()
     for share in (0.001, 0.3, 0.99):
         file.write_bytes(whole[: int(share * len(whole))])
-        assert "rosbags cannot read it (" in refused(capsys, bag, *ALL, "--out", tmp_path / "out")
-        assert leftovers() == there
+        unfit(bag, *ALL, says="rosbags cannot read it (")
     rng = np.random.default_rng(0)
     for _ in range(15):
         damaged = bytearray(whole)
@@ -340,17 +315,10 @@ def test_a_bag_that_was_cut_off_or_has_wrong_bytes_is_read_or_refused_in_one_lin
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
 
 
-@pytest.mark.parametrize("kind", KINDS, ids=["ROS 1", "sqlite3", "mcap"])
-def test_an_empty_bag(tmp_path, kind, capsys):
-    bag = bag_of(tmp_path, None, kind)
-    assert "the bag is empty" in refused(capsys, bag, *TOPICS, "--out", tmp_path / "out")
-
-
-def test_without_the_library_the_extra_is_named(tmp_path, views, capsys, monkeypatch):
+def test_without_the_library_the_extra_is_named(tmp_path, views, unfit, monkeypatch):
     bag = bag_of(tmp_path, views)
     monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    told = refused(capsys, bag, *ALL, "--out", tmp_path / "out")
-    assert 'reading bags needs rosbags; pip install "caryatid[ros]"' in told
+    unfit(bag, *ALL, says='reading bags needs rosbags; pip install "caryatid[ros]"')
 
 
 # Folders of the TUM RGB-D benchmark
@@ -404,24 +372,19 @@ def spoil(name, text):
         (lambda folder: (folder / "depth.txt").write_bytes(b"\xff\xfe"), "depth.txt: cannot be read"),
     ],
 )
-def test_a_folder_that_is_broken(tmp_path, views, capsys, change, said):
+def test_a_folder_that_is_broken(tmp_path, views, unfit, change, said):
     folder = tum_folder(tmp_path, views)
-    camera = camera_file(tmp_path, views[0].K)
     change(folder)
-    assert said in refused(capsys, folder, "--camera", camera, "--out", tmp_path / "out")
-    assert {p.name for p in tmp_path.iterdir()} == {"mine", "camera.json"}
+    unfit(folder, "--camera", camera_file(tmp_path, views[0].K), says=said)
 
 
-def test_a_camera_that_is_not_known_or_does_not_fit(tmp_path, views, capsys):
+def test_a_camera_that_is_not_known_or_does_not_fit(tmp_path, views, unfit):
     folder = tum_folder(tmp_path, views)
-    out = ("--out", tmp_path / "out")
-    assert "name holds none of freiburg1, freiburg2, freiburg3" in refused(capsys, folder, *out)
+    unfit(folder, says="name holds none of freiburg1, freiburg2, freiburg3")
     (tmp_path / "camera.json").write_text('{"fx": 500, "fy": 500, "cx": 320}')
-    told = refused(capsys, folder, "--camera", tmp_path / "camera.json", *out)
-    assert "the key 'cy' is missing" in told
-    other = tum_folder(tmp_path, views, "freiburg1")
-    assert "its images (640×480 pixels" in refused(capsys, other, *out)
-    assert "are for bags" in refused(capsys, folder, *TOPICS, *out)
+    unfit(folder, "--camera", tmp_path / "camera.json", says="the key 'cy' is missing")
+    unfit(tum_folder(tmp_path, views, "freiburg1"), says="its images (640×480 pixels")
+    unfit(folder, *TOPICS, says="are for bags")
 
 
 def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views, capsys):
@@ -436,38 +399,27 @@ def test_a_world_that_lies_on_its_side_is_levelled_by_the_table(tmp_path, views,
     assert np.allclose(before, after, atol=1e-5)
 
 
-def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, capsys):
+def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views, unfit):
     turned = []
     for n, view in enumerate(views):
         T = transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
         turned.append(replace(view, T_world_camera=T @ view.pose))
-    options = ("--camera", camera_file(tmp_path, views[0].K), "--level", "--out", tmp_path / "out")
-    assert "1 of 3 views agree on where up is" in refused(capsys, tum_folder(tmp_path, turned), *options)
-    assert not (tmp_path / "out").exists()
+    options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
+    unfit(tum_folder(tmp_path, turned), *options, says="1 of 3 views agree on where up is")
 
 
 # Which frames become views
 
 
-def poses(positions=(), turns_deg=()):
-    """Cameras along a line [m], or turning on the spot [deg]."""
-    moved = [transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions]
-    turned = [Rotation.from_rotvec((0.0, turn, 0.0), degrees=True).as_matrix() for turn in turns_deg]
-    return np.stack([*moved, *(transforms.rigid(R, np.zeros(3)) for R in turned)])
+def poses(positions):
+    """Cameras along a line [m]."""
+    return np.stack([transforms.rigid(np.eye(3), (x, 0.0, 0.0)) for x in positions])
 
 
-@pytest.mark.parametrize(
-    ("T_world_camera", "most", "chosen", "skipped"),
-    [
-        (poses(turns_deg=[0.0, 4.0, 12.0, 4.0, 0.0]), 30, [0, 2], {"seen from where another view is": 3}),
-        (poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0]), 3, [0, 11, 12], {"more than are wanted": 10}),
-    ],
-    ids=["a turn without a step is another view", "those farthest apart stay"],
-)
-def test_equally_sharp_frames_are_chosen_by_where_they_are_seen_from(T_world_camera, most, chosen, skipped):
-    count = len(T_world_camera)
-    config = RecordingConfig(max_views=most)
-    assert choose_views(np.arange(count) * 1.0, np.ones(count), T_world_camera, config) == (chosen, skipped)
+def test_of_too_many_views_those_farthest_apart_stay():
+    along = poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0])
+    chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along, RecordingConfig(max_views=3))
+    assert chosen == ([0, 11, 12], {"more than are wanted": 10})
 
 
 def test_of_frames_from_one_place_the_sharpest_is_chosen_and_blurred_ones_never():

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import gc
-import json
-import pickle
-import subprocess
-import sys
 import types
 
 import numpy as np
@@ -29,42 +25,6 @@ FORBIDDEN = ("mujoco", "caryatid.simulation", "caryatid.evaluation")
 CONFIG = Config(
     sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
 )
-
-ELSEWHERE = """
-import json, pickle, sys, types
-
-# The contacts of fitted shapes are computed by MuJoCo; importing them takes the names of its shapes only.
-shapes = types.SimpleNamespace(mjGEOM_BOX=0, mjGEOM_CYLINDER=1, mjGEOM_SPHERE=2)
-sys.modules["mujoco"] = types.SimpleNamespace(mjtGeom=shapes)
-FORBIDDEN = sys.argv[2:]
-
-class Refuse:
-    def find_spec(self, name, path=None, target=None):
-        if any(name == f or name.startswith(f + ".") for f in FORBIDDEN):
-            raise ImportError(f"{name} is not to be had")
-
-sys.meta_path.insert(0, Refuse())
-import numpy as np
-from caryatid.planning.planners import BUILT_IN, make_planner
-planners = {name: make_planner(name) for name in BUILT_IN}
-del sys.modules["mujoco"]
-
-said = {}
-for forbidden in FORBIDDEN:
-    try:
-        __import__(forbidden)
-        said[forbidden] = "imported"
-    except ImportError as error:
-        said[forbidden] = str(error)
-with open(sys.argv[1], "rb") as file:
-    states = pickle.load(file)
-for name, planner in planners.items():
-    try:
-        said[name] = [planner.plan(s, np.random.default_rng([0, k])).index for k, s in enumerate(states)]
-    except Exception as error:
-        said[name] = repr(error)
-print(json.dumps(said))
-"""
 
 
 def reachable(*roots: object) -> list[object]:
@@ -118,20 +78,6 @@ def test_no_planner_can_reach_the_truth(name):
     witness = witnessed(make_planner(name))
     assert len(witness.states) == 2
     assert not forbidden(witness.states, witness.planner, witness.decisions)
-
-
-def test_planners_decide_the_same_in_a_process_where_the_truth_cannot_be_imported(tmp_path):
-    states = witnessed(make_planner("support")).states
-    file = tmp_path / "states.pickle"
-    file.write_bytes(pickle.dumps(states))
-    command = [sys.executable, "-c", ELSEWHERE, str(file), *FORBIDDEN]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    here = {
-        name: [make_planner(name).plan(s, np.random.default_rng([0, k])).index for k, s in enumerate(states)]
-        for name in BUILT_IN
-    }
-    assert json.loads(done.stdout) == here | {f: f"{f} is not to be had" for f in FORBIDDEN}
 
 
 def test_the_truth_would_be_found():

@@ -1,4 +1,4 @@
-"""Kernels are compiled once, beforehand; work is shared out among threads; stages are timed."""
+"""Kernels are compiled once, beforehand; work is shared out among threads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from conftest import SMALL
 from numba import njit
 
-from caryatid.runtime import compiling, stopwatch
+from caryatid.runtime import compiling
 from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.parallel import for_each
 
@@ -192,11 +192,6 @@ def test_where_nothing_can_be_compiled_beforehand_nothing_is(package, monkeypatc
     assert package == []
 
 
-def test_processes_that_do_not_start_do_no_harm(monkeypatch, tmp_path):
-    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))
-    compiling._run_processes()
-
-
 # Sharing work out
 
 
@@ -258,15 +253,3 @@ def test_a_kept_kernel_whose_types_were_renamed_is_compiled_again(tmp_path):
             capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert done.stdout == "[0.0, 1.0, 2.0]", done.stderr
-
-
-# Time
-
-
-def test_each_stage_gets_the_time_since_the_one_before(monkeypatch):
-    clock = iter([10.0, 11.0, 13.5, 14.0])
-    monkeypatch.setattr(stopwatch, "perf_counter", lambda: next(clock))
-    watch = stopwatch.Stopwatch()
-    for stage in ("look", "think", "look"):
-        watch.lap(stage)
-    assert watch.laps == pytest.approx({"look": 1.5, "think": 2.5})

@@ -80,22 +80,15 @@ def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
     assert run_command("session", "next", folder, "--candidates", path) == 0
     told = json.loads(capsys.readouterr().out)
     assert np.allclose(told["T_world_camera"], poses[told["candidate"]])
-    for document, said in (
-        ({}, "'T_world_camera' is missing"),
-        ({"T_world_camera": [[1]]}, "4×4 finite numbers"),
-    ):
-        path.write_text(json.dumps(document))
-        assert run_command("session", "next", folder, "--candidates", path) == 1
-        assert said in capsys.readouterr().err
+    path.write_text("{}")
+    assert run_command("session", "next", folder, "--candidates", path) == 1
+    assert "'T_world_camera' is missing" in capsys.readouterr().err
 
 
 BAD = (
     ({"T_world_camera": None}, "'T_world_camera' is null: must be 4×4 finite numbers; give K"),
-    ({"T_world_camera": [[1, 0], [0, 1]]}, "4×4 finite numbers"),
     ({"T_world_camera": np.diag((2, 2, 2, 2)).tolist()}, "camera.json"),
-    ({"K": "wide"}, "3×3 finite numbers"),
     ({"depth_scale": 0}, "'depth_scale' is 0"),
-    ({"depth_scale": "mm"}, "'depth_scale' is"),
 )
 
 
@@ -117,12 +110,3 @@ def test_views_that_cannot_be_used_are_one_line_each(folder, files, capsys):
         refused(options, name.split(".")[0])
         (folder.parent / name).unlink()
         refused(options, name)
-
-
-def test_what_is_no_session_is_said(tmp_path, files, capsys):
-    options = files(0)
-    before = sorted(tmp_path.rglob("*"))
-    for step, words in {"add": options, "next": [], "graph": [], "undo": []}.items():
-        assert run_command("session", step, tmp_path, *words) == 1
-        assert "holds no session; begin one with `caryatid session new`" in capsys.readouterr().err
-    assert sorted(tmp_path.rglob("*")) == before

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -289,25 +287,6 @@ def test_a_second_writer_is_refused_and_a_reader_is_not(begun, views):
         session.add(views[2])
     with Session.open(begun) as session:
         assert session.views == 3
-
-
-@pytest.mark.slow
-def test_another_process_is_refused_and_the_lock_of_a_dead_one_is_gone(begun):
-    code = (
-        "import sys; from caryatid.sessions import Session; s = Session.open(sys.argv[1]);"
-        "print('open', flush=True); sys.stdin.read()"
-    )
-    command = [sys.executable, "-c", code, str(begun)]
-    other = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    try:
-        assert other.stdout.readline() == "open\n"
-        with pytest.raises(SessionBusyError):
-            Session.open(begun)
-    finally:
-        other.kill()
-        other.communicate()
-    with Session.open(begun) as session:
-        assert session.undo() == 1
 
 
 def test_a_lock_that_cannot_be_had_is_said(begun):
