@@ -9,13 +9,12 @@ from numba import njit
 
 from caryatid.config import FitConfig
 from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_marquardt, normal_equations
-from caryatid.fitting.scoring import in_frame
 from caryatid.fitting.search import TRIM
 from caryatid.fitting.uncertainty import Uncertainty, estimate
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import signed_distances
+from caryatid.geometry.signed_distance import in_frame, signed_distances
 from caryatid.geometry.transforms import Array, rigid
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
@@ -54,16 +53,17 @@ def close_hidden_faces(
     unseen_mantle = kind == CYLINDER and not sides[:4].any()
     flat = np.array([kind == BOX, kind == BOX, kind != SPHERE])
     low, high = np.where(flat, opening * ~sides.reshape(3, 2).T, 0.0)
-    opened = half + (low + high) / 2.0
+    middle = centre + np.einsum("ab,b->a", R, (high - low) / 2.0)
+    refined = np.concatenate([R, [middle, half + (low + high) / 2.0]])
+    turned, middle, opened = refined[:3], refined[3], refined[4]
     if unseen_mantle:
         opened[:2] += opening
-    turned, middle = R.copy(), centre + np.einsum("ab,b->a", R, (high - low) / 2.0)
-    levenberg_marquardt(kind, turned, middle, opened, points, config.steps, config.min_extent, 0.0, CONVERGED)
+    levenberg_marquardt(kind, refined, points, config.steps, config.min_extent, 0.0, CONVERGED)
     distance = np.abs(signed_distances(kind, turned, middle, opened, points))
     near = distance[distance < config.threshold]
     sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) else config.threshold
     information = np.empty((9, 9))
-    normal_equations(kind, turned, middle, opened, points, 2.5 * sigma, information, np.empty(9))
+    normal_equations(kind, refined, points, 2.5 * sigma, information, np.empty(9))
     # Each unseen side is put where points end, or back where it was.
     hidden, closed = np.full(6, config.max_extent / np.sqrt(12.0)), opened.copy()
     own = np.ascontiguousarray(in_frame(turned, middle, points).T)

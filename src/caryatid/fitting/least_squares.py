@@ -7,7 +7,7 @@ from numba import njit
 
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile, solve_positive
-from caryatid.geometry.signed_distance import gradient, local, write_distances
+from caryatid.geometry.signed_distance import gradient, local, signed_distances
 
 RIDGE = 1e-3 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
 """Added to the diagonal, times the damping, so that what no point determines stays where it is."""
@@ -19,14 +19,11 @@ CONVERGED = 1e-4
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def levenberg_marquardt(  # type: ignore[no-untyped-def]
-    kind, R, centre, half, points, steps, min_extent, shrink, converged
-):
+def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converged):  # type: ignore[no-untyped-def]
     """Minimise the Geman–McClure cost of signed distances of points (N, 3) to a shape.
 
-    Its axes (3, 3), centre (3,) and half extents (3,) [m] are replaced by those of the least cost. There is a
-    least extent [m] and a pull `shrink` on the extents [m]; the last step lowers the cost by no more than the
-    share `converged`.
+    The shape (5, 3) is replaced by the one of the least cost. There is a least extent [m] and a pull `shrink`
+    on the extents [m]; the last step lowers the cost by no more than the share `converged`.
     """
     columns, size = np.empty(9, np.intp), 0
     for a in range(9):
@@ -36,16 +33,15 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
     damping = 1e-3
     H_all, g_all = np.empty((9, 9)), np.empty(9)
     H, g = np.empty((size, size)), np.empty(size)
-    R_trial, centre_trial, half_trial = np.empty((3, 3)), np.empty(3), np.empty(3)
-    distance, absolute = np.empty(len(points)), np.empty(len(points))
-    write_distances(kind, R, centre, half, points, distance)
+    trial, absolute = np.empty((5, 3)), np.empty(len(points))
+    distance = signed_distances(kind, shape[:3], shape[3], shape[4], points)
     for _ in range(steps):
         for i in range(len(points)):
             absolute[i] = abs(distance[i])
         # What is further off than 2.5 robust standard deviations loses most of its weight.
         scale = 2.5 * max(1.4826 * quantile(absolute, 0.5), NOISE_FLOOR)
-        normal_equations(kind, R, centre, half, points, scale, H_all, g_all)
-        cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half)
+        normal_equations(kind, shape, points, scale, H_all, g_all)
+        cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, shape[4])
         improved = False
         trial_cost = cost
         for _ in range(6):
@@ -55,15 +51,12 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
                     H[a, b] = H_all[columns[a], columns[b]]
                 H[a, a] += damping * (H[a, a] + RIDGE[a])
             step = solve_positive(H, g)
-            _stepped(kind, R, centre, half, step, columns, min_extent, R_trial, centre_trial, half_trial)
-            write_distances(kind, R_trial, centre_trial, half_trial, points, distance)
-            trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, half_trial)
+            _stepped(kind, shape, step, columns, min_extent, trial)
+            distance = signed_distances(kind, trial[:3], trial[3], trial[4], points)
+            trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, trial[4])
             if trial_cost < cost:
                 improved = True
-                for a in range(3):
-                    centre[a], half[a] = centre_trial[a], half_trial[a]
-                    for b in range(3):
-                        R[a, b] = R_trial[a, b]
+                shape[:] = trial
                 break
             damping *= 6.0
         if not improved:
@@ -74,7 +67,7 @@ def levenberg_marquardt(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def normal_equations(kind, R, centre, half, points, scale, H, g):  # type: ignore[no-untyped-def]
+def normal_equations(kind, shape, points, scale, H, g):  # type: ignore[no-untyped-def]
     """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over points (N, 3).
 
     Columns: translation [m] and rotation [rad] in the object's frame, then half extents [m]; of a cylinder
@@ -83,8 +76,8 @@ def normal_equations(kind, R, centre, half, points, scale, H, g):  # type: ignor
     """
     J = np.empty(9)
     H[:], g[:], J[:] = 0.0, 0.0, 0.0
-    share = 1.0 / len(points)
-    hx, hy, hz = half[0], half[1], half[2]
+    R, centre, share = shape[:3], shape[3], 1.0 / len(points)
+    hx, hy, hz = shape[4]
     for i in range(len(points)):
         x, y, z = local(R, centre, points, i)
         d, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
@@ -109,17 +102,15 @@ def normal_equations(kind, R, centre, half, points, scale, H, g):  # type: ignor
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _stepped(  # type: ignore[no-untyped-def]
-    kind, R, centre, half, step, columns, min_extent, turned, moved, grown
-):
+def _stepped(kind, shape, step, columns, min_extent, trial):  # type: ignore[no-untyped-def]
     """Write the shape after a step in its own frame, shortened to 3 cm and 0.3 rad, no extent too short."""
     longest = 1.0
     for a in range(len(step)):
         longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
-    for a in range(3):
-        grown[a], moved[a] = half[a], centre[a]
+    trial[:] = shape
+    turned, moved, grown = trial[:3], trial[3], trial[4]
     for a in range(6, len(step)):
-        grown[columns[a] - 6] = max(half[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
+        grown[columns[a] - 6] = max(grown[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
     if kind == SPHERE:
         grown[1] = grown[2] = grown[0]
     elif kind == CYLINDER:
@@ -130,7 +121,7 @@ def _stepped(  # type: ignore[no-untyped-def]
     sine = np.sin(angle) / angle if angle >= 1e-12 else 1.0
     rest = (1.0 - np.cos(angle)) / (angle * angle) if angle >= 1e-12 else 0.0
     for i in range(3):
-        u, v, w = R[i, 0], R[i, 1], R[i, 2]
+        u, v, w = shape[i]
         moved[i] += (u * step[0] + v * step[1] + w * step[2]) / longest
         along = rest * (u * x + v * y + w * z)
         cosine = np.cos(angle) if angle >= 1e-12 else 1.0

@@ -197,28 +197,28 @@ def _ranked(
     kinds = [KINDS[kind] for kind in config.shapes]
     samples = rng.integers(0, -(-count // every), size=(len(kinds), config.hypotheses, 2))
     rows = len(kinds), config.polish + 2
-    R, centre, half = np.empty((*rows, 3, 3)), np.empty((*rows, 3)), np.empty((*rows, 3))
-    score, seen = np.full((*rows, 3), np.inf), np.empty((*rows, 6), dtype=np.bool_)
+    shapes, score = np.empty((*rows, 5, 3)), np.full((*rows, 3), np.inf)
+    seen = np.empty((*rows, 6), dtype=np.bool_)
     best = _best_of_each(
         np.array([kind.code for kind in kinds]), points - origin, normals, every, samples, config.steps,
         config.threshold, config.max_radius, config.max_extent, config.min_extent, config.normal_weight,
-        config.min_points, R, centre, half, score, seen,
+        config.min_points, shapes, score, seen,
     )  # fmt: skip
     fits = []
     for number, (kind, row) in enumerate(zip(kinds, best.tolist(), strict=True)):
         if row >= 0:
-            at = number, row
-            shape = kind.from_extents(transforms.rigid(R[at], centre[at] + origin), 2.0 * half[at])
-            cost, residual, inliers = score[at].tolist()
+            found = shapes[number, row]
+            shape = kind.from_extents(transforms.rigid(found[:3], found[3] + origin), 2.0 * found[4])
+            cost, residual, inliers = score[number, row].tolist()
             poor = residual > config.max_residual
-            fits.append(Fit(shape, residual, inliers, tuple(seen[at].tolist()), cost, poor))
+            fits.append(Fit(shape, residual, inliers, tuple(seen[number, row].tolist()), cost, poor))
     return sorted(fits, key=lambda f: f.cost), points
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     kinds, points, normals, every, samples, steps, threshold, max_radius, max_extent, min_extent,
-    normal_weight, min_points, R, centre, half, score, seen,
+    normal_weight, min_points, shapes, score, seen,
 ):  # fmt: skip
     """Fit each kind of shape: search among every so many of the points, least squares, score by all of them.
 
@@ -228,24 +228,22 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
         normals: Unit normals (N, 3).
         every: Every so many of the points are searched.
         samples: Pairs (K, B, 2) of those points that hypotheses are made from; then settings as configured.
-        R: Axes (K, S, 3, 3) of S shapes of each kind; written to, and so are the rest. All but two of them
-            are hypotheses from the search, one is of a single face, one the last refinement of the best.
-        centre: (K, S, 3) [m].
-        half: Half extents (K, S, 3) [m].
+        shapes: S of each kind (K, S, 5, 3); written to, and so are the rest. All but two of them are
+            hypotheses from the search, one is of a single face, one the last refinement of the best.
         score: Cost [m], infinite at first, mean distance [m] and share of inliers (K, S, 3).
         seen: Which sides points bear out (K, S, 6).
 
     Returns:
         Which of its shapes is the best of each kind (K,); −1 = none.
     """
-    some, facing, polish = points[::every].copy(), normals[::every].copy(), R.shape[1] - 2
+    some, facing, polish = points[::every].copy(), normals[::every].copy(), shapes.shape[1] - 2
     best, found = np.zeros(len(kinds), np.intp), np.zeros(len(kinds), np.intp)
     within = np.zeros(len(kinds), np.bool_)
     least_seen = max(min_points / 3.0, 0.02 * len(points))  # Points that bear out a side.
     for turn in range(4):
         least = np.inf
         for k in range(len(kinds)):
-            x, y, z = half[k, best[k]]
+            x, y, z = shapes[k, best[k], 4]
             within[k] = score[k, best[k], 0] < np.inf and 2.0 * max(x, y, z) <= max_extent
             if within[k]:
                 least = min(least, score[k, best[k], 0])
@@ -254,7 +252,7 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
             if turn == 0:
                 found[k] = search(
                     kinds[k], some, facing, samples[k], polish, threshold, max_radius, max_extent, min_extent,
-                    R[k], centre[k], half[k],
+                    shapes[k],
                 )  # fmt: skip
                 last = min(found[k], 1)
             elif turn == 1 and not (within[k] and score[k, best[k], 0] > 4.0 * least):
@@ -265,23 +263,17 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
                 # Kinds are compared once least squares on all the points have nothing left to gain. By now
                 # they gain a thousandth a step, so kinds that cost twice as much as the best cannot catch up.
                 first, last, used = polish + 1, polish + 2, points
-                for a in range(3):
-                    centre[k, first, a], half[k, first, a] = centre[k, best[k], a], half[k, best[k], a]
-                    for b in range(3):
-                        R[k, first, a, b] = R[k, best[k], a, b]
+                shapes[k, first] = shapes[k, best[k]]
             elif turn == 3 and not within[k]:
                 best[k] = -1
             # A small pull on the extents keeps sides that hold no points near; the last fit has none.
             for row in range(first, last):
-                levenberg_marquardt(
-                    kinds[k], R[k, row], centre[k, row], half[k, row], used, steps, min_extent, 2e-5,
-                    CONVERGED if turn == 2 else 10.0 * CONVERGED,
-                )  # fmt: skip
+                shape, converged = shapes[k, row], CONVERGED if turn == 2 else 10.0 * CONVERGED
+                levenberg_marquardt(kinds[k], shape, used, steps, min_extent, 2e-5, converged)
                 residual, turned, inliers = judge(
-                    kinds[k], R[k, row], centre[k, row], half[k, row], points, normals, threshold, least_seen,
-                    min_extent, seen[k, row],
-                )  # fmt: skip
-                x, y, z = half[k, row]
+                    kinds[k], shape, points, normals, threshold, least_seen, min_extent, seen[k, row]
+                )
+                x, y, z = shape[4]
                 # Of the mean squared extent a dm² costs 0.125 mm.
                 size = 4.0 * (x * x + y * y + z * z) / 3.0
                 cost = residual + normal_weight * turned + 0.0125 * size

@@ -8,38 +8,27 @@ from numba import njit
 from caryatid.fitting.search import TRIM
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
-from caryatid.geometry.signed_distance import gradient, local
+from caryatid.geometry.signed_distance import gradient, in_frame
 
 BARE_SPACING = 0.008
 """Spacing of the samples that look for points near a side [m]; a point within twice that is near one."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
-    """Coordinates (N, 3) of points (N, 3) in a frame with axes R (3, 3) at an origin (3,)."""
-    own = np.empty((len(points), 3))
-    for i in range(len(points)):
-        own[i, 0], own[i, 1], own[i, 2] = local(R, origin, points, i)
-    return own
-
-
 @njit(cache=True, error_model="numpy", inline="always")
-def judge(  # type: ignore[no-untyped-def]
-    kind, R, centre, half, points, normals, threshold, least, min_extent, seen
-):
+def judge(kind, shape, points, normals, threshold, least, min_extent, seen):  # type: ignore[no-untyped-def]
     """Find the sides that points bear out, draw the others in to where the points end, and score the shape.
 
     Points and unit normals are (N, 3); those nearer than the threshold [m] are the shape's, and a side needs
-    at least `least` of them. Centre (3,) and half extents (3,) [m] change, down to a least extent [m]; `seen`
-    (6,) is written to: whether the sides -x, +x, -y, +y, -z, +z are.
+    at least `least` of them. The shape (5, 3) changes, down to a least extent [m]; `seen` (6,) is written to:
+    whether the sides -x, +x, -y, +y, -z, +z are.
 
     Returns:
         Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, 1 at the most;
         share of the points within the threshold.
     """
-    own, facing = in_frame(R, centre, points), in_frame(R, np.zeros(3), normals)
+    own, facing = in_frame(shape[:3], shape[3], points), in_frame(shape[:3], np.zeros(3), normals)
     counts, near, count = np.zeros(6), np.empty((len(points), 3)), 0
-    hx, hy, hz = half[0], half[1], half[2]
+    hx, hy, hz = shape[4]
     for i in range(len(points)):
         d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
         if not abs(d) < threshold:
@@ -53,11 +42,11 @@ def judge(  # type: ignore[no-untyped-def]
     for side in range(6):
         seen[side] = counts[side] >= least
     if kind != SPHERE:
-        _draw_in(kind, R, centre, half, own, near[:count] if count > 0 else own, min_extent, seen)
+        _draw_in(kind, shape, own, near[:count] if count > 0 else own, min_extent, seen)
     away = turned = 0.0
     inliers = 0
     count = len(points)
-    hx, hy, hz = half[0], half[1], half[2]
+    hx, hy, hz = shape[4]
     for i in range(count):
         d, gx, gy, gz = gradient(kind, own[i, 0], own[i, 1], own[i, 2], hx, hy, hz)
         away += min(abs(d), threshold)
@@ -68,8 +57,9 @@ def judge(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _draw_in(kind, R, centre, half, own, near, min_extent, seen):  # type: ignore[no-untyped-def]
+def _draw_in(kind, shape, own, near, min_extent, seen):  # type: ignore[no-untyped-def]
     """Move sides that are not seen inwards to where the near points end; all points move with the centre."""
+    R, centre, half = shape[:3], shape[3], shape[4]
     shift, reach = np.zeros(3), np.empty(len(near))
     for axis in range(2 if kind == CYLINDER else 0, 3):
         low, high = -half[axis], half[axis]

@@ -7,7 +7,7 @@ from numba import njit
 
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile, select
-from caryatid.geometry.signed_distance import local, signed_distance
+from caryatid.geometry.signed_distance import gradient, local
 
 TRIM = 0.005
 """Share of the points beyond each end of an extent that count as noise [1]."""
@@ -17,13 +17,13 @@ LEAST_EXTENT, LEAST_RADIUS = 1e-4, 1e-3
 
 @njit(cache=True, error_model="numpy", inline="always")
 def search(  # type: ignore[no-untyped-def]
-    kind, points, normals, samples, keep, threshold, max_radius, max_extent, min_extent, R, centre, half
+    kind, points, normals, samples, keep, threshold, max_radius, max_extent, min_extent, shapes
 ):
     """Score hypotheses until a better one has become unlikely, and keep the best (MSAC).
 
     Each is made from a pair of oriented points (N, 3), in the order of the samples (B, 2), and is to keep
-    within the limits [m]. Axes (K, 3, 3), columns = x, y, z, centres (K, 3) and half extents (K, 3) [m] are
-    written to: the best `keep` hypotheses, the best first, and a shape for points of one face behind them.
+    within the limits [m]. Shapes (K, 5, 3) are written to: the best `keep` hypotheses, the best first, and a
+    shape for points of one face behind them.
 
     Returns:
         How many there are; none where nothing is within the limits.
@@ -32,18 +32,17 @@ def search(  # type: ignore[no-untyped-def]
     most_inliers = found = 0
     for b in range(len(samples)):
         i, j = samples[b]
-        valid = _hypothesis(
-            kind, points, normals, i, j, max_radius, max_extent, R[keep], centre[keep], half[keep]
-        )
-        if valid:
+        if _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shapes[keep]):
             limit = cost[keep - 1] * count
-            total, inliers = _msac(kind, R[keep], centre[keep], half[keep], points, threshold, limit)
+            total, inliers = _msac(kind, shapes[keep], points, threshold, limit)
             if inliers > 0 and total < limit:
                 place = keep
                 cost[keep] = total / count
                 while place > 0 and cost[place] < cost[place - 1]:
-                    _swap(place, R, centre, half, cost)
                     place -= 1
+                    cost[place], cost[place + 1] = cost[place + 1], cost[place]
+                    better = shapes[place + 1].copy()
+                    shapes[place + 1], shapes[place] = shapes[place], better
                 found = min(found + 1, keep)
                 if place == 0:
                     most_inliers = inliers
@@ -52,33 +51,19 @@ def search(  # type: ignore[no-untyped-def]
             hit = min(max((most_inliers / count) ** 2, 1e-9), 1.0 - 1e-9)
             if b + 1 >= keep * np.log(0.01) / np.log(1.0 - hit):
                 break
-    if kind != SPHERE and _of_one_face(
-        kind, points, normals, min_extent, max_radius, max_extent, R[found], centre[found], half[found]
-    ):
-        found += 1
-    return found
+    if kind == SPHERE:
+        return found
+    return found + _of_one_face(kind, points, normals, min_extent, max_radius, max_extent, shapes[found])
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _swap(k, R, centre, half, cost):  # type: ignore[no-untyped-def]
-    """Exchange a hypothesis and the one before it."""
-    cost[k], cost[k - 1] = cost[k - 1], cost[k]
-    for a in range(3):
-        centre[k, a], centre[k - 1, a] = centre[k - 1, a], centre[k, a]
-        half[k, a], half[k - 1, a] = half[k - 1, a], half[k, a]
-        for b in range(3):
-            R[k, a, b], R[k - 1, a, b] = R[k - 1, a, b], R[k, a, b]
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _of_one_face(  # type: ignore[no-untyped-def]
-    kind, points, normals, min_extent, max_radius, max_extent, R, centre, half
-):
+def _of_one_face(kind, points, normals, min_extent, max_radius, max_extent, shape):  # type: ignore[no-untyped-def]
     """Make a box or a cylinder for points of one face: their main normal, and what holds them along it.
 
-    A box has the least rectangle around them, a cylinder the circle that reaches as far. It is written to the
-    last three arguments. Returns whether it is within the limits.
+    A box has the least rectangle around them, a cylinder the circle that reaches as far. Returns whether it
+    is within the limits.
     """
+    R, centre, half = shape[:3], shape[3], shape[4]
     (x, y, z), on_face = _main_normal(normals)
     if not x * x + y * y + z * z > 0.0:
         return False
@@ -120,15 +105,16 @@ def _of_one_face(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _msac(kind, R, centre, half, points, threshold, limit):  # type: ignore[no-untyped-def]
+def _msac(kind, shape, points, threshold, limit):  # type: ignore[no-untyped-def]
     """Sum of truncated squared distances in units of the threshold, and how many points lie within it.
 
     Ends early, with what it has, once the sum exceeds the limit.
     """
+    R, centre, half = shape[:3], shape[3], shape[4]
     total, inliers = 0.0, 0
     for i in range(len(points)):
         x, y, z = local(R, centre, points, i)
-        off = signed_distance(kind, x, y, z, half[0], half[1], half[2]) / threshold
+        off = gradient(kind, x, y, z, half[0], half[1], half[2])[0] / threshold
         if abs(off) < 1.0:
             total += off * off
             inliers += 1
@@ -140,14 +126,13 @@ def _msac(kind, R, centre, half, points, threshold, limit):  # type: ignore[no-u
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _hypothesis(  # type: ignore[no-untyped-def]
-    kind, points, normals, i, j, max_radius, max_extent, R, centre, half
-):
+def _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shape):  # type: ignore[no-untyped-def]
     """Make a shape of two oriented points; what they leave open is as long as all points reach.
 
     A box has adjacent faces through them; a cylinder has them on its mantle, its axis where the lines along
     their normals come closest; so does the centre of a sphere. Returns whether it is within the limits.
     """
+    R, centre, half = shape[:3], shape[3], shape[4]
     ax, ay, az = normals[i, 0], normals[i, 1], normals[i, 2]
     bx, by, bz = normals[j, 0], normals[j, 1], normals[j, 2]
     if kind == BOX:

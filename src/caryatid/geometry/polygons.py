@@ -16,7 +16,7 @@ from caryatid.geometry.transforms import Array
 @njit(cache=True, error_model="numpy")
 def hull(points: NDArray[np.float64]) -> Array:
     """Convex hull of points laid onto the ground (N, 2) or (N, 3)."""
-    p, count = _maybe_corners(points)
+    p, count = points[:, :2].copy(), len(points)
     gap = count // 2
     while gap > 0:
         for i in range(gap, count):
@@ -43,45 +43,6 @@ def hull(points: NDArray[np.float64]) -> Array:
         size += 1
     # The way back ends where the way there began.
     return corners[: size - 1 if size > 1 else size]
-
-
-@njit(cache=True, error_model="numpy")
-def _maybe_corners(points: NDArray[np.float64]) -> tuple[Array, int]:
-    """Points of which some are corners of the hull, and how many: those inside an octagon of others are not.
-
-    After Akl and Toussaint, A fast convex hull algorithm, 1978.
-    """
-    count = len(points)
-    p = np.empty((count, 2))
-    for i in range(count):
-        p[i, 0], p[i, 1] = points[i, 0], points[i, 1]
-    if count < 64:  # Fewer are sorted in less time.
-        return p, count
-    # Outermost to the right, the upper right, and so on counter-clockwise.
-    outermost = np.zeros(8, dtype=np.int64)
-    farthest = np.full(8, -np.inf)
-    for i in range(count):
-        x, y = p[i, 0], p[i, 1]
-        for k, reach in enumerate((x, x + y, y, y - x, -x, -x - y, -y, x - y)):
-            if reach > farthest[k]:
-                farthest[k], outermost[k] = reach, i
-    octagon = np.empty((8, 2))
-    for k in range(8):
-        octagon[k, 0], octagon[k, 1] = p[outermost[k], 0], p[outermost[k], 1]
-    kept = 0
-    for i in range(count):
-        x, y = p[i, 0], p[i, 1]
-        inside = False
-        for k in range(8):
-            if octagon[k, 0] == octagon[k - 1, 0] and octagon[k, 1] == octagon[k - 1, 1]:
-                continue
-            inside = _turn(octagon, k - 1, k, x, y) > 0.0
-            if not inside:
-                break
-        if not inside:
-            p[kept, 0], p[kept, 1] = x, y
-            kept += 1
-    return p, kept
 
 
 @njit(cache=True, error_model="numpy")

@@ -25,39 +25,24 @@ def local(R, centre, points, i):  # type: ignore[no-untyped-def]
     return x, y, z
 
 
+@njit(cache=True, error_model="numpy", nogil=True)
+def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
+    """Coordinates (N, 3) of points (N, 3) in a frame with axes R (3, 3) at an origin (3,)."""
+    own = np.empty((len(points), 3))
+    for i in range(len(points)):
+        own[i, 0], own[i, 1], own[i, 2] = local(R, origin, points, i)
+    return own
+
+
 @njit(cache=True, error_model="numpy")
 def signed_distances(kind, R, centre, half, points):  # type: ignore[no-untyped-def]
     """Distances (N,) [m] of points (N, 3) to a shape's surface, negative inside."""
     distance = np.empty(len(points))
-    write_distances(kind, R, centre, half, points, distance)
-    return distance
-
-
-@njit(cache=True, error_model="numpy")
-def write_distances(kind, R, centre, half, points, distance):  # type: ignore[no-untyped-def]
-    """Do as `signed_distances` does, into an array (N,)."""
     hx, hy, hz = half[0], half[1], half[2]
     for i in range(len(points)):
         x, y, z = local(R, centre, points, i)
-        distance[i] = signed_distance(kind, x, y, z, hx, hy, hz)
-
-
-@njit(cache=True, inline="always")
-def signed_distance(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
-    """Signed distance [m] of one point in the object's frame to a shape with these half extents [m]."""
-    if kind == SPHERE:
-        return np.sqrt(x * x + y * y + z * z) - hx
-    if kind == CYLINDER:
-        q0, q2 = np.sqrt(x * x + y * y) - hx, abs(z) - hz
-        if q0 > 0.0 and q2 > 0.0:
-            return np.sqrt(q0 * q0 + q2 * q2)
-        return max(q0, q2)
-    qx, qy, qz = abs(x) - hx, abs(y) - hy, abs(z) - hz
-    most = max(qx, qy, qz)
-    if most <= 0.0:
-        return most
-    ox, oy, oz = max(qx, 0.0), max(qy, 0.0), max(qz, 0.0)
-    return np.sqrt(ox * ox + oy * oy + oz * oz)
+        distance[i] = gradient(kind, x, y, z, hx, hy, hz)[0]
+    return distance
 
 
 @njit(cache=True, error_model="numpy")
@@ -72,7 +57,7 @@ def distances_and_gradients(kind, R, centre, half, points):  # type: ignore[no-u
     return distance, gradients
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@njit(cache=True, inline="always")
 def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
     """Signed distance [m] of one point in the object's frame, and its gradient (3) there."""
     if kind == SPHERE:

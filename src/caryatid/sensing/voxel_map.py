@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from caryatid.config import VoxelConfig
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
-from caryatid.geometry.signed_distance import local, signed_distance
+from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each
 from caryatid.sensing.views import View
@@ -272,5 +272,5 @@ def _fill_layer(i, data):  # type: ignore[no-untyped-def]
             for k in range(low[s, 2], high[s, 2]):
                 centre[0, 2] = origin[2] + (k + 0.5) * size
                 x, y, z = local(R[s], centres[s], centre, 0)
-                if signed_distance(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2]) < 0.0:
+                if gradient(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2])[0] < 0.0:
                     grid[i, j, k] = 1
