@@ -23,11 +23,12 @@ from caryatid.geometry.shapes import Box, Cylinder, Sphere
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.planning.candidates import Candidates
 from caryatid.sensing.views import Cloud, View
-from caryatid.viz import Figure, Report, make_report, render_html, render_pdf
 from caryatid.viz.colours import object_colour, rgb
 from caryatid.viz.drawings import Projection, draw_chart, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import arrange, draw_graph, layers
+from caryatid.viz.pdf import render_pdf
 from caryatid.viz.pictures import keep_apart, picture_svg
+from caryatid.viz.report import Figure, Report, make_report, render_html
 from caryatid.viz.tables import object_table
 
 VOID = {"meta", "input", "br", "link", "img", "hr"}
@@ -150,8 +151,7 @@ def test_charts_need_several_views_or_scores_and_changes_are_said():
     assert charts(steps, scores) == ["F1 over views", "Found so far"]
     assert charts(steps[:1]) == []
     changed = make_report("t", steps, config=SMALL).sections[3].text
-    assert "objects gone: o7" in changed
-    assert "supports gone: o0 → o2, o2 → o1" in changed
+    assert "now: o1 (box) held by the table, o2 (cylinder) held by o1; gone: o7" in changed
     with pytest.raises(ValueError, match="1 scores for 2 views"):
         charts(steps, scores[:1])
 

@@ -40,7 +40,7 @@ from caryatid.simulation.world import box, build_spec, cylinder, scene_from_spec
 from caryatid.viz.drawings import Projection, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, own_style
-from caryatid.viz.strip import draw_lifts
+from caryatid.viz.report import draw_lifts
 
 PICTURES = Path(__file__).parent
 TITLE = 24.0

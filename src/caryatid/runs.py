@@ -17,8 +17,8 @@ from caryatid.exploration import Step
 from caryatid.graph import SupportGraph
 from caryatid.io.staging import write_file
 from caryatid.steps import RunWriter, read_config, read_run, read_steps
-from caryatid.viz import make_report, render_html, render_pdf
-from caryatid.viz.strip import read_figures
+from caryatid.viz.pdf import render_pdf
+from caryatid.viz.report import make_report, read_lifts, render_html
 
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 """Packages whose versions run.json records."""
@@ -138,7 +138,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
         read_steps(run),
         settings=settings,
         scores=record.get("scores", ()),
-        strip=read_figures(folder),
+        strip=read_lifts(folder),
         config=config.report,
     )
     files = {} if pdf is None else {pdf: render_pdf(report)}

@@ -17,7 +17,7 @@ from rich.text import Text
 if TYPE_CHECKING:
     from caryatid.evaluation.scores import Score
     from caryatid.exploration import Step
-    from caryatid.graph import SceneObject, SupportGraph
+    from caryatid.graph import SupportGraph
 
 
 class Output(logging.Handler):
@@ -72,46 +72,16 @@ class Output(logging.Handler):
 
     def step(self, step: Step, before: SupportGraph | None, score: Score | None) -> None:
         """Print what a view changed, its score where the ground truth is known, and what comes next."""
+        from caryatid.viz.tables import census, changes
+
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
-        self.say(f"view {step.index:02d}: {summary(step.graph)}{f1} ({turn(step.timings):.1f} s)")
+        self.say(f"view {step.index:02d}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
         for line in changes(before, step.graph):
             self.say(f"  {line}")
         if step.decision is not None:
             self.say(f"  next view: {step.decision.why}")
         if step.stop is not None:
             self.say(f"  done: {step.stop}")
-
-
-def counted(number: int, what: str) -> str:
-    """A number of things in words."""
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
-
-
-def summary(graph: SupportGraph) -> str:
-    """Objects and supports of a graph in a few words."""
-    objects = sum(o.role == "object" for o in graph.objects)
-    uncertain = sum(not s.certain for s in graph.supports)
-    doubt = f" ({uncertain} uncertain)" if uncertain else ""
-    return f"{counted(objects, 'object')}, {counted(len(graph.supports), 'support')}{doubt}"
-
-
-def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
-    """What a view changed: a line each for objects found, supported differently, and gone."""
-    known = {} if before is None else {o.id: _held(o, before) for o in before.objects}
-    held = {o.id: _held(o, after) for o in after.objects}
-    objects = [o for o in after.objects if o.role == "object"]
-    lines = {
-        "found": [f"{o.id} ({o.shape.kind}) {held[o.id]}" for o in objects if o.id not in known],
-        "now": [f"{o.id} {held[o.id]}" for o in objects if known.get(o.id, held[o.id]) != held[o.id]],
-        "gone": [i for i in known if i not in held],
-    }
-    return [f"{kind}: {', '.join(items)}" for kind, items in lines.items() if items]
-
-
-def _held(o: SceneObject, graph: SupportGraph) -> str:
-    supporters = sorted(s.supporter for s in graph.supports if s.supported == o.id)
-    names = [i if graph[i].role == "object" else "the table" for i in supporters]
-    return f"held by {' and '.join(names)}" if names else "held by nothing seen yet"
 
 
 def table(

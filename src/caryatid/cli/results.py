@@ -175,13 +175,13 @@ class Export(options.Command):
     """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
 
     def __call__(self) -> None:
-        from caryatid.cli.output import summary
         from caryatid.exports import export_graph, format_of
         from caryatid.io.graph_json import read_graph
         from caryatid.steps import read_run
+        from caryatid.viz.tables import census
 
         config, format_ = self.settings.read(), format_of(self.out, self.format)
         graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
         export_graph(graph, self.out, config.export)
         self.output.result({"file": str(self.out), "format": format_}, "")
-        self.output.say(f"{self.out}: {format_}, {summary(graph)}")
+        self.output.say(f"{self.out}: {format_}, {census(graph)}")

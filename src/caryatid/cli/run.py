@@ -41,8 +41,9 @@ class RunCommand(options.Command):
 
     def run(self, config: Config, page: PageProcess | None = None) -> None:
         """Keep all steps, write the report and print what came of the run."""
-        from caryatid.cli.output import counted, profile, summary
+        from caryatid.cli.output import profile
         from caryatid.io.graph_json import graph_to_json
+        from caryatid.viz.tables import census, count_of
 
         output = self.output
         with _recorder(self, config) as recorder:
@@ -50,7 +51,7 @@ class RunCommand(options.Command):
             graph = _record(recorder, steps, output, page).graph
         if not self.no_report:
             _draw_report(self.out, output)
-        output.say(f"{name}: {summary(graph)} after {counted(recorder.views, 'view')}")
+        output.say(f"{name}: {census(graph)} after {count_of(recorder.views, 'view')}")
         output.say(f"run: {self.out}" + ("" if self.no_report else ", open its report.html"))
         document: dict[str, Any] = {"run": str(self.out), "graph": graph_to_json(graph)}
         if self.profile:
@@ -199,7 +200,7 @@ class Dismantle(Exploring):
         from caryatid.manipulation.order import Order, plan_order
         from caryatid.runtime.parallel import cores
         from caryatid.simulation.camera import SimulatedCamera
-        from caryatid.viz.strip import draw_lifts, stored_figures
+        from caryatid.viz.report import draw_lifts, stored_lifts
 
         config, seed, taken = self.config(), self.settings.seed, []
         order = Order((), "interrupted before an order was found")
@@ -220,7 +221,7 @@ class Dismantle(Exploring):
                 if self.out is not None:
                     T_world_camera = last.sphere.poses(last.visited[:1])[0]
                     lifts = draw_lifts(scene, taken, last.graph, T_world_camera, config)
-                    recorder.files |= stored_figures(lifts)
+                    recorder.files |= stored_lifts(lifts)
             finally:
                 bodies = {t.body for t in taken}
                 left = [name for name in scene.object_bodies.values() if name not in bodies]

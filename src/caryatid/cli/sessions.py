@@ -82,8 +82,8 @@ class Add(SessionStep):
     """Expected number of the view, from 0; a view that is already there is not added again."""
 
     def __call__(self) -> None:
-        from caryatid.cli.output import summary
         from caryatid.sessions import Capture, Session
+        from caryatid.viz.tables import census
 
         with _views_kept(), Session.open(self.folder) as session:
             limits = session.beginning.settings.session
@@ -91,7 +91,7 @@ class Add(SessionStep):
             capture = Capture.from_files(images, self.camera, limits)
             added = session.add(capture, self.number)
         news = "" if added.changed else ", nothing new"
-        self.show(added.to_json(), f"view {added.number + 1}: {summary(added.graph)}{news}")
+        self.show(added.to_json(), f"view {added.number + 1}: {census(added.graph)}{news}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,14 +147,14 @@ class Undo(SessionStep):
     """
 
     def __call__(self) -> None:
-        from caryatid.cli.output import counted, summary
         from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Session
+        from caryatid.viz.tables import census, count_of
 
         with _views_kept(), Session.open(self.folder) as session:
             left = session.undo()
             document = {"views": left, "graph": graph_to_json(session.graph)}
-            self.show(document, f"{counted(left, 'view')} left: {summary(session.graph)}")
+            self.show(document, f"{count_of(left, 'view')} left: {census(session.graph)}")
 
 
 @dataclass(frozen=True)

@@ -5,16 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
-from caryatid.config import ReportConfig
+from caryatid.config import Config, ReportConfig
 from caryatid.geometry.transforms import Array
-from caryatid.sensing.views import Cloud
-from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_sphere
+from caryatid.graph import SupportGraph
+from caryatid.manipulation.dismantling import Taken, posed
+from caryatid.sensing.views import Cloud, View
+from caryatid.simulation.camera import intrinsics, render
+from caryatid.simulation.lifting import ASIDE
+from caryatid.simulation.world import SimulatedScene
+from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_layers, draw_sphere
 from caryatid.viz.graph_drawing import draw_graph
-from caryatid.viz.pictures import Picture, picture_svg
+from caryatid.viz.pictures import Picture, picture_png, picture_svg
 from caryatid.viz.tables import (
     Table,
     census,
@@ -191,7 +198,8 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
 def _view(step: Step, before: Step | None, f1: str, width: int) -> Section:
     """A view: its counts, its score and what it changed, pictures, what comes next, tables."""
     graph, decision = step.graph, step.decision
-    parts = [step.name, census(graph), f1, "" if before is None else changes(before.graph, graph)]
+    news = "" if before is None else "; ".join(changes(before.graph, graph)) or "nothing new"
+    parts = [step.name, census(graph), f1, news]
     facts, tables = [], [object_table(graph), support_table(graph)]
     if decision is not None:
         scores = (
@@ -257,6 +265,67 @@ def _sphere_caption(step: Step) -> str:
         refused = ", ".join(f"{count:,} {reason}" for reason, count in step.candidates.rejected.items())
         text += f" {len(step.candidates):,} views can be reached{f'; refused: {refused}' if refused else ''}."
     return text
+
+
+# Objects being taken away
+
+
+def draw_lifts(
+    scene: SimulatedScene,
+    taken: Sequence[Taken],
+    graph: SupportGraph,
+    T_world_camera: Array,
+    config: Config,
+) -> list[Figure]:
+    """Draw each lift as it looked half way up, or at its end where it did harm, in the objects' colours.
+
+    Args:
+        scene: The scene in physics.
+        taken: The steps, done.
+        graph: The objects they took.
+        T_world_camera: Where it is seen from (4, 4).
+        config: Sizes of the pictures.
+    """
+    names, K = list(scene.object_bodies.values()), intrinsics(config.sensor)
+    found = {t.body: graph[t.step.object_id] for t in taken if t.body is not None}
+    label_of = np.zeros(max(scene.object_bodies, default=0) + 1, dtype=np.int32)
+    for label, name in scene.object_bodies.items():
+        label_of[label] = found[name].label if name in found else 0
+    figures = []
+    for number, t in enumerate(taken, start=1):
+        if t.body is None:
+            continue
+        rising = np.flatnonzero(t.film[:, names.index(t.body), 2] < ASIDE / 2.0)
+        state = t.film[rising[(len(rising) - 1) // 2]] if t.ok else t.film[-1]
+        image = render(posed(scene, state), T_world_camera, K, config.sensor)
+        view = View(image.depth.astype(np.float32), K, rgb=image.rgb, name=f"lift {number}")
+        objects, width = SupportGraph(tuple(found.values())), config.report.image_width // 2
+        picture = draw_image(view, label_of[image.labels], objects, width)
+        held = f", {', '.join(t.step.hold)} held" if t.held else ""
+        outcome = "Nothing else moved" if t.ok else f"{', '.join(t.disturbed)} moved"
+        figures.append(Figure(f"{number}: {t.step.object_id}{held}", picture, f"{outcome}; {t.step.why}.", 3))
+    return figures
+
+
+def stored_lifts(figures: Sequence[Figure]) -> dict[str, bytes]:
+    """The pictures of lifts as files of a run folder: `lifts/NN.png`, with headings and captions in them."""
+    return {
+        f"lifts/{number:02d}.png": picture_png(f.picture, heading=f.heading, caption=f.caption)
+        for number, f in enumerate(figures, start=1)
+    }
+
+
+def read_lifts(folder: Path) -> list[Figure]:
+    """Read back what `stored_lifts` gave; none where there are none."""
+    figures = []
+    for path in sorted((folder / "lifts").glob("*.png")):
+        with Image.open(path) as image:
+            picture = draw_layers(f"lift {path.stem}", [np.asarray(image.convert("RGB"))])
+            figures.append(Figure(image.info.get("heading", ""), picture, image.info.get("caption", ""), 3))
+    return figures
+
+
+# As HTML
 
 
 @cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -48,7 +48,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
     surface, stability = item.role == "support_surface", graph.stability.get(item.id)
     faces = ("−x", "+x", "−y", "+y", "−z", "+z")
     unseen = " ".join(face for face, seen in zip(faces, item.seen, strict=True) if not seen)
-    supporters = ", ".join(s.supporter if s.certain else f"{s.supporter}?" for s in graph.supporters(item.id))
+    supporters = ", ".join(s.supporter + "?" * (not s.certain) for s in graph.supporters(item.id))
     verdict, ratio, overhang = "–" if surface else "not tested", "–", "–"
     if stability is not None:
         found = ["small area"] * stability.small_area + ["tips"] * stability.tips
@@ -143,20 +143,27 @@ def uncertain_supports(graph: SupportGraph) -> int:
     return sum(not s.certain for s in graph.supports)
 
 
-def changes(before: SupportGraph, after: SupportGraph) -> str:
-    """Say what a view added to and took from the graph."""
-    old, new = ({o.id: o.shape.kind for o in graph.objects} for graph in (before, after))
-    old_edges, new_edges = (
-        {f"{s.supporter} → {s.supported}": s.certain for s in graph.supports} for graph in (before, after)
-    )
-    parts: dict[str, Iterable[Any]] = {
-        "new objects": [n for n in new if n not in old],
-        "objects gone": [n for n in old if n not in new],
-        "new supports": [p for p in new_edges if p not in old_edges],
-        "supports gone": [p for p in old_edges if p not in new_edges],
-        "now certain": [p for p, certain in new_edges.items() if certain and not old_edges.get(p, True)],
-        "now uncertain": [p for p, certain in new_edges.items() if not certain and old_edges.get(p, False)],
-        "other shape": [n for n in new if old.get(n, new[n]) != new[n]],
+def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
+    """Say what a view changed: a line each for objects found, shaped or supported differently, and gone."""
+    known, now = {} if before is None else _held(before), _held(after)
+    lines = {
+        "found": [f"{name} {said}" for name, said in now.items() if name not in known],
+        "now": [f"{name} {said}" for name, said in now.items() if known.get(name, said) != said],
+        "gone": [name for name in known if name not in now],
     }
-    said = (f"{name}: {', '.join(items)}" for name, items in parts.items() if items)
-    return "; ".join(said) or "nothing new"
+    return [f"{kind}: {', '.join(items)}" for kind, items in lines.items() if items]
+
+
+def _held(graph: SupportGraph) -> dict[str, str]:
+    """Shape and supporters of each object by id; uncertain supporters with a question mark."""
+    said = {}
+    for item in graph.objects:
+        supporters = sorted(graph.supporters(item.id), key=lambda s: s.supporter)
+        names = [
+            ("the table" if graph[s.supporter].role == "support_surface" else s.supporter)
+            + "?" * (not s.certain)
+            for s in supporters
+        ]
+        if item.role == "object":
+            said[item.id] = f"({item.shape.kind}) held by {' and '.join(names) or 'nothing seen yet'}"
+    return said
