@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from caryatid.config import Config, SegmentationMethod
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
-from caryatid.objects.fusion import Evidence, absorbed, changed, fuse, fused_graph
+from caryatid.objects.fusion import changed, fuse, fused_graph, renamed
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.runtime.compiling import compile_kernels
@@ -74,7 +74,7 @@ class Scene(Pictured):
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
         self._registration: ViewRegistration | None = None
-        self._evidence = Evidence()
+        self._graphs: tuple[SupportGraph, ...] = ()
         self._shown: Counter[str] = Counter()
         self._contradicted: Counter[str] = Counter()
 
@@ -225,16 +225,15 @@ class Scene(Pictured):
         if changed:
             observation = self._models.nearest(observation, changed)
         given_up = self._models.unite(shown | changed, self.voxels)
-        self._evidence = absorbed(
-            self._evidence, {object_id(old): object_id(new) for old, new in given_up.items()}
-        )
+        names = {object_id(old): object_id(new) for old, new in given_up.items()}
+        self._graphs = tuple(renamed(graph, names) for graph in self._graphs) if names else self._graphs
         return observation.relabelled(given_up)
 
     def _fused(self, observation: Observation, newest: SupportGraph, given: bool) -> Observation:
-        """Add the newest graph to the evidence; its labels become those of the fused objects."""
+        """Add the newest graph to the earlier ones; its labels become those of the fused objects."""
         config = self.config.fusion
         same_labels = given or config.method != "sg"
-        self._evidence, names = fuse(self._evidence, newest, config, same_labels=same_labels)
+        self._graphs, names = fuse(self._graphs, newest, config, same_labels=same_labels)
         observation = observation.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
         seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}
         self._shown.update(seen)
@@ -242,7 +241,7 @@ class Scene(Pictured):
             for o in self.graph.objects:
                 if o.role == "object" and o.id not in seen and seen_through(o.shape, observation.view):
                     self._contradicted[o.id] += 1
-        fused = fused_graph(self._evidence, config, shown=self._shown, contradicted=self._contradicted)
+        fused = fused_graph(self._graphs, config, shown=self._shown, contradicted=self._contradicted)
         ids = {o.id for o in fused.objects}
         stability = {names[i]: verdict for i, verdict in newest.stability.items() if names[i] in ids}
         before, self.graph = self.graph, replace(fused, stability=stability)

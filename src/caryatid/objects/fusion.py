@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,104 +17,80 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
 
 Pair = tuple[str, str]
+Graphs = tuple[SupportGraph, ...]
 
 _TURNS = np.rint(Rotation.create_group("O").as_matrix())
 """The 24 rotations (24, 3, 3) of a cube: ways to name the axes of a box."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class Evidence:
-    """What the graphs of all views so far have said.
-
-    Attributes:
-        sightings: Per fused object id, its vertex in each view's graph that has it: view → vertex.
-        supports: Per (supporter, supported), the edge in each view's graph that has it: view → edge.
-        views: How many views have been fused.
-    """
-
-    sightings: Mapping[str, Mapping[int, SceneObject]] = field(default_factory=dict)
-    supports: Mapping[Pair, Mapping[int, Support]] = field(default_factory=dict)
-    views: int = 0
-
-
 def fuse(
-    evidence: Evidence, graph: SupportGraph, config: FusionConfig, *, same_labels: bool
-) -> tuple[Evidence, dict[str, str]]:
-    """Add one view's support graph to the evidence.
+    graphs: Graphs, graph: SupportGraph, config: FusionConfig, *, same_labels: bool
+) -> tuple[Graphs, dict[str, str]]:
+    """Add one view's support graph to those before, with the ids of the fused objects.
 
     Args:
-        evidence: All views before.
+        graphs: Those of all views before.
         graph: G_s^{t+1}: of this view alone (`sg`), or of the registered cloud so far (`pc`, `pc+sg`).
         config: Tolerances of the match.
         same_labels: A label means the same object in every view, so that shapes need not be compared.
 
     Returns:
-        The evidence with this view, and the fused id of each of the graph's objects.
+        All graphs, and the fused id of each of the new graph's objects.
     """
+    sightings, _ = _by_view(graphs)
     # By label alone, any sighting will do.
-    known = [_newest(seen) if same_labels else _vertex(seen, config) for seen in evidence.sightings.values()]
+    known = [_newest(seen) if same_labels else _vertex(seen, config) for seen in sightings.values()]
     names = match(known, list(graph.objects), config, same_labels=same_labels)
-    taken = {*evidence.sightings, *names.values()}
+    taken = {*sightings, *names.values()}
     for o in graph.objects:
         if o.id not in names:
             names[o.id] = _fresh_id(o, taken)
             taken.add(names[o.id])
-    sightings = {i: dict(seen) for i, seen in evidence.sightings.items()}
-    for o in graph.objects:
-        new_id = names[o.id]
-        sightings.setdefault(new_id, {})[evidence.views] = _named(o, new_id)
-    supports = {pair: dict(seen) for pair, seen in evidence.supports.items()}
-    for s in graph.supports:
-        renamed = replace(s, supporter=names[s.supporter], supported=names[s.supported])
-        supports.setdefault(renamed.pair, {})[evidence.views] = renamed
-    return Evidence(sightings, supports, evidence.views + 1), names
+    return (*graphs, renamed(graph, names)), names
 
 
-def absorbed(evidence: Evidence, names: Mapping[str, str]) -> Evidence:
-    """Return the evidence with some objects taken for others: what was said of the old id counts for the new.
+def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:
+    """Return a graph in which objects have other ids; of two that get the same one stays.
 
     Args:
-        evidence: All views so far.
-        names: Id to give up → id that takes its place; a support between the two is dropped.
+        graph: Of one view.
+        names: Id → id that takes its place; a support between two of the same is dropped.
     """
-    if not names:
-        return evidence
-    sightings: dict[str, dict[int, SceneObject]] = {}
-    for i, seen in evidence.sightings.items():
-        new_id = names.get(i, i)
-        merged = sightings.setdefault(new_id, {})
-        merged.update({v: _named(o, new_id) for v, o in seen.items() if v not in merged})
-    supports: dict[Pair, dict[int, Support]] = {}
-    for (a, b), found in evidence.supports.items():
-        pair = names.get(a, a), names.get(b, b)
-        if pair[0] != pair[1]:
-            renamed = {v: replace(s, supporter=pair[0], supported=pair[1]) for v, s in found.items()}
-            supports.setdefault(pair, {}).update(renamed)
-    return Evidence(sightings, supports, evidence.views)
+    objects: dict[str, SceneObject] = {}
+    for o in graph.objects:
+        new_id = names.get(o.id, o.id)
+        named = o if new_id == o.id else replace(o, id=new_id, label=int(new_id[1:]))
+        objects.setdefault(new_id, named)
+    supports: dict[Pair, Support] = {}
+    for s in graph.supports:
+        a, b = (names.get(i, i) for i in s.pair)
+        if a != b:
+            supports[a, b] = replace(s, supporter=a, supported=b)
+    return SupportGraph(tuple(objects.values()), tuple(supports.values()))
 
 
 def fused_graph(
-    evidence: Evidence,
+    graphs: Graphs,
     config: FusionConfig,
     *,
     shown: Mapping[str, int] | None = None,
     contradicted: Mapping[str, int] | None = None,
 ) -> SupportGraph:
-    """Read the fused graph off the evidence.
+    """Read the fused graph off those of all views.
 
     With `pc` it is the newest graph, with its counts; with `sg` all that most of the views that could tell
     agree on; with `pc+sg` the newest graph's edges, and those of earlier ones that were mostly found.
 
     Args:
-        evidence: All views.
+        graphs: Of all views, with the ids of the fused objects.
         config: Method and the share an edge must keep.
         shown: Per object id, in how many views it was seen; without it, in how many graphs it is.
         contradicted: Per object id, in how many views something behind it was seen instead.
     """
     shown, contradicted = shown or {}, contradicted or {}
-    newest = evidence.views - 1
+    newest, (sightings, edges) = len(graphs) - 1, _by_view(graphs)
     objects: dict[str, SceneObject] = {}
-    for i, seen in evidence.sightings.items():
+    for i, seen in sightings.items():
         if config.method == "pc" and newest not in seen:
             continue
         occurrences = shown.get(i, len(seen))
@@ -123,10 +99,10 @@ def fused_graph(
             vertex = _vertex(seen, config)
             objects[i] = replace(vertex, occurrences=occurrences, opportunities=opportunities)
     supports = []
-    for pair, found in evidence.supports.items():
+    for pair, found in edges.items():
         if pair[0] not in objects or pair[1] not in objects:
             continue
-        views = evidence.sightings[pair[0]].keys() & evidence.sightings[pair[1]].keys()
+        views = sightings[pair[0]].keys() & sightings[pair[1]].keys()
         least = config.keep_share * len(views)
         mostly = len(found) >= least if config.method == "sg" else len(found) > least
         if (mostly and config.method != "pc") or (newest in found and config.method != "sg"):
@@ -206,8 +182,18 @@ def _newest(seen: Mapping[int, SceneObject]) -> SceneObject:
     return seen[max(seen)]
 
 
-def _named(o: SceneObject, new_id: str) -> SceneObject:
-    return o if new_id == o.id else replace(o, id=new_id, label=int(new_id[1:]))
+def _by_view(
+    graphs: Graphs,
+) -> tuple[dict[str, dict[int, SceneObject]], dict[Pair, dict[int, Support]]]:
+    """Vertices by their ids and edges by their ends, each in the views whose graphs have it: view → it."""
+    sightings: dict[str, dict[int, SceneObject]] = {}
+    edges: dict[Pair, dict[int, Support]] = {}
+    for view, graph in enumerate(graphs):
+        for o in graph.objects:
+            sightings.setdefault(o.id, {})[view] = o
+        for s in graph.supports:
+            edges.setdefault(s.pair, {})[view] = s
+    return sightings, edges
 
 
 def _fresh_id(o: SceneObject, taken: set[str]) -> str:
