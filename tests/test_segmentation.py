@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 from caryatid.config import CloudConfig, FitConfig, SegmentationConfig, SurfaceConfig
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
-from caryatid.segmentation.lccp import cluster_by_mean, convex_parts
+from caryatid.segmentation.lccp import convex_parts
 from caryatid.segmentation.segments import cut_by_colour, occlusion_gaps, segment, segment_cloud
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points, thin
@@ -181,15 +181,6 @@ def test_a_grazing_face_is_cut_into_no_slivers():
     box = (np.array([0.0, 0.0, TABLE + 0.1]), np.array([0.2, 0.2, 0.2]))
     view = table_scene(from_the_side(0.0, elevation=29.0, distance=1.0), [box], sigma=0.001)
     assert found(parts(view), view.labels) == (1, 1, 1)
-
-
-def test_clusters_weigh_the_mean_of_their_border():
-    pairs = np.array([[0, 1], [2, 3], [0, 2], [1, 3]])
-    attraction = np.array([1.0, 0.9, 0.5, -0.8])
-    cluster = cluster_by_mean(4, pairs, attraction, np.ones(4))
-    assert cluster[0] == cluster[1] != cluster[2] == cluster[3]
-    joined = cluster_by_mean(4, pairs, attraction, np.array([1.0, 1.0, 3.0, 1.0]))
-    assert len(set(joined.tolist())) == 1
 
 
 POST = (np.array([0.15, 0.0, TABLE + 0.13]), np.array([0.05, 0.08, 0.26]))

@@ -8,7 +8,7 @@ from raycast import TABLE, from_the_side, table_scene
 from synthetic import box, sphere
 
 from caryatid.geometry import transforms
-from caryatid.sensing.visibility import seen_through, shown
+from caryatid.sensing.views import seen_through
 
 EYE = from_the_side(azimuth=180.0)
 CRATE = box((0.0, 0.0, TABLE + 0.06), (0.1, 0.1, 0.12))
@@ -70,26 +70,3 @@ def test_pixels_without_a_reading_say_nothing():
     half = EMPTY.depth.copy()
     half[:, ::2] = 0.0
     assert seen_through(CRATE, replace(EMPTY, depth=half))
-
-
-def sights(rng: np.random.Generator, points: int, cameras: int) -> tuple[np.ndarray, ...]:
-    """Random arguments of `shown`: points without a side, worth nothing, seen before are among them."""
-    normals = transforms.unit(rng.normal(size=(points, 3)))
-    normals[::3] = 0.0
-    before = np.where(rng.random(points) < 0.5, 0.0, rng.random(points))
-    weights = np.where(rng.random(points) < 0.2, 0.0, rng.random(points))
-    eyes = rng.uniform(-1.0, 1.0, (cameras, 3))
-    axes = transforms.unit(rng.uniform(-0.3, 0.3, (cameras, 3)) - eyes)
-    solid = (rng.random((13, 17, 11)) < 0.02).astype(np.uint8)
-    return (
-        solid, np.array([-0.3, -0.4, -0.2]), 0.05, rng.uniform(-0.6, 0.6, (points, 3)), normals, before,
-        weights, eyes.T.copy(), axes.T.copy(),
-    )  # fmt: skip
-
-
-def test_without_anything_solid_nothing_is_hidden():
-    args = (*sights(np.random.default_rng(1), 10, 20), 0.0, 0.5, -1.0)
-    nothing = (np.zeros((0, 0, 0), dtype=np.uint8), *args[1:])
-    np.testing.assert_array_equal(shown(*nothing), shown(np.zeros_like(args[0]), *args[1:]))
-    assert shown(*(a[:0] if n in (3, 4, 5, 6) else a for n, a in enumerate(args))).shape == (0, 20)
-    assert shown(*(a[:, :0].copy() if n in (7, 8) else a for n, a in enumerate(args))).shape == (10, 0)

@@ -24,8 +24,7 @@ from caryatid.segmentation.observation import UP, Observation, label_image, obse
 from caryatid.segmentation.support_plane import SupportSurface, refitted
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
-from caryatid.sensing.visibility import seen_through
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View, seen_through
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.plausibility import reconcile
 from caryatid.support.relations import Effect, explain, infer, predict_removal

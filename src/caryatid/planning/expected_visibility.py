@@ -15,7 +15,6 @@ from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.sensing.visibility import shown
 from caryatid.sensing.voxel_map import UNKNOWN, Solid, VoxelMap
 from caryatid.support.stability import ground_outline
 
@@ -154,21 +153,11 @@ def shown_anew(
     sample's own surface. Lines of sight are all free where `config.occlusion` is `ignore`, and not
     followed where they could show nothing new; `before` is from 0 to 1.
     """
-    see_through = config.occlusion == "ignore"
-    return shown(
-        np.zeros((0, 0, 0), dtype=np.uint8) if see_through else solid.grid,
-        solid.origin_world,
-        solid.voxels.config.size,
-        samples.points_world,
-        samples.normals_world,
-        before,
-        samples.weights,
-        np.ascontiguousarray(T_world_camera[:, :3, 3].T),
-        np.ascontiguousarray(T_world_camera[:, :3, 2].T),
-        2.5 * solid.voxels.config.size,
-        float(np.cos(np.deg2rad(60.0))),
-        float(np.cos(np.deg2rad(config.view_cone))),
-    )
+    if config.occlusion == "ignore":
+        solid = replace(solid, grid=np.zeros((0, 0, 0), dtype=np.uint8))
+    points, eyes, axes = samples.points_world, T_world_camera[:, :3, 3], T_world_camera[:, :3, 2]
+    clearance, cone = 2.5 * solid.voxels.config.size, float(np.cos(np.deg2rad(config.view_cone)))
+    return solid.shown(points, samples.normals_world, before, samples.weights, eyes, axes, clearance, cone)
 
 
 def unseen_shares(samples: Samples, seen: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -95,18 +96,19 @@ def convex_parts(
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)
-    distances, turns = _measure_edges(points, normals, edges)
-    costs = distances / config.surfel + config.crease * turns
     seeds = thin(points, config.surfel)
     start = np.concatenate([[0], np.cumsum(np.bincount(edges.ravel(), minlength=len(points)))])
-    owner, count = _spread_seeds(edges, costs, start, seeds), len(seeds)
-    sizes = np.bincount(owner + 1, minlength=count + 1)[1:]
-    pairs, lengths = _count_borders(owner, edges, count)
+    owner, distances = _spread_seeds(points, normals, edges, start, seeds, config.surfel, config.crease)
+    sizes = np.bincount(owner + 1, minlength=len(seeds) + 1)[1:]
+    pairs, lengths = _count_borders(owner, edges)
     attraction = _border_attraction(points, normals, owner, sizes, pairs, config)
-    borders = pairs, attraction, lengths
+    joint, weights, totals = pairs, lengths, attraction * lengths
     if steps is not None:
-        borders = _with_steps(*borders, *_count_borders(owner, steps, count), count)
-    cluster = cluster_by_mean(count, *borders)
+        # Depth steps along a border repel, each as much as flat surface attracts.
+        others, repelling = _count_borders(owner, steps)
+        values = np.concatenate([totals, -repelling]), np.concatenate([lengths, repelling])
+        joint, totals, weights = _summed(np.concatenate([pairs, others]), *values)
+    cluster = _roots(_merge_all(len(seeds), joint.flatten(), totals, weights.copy()))
     apart = distances[distances > 0.0]
     min_width = config.min_width / np.median(apart) if len(apart) else 0.0
     cluster = _absorb_slivers(cluster, sizes, pairs, lengths, config.min_size, min_width)
@@ -116,37 +118,30 @@ def convex_parts(
 
 
 @njit(cache=True)
-def _measure_edges(points, normals, edges):  # type: ignore[no-untyped-def]
-    """How long each edge (E,) is [m], and how far the normal turns along it: 1 − cosine."""
-    lengths, turns = np.empty(len(edges)), np.empty(len(edges))
-    for e in range(len(edges)):
-        i, j = edges[e]
-        square, cosine = 0.0, 0.0
-        for axis in range(3):
-            square += (points[i, axis] - points[j, axis]) ** 2
-            cosine += normals[i, axis] * normals[j, axis]
-        lengths[e], turns[e] = np.sqrt(square), 1.0 - cosine
-    return lengths, turns
-
-
-@njit(cache=True)
-def _spread_seeds(edges, costs, start, seeds):  # type: ignore[no-untyped-def]
+def _spread_seeds(points, normals, edges, start, seeds, surfel, crease):  # type: ignore[no-untyped-def]
     """For each node (N,), the number of the seed (S,) nearest along the edges (E, 2), −1 = none.
 
-    Edges are relaxed in sweeps back and forth until nothing changes (Bellman and Ford); faster than a heap
-    here. The neighbours of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them.
+    Edges are as long as they are [surfels], and longer where the normal turns; their lengths (E,) [m] come
+    second. They are relaxed in sweeps back and forth until nothing changes (Bellman and Ford); faster than a
+    heap here. The neighbours of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them.
     """
     count = len(start) - 1
     distance, owner = np.full(count, np.inf), np.full(count, -1)
     for k in range(len(seeds)):
         distance[seeds[k]], owner[seeds[k]] = 0.0, k
     neighbour, length = np.empty(2 * len(edges), dtype=np.intp), np.empty(2 * len(edges))
-    free = start[:-1].copy()
+    free, apart = start[:-1].copy(), np.empty(len(edges))
     for e in range(len(edges)):
-        for k in range(2):
-            at = free[edges[e, k]]
-            free[edges[e, k]] += 1
-            neighbour[at], length[at] = edges[e, 1 - k], costs[e]
+        i, j = edges[e]
+        square, cosine = 0.0, 0.0
+        for axis in range(3):
+            square += (points[i, axis] - points[j, axis]) ** 2
+            cosine += normals[i, axis] * normals[j, axis]
+        apart[e] = np.sqrt(square)
+        for node, other in ((i, j), (j, i)):
+            at = free[node]
+            free[node] += 1
+            neighbour[at], length[at] = other, apart[e] / surfel + crease * (1.0 - cosine)
     changed, forward = True, True
     while changed:
         changed = False
@@ -158,17 +153,23 @@ def _spread_seeds(edges, costs, start, seeds):  # type: ignore[no-untyped-def]
                     distance[node], owner[node] = through, owner[neighbour[at]]
                     changed = True
         forward = not forward
-    return owner
+    return owner, apart
 
 
-def _count_borders(owner: Index, edges: Index, owners: int) -> tuple[Index, Array]:
+def _count_borders(owner: Index, edges: Index) -> tuple[Any, ...]:
     """Pairs (B, 2), ascending, of owners that edges (E, 2) lead across, and how many do; owner −1 = none."""
     first, second = owner[edges].T
     across = (first != second) & (first >= 0) & (second >= 0)
-    first, second = first[across], second[across]
-    keys = np.minimum(first, second) * owners + np.maximum(first, second)
-    keys, lengths = np.unique(keys, return_counts=True)
-    return np.stack(np.divmod(keys, owners), axis=-1), lengths.astype(np.float64)
+    pairs = np.sort(np.stack([first[across], second[across]], axis=-1), axis=1)
+    return _summed(pairs, np.ones(len(pairs)))
+
+
+def _summed(pairs: Index, *values: Array) -> tuple[Any, ...]:
+    """Each pair of P (P, 2) once (B, 2), ascending, and the sums of its values (P,)."""
+    factor = int(pairs.max(initial=0)) + 1
+    keys, inverse = np.unique(pairs @ np.array([factor, 1]), return_inverse=True)
+    sums = (np.bincount(inverse, v, len(keys)).astype(np.float64) for v in values)
+    return np.stack(np.divmod(keys, factor), axis=-1), *sums
 
 
 def _border_attraction(
@@ -188,36 +189,14 @@ def _border_attraction(
     return np.clip(np.minimum(bend, step), -2.0, 1.0)
 
 
-def _with_steps(
-    pairs: Index, attraction: Array, lengths: Array, apart: Index, apart_lengths: Array, count: int
-) -> tuple[Index, Array, Array]:
-    """Borders once depth steps along them repel, each as much as flat surface attracts."""
-    if len(apart) == 0:
-        return pairs, attraction, lengths
-    keys = np.concatenate([pairs, apart]) @ np.array([count, 1])
-    keys, inverse = np.unique(keys, return_inverse=True)
-    total = np.bincount(inverse, np.concatenate([attraction * lengths, -apart_lengths]))
-    length = np.bincount(inverse, np.concatenate([lengths, apart_lengths])).astype(np.float64)
-    return np.stack(np.divmod(keys, count), axis=-1), total / length, length
-
-
-def cluster_by_mean(count: int, pairs: Index, attraction: Array, lengths: Array) -> Index:
+@njit(cache=True, error_model="numpy")
+def _merge_all(count, node, total, length):  # type: ignore[no-untyped-def]
     """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
 
-    Borders are pairs (B, 2) of N = `count` nodes, each once, with a signed attraction (B,) and their length
-    (B,), which weighs it. The cluster of each node (N,) is the number of one of its nodes.
-    """
-    node = np.array(pairs, dtype=np.intp).ravel()
-    return _roots(_merge_all(count, node, attraction, attraction * lengths, np.array(lengths, dtype=float)))
-
-
-@njit(cache=True, error_model="numpy")
-def _merge_all(count, node, attraction, total, length):  # type: ignore[no-untyped-def]
-    """Do as `cluster_by_mean` says, and return the cluster that each node was merged into.
-
-    The sides 2e and 2e + 1 of border e lie at the nodes `node` (2B,). `first` (N,) is the first side at each
-    node and `after` (2B,) the next at the same one, −1 = none; `degree` (N,) is how many there are. `total`
-    (B,) is attraction times length, and 0 the `length` of a border that is no more.
+    Of the clusters of each node (N,) it gives one of its nodes, or one that was merged into it. The sides 2e
+    and 2e + 1 of border e lie at the nodes `node` (2B,). `first` (N,) is the first side at each node and
+    `after` (2B,) the next at the same one, −1 = none; `degree` (N,) is how many there are. `total` (B,) is
+    attraction times length, and 0 the `length` of a border that is no more.
     """
     first, after, degree = np.full(count, -1), np.full(len(node), -1), np.zeros(count, dtype=np.intp)
     parent, shared = np.arange(count), np.full(count, -1)
@@ -228,8 +207,8 @@ def _merge_all(count, node, attraction, total, length):  # type: ignore[no-untyp
     heap = [(0.0, 0, 0, 0, 0.0) for _ in range(0)]
     for e in range(len(total)):
         i, j = node[2 * e], node[2 * e + 1]
-        if attraction[e] > 0.0:
-            heapq.heappush(heap, (-attraction[e], min(i, j), max(i, j), e, length[e]))
+        if total[e] > 0.0:
+            heapq.heappush(heap, (-total[e] / length[e], min(i, j), max(i, j), e, length[e]))
     while len(heap) > 0:
         _, i, j, e, known_length = heapq.heappop(heap)
         if parent[i] != i or parent[j] != j or length[e] != known_length:
@@ -281,16 +260,13 @@ def _absorb_slivers(
     cluster = cluster.copy()
     for _ in range(3):
         total = np.bincount(cluster, weights=sizes, minlength=len(cluster))
-        i, j = cluster[pairs[:, 0]], cluster[pairs[:, 1]]
-        outer = i != j
-        keys, inverse = np.unique(
-            np.concatenate([i[outer], j[outer]]) * len(cluster) + np.concatenate([j[outer], i[outer]]),
-            return_inverse=True,
-        )
-        if len(keys) == 0:
+        joint = cluster[pairs]
+        outer = joint[:, 0] != joint[:, 1]
+        if not outer.any():
             break
-        border = np.bincount(inverse, weights=np.concatenate([lengths[outer], lengths[outer]]))
-        small, large = np.divmod(keys, len(cluster))
+        both_ways = np.concatenate([joint[outer], joint[outer, ::-1]])
+        joint, border = _summed(both_ways, np.tile(lengths[outer], 2))
+        small, large = joint.T
         # On a grid with diagonals, three edges cross a border for each sample along it.
         narrow = 3.0 * total[small] < min_width * border
         absorbed = (total[small] < total[large]) & (narrow | (total[small] < min_size))

@@ -79,8 +79,16 @@ def take_samples(
     x, y = (column - view.K[0, 2]) / view.K[0, 0], (row - view.K[1, 2]) / view.K[1, 1]
     rays = np.column_stack([x, y, np.ones(len(row))])
     if view.normals_camera is None:
-        scale = view.K[0, 0] / float(np.median(depth[places]))
-        planes = _tangent_planes(view, row, column, scale, clouds)
+        scale = view.K[0, 0] / float(np.median(depth[places]))  # Of the usual object [px/m].
+        # 13 mm at the objects' median distance; fewer than 5 px leave the noise, more than 13 px cost time.
+        radius = int(np.clip(np.floor(0.013 * scale / 2.0), 2, 6))
+        radius = min(radius, max(1, round((clouds.normal_size * scale - 1.0) / 2.0)))
+        counts = (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
+        image = np.zeros(view.depth.shape, dtype=np.float32)
+        np.divide(np.float32(1.0), view.depth, out=image, where=counts)
+        shares = np.array_split(np.column_stack([row, column]), SHARES)
+        windows = radius, clouds.edge_jump, clouds.max_slope
+        planes = np.concatenate(on_threads(lambda k: _fit_planes(image, shares[k], *windows), SHARES))
         known = planes[:, 0] > 0.0
         slopes = planes[:, 1:] * view.K[[0, 1], [0, 1]]
         normals = -np.column_stack([slopes, planes[:, 0] - np.einsum("ij,ij->i", slopes, rays[:, :2])])
@@ -101,30 +109,14 @@ def take_samples(
     return Samples(grid, places, points, normals, height, depth, rgb, K)
 
 
-def _tangent_planes(
-    view: View, row: NDArray[np.intp], column: NDArray[np.intp], scale: float, clouds: CloudConfig
-) -> Array:
+@njit(cache=True, error_model="numpy", nogil=True)
+def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-def]
     """Planes 1/z = c + a·du + b·dv (N, 3) [1/m, 1/m per px] of the surface around pixels, up to its creases.
 
     By least squares: first over the readings of a narrow window that lie near the pixel's own, then in two
     rounds over those of a wide one that lie near the plane. Where a wide window determines none, the plane
-    stays as it was; where readings are too few for a first plane it is zero. `scale` is that of the usual
-    object [px/m].
+    stays as it was; where readings are too few for a first plane it is zero.
     """
-    # 13 mm at the objects' median distance; fewer than 5 px leave the noise, more than 13 px cost time.
-    radius = int(np.clip(np.floor(0.013 * scale / 2.0), 2, 6))
-    radius = min(radius, max(1, round((clouds.normal_size * scale - 1.0) / 2.0)))
-    counts = (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
-    inverse_depth = np.zeros(view.depth.shape, dtype=np.float32)
-    np.divide(np.float32(1.0), view.depth, out=inverse_depth, where=counts)
-    shares = np.array_split(np.column_stack([row, column]), SHARES)
-    windows = radius, clouds.edge_jump, clouds.max_slope
-    return np.concatenate(on_threads(lambda k: _fit_planes(inverse_depth, shares[k], *windows), SHARES))
-
-
-@njit(cache=True, error_model="numpy", nogil=True)
-def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-def]
-    """Fit the planes (N, 3) of some pixels (N, 2) as `_tangent_planes` says."""
     planes = np.zeros((len(pixels), 3))
     side = 2.0 * radius + 1.0
     for n in range(len(pixels)):

@@ -20,8 +20,7 @@ from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.lccp import convex_parts, grid_edges, hollowness, number_by_appearance, wide_parts
 from caryatid.segmentation.samples import Samples, take_samples
 from caryatid.segmentation.support_plane import SupportSurface
-from caryatid.sensing.views import Cloud, View
-from caryatid.sensing.visibility import depth_behind
+from caryatid.sensing.views import Cloud, View, depth_behind
 
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]

@@ -38,38 +38,24 @@ def oriented_points(
     T = np.ascontiguousarray(np.eye(4) if view.T_world_camera is None else view.T_world_camera)
     taken = view.valid & (view.depth >= config.min_depth) & (view.depth <= config.max_depth)
     given = view.normals_camera
-    if given is None:
-        planes = local_planes(*_inverse_depth(view, taken, among, config), config.edge_jump, config.max_slope)
-        taken = planes[2] > 0.0
-    else:
+    if given is not None:
         taken &= np.einsum("hwi,hwi->hw", given, given) > 0.5
-        taken &= True if among is None else among
-    pixels = np.flatnonzero(taken)
-    if given is None:
-        points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
-        for_each(_orient, SHARES, (pixels, planes, np.ascontiguousarray(view.K), T, points, normals))
-        return points, normals, pixels
-    points_camera, normals_camera = view.points_camera.reshape(-1, 3), given.reshape(-1, 3).astype(float)
-    points, normals = points_camera[pixels], normals_camera[pixels]
-    return transforms.transform(T, points), transforms.rotate(T, normals), pixels
-
-
-def _inverse_depth(
-    view: View, taken: NDArray[np.bool_], among: NDArray[np.bool_] | None, config: CloudConfig
-) -> tuple[Image, int]:
-    """1/z (H, W) [1/m] of the readings in range, else 0, and the radius [px] of their windows.
-
-    The median depth of all readings in range, of every fourth row and column, tells how wide a window is.
-    """
+        pixels = np.flatnonzero(taken if among is None else taken & among)
+        points = transforms.transform(T, view.points_camera.reshape(-1, 3)[pixels])
+        return points, transforms.rotate(T, given.reshape(-1, 3)[pixels].astype(float)), pixels
     inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=taken)
-    radius = config.normal_window // 2
-    readings = view.depth[::4, ::4][taken[::4, ::4]]
+    # The median depth of all readings in range, of every fourth row and column, tells how wide a window is.
+    radius, readings = config.normal_window // 2, view.depth[::4, ::4][taken[::4, ::4]]
     if len(readings) > 0:
         width = config.normal_size * view.K[0, 0] / float(np.median(readings))
         radius = min(radius, max(1, round((width - 1.0) / 2.0)))
     if among is not None:
         inverse_depth[~among] = 0.0
-    return inverse_depth, radius
+    planes = local_planes(inverse_depth, radius, config.edge_jump, config.max_slope)
+    pixels = np.flatnonzero(planes[2] > 0.0)
+    points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
+    for_each(_orient, SHARES, (pixels, planes, np.ascontiguousarray(view.K), T, points, normals))
+    return points, normals, pixels
 
 
 def local_planes(inverse_depth: Image, radius: int, edge_jump: float, max_slope: float) -> Image:

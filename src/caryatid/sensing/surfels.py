@@ -49,15 +49,13 @@ def surfels_of(
     for alike in (far, ~far):
         if alike.any():
             enough[alike] = min(4, 0.33 * quantile(count[alike], 0.9))
-    full = np.flatnonzero(count >= enough)
-    count = count[full]
-    x, y, z, u, v, w, xx, xy, xz, yy, yz, zz = means = np.ascontiguousarray(sums[full, 1:].T) / count
+    u, v, w = sums[:, 4:7].T / count
     length = np.sqrt(u * u + v * v + w * w)
     # Where the mean of the normals is shorter, there is an edge.
-    keep = length > 0.97
-    voxels, kinds, count = voxels[full[keep]], kinds[full[keep]], count[keep]
-    means[3:6] *= 1.0 / length
-    x, y, z, u, v, w, xx, xy, xz, yy, yz, zz = means = means[:, keep]
+    keep = np.flatnonzero((count >= enough) & (length > 0.97))
+    voxels, kinds, count = voxels[keep], kinds[keep], count[keep]
+    x, y, z, u, v, w, xx, xy, xz, yy, yz, zz = means = np.ascontiguousarray(sums[keep, 1:].T) / count
+    means[3:6] *= 1.0 / length[keep]
     spread = (xx - x * x) * u * u + (yy - y * y) * v * v + (zz - z * z) * w * w
     across = (xy - x * y) * u * v + (xz - x * z) * u * w + (yz - y * z) * v * w
     variance = np.maximum(spread + 2.0 * across, 0.0) / count

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from caryatid.errors import InputError
 from caryatid.geometry import points as kernels
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
 
@@ -181,6 +182,35 @@ class Camera(Protocol):
             T_world_camera: Where the camera is to be (4, 4); the view says where it believes it was.
         """
         ...
+
+
+def seen_through(shape: Shape, view: View) -> bool:
+    """Whether a view with a pose looks through most of where a shape in the world frame should be."""
+    behind = depth_behind(shape.moved(transforms.invert(view.pose)), view.depth, view.K)
+    read = np.isfinite(behind)
+    # A reading 2 cm behind a point contradicts it: 2σ of registration and depth together.
+    return bool(read.any()) and bool((behind[read] > 0.02).mean() > 0.5)
+
+
+def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
+    """How far readings lie behind the surface of a shape where it faces the camera.
+
+    Args:
+        shape: In the camera frame.
+        depth: Readings (H, W) [m], 0 = none.
+        K: Pinhole matrix (3, 3) [px].
+
+    Returns:
+        Of points about 1 cm apart that are in the image (N,) [m]; −inf where there is no reading.
+    """
+    points, outward = shape.surface(0.01)
+    facing = np.einsum("ij,ij->i", points, outward) < 0.0
+    points = points[facing & (points[:, 2] > 1e-3)]
+    u, v = np.rint((points @ K.T)[:, :2] / points[:, 2:]).astype(np.intp).T
+    height, width = depth.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    reading = depth[v[inside], u[inside]]
+    return np.where(reading > 0.0, reading - points[inside, 2], -np.inf)
 
 
 def check_intrinsics(K: Array, name: str) -> Array:

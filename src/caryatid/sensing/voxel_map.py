@@ -25,10 +25,11 @@ from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, for_each
 from caryatid.sensing.views import View
-from caryatid.sensing.visibility import shown
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
+FULLY = float(np.cos(np.deg2rad(60.0)))
+"""Cosine of the angle to its normal up to which a point is shown fully [1]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,14 +175,46 @@ class Solid:
         Returns:
             (P, T), True where something stands between.
         """
-        points = np.ascontiguousarray(points_world, dtype=np.float64)
-        targets = np.ascontiguousarray(np.transpose(targets_world), dtype=np.float64)
+        points, eyes = (np.asarray(x, dtype=np.float64) for x in (points_world, targets_world))
         anywhere, known, worth = np.zeros_like(points), np.zeros(len(points)), np.ones(len(points))
-        free = shown(
-            self.grid, self.origin_world, self.voxels.config.size, points, anywhere, known, worth,
-            targets, np.zeros_like(targets), float(clearance), 1.0, -1.0,
-        )  # fmt: skip
+        free = self.shown(points, anywhere, known, worth, eyes, np.zeros_like(eyes), clearance, -1.0)
         return free == 0.0
+
+    def shown(
+        self,
+        points_world: Array,
+        normals_world: Array,
+        before: Array,
+        weights: Array,
+        eyes_world: Array,
+        axes_world: Array,
+        clearance: float,
+        cone: float,
+    ) -> Array:
+        """Worth of what each camera shows of each point anew.
+
+        A camera shows a point fully up to 60° from its normal, then as well as the cosine; not at all where
+        the point lies outside its image or the line of sight is blocked.
+
+        Args:
+            points_world: (P, 3) [m].
+            normals_world: Outward unit normals (P, 3); zero where a point looks the same from all sides.
+            before: How well each has been shown (P,), from 0 to 1.
+            weights: Worth (P,) of showing each fully.
+            eyes_world: Camera centres (C, 3) [m].
+            axes_world: Optical axes (C, 3), unit.
+            clearance: Length of a line of sight's beginning at the point that does not count [m].
+            cone: Least cosine of the angle to the optical axis within the image.
+
+        Returns:
+            (P, C): weight · (how well it is shown − how well before), 0 where that is less.
+        """
+        solid = (self.grid, self.origin_world, 1.0 / self.voxels.config.size)
+        samples = (np.ascontiguousarray(points_world), normals_world, before, weights)
+        cameras = (np.ascontiguousarray(eyes_world.T), np.ascontiguousarray(axes_world.T))
+        worth = np.empty((len(points_world), len(eyes_world)))
+        for_each(_show, SHARES, (*solid, *samples, *cameras, float(clearance), cone, worth))
+        return worth
 
 
 def _values_at(grid: NDArray[np.int8], points: Array, origin: Array, size: float) -> NDArray[np.int8]:
@@ -274,3 +307,58 @@ def _fill_layer(i, data):  # type: ignore[no-untyped-def]
                 x, y, z = local(R[s], centres[s], centre, 0)
                 if gradient(kinds[s], x, y, z, half[s, 0], half[s, 1], half[s, 2])[0] < 0.0:
                     grid[i, j, k] = 1
+
+
+@njit(cache=True, error_model="numpy")
+def _show(share, data):  # type: ignore[no-untyped-def]
+    """Write the worth of a share of the work: each piece is one point and 128 of the cameras."""
+    solid, worth = data[0], data[-1]
+    found, count = room(solid.shape), worth.shape[1]
+    across = (count + 127) // 128
+    for piece in range(share, len(worth) * across, SHARES):
+        p, first = piece // across, piece % across * 128
+        end = min(first + 128, count)
+        _face(data, p, first, end)
+        _hide(data, found, p, first, end)
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _face(data, p, first, end):  # type: ignore[no-untyped-def]
+    """Write what each camera shows of one point anew where nothing is in between."""
+    _, _, _, points, normals, befores, weights, eyes, axes, _, cone, worths = data
+    x, y, z = points[p, 0], points[p, 1], points[p, 2]
+    a, b, c = normals[p, 0], normals[p, 1], normals[p, 2]
+    before, weight, worth = befores[p], weights[p], worths[p]
+    around = a == 0.0 and b == 0.0 and c == 0.0
+    for n in range(first, end):
+        dx, dy, dz = eyes[0, n] - x, eyes[1, n] - y, eyes[2, n] - z
+        distance = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
+        facing = 1.0 if around else min((a * dx + b * dy + c * dz) / (distance * FULLY), 1.0)
+        along = -(axes[0, n] * dx + axes[1, n] * dy + axes[2, n] * dz)
+        new = facing - before
+        worth[n] = weight * new if new > 0.0 and along >= cone * distance else 0.0
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract"})
+def _hide(data, found, p, first, end):  # type: ignore[no-untyped-def]
+    """Set to nought what cameras would show of one point but for what is in between."""
+    solid, origin, per_metre, points, _, _, _, eyes, _, clearance, _, worths = data
+    shape, flat, worth = solid.shape, solid.reshape(-1), worths[p]
+    x, y, z = points[p, 0], points[p, 1], points[p, 2]
+    start = ((x - origin[0]) * per_metre, (y - origin[1]) * per_metre, (z - origin[2]) * per_metre)
+    for n in range(first, end):
+        if worth[n] == 0.0:
+            continue
+        dx, dy, dz = eyes[0, n] - x, eyes[1, n] - y, eyes[2, n] - z
+        length = np.sqrt(dx * dx + dy * dy + dz * dz)
+        if length <= clearance:
+            continue
+        ray = (dx * per_metre, dy * per_metre, dz * per_metre)
+        slabs = traverse(found, shape, start, ray, clearance / length, 1.0)
+        blocked = np.uint8(0)
+        for m in range(slabs):
+            blocked |= flat[np.uint32(found[0, m])]
+            blocked |= flat[np.uint32(found[1, m])]
+            blocked |= flat[np.uint32(found[2, m])]
+        if blocked:
+            worth[n] = 0.0
