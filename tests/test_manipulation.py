@@ -18,7 +18,7 @@ from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.graph import Support, SupportGraph
 from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses_of
 from caryatid.manipulation.order import TakeStep, plan_order
-from caryatid.simulation.lifting import ASIDE, Lifting
+from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import TABLE_HEIGHT, Solid, build_spec, scene_from_spec
 from caryatid.steps import read_run
@@ -99,11 +99,18 @@ class TestOrder:
             plan_order(SupportGraph(tower().objects[1:]), CONFIG)
 
 
+def in_physics(*shapes):
+    return scene_from_spec(build_spec([Solid(shape) for shape in shapes], "test"), "test", "test")
+
+
+def take(object_id, *hold):
+    return TakeStep(object_id, hold, True, 0.0, "")
+
+
 @pytest.fixture(scope="module")
 def scene():
     """The tower in physics."""
-    solids = [Solid(o.shape) for o in tower().objects if o.role == "object"]
-    return scene_from_spec(build_spec(solids, "tower"), "tower", "test")
+    return in_physics(*(o.shape for o in tower().objects if o.role == "object"))
 
 
 BODIES = {f"o{k}": f"object{k - 1}" for k in range(1, 5)}
@@ -116,65 +123,34 @@ class TestDismantling:
         taken = list(dismantle(scene, order.steps, BODIES, CONFIG))
         assert [t.body for t in taken] == [BODIES[s.object_id] for s in order.steps]
         assert all(t.ok for t in taken)
-        (harm,) = dismantle(scene, [TakeStep("o1", (), True, 0.0, "")], BODIES, CONFIG)
+        (harm,) = dismantle(scene, [take("o1")], BODIES, CONFIG)
         assert not harm.ok
         assert harm.disturbed == ("object1", "object2")
-        (nothing,) = dismantle(scene, [TakeStep("o7", ("o8",), True, 0.0, "")], BODIES, CONFIG)
+        (nothing,) = dismantle(scene, [take("o7", "o8")], BODIES, CONFIG)
         assert (nothing.body, nothing.ok, nothing.held) == (None, True, ())
 
-    def test_the_scene_stays_as_it_is_and_can_be_shown_otherwise(self, scene):
-        before = poses_of(scene)
-        (taken,) = dismantle(scene, [TakeStep("o3", (), True, 0.0, "")], BODIES, CONFIG)
-        assert poses_of(posed(scene, taken.film[2]))[2, 2] > before[2, 2] + 0.02
-        np.testing.assert_array_equal(poses_of(scene), before)
+    def test_what_is_held_stays_and_what_is_gone_stays_away(self, scene):
+        top, bottom = dismantle(scene, [take("o3"), take("o1", "o2")], BODIES, CONFIG)
+        assert [top.ok, bottom.ok] == [True, True]
+        assert bottom.held == ("object1",)
+        assert np.abs(bottom.film[:, 1] - poses_of(scene)[1]).max() < 0.01
+        assert (bottom.film[:, 2, 2] > ASIDE / 2.0).all()
+        np.testing.assert_array_equal(bottom.film[-1, :, 2] > ASIDE / 2.0, [True, False, True, False])
 
-
-LOWER, UPPER, BESIDE = range(3)
-
-
-@pytest.fixture(scope="module")
-def stack():
-    """A box on a box, and one beside them, at rest on a table."""
-    return lifting(
-        box((0.0, 0.0, TOP + 0.03), (0.1, 0.1, 0.06)),
-        box((0.0, 0.0, TOP + 0.09), (0.08, 0.08, 0.06)),
-        box((0.2, 0.0, TOP + 0.025), (0.05, 0.05, 0.05)),
-    )
-
-
-def lifting(*shapes):
-    built = scene_from_spec(build_spec([Solid(s) for s in shapes], "test"), "test", "test")
-    lift = Lifting(built.spec, list(built.object_bodies.values()))
-    return lift, lift.rest(lift.start, (), 0.3)
-
-
-class TestLifting:
-    CONFIG = LiftConfig(watch=1.0)
-
-    def test_what_carries_nothing_is_lifted_without_harm_and_stays_away(self, stack):
-        lift, state = stack
-        once = lift.lift(state, UPPER, self.CONFIG)
-        assert not once.disturbed.any()
-        assert np.abs(once.film[:, LOWER, :3] - state[LOWER, :3]).max() < 0.002
-        assert once.state[UPPER, 2] > ASIDE / 2.0
-        then = lift.lift(once.state, LOWER, self.CONFIG)
-        assert not then.disturbed.any()
-        np.testing.assert_allclose(then.state[UPPER, :3], once.state[UPPER, :3], atol=1e-3)
-
-    def test_what_loses_its_support_is_disturbed_unless_it_is_held(self, stack):
-        lift, state = stack
-        before = state.copy()
-        for to_the_end in (True, False):
-            done = lift.lift(state, LOWER, self.CONFIG, to_the_end=to_the_end)
-            assert done.disturbed.tolist() == [False, True, False]
-        assert not lift.lift(state, LOWER, self.CONFIG, held=[UPPER]).disturbed.any()
-        np.testing.assert_array_equal(state, before)
-        ball, at_rest = lifting(
+    def test_what_leans_on_two_things_falls_when_one_is_taken(self):
+        shapes = (
             box((0.0, 0.0, TOP + 0.06), (0.06, 0.2, 0.12)),
             box((0.1, 0.0, TOP + 0.06), (0.06, 0.2, 0.12)),
             sphere((0.05, 0.0, TOP + 0.14), 0.035),
         )
-        assert ball.lift(at_rest, 0, self.CONFIG).disturbed[2]
+        (taken,) = dismantle(in_physics(*shapes), [take("o1")], BODIES, CONFIG)
+        assert taken.disturbed == ("object2",)
+
+    def test_the_scene_stays_as_it_is_and_can_be_shown_otherwise(self, scene):
+        before = poses_of(scene)
+        (taken,) = dismantle(scene, [take("o3")], BODIES, CONFIG)
+        assert poses_of(posed(scene, taken.film[2]))[2, 2] > before[2, 2] + 0.02
+        np.testing.assert_array_equal(poses_of(scene), before)
 
 
 QUICK = ["--set=rehearsal.draws=2", "--set=lift.watch=1.0"]

@@ -6,10 +6,9 @@ from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.generation import generate
 from caryatid.simulation.scenes import is_builtin, list_scenes, load_scene
 from caryatid.simulation.truth import GroundTruth, TrueEdge, ground_truth, read_truth, write_truth
-from caryatid.simulation.world import SimulatedScene, static_boxes, table_centre, table_top, true_shapes
+from caryatid.simulation.world import SimulatedScene, static_boxes, table_centre, true_shapes
 
 __all__ = [
     "GroundTruth", "SimulatedCamera", "SimulatedScene", "TrueEdge", "generate", "ground_truth", "is_builtin",
-    "list_scenes", "load_scene", "read_truth", "static_boxes", "table_centre", "table_top", "true_shapes",
-    "write_truth",
+    "list_scenes", "load_scene", "read_truth", "static_boxes", "table_centre", "true_shapes", "write_truth",
 ]  # fmt: skip

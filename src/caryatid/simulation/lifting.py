@@ -61,11 +61,11 @@ class Lifting:
     """
 
     def __init__(self, spec: Any, bodies: Sequence[str]) -> None:
-        self.bodies = tuple(bodies)
-        self.model = model = _with_hands(spec, self.bodies)
+        self.model = model = _with_hands(spec, bodies)
         body = [model.body(name).id for name in bodies]
         joints = model.body_jntadr[body]
         self._qpos = model.jnt_qposadr[joints][:, None] + np.arange(7)
+        self._qvel = model.jnt_dofadr[joints][:, None] + np.arange(6)
         self._weld = np.array([model.equality(HAND + name).id for name in bodies], dtype=np.intp)
         self._hand = np.array([model.body(HAND + name).mocapid[0] for name in bodies], dtype=np.intp)
         roots = model.body_rootid[model.geom_bodyid]
@@ -132,9 +132,7 @@ class Lifting:
         """Put an object out of the way, at rest, in place."""
         place = np.array([0.0, 0.0, ASIDE + index])
         data.qpos[self._qpos[index, :3]] = data.mocap_pos[self._hand[index]] = place
-        joint = self.model.body_jntadr[self.model.body(self.bodies[index]).id]
-        velocity = int(self.model.jnt_dofadr[joint])
-        data.qvel[velocity : velocity + 6] = 0.0
+        data.qvel[self._qvel[index]] = 0.0
 
     def _after(self, data: Any, speed: float, seconds: float, index: int = 0) -> Array:
         """Simulate for some time [s], in place, while one hand goes up [m/s]; the objects' state then."""

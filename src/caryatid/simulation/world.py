@@ -217,33 +217,26 @@ class Solid:
     friction: float = 0.8
 
 
-def box(
-    size: Vector,
-    at: Vector,
-    turn: Vector = (0.0, 0.0, 0.0),
-    density: float = 600.0,
-    friction: float = 0.8,
-) -> Solid:
+def box(size: Vector, at: Vector, turn: Vector = (0.0, 0.0, 0.0), **matter: float) -> Solid:
     """A cuboid.
 
     Args:
         size: Full edge lengths [m].
         at: Centre in x and y, and the height of the centre over the table top in z [m].
         turn: Rotation vector [deg].
-        density: [kg/m³].
-        friction: Sliding friction [1].
+        **matter: Density and friction of a `Solid`.
     """
-    return Solid(Box(_placed(at, turn), np.array(size)), density, friction)
+    return Solid(Box(_placed(at, turn), np.array(size)), **matter)
 
 
-def cylinder(radius: float, height: float, at: Vector, density: float = 600.0) -> Solid:
+def cylinder(radius: float, height: float, at: Vector, **matter: float) -> Solid:
     """An upright cylinder [m]; the other arguments are as in `box`."""
-    return Solid(Cylinder(_placed(at, (0.0, 0.0, 0.0)), radius, height), density)
+    return Solid(Cylinder(_placed(at), radius, height), **matter)
 
 
 def sphere(radius: float, at: Vector) -> Solid:
     """A ball [m]; `at` is as in `box`."""
-    return Solid(Sphere(_placed(at, (0.0, 0.0, 0.0)), radius))
+    return Solid(Sphere(_placed(at), radius))
 
 
 def empty_spec(name: str) -> Any:
@@ -298,7 +291,7 @@ def quaternion(R: Array) -> Array:
     return wxyz
 
 
-def _placed(at: Vector, turn: Vector) -> Array:
+def _placed(at: Vector, turn: Vector = (0.0, 0.0, 0.0)) -> Array:
     R = transforms.rotation_from_vector(np.deg2rad(turn))
     return transforms.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
 
@@ -373,7 +366,7 @@ def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[
         (N,) bool.
     """
     inside = np.zeros(len(points_world), dtype=bool)
-    for geom in solid_geoms(scene, label):
+    for geom in _solid_geoms(scene, label):
         shape = _primitive(scene, geom)
         if shape is not None:
             inside |= shape.signed_distance(points_world) <= 0.0
@@ -385,13 +378,13 @@ def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[
 
 def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
     """Lowest and highest corner, (3,) each [m], of the world-aligned box around an object (0: the table)."""
-    lows, highs = zip(*(_span(scene, geom) for geom in solid_geoms(scene, label)), strict=True)
+    lows, highs = zip(*(_span(scene, geom) for geom in _solid_geoms(scene, label)), strict=True)
     return np.min(lows, axis=0), np.max(highs, axis=0)
 
 
 def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
     """Shape of every object, by label, that is a single box, cylinder or sphere; others are left out."""
-    geoms = {label: solid_geoms(scene, label) for label in scene.object_bodies}
+    geoms = {label: _solid_geoms(scene, label) for label in scene.object_bodies}
     shapes = {label: _primitive(scene, own[0]) for label, own in geoms.items() if len(own) == 1}
     return {label: shape for label, shape in shapes.items() if shape is not None}
 
@@ -403,19 +396,18 @@ def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
     return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
 
 
-def table_top(scene: SimulatedScene) -> Box:
-    """The table geom with the largest area seen from above, as a level box; things stand on it."""
-    boxes = [_level(_geom_box(scene, g)) for g in scene.geoms(0)]
-    return max(boxes, key=lambda box: box.extents[0] * box.extents[1])
-
-
 def table_centre(scene: SimulatedScene) -> Array:
-    """Middle (3,) of the table's upper face [m], world frame."""
-    top = table_top(scene)
-    return top.T_world_object[:3, 3] + (0.0, 0.0, top.extents[2] / 2.0)
+    """Middle (3,) [m] of the table's upper face, world frame: of the geom with the largest."""
+    faces = []
+    for box in (_geom_box(scene, g) for g in scene.geoms(0)):
+        R, half = box.T_world_object[:3, :3], box.extents / 2.0
+        up = int(np.argmax(np.abs(R[2])))
+        area = float(abs(R[2, up]) * np.prod(np.delete(half, up)))
+        faces.append((area, box.T_world_object[:3, 3] + np.copysign(half[up], R[2, up]) * R[:, up]))
+    return max(faces, key=lambda face: face[0])[1]
 
 
-def solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
+def _solid_geoms(scene: SimulatedScene, label: int) -> list[int]:
     """Geoms that make up the solid of an object (0 = table): those that collide, or all if none does."""
     geoms, model = scene.geoms(label), scene.model
     return [g for g in geoms if model.geom_contype[g] or model.geom_conaffinity[g]] or geoms
@@ -442,19 +434,6 @@ def _geom_box(scene: SimulatedScene, geom: int) -> Box:
     centre, half = scene.model.geom_aabb[geom, :3], scene.model.geom_aabb[geom, 3:]
     T_world_geom = _geom_pose(scene, geom)
     return Box(T_world_geom @ transforms.rigid(np.eye(3), centre), 2.0 * half)
-
-
-def _level(box: Box) -> Box:
-    """Turn a box's axes so that its third is up; a box askew becomes the world-aligned one around it."""
-    R = box.T_world_object[:3, :3]
-    upright = int(np.argmax(np.abs(R[2])))
-    if abs(R[2, upright]) < np.cos(np.deg2rad(1.0)):
-        half = np.abs(R) @ (box.extents / 2.0)
-        return Box(transforms.rigid(np.eye(3), box.T_world_object[:3, 3]), 2.0 * half)
-    first, second = (upright + 1) % 3, (upright + 2) % 3
-    x = transforms.unit(R[:, first] * (1.0, 1.0, 0.0))
-    R_level = np.stack([x, np.cross((0.0, 0.0, 1.0), x), (0.0, 0.0, 1.0)], axis=1)
-    return Box(transforms.rigid(R_level, box.T_world_object[:3, 3]), box.extents[[first, second, upright]])
 
 
 def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:
