@@ -51,7 +51,7 @@ def without_frames(folder):
 @pytest.mark.parametrize(
     ("change", "names", "says"),
     [
-        (image("rgb/000001.png", lambda p: p[::2, ::2]), "rgb/000001.png", "80×60 pixels"),
+        (image("rgb/000001.png", lambda p: p[::2, ::2]), "recording/000001", "rgb is 80×60, depth is 160"),
         (image("depth/000000.png", np.zeros_like), "depth/000000.png", "the frame is empty"),
         (image("depth/000000.png", lambda p: p * 0 + 50_000), "recording/000000", "no depth readings within"),
         (without_frames, "recording", "has no frames"),

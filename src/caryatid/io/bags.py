@@ -231,7 +231,7 @@ def _compressed_depth(message: Any, source: str) -> NDArray[np.floating[Any]]:
 def _colour(message: Any, source: str) -> NDArray[np.uint8]:
     """Colour (H, W, 3) of an image message, compressed or not; grey images have three equal channels."""
     if message.__msgtype__ == COMPRESSED:
-        return images.read_colour(message.data.tobytes(), source)
+        return images.decode_image(message.data.tobytes(), source)
     count, channels = _known(message, COLOUR_ENCODINGS, source)
     return np.ascontiguousarray(_pixels(message, "u1", count, source)[:, :, channels])
 

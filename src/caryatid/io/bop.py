@@ -161,10 +161,7 @@ def _frame(folder: Path, number: int, camera: _Camera, masks: Masks | None, sour
         if not depth.any():
             reason = "the frame is empty: no pixel has a depth reading"
             raise InputError(depth_path, reason, "leave this frame out")
-        rgb = None
-        if rgb_path is not None:
-            rgb = images.read_colour(rgb_path)
-            _check_size(rgb_path, rgb, depth)
+        rgb = None if rgb_path is None else images.decode_image(rgb_path)
         labels = None if masks is None else _read_labels(masks, depth)
         return View(depth, K, T_world_camera, rgb, labels, name=name)
 
@@ -176,20 +173,16 @@ def _read_labels(masks: Masks, depth: NDArray[np.float32]) -> NDArray[np.int32]:
     labels = np.zeros(depth.shape, dtype=np.int32)
     for path, label in masks:
         mask = images.decode_image(path, "", images.MASK_MODES, "a grey PNG") > 0
-        _check_size(path, mask, depth)
+        if mask.shape != depth.shape:
+            (height, width), (rows, columns) = mask.shape, depth.shape
+            reason = f"is {width}×{height} pixels, the depth image is {columns}×{rows}"
+            raise InputError(path, reason, "register the images to one size")
         taken = labels[mask & (labels > 0)]
         if len(taken):
             reason = f"overlaps the mask of obj_id {taken[0]} in {len(taken)} pixels"
             raise InputError(path, reason, "give each pixel to one object")
         labels[mask] = label
     return labels
-
-
-def _check_size(path: Path, image: NDArray[Any], depth: NDArray[np.float32]) -> None:
-    (height, width), (rows, columns) = image.shape[:2], depth.shape
-    if (height, width) != (rows, columns):
-        reason = f"is {width}×{height} pixels, the depth image is {columns}×{rows}"
-        raise InputError(path, reason, "register the images to one size")
 
 
 def _pose(camera: _Camera, name: str) -> Array | None:

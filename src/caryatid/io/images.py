@@ -46,15 +46,6 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     return (read_units(path) * (depth_scale / 1000.0)).astype(np.float32)
 
 
-def read_colour(image: Path | bytes, name: str = "") -> NDArray[np.uint8]:
-    """Read a colour image (H, W, 3), a file or its content; grey ones become three equal channels.
-
-    Raises:
-        InputError: Missing, truncated or not an image.
-    """
-    return decode_image(image, name)
-
-
 def read_units(image: Path | bytes, name: str = "") -> NDArray[np.int32]:
     """Read a 16-bit grey PNG (H, W), a file or its content, as it is: depth in units of its own, or labels.
 
@@ -71,7 +62,7 @@ def decode_image(
     what: str = "",
     most: float = inf,
 ) -> NDArray[Any]:
-    """Decode a PNG or JPEG: (H, W), or (H, W, 3) where colour is allowed.
+    """Decode a PNG or JPEG: (H, W), or (H, W, 3) where colour is allowed; grey then has three equal channels.
 
     Args:
         image: A file, or its content.

@@ -146,9 +146,7 @@ def plain(value: Any) -> Any:
     return value
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
+_adapter = cache(TypeAdapter[Any])
 
 
 def _sentence(error: Any) -> str:

@@ -64,7 +64,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     K = np.array([[file.fx, 0.0, file.cx], [0.0, file.fy, file.cy], [0.0, 0.0, 1.0]])
     camera = TimedCamera(f"{path}: camera", 0, _CAMERA, check_intrinsics(K, str(options.camera_file)), size)
     depths = _read_list(path / "depth.txt", partial(images.read_depth, depth_scale=file.depth_scale))
-    colours = _read_list(path / "rgb.txt", images.read_colour) if (path / "rgb.txt").is_file() else None
+    colours = _read_list(path / "rgb.txt", images.decode_image) if (path / "rgb.txt").is_file() else None
     pose_at, notes = None, [note]
     if (path / "groundtruth.txt").is_file():
         pose_at = partial(_read_poses(path / "groundtruth.txt", config.pose_gap).between, _WORLD)

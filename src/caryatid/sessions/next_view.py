@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from caryatid.errors import InputError, PlanningError
-from caryatid.exploration import next_best_view
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
 from caryatid.io.json_files import Numbers
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
-from caryatid.robots import Posture, Robot, Surroundings, find_robot, view_sphere_of
+from caryatid.robots import Posture, Robot
 from caryatid.robots.floor import STEP, FloorGrid
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
@@ -69,32 +68,6 @@ class Reachable:
     path_length: Annotated[Array, Numbers(-1)] | None = None
 
 
-def plan_next(
-    scene: Scene, T_world_cameras: Sequence[Array], reachable: Reachable | None, planner: str, robot_name: str
-) -> tuple[Decision, Posture | None]:
-    """Choose the next view, after views from poses (4, 4), and say how the robot of this name stands there.
-
-    A robot that says itself what it reaches has no posture.
-
-    Raises:
-        PlanningError: Nothing has been seen yet, or no view can be reached.
-        InputError: A candidate is no pose, path lengths are not as many, or negative; or no such robot.
-    """
-    if scene.sphere is None:
-        raise PlanningError("nothing has been seen yet; add a first view")
-    sphere, robot = scene.sphere, None
-    if reachable is not None:
-        candidates = _given(reachable, T_world_cameras[-1], sphere)
-    else:
-        robot = find_robot(robot_name)(Surroundings(sphere.centre_world, table_floor(scene), scene.config))
-        sphere = view_sphere_of(robot, sphere)
-        candidates = _reached(robot, T_world_cameras[-1], sphere, scene.sphere.centre_world)
-    visited = sphere.direction_of(np.stack(T_world_cameras))
-    decision = next_best_view(scene, robot, visited, candidates=candidates, planner=planner)
-    posture = None if robot is None else robot.solve(decision.T_world_camera)
-    return decision, posture if isinstance(posture, Posture) else None
-
-
 def table_floor(scene: Scene) -> FloorGrid:
     """The floor around the table: under its top, and everything on it, nobody can stand.
 
@@ -111,21 +84,29 @@ def table_floor(scene: Scene) -> FloorGrid:
     return FloorGrid.from_boxes([box], scene.config.robot, scene.sphere.centre_world[:2])
 
 
-def _given(reachable: Reachable, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
-    """What a robot whose camera is at a pose (4, 4) says it reaches, checked."""
-    named = enumerate(reachable.T_world_camera)
-    poses = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
-    lengths = reachable.path_length
-    if lengths is None:
-        lengths = _straight(T_world_camera, poses)
-    if lengths.shape != (len(poses),) or not (lengths >= 0.0).all():
+def given_candidates(
+    poses: ArrayLike, path_length: ArrayLike | None, T_world_camera: Array, sphere: ViewSphere
+) -> Candidates:
+    """What a robot whose camera is at a pose (4, 4) says it reaches, checked.
+
+    Raises:
+        InputError: One of the poses (N, 4, 4) is none, or path lengths (N,) [m] are not as many or negative.
+    """
+    named = enumerate(np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4))
+    rigid = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
+    if path_length is None:
+        path_length = _straight(T_world_camera, rigid)
+    lengths = np.asarray(path_length, dtype=np.float64)
+    if lengths.shape != (len(rigid),) or not (lengths >= 0.0).all():
         remedy = "give as many as candidates, 0 or more"
         raise InputError("path_length", "is not one length a candidate", remedy)
-    return Candidates(poses, sphere.direction_of(poses), lengths, {})
+    return Candidates(rigid, sphere.direction_of(rigid), lengths, {})
 
 
-def _reached(robot: Robot, T_world_camera: Array, sphere: ViewSphere, centre_world: Array) -> Candidates:
-    """What a robot reaches from where its camera is, as it is held or without roll.
+def reached_candidates(
+    robot: Robot, T_world_camera: Array, sphere: ViewSphere, centre_world: Array
+) -> Candidates:
+    """What a robot reaches from where its camera (4, 4) is, as it is held or without roll.
 
     Where it cannot stand there, paths are straight lines.
     """

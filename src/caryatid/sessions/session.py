@@ -28,19 +28,19 @@ from filelock import FileLock, Timeout
 from numpy.typing import ArrayLike
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import InputError
-from caryatid.exploration import reason_to_stop
+from caryatid.errors import InputError, PlanningError
+from caryatid.exploration import next_best_view, reason_to_stop
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
 from caryatid.planning.planners import make_planner
-from caryatid.robots import HUMANOID, find_robot
+from caryatid.robots import HUMANOID, Posture, Surroundings, find_robot, view_sphere_of
 from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions.captures import CameraRecord, Capture, check_view
-from caryatid.sessions.next_view import NextView, Reachable, plan_next
+from caryatid.sessions.next_view import NextView, given_candidates, reached_candidates, table_floor
 
 FORMAT: Final = {"format": "caryatid/session", "version": 1}
 """How session.json begins."""
@@ -280,16 +280,27 @@ class Session:
             PlanningError: There is no view yet, or none can be reached.
             InputError: Candidates are no poses.
         """
-        reachable = None
+        sphere, robot, posture = self.scene.sphere, None, None
+        if sphere is None:
+            raise PlanningError("nothing has been seen yet; add a first view")
+        T_world_cameras = np.stack([record.T_world_camera for record in self._records])
         if candidates is not None:
-            lengths = None if path_length is None else np.asarray(path_length, dtype=np.float64)
-            reachable = Reachable(np.asarray(candidates, dtype=np.float64).reshape(-1, 4, 4), lengths)
-        poses = [record.T_world_camera for record in self._records]
-        decision, posture = plan_next(
-            self.scene, poses, reachable, self.beginning.planner, self.beginning.robot
+            reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
+        else:
+            centre_world, config = sphere.centre_world, self.scene.config
+            robot = find_robot(self.beginning.robot)(
+                Surroundings(centre_world, table_floor(self.scene), config)
+            )
+            sphere = view_sphere_of(robot, sphere)
+            reachable = reached_candidates(robot, T_world_cameras[-1], sphere, centre_world)
+        visited = sphere.direction_of(T_world_cameras)
+        decision = next_best_view(
+            self.scene, robot, visited, candidates=reachable, planner=self.beginning.planner
         )
+        if robot is not None:
+            posture = robot.solve(decision.T_world_camera)
         stop = reason_to_stop(self.views, self.scene.changed, self.beginning.settings.active)
-        return NextView(self.views, decision, posture, stop)
+        return NextView(self.views, decision, posture if isinstance(posture, Posture) else None, stop)
 
     def undo(self) -> int:
         """Remove the last view.
