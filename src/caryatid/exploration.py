@@ -20,8 +20,7 @@ from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.robots.arm import ArmRobot
 from caryatid.runtime.display import Pictured
 from caryatid.runtime.parallel import one_blas_thread
-from caryatid.runtime.stopwatch import Stopwatch
-from caryatid.scene import Scene
+from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
 
