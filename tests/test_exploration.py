@@ -189,10 +189,9 @@ def test_views_may_be_handed_in_without_camera_or_robot():
 
 
 def written(folder, steps):
-    with RunWriter(folder) as writer:
+    with RunWriter(folder, CONFIG, {}) as writer:
         for step in steps:
             writer.add(step)
-        writer.finish(steps[-1].graph, {"versions": {"caryatid": "0.2.0"}})
     return read_run(folder)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 from conftest import step_of
 
-from caryatid.errors import CaryatidError, InputError
+from caryatid.config import Config
+from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Sphere
 from caryatid.graph import SceneObject, SupportGraph
@@ -33,13 +35,18 @@ def step(count=1, labels=LABELS, name="a"):
     return step_of(graph(count), labels, name)
 
 
+def writer(folder, seed=7):
+    return RunWriter(folder, Config(), {"seed": seed})
+
+
 def write_run(folder, views=2, seed=7, labels=LABELS):
     view = View(np.ones((6, 8), np.float32), K, T)
-    with RunWriter(folder) as run:
+    with writer(folder, seed) as run:
         for index in range(views):
-            run.add(replace(step(index + 1, labels, f"scene/{index:06d}"), view=view))
-        record = {"seed": seed, "timings": [{"perceive": np.float64(0.25)}]}
-        run.finish(graph(views), record, {"report.html": "<html>σ</html>".encode()})
+            run.add(
+                replace(step(index + 1, labels, f"scene/{index:06d}"), view=view), {"f1": np.float64(0.25)}
+            )
+        run.files["report.html"] = "<html>σ</html>".encode()
 
 
 def test_a_run_is_read_back_and_laid_out_as_documented(tmp_path):
@@ -47,7 +54,10 @@ def test_a_run_is_read_back_and_laid_out_as_documented(tmp_path):
     write_run(folder)
     run = read_run(folder)
     assert run.record["seed"] == 7
-    assert run.record["timings"] == [{"perceive": 0.25}]
+    assert run.record["scores"] == [{"f1": 0.25}] * 2
+    assert run.record["settings"]["active"]["max_views"] == Config().active.max_views
+    assert [told["view"] for told in run.record["steps"]] == [0, 0]
+    assert "caryatid" in run.record["versions"]
     assert [len(v.graph.objects) for v in run.views] == [1, 2]
     assert len(run.graph.objects) == 2
     assert [view.name for view in run.views] == ["scene/000000", "scene/000001"]
@@ -76,20 +86,20 @@ def test_the_same_run_gives_the_same_bytes(tmp_path):
         assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes()
 
 
-@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
-def test_a_run_that_fails_leaves_nothing(tmp_path, error):
-    def fail():
-        with RunWriter(tmp_path / "new" / "RUN") as run:
+@pytest.mark.parametrize(
+    ("error", "views"), [(RuntimeError, 1), (SystemExit, 1), (KeyboardInterrupt, 0), (None, 0)]
+)
+def test_a_run_that_fails_or_has_no_views_leaves_nothing(tmp_path, error, views):
+    with nullcontext() if error is None else pytest.raises(error), writer(tmp_path / "new" / "RUN") as run:
+        for _ in range(views):
             run.add(step())
-            assert not (tmp_path / "new/RUN").exists()
+        assert not (tmp_path / "new/RUN").exists()
+        if error:
             raise error
-
-    with pytest.raises(error):
-        fail()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_interrupted_run_can_be_finished_with_the_views_done(tmp_path, monkeypatch):
+def test_an_interrupted_run_is_kept_with_the_views_done(tmp_path, monkeypatch):
     write = Path.write_bytes
 
     def interrupt(path, data):
@@ -98,30 +108,25 @@ def test_an_interrupted_run_can_be_finished_with_the_views_done(tmp_path, monkey
         return write(path, data)
 
     monkeypatch.setattr(Path, "write_bytes", interrupt)
-    with RunWriter(tmp_path / "RUN") as run:
-        run.add(step(1, name="a"))
-        with pytest.raises(KeyboardInterrupt):
-            run.add(step(2, name="b"))
-        run.finish(graph(1), {"interrupted": True})
-    assert [view.name for view in read_run(tmp_path / "RUN").views] == ["a"]
+    with pytest.raises(KeyboardInterrupt, match="1 view is kept"):
+        write_run(tmp_path / "RUN")
+    assert read_run(tmp_path / "RUN").record["interrupted"]
+    assert [view.name for view in read_run(tmp_path / "RUN").views] == ["scene/000000"]
     assert not (tmp_path / "RUN/views/01").exists()
 
 
-def test_a_run_without_views_and_labels_beyond_16_bits_are_refused(tmp_path):
-    with pytest.raises(CaryatidError, match="no view"), RunWriter(tmp_path / "RUN") as run:
-        run.finish(graph(), {})
+def test_labels_beyond_16_bits_are_refused(tmp_path):
     for bad in (-1, 65536):
-        with pytest.raises(InputError, match="labels leave"), RunWriter(tmp_path / "RUN") as run:
+        with pytest.raises(InputError, match="labels leave"), writer(tmp_path / "RUN") as run:
             run.add(step(labels=np.full((2, 2), bad)))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_older_run_is_replaced_at_the_end_and_not_before(tmp_path):
     write_run(tmp_path / "RUN", views=3, seed=1)
-    with RunWriter(tmp_path / "RUN") as run:
+    with writer(tmp_path / "RUN", seed=2) as run:
         run.add(step())
         assert read_run(tmp_path / "RUN").record["seed"] == 1
-        run.finish(graph(), {"seed": 2})
     assert read_run(tmp_path / "RUN").record["seed"] == 2
     assert not (tmp_path / "RUN/views/02").exists()
     assert [p.name for p in tmp_path.iterdir()] == ["RUN"]
@@ -133,7 +138,7 @@ def test_what_is_no_run_is_never_touched(tmp_path, name):
     folder.mkdir()
     (folder / name).write_text('{"format": "something else"}')
     with pytest.raises(InputError, match="holds other files") as caught:
-        RunWriter(folder)
+        writer(folder)
     assert str(folder) in str(caught.value)
     assert (folder / name).read_text() == '{"format": "something else"}'
     assert [p.name for p in tmp_path.iterdir()] == ["thesis"]
@@ -142,9 +147,9 @@ def test_what_is_no_run_is_never_touched(tmp_path, name):
 def test_files_and_empty_folders_in_the_way(tmp_path):
     (tmp_path / "file").write_text("kept")
     with pytest.raises(InputError, match="not a folder"):
-        RunWriter(tmp_path / "file")
+        writer(tmp_path / "file")
     with pytest.raises(InputError, match="file/RUN"):
-        RunWriter(tmp_path / "file" / "RUN")
+        writer(tmp_path / "file" / "RUN")
     assert (tmp_path / "file").read_text() == "kept"
     (tmp_path / "RUN").mkdir()
     write_run(tmp_path / "RUN")

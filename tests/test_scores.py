@@ -11,6 +11,7 @@ from conftest import step_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.evaluation import as_scene, evaluate_run, score, score_masks, true_scene_from_simulation
 from caryatid.evaluation.scores import mask_ious
@@ -204,11 +205,10 @@ def scene_graph(objects):
 
 
 def write_run(folder, graphs, labels=None, names=None):
-    with RunWriter(folder) as run:
+    with RunWriter(folder, Config(), {}) as run:
         for index, graph in enumerate(graphs):
             image = np.zeros((4, 4), np.int32) if labels is None else labels[index]
             run.add(step_of(graph, image, f"view {index}" if names is None else names[index]))
-        run.finish(graphs[-1], {})
 
 
 def test_a_run_is_scored_view_by_view_against_its_scene(tmp_path, scene_folder):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import json
+import platform
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import Config
 from caryatid.config.settings import changed_settings
-from caryatid.errors import CaryatidError, InputError
+from caryatid.errors import InputError
 from caryatid.exploration import RobotPose, Step
 from caryatid.graph import SupportGraph
 from caryatid.io import images
@@ -32,40 +34,57 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 FORMAT: Final = "caryatid/run"
 AGAIN: Final = "run caryatid again"
 """What to do where a file of a run is broken."""
+PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
+"""Packages whose versions run.json records."""
 PARTS = {"cloud": Cloud, "sphere": ViewSphere, "view": View, "candidates": Candidates, "decision": Decision}
 """The parts of a step that hold arrays."""
 
 
 class RunWriter(StagedFolder):
-    """Writes a run folder step by step, in a `with` block.
+    """Writes a run folder step by step, in a `with` block at whose end the folder is put in its place.
 
-    Leaving the block without `finish`, by an error or otherwise, leaves nothing behind. After an interrupt
-    call `finish`, inside the block, to keep the views done so far. A run folder already there is replaced, at
-    `finish` and not before; a folder that is no run is never touched.
+    Ctrl-C ends the block too: the views so far are kept. Any other error leaves nothing behind. A run folder
+    already there is replaced at the end of the block and not before; any other folder is never touched.
 
     Args:
         folder: RUN.
+        config: All settings.
+        about: What run.json says of the run besides: command, source, seed, options.
 
     Attributes:
-        views: Number of views written.
+        more: What else run.json is to hold.
+        files: Further files of the folder: path in it → content.
 
     Raises:
         InputError: RUN holds something else, or cannot be written.
     """
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, config: Config, about: Mapping[str, Any]) -> None:
         super().__init__(folder, replaces=is_run)
-        self.views = 0
+        self.more: dict[str, Any] = {}
+        self.files: dict[str, bytes] = {}
+        self._about = dict(about) | {"settings": asdict(config)}
+        self._views: list[tuple[dict[str, Any], SupportGraph, Mapping[str, Any] | None]] = []
 
-    def add(self, step: Step) -> None:
+    @property
+    def steps(self) -> list[dict[str, Any]]:
+        """What run.json says of each view: its number, its timings [s], angle and path so far."""
+        return [step for step, _, _ in self._views]
+
+    def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
         """Write the next view.
 
         Points and normals of the cloud are rounded to float32; all else comes back as it was.
 
+        Args:
+            step: The step of this view.
+            score: What run.json says of its score, where the truth is known.
+
         Raises:
             InputError: Labels leave 16 bits, or the disk is full or refuses.
         """
-        labels, folder = step.labels, _view_folder(self.views)
+        number = len(self._views)
+        labels, folder = step.labels, _view_folder(number)
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
             reason = f"labels leave 0…{SUPPORT_LABEL}"
             raise InputError(step.name, reason, "number objects from 1, 0 = nothing")
@@ -76,31 +95,38 @@ class RunWriter(StagedFolder):
             buffer = io.BytesIO()
             np.save(buffer, labels.astype(np.int32))
             self.write(f"{folder}/labels.npy", buffer.getvalue())
-        document = {"view": self.views, "name": step.name} | _summary(step)
+        document = {"view": number, "name": step.name} | _summary(step)
         self.write(f"{folder}/view.json", json_text(document).encode())
         self.write(f"{folder}/step.npz", _encoded(step))
-        self.views += 1
+        names = ("timings", "angle_travelled", "path_travelled", "stop")
+        told = {"view": step.index} | {name: getattr(step, name) for name in names}
+        self._views.append((told, step.graph, score))
 
-    def finish(
-        self, graph: SupportGraph, record: Mapping[str, Any], files: Mapping[str, bytes] | None = None
-    ) -> None:
-        """Write the rest and put the folder in its place.
+    def __exit__(self, kind: object = BaseException, *error: object) -> None:
+        """Write the rest and put the folder in its place; after an error but Ctrl-C remove it."""
+        interrupted = kind is KeyboardInterrupt and len(self._views) > 0
+        try:
+            if interrupted or (kind is None and self._views):
+                self._finish({"interrupted": True} if interrupted else {})
+        finally:
+            super().__exit__()
+        if interrupted:
+            count = "1 view is" if len(self._views) == 1 else f"{len(self._views)} views are"
+            reason = f"{count} kept in {self.folder}; `caryatid report {self.folder}` makes the report"
+            raise KeyboardInterrupt(reason) from None
 
-        Args:
-            graph: The final fused graph.
-            record: For run.json: settings, seed, versions, source, timings [s], angle and path travelled.
-            files: Further files by their paths in the folder.
-
-        Raises:
-            CaryatidError: No view was added.
-            InputError: The disk is full or refuses.
-        """
-        if self.views == 0:
-            raise CaryatidError(f"{self.folder}: no view was finished, so there is no run to keep")
-        self.remove(_view_folder(self.views))
-        document = {"format": FORMAT, "version": 2, "views": self.views} | dict(record)
+    def _finish(self, more: dict[str, Any]) -> None:
+        """Write what a run says as a whole, and put the folder in its place."""
+        last, graph, _ = self._views[-1]
+        document = {"format": FORMAT, "version": 2, "views": len(self._views)} | self._about
+        document["versions"] = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
+        document |= {name: last[name] for name in ("angle_travelled", "path_travelled")}
+        document["steps"] = self.steps
+        scores = [score for _, _, score in self._views if score is not None]
+        document |= ({"scores": scores} if scores else {}) | self.more | more
+        self.remove(_view_folder(len(self._views)))
         written = {"graph.json": graph_text(graph).encode(), "run.json": json_text(document).encode()}
-        for path, content in (written | dict(files or {})).items():
+        for path, content in (written | self.files).items():
             self.write(path, content)
         self.publish()
 
@@ -194,8 +220,8 @@ def read_steps(run: Run) -> Iterator[Step]:
         InputError: A step is missing or broken, or the run was written by a version that kept no steps.
     """
     if run.record["version"] == 1:
-        version = run.record.get("versions", {}).get("caryatid", "0.1.0")
-        reason = f"was written by caryatid {version}, which kept no views"
+        ours = run.record.get("versions", {}).get("caryatid", "0.1.0")
+        reason = f"was written by caryatid {ours}, which kept no views"
         raise InputError(
             run.folder, reason, "make the run again; order, evaluate and export need only its graph"
         )

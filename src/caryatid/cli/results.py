@@ -148,8 +148,6 @@ class ReportCommand(options.Command):
     """PDF (A4) to write as well; replaces an earlier one."""
 
     def __call__(self) -> None:
-        from caryatid.runs import write_report
-
         for path in write_report(self.run, self.pdf):
             self.output.say(f"report: {path}")
         self.output.result({"html": self.run / "report.html", "pdf": self.pdf}, "")
@@ -185,3 +183,41 @@ class Export(options.Command):
         export_graph(graph, self.out, config.export)
         self.output.result({"file": str(self.out), "format": format_}, "")
         self.output.say(f"{self.out}: {format_}, {census(graph)}")
+
+
+def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
+    """Draw the report of a run folder and write its report.html.
+
+    Args:
+        folder: The run.
+        pdf: Where to write it as a PDF too.
+
+    Returns:
+        The files that were written.
+
+    Raises:
+        InputError: It is no run, a file in it is broken, or a file cannot be written; an older report.html
+            is left as it was.
+    """
+    from caryatid.io.staging import write_file
+    from caryatid.steps import read_config, read_run, read_steps
+    from caryatid.viz.pdf import render_pdf
+    from caryatid.viz.report import make_report, read_lifts, render_html
+
+    run = read_run(folder)
+    config, record = read_config(run), run.record
+    settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
+    settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
+    report = make_report(
+        f"caryatid: {Path(record['source']).name}",
+        read_steps(run),
+        settings=settings,
+        scores=record.get("scores", ()),
+        strip=read_lifts(folder),
+        config=config.report,
+    )
+    files = {} if pdf is None else {pdf: render_pdf(report)}
+    files[folder / "report.html"] = render_html(report).encode()
+    for path, content in files.items():
+        write_file(path, content)
+    return list(files)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,9 +16,10 @@ from caryatid.errors import InputError
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
     from caryatid.config import Config
+    from caryatid.evaluation.scores import TrueScene
     from caryatid.exploration import Step
-    from caryatid.runs import RunRecorder
     from caryatid.sources import Source
+    from caryatid.steps import RunWriter
     from caryatid.viewer.page import PageProcess
 
 
@@ -35,27 +36,28 @@ class RunCommand(options.Command):
     profile: options.Flag = False
     """Print the time of each stage at the end; with --json as part of the document."""
 
-    def open(self, config: Config, recorder: RunRecorder) -> tuple[str, Iterator[Step]]:
-        """Open the source; returns its name and the steps of the run."""
+    def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
+        """Open the source; returns its name, what is really there, and the steps of the run."""
         raise NotImplementedError
 
     def run(self, config: Config, page: PageProcess | None = None) -> None:
         """Keep all steps, write the report and print what came of the run."""
         from caryatid.cli.output import profile
         from caryatid.io.graph_json import graph_to_json
+        from caryatid.steps import RunWriter
         from caryatid.viz.tables import census, count_of
 
         output = self.output
-        with _recorder(self, config) as recorder:
-            name, steps = self.open(config, recorder)
-            graph = _record(recorder, steps, output, page).graph
+        with RunWriter(self.out, config, _about(self)) as writer:
+            name, truth, steps = self.open(config)
+            graph = _record(writer, steps, truth, output, page).graph
         if not self.no_report:
             _draw_report(self.out, output)
-        output.say(f"{name}: {census(graph)} after {count_of(recorder.views, 'view')}")
+        output.say(f"{name}: {census(graph)} after {count_of(len(writer.steps), 'view')}")
         output.say(f"run: {self.out}" + ("" if self.no_report else ", open its report.html"))
         document: dict[str, Any] = {"run": str(self.out), "graph": graph_to_json(graph)}
         if self.profile:
-            document["profile"], shown = profile(recorder.steps)
+            document["profile"], shown = profile(writer.steps)
             output.result(document, shown)
         else:
             output.result(document, "")
@@ -69,7 +71,7 @@ class Exploring(options.ExploringCommand):
     no_early_stop: options.Flag = False
     """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
 
-    def explore(self, config: Config, recorder: RunRecorder) -> tuple[Source, Iterator[Step]]:
+    def explore(self, config: Config) -> tuple[Source, Iterator[Step]]:
         """Open the source; returns it and the steps of its exploration."""
         from caryatid.evaluation.oracle import planner_for
         from caryatid.exploration import explore
@@ -78,7 +80,6 @@ class Exploring(options.ExploringCommand):
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         with self.output.working("opening"):
             source = open_source(self.source, config, noise=self.noise, robot=self.robot, **known)
-        recorder.truth = source.truth
         planner, camera = planner_for(self.planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "early_stop": not self.no_early_stop}
         return source, explore(camera, source.robot, **known)
@@ -105,9 +106,9 @@ class Explore(RunCommand, Exploring):
     view: options.Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
 
-    def open(self, config: Config, recorder: RunRecorder) -> tuple[str, Iterator[Step]]:
-        source, steps = self.explore(config, recorder)
-        return source.name, steps
+    def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
+        source, steps = self.explore(config)
+        return source.name, source.truth, steps
 
     def __call__(self, config: Config | None = None) -> None:
         from caryatid.cli.view import watched
@@ -158,7 +159,7 @@ class Extract(RunCommand, options.LookingCommand):
     label_divisor: options.Count = 1
     """For clouds whose labels number parts of objects: object = label // N."""
 
-    def open(self, config: Config, recorder: RunRecorder) -> tuple[str, Iterator[Step]]:
+    def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
         from caryatid.sources import extract
 
         with self.output.working("opening"):
@@ -169,7 +170,7 @@ class Extract(RunCommand, options.LookingCommand):
                 seed=self.settings.seed,
                 label_divisor=self.label_divisor,
             )
-        return Path(self.source).name, steps
+        return Path(self.source).name, None, steps
 
     def __call__(self) -> None:
         self.run(self.settings.read())
@@ -200,32 +201,36 @@ class Dismantle(Exploring):
         from caryatid.manipulation.order import Order, plan_order
         from caryatid.runtime.parallel import cores
         from caryatid.simulation.camera import SimulatedCamera
+        from caryatid.steps import RunWriter
         from caryatid.viz.report import draw_lifts, stored_lifts
 
         config, seed, taken = self.config(), self.settings.seed, []
         order = Order((), "interrupted before an order was found")
-        with _recorder(self, config) as recorder:
-            source, steps = self.explore(config, recorder)
+        kept = nullcontext() if self.out is None else RunWriter(self.out, config, _about(self))
+        with kept as writer:
+            source, steps = self.explore(config)
             if source.truth is None or not isinstance(source.camera, SimulatedCamera):
                 remedy = "give an MJCF scene; for a run, use `caryatid order`"
                 raise InputError(self.source, "cannot be simulated", remedy)
             scene = source.camera.scene
             try:
-                last = _record(recorder, steps, self.output)
+                last = _record(writer, steps, source.truth, self.output)
                 with self.output.working("rehearsing"):
                     order = plan_order(last.graph, config, hands=self.hands, seed=seed, threads=cores())
                 for t in dismantle(scene, order.steps, bodies_of(last.graph, source.truth), config):
                     taken.append(t)
                     disturbed = ", ".join(t.disturbed)
                     self.output.say(f"{t.step.object_id}: {f'{disturbed} disturbed' if disturbed else 'ok'}")
-                if self.out is not None:
+                if writer is not None:
                     T_world_camera = last.sphere.poses(last.visited[:1])[0]
                     lifts = draw_lifts(scene, taken, last.graph, T_world_camera, config)
-                    recorder.files |= stored_lifts(lifts)
+                    writer.files |= stored_lifts(lifts)
             finally:
                 bodies = {t.body for t in taken}
                 left = [name for name in scene.object_bodies.values() if name not in bodies]
-                recorder.more["dismantling"] = record = dismantling_record(order, taken, left)
+                record = dismantling_record(order, taken, left)
+                if writer is not None:
+                    writer.more["dismantling"] = record
         if self.out is not None:
             _draw_report(self.out, self.output)
         outcome = "all taken, nothing disturbed" if record["success"] else "not without harm"
@@ -241,33 +246,34 @@ class Dismantle(Exploring):
         self.output.result(record, shown, f"{order.refusal}\n" if order.refusal else "")
 
 
-def _recorder(command: RunCommand | Dismantle, config: Config) -> RunRecorder:
-    from caryatid.runs import RunRecorder
-
+def _about(command: RunCommand | Dismantle) -> dict[str, Any]:
+    """What run.json says of the command."""
     names = ("planner", "robot", "segmentation", "noise", "label_divisor")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     if isinstance(command, Exploring):
         options["early_stop"] = not command.no_early_stop
-    return RunRecorder(
-        command=type(command).__name__.lower(),
-        source=command.source,
-        seed=command.settings.seed,
-        options=options,
-        config=config,
-        folder=command.out,
-    )
+    name, seed = type(command).__name__.lower(), command.settings.seed
+    return {"command": name, "source": command.source, "seed": seed, "options": options}
 
 
 def _record(
-    recorder: RunRecorder, steps: Iterable[Step], output: Output, page: PageProcess | None = None
+    writer: RunWriter | None,
+    steps: Iterable[Step],
+    truth: TrueScene | None,
+    output: Output,
+    page: PageProcess | None = None,
 ) -> Step:
-    """Keep, print and show every step; returns the last."""
+    """Score, keep, print and show every step; returns the last."""
+    from caryatid.evaluation.scores import score
+
     last = None
     for step in steps:
-        score = recorder.keep(step)
-        output.step(step, None if last is None else last.graph, score)
+        scored = None if truth is None else score(step.graph, truth)
+        if writer is not None:
+            writer.add(step, None if scored is None else asdict(scored))
+        output.step(step, None if last is None else last.graph, scored)
         if page is not None:
-            page.add(step, None if score is None else score.f1)
+            page.add(step, None if scored is None else scored.f1)
         last = step
     assert last is not None, "the first view is always taken"
     return last
@@ -275,7 +281,7 @@ def _record(
 
 def _draw_report(folder: Path, output: Output) -> None:
     """Draw the report of a run that is in its place already."""
-    from caryatid.runs import write_report
+    from caryatid.cli.results import write_report
 
     try:
         with output.working("drawing the report"):
