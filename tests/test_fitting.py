@@ -10,9 +10,8 @@ from synthetic import box, cylinder, hausdorff, sphere, surface_points
 
 from caryatid.config import FitConfig, VoxelConfig
 from caryatid.fitting import primitives
-from caryatid.fitting.hidden_faces import close_hidden_faces, likeliest_end
+from caryatid.fitting.hidden_faces import close_hidden_faces, deviations, likeliest_end
 from caryatid.fitting.primitives import Fit, FitFailure, candidates, fit, free_inside
-from caryatid.fitting.uncertainty import estimate
 from caryatid.geometry import BOX as BOX_CODE
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
@@ -408,9 +407,9 @@ def test_what_no_number_of_points_averages_out_is_the_least_deviation():
 def test_deviations_are_numbers_where_rounding_makes_a_variance_negative():
     information = np.diag(np.full(9, 1e12))
     information[0, 6] = information[6, 0] = 1e12 * (1.0 + 1e-10)
-    found = estimate(BOX_CODE, np.ones(6, dtype=np.bool_), np.zeros(6), information, 1.0, INDEPENDENT)
-    for deviations in (found.position, found.rotation, found.sizes, found.sides):
-        assert np.isfinite(deviations).all()
+    found = deviations(BOX_CODE, np.ones(6, dtype=np.bool_), np.zeros(6), information, 1.0, INDEPENDENT)
+    for each in (found.position, found.rotation, found.sizes, found.sides):
+        assert np.isfinite(each).all()
 
 
 INSET = 0.012

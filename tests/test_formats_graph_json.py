@@ -12,9 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from caryatid.errors import InputError
-from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Sphere, Uncertainty
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
 from caryatid.io import graph_from_json, graph_text, graph_to_json, read_graph
 from caryatid.io.json_files import json_text, read_json

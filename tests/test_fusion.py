@@ -7,7 +7,7 @@ import pytest
 from synthetic import box, cylinder, edges, hausdorff, sphere, table_object, thing, vertices
 
 from caryatid.config import FusionConfig
-from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry.shapes import Uncertainty
 from caryatid.graph import Support, SupportGraph
 from caryatid.objects.fusion import fuse, fused_graph, match, renamed
 

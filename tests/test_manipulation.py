@@ -14,7 +14,7 @@ from synthetic import box, sphere, table_object, thing
 from caryatid.config import Config, LiftConfig, RehearsalConfig, SupportConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
-from caryatid.fitting.uncertainty import Uncertainty
+from caryatid.geometry.shapes import Uncertainty
 from caryatid.graph import Support, SupportGraph
 from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses_of
 from caryatid.manipulation.order import TakeStep, plan_order

@@ -14,10 +14,9 @@ from synthetic import motion_about_vertical
 
 from caryatid.config import PlausibilityConfig, SupportConfig
 from caryatid.errors import InputError
-from caryatid.fitting.uncertainty import Uncertainty
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import area, hull
-from caryatid.geometry.shapes import Box, Cylinder, Primitives, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Primitives, Sphere, Uncertainty
 from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject
 from caryatid.support.contacts import find_contacts, find_gap, local_frames

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
-from caryatid.fitting.uncertainty import Uncertainty
-from caryatid.geometry.shapes import Shape
+from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
 

@@ -1,4 +1,4 @@
-"""The last step of fits: seen sides where their points lie, all others where the points beside them end."""
+"""The last step of fits: seen sides where their points lie, others where points beside them end; how sure."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_marquardt, normal_equations
 from caryatid.fitting.search import TRIM
-from caryatid.fitting.uncertainty import Uncertainty, estimate
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile
-from caryatid.geometry.shapes import Primitives, Shape
+from caryatid.geometry.shapes import Primitives, Shape, Uncertainty
 from caryatid.geometry.signed_distance import in_frame, signed_distances
 from caryatid.geometry.transforms import Array, rigid
 
@@ -90,8 +90,48 @@ def close_hidden_faces(
     distance = np.abs(signed_distances(kind, R, centre, half, points))
     residual = float(np.minimum(distance, config.threshold).mean())
     inliers = float((distance < config.threshold).mean())
-    uncertainty = estimate(kind, sides, hidden, information * len(points), sigma, config)
+    uncertainty = deviations(kind, sides, hidden, information * len(points), sigma, config)
     return shape.from_extents(rigid(R, centre + origin), 2.0 * half), residual, inliers, uncertainty
+
+
+def deviations(
+    kind: int, seen: NDArray[np.bool_], unseen: Array, information: Array, sigma: float, config: FitConfig
+) -> Uncertainty:
+    """Standard deviations of a shape from the normal equations of its last fit.
+
+    Args:
+        kind: Code of the shape.
+        seen: Which sides (6,) points bear out.
+        unseen: Standard deviation (6,) [m] of the sides that no point bears out.
+        information: Sum over the points of the products of their derivatives (9, 9), unseen sides out of the
+            way; rows and columns as of `least_squares.normal_equations`.
+        sigma: Robust standard deviation [m] of the points' distances to the shape.
+        config: How many points share an error, and the error of registration.
+    """
+    # A radian for a rotation that nothing determines.
+    prior = np.array([config.max_extent] * 3 + [1.0] * 3 + [config.max_extent] * 3)
+    information = information / (config.correlated * sigma**2)
+    covariance = np.linalg.inv(information + np.diag(prior**-2.0))
+    # Rounding may leave a variance a little below zero.
+    variance = np.maximum(np.diagonal(covariance), 0.0)
+    # The half extents along x, y, z have these columns: round ones share one.
+    columns = {BOX: (6, 7, 8), SPHERE: (6, 6, 6)}.get(kind, (6, 6, 8))
+    centre, half, both = variance[:3], variance[list(columns)], covariance[range(3), columns]
+    borne_out = seen.copy()
+    if kind != BOX:
+        # Any part of a round surface tells where all of it is.
+        borne_out[:4] |= seen[:4].any()
+    borne_out |= kind == SPHERE
+    low = np.where(borne_out[0::2], np.maximum(centre + half - 2.0 * both, 0.0), unseen[0::2] ** 2)
+    high = np.where(borne_out[1::2], np.maximum(centre + half + 2.0 * both, 0.0), unseen[1::2] ** 2)
+    determined = borne_out[0::2] & borne_out[1::2]
+    floor = config.registration**2
+    return Uncertainty(
+        position=np.sqrt(np.where(determined, centre, (low + high) / 4.0) + floor),
+        rotation=np.sqrt(variance[3:6]),
+        sizes=np.sqrt(np.where(determined, 4.0 * half, low + high) + floor),
+        sides=np.sqrt(np.stack([low, high], axis=1).ravel() + floor),
+    )
 
 
 def _end(

@@ -33,6 +33,8 @@ class Shape(Pictured):
         code: What the compiled kernels take it for.
         ties: Which of the extents along x, y, z are one number: equal entries are.
         parameters: Numbers that determine the shape.
+        fill: Share of the box around it that it fills [1]; None: as its mesh does.
+        spread: Mean square of its points' coordinates along x, y, z, per squared extent [1].
         T_world_object: Pose (4, 4) of the centre.
     """
 
@@ -42,6 +44,8 @@ class Shape(Pictured):
     code: ClassVar[int] = BOX
     ties: ClassVar[tuple[int, int, int]] = (0, 1, 2)
     parameters: ClassVar[int] = 9
+    fill: ClassVar[float | None] = None
+    spread: ClassVar[tuple[float, float, float]] = (1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0)
     T_world_object: Array
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -87,13 +91,13 @@ class Shape(Pictured):
     @property
     def volume(self) -> float:
         """Volume [m³]."""
-        return float(self.mesh().volume)
+        return float(self.mesh().volume if self.fill is None else self.fill * np.prod(self.extents))
 
     @property
     def moments(self) -> Array:
         """Moments of inertia (3,) [m²] about the object's axes, per mass; of the box around it by default."""
-        x, y, z = self.extents**2
-        return np.array([y + z, x + z, x + y]) / 12.0
+        squares: Array = np.multiply(self.spread, self.extents**2)
+        return squares.sum() - squares
 
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside."""
@@ -126,13 +130,17 @@ class Shape(Pictured):
 
     def lines(self, eye_world: Array) -> list[Array]:
         """Lines (M, 3) [m] that draw the shape: edges, rims, and the silhouette seen from a point (3,)."""
-        mesh, T = self.mesh(), self.T_world_object
-        eye = transforms.transform(transforms.invert(T), eye_world)
+        eye = transforms.transform(transforms.invert(self.T_world_object), eye_world)
+        return [transforms.transform(self.T_world_object, line) for line in self._drawn(eye)]
+
+    def _drawn(self, eye: Array) -> list[Array]:
+        """What `lines` are in the object's frame."""
+        mesh = self.mesh()
         faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
         drawn = mesh.face_adjacency_angles > np.radians(20.0)
         drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
         edges = mesh.vertices[mesh.face_adjacency_edges[drawn]]
-        return [transforms.transform(T, np.linspace(a, b, 33)) for a, b in edges]
+        return [np.linspace(a, b, 33) for a, b in edges]
 
     def moved(self, T: Array) -> Self:
         """Return the shape moved by a rigid transform (4, 4) of the world: T @ T_world_object."""
@@ -156,6 +164,7 @@ class Box(Shape):
     T_world_object: Array
     extents: Array
     kind: ClassVar[str] = "box"
+    fill: ClassVar[float] = 1.0
 
     @classmethod
     def from_extents(cls, T_world_object: Array, extents: Array) -> Box:
@@ -178,11 +187,6 @@ class Box(Shape):
     def size(self) -> list[float]:
         """Edge lengths [x, y, z] [m]."""
         return [float(e) for e in self.extents]
-
-    @property
-    def volume(self) -> float:
-        """Volume [m³]."""
-        return float(np.prod(self.extents))
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3)."""
@@ -222,6 +226,8 @@ class Cylinder(Shape):
     code: ClassVar[int] = CYLINDER
     ties: ClassVar[tuple[int, int, int]] = (0, 0, 2)
     parameters: ClassVar[int] = 7
+    fill: ClassVar[float] = np.pi / 4.0
+    spread: ClassVar[tuple[float, float, float]] = (1.0 / 16.0, 1.0 / 16.0, 1.0 / 12.0)
 
     @property
     def extents(self) -> Array:
@@ -232,17 +238,6 @@ class Cylinder(Shape):
     def from_extents(cls, T_world_object: Array, extents: Array) -> Cylinder:
         """Build a cylinder with a pose (4, 4) and full extents (3,) [m]: the first is its diameter."""
         return cls(T_world_object, float(extents[0]) / 2.0, float(extents[2]))
-
-    @property
-    def volume(self) -> float:
-        """Volume [m³]."""
-        return float(np.pi * self.radius**2 * self.height)
-
-    @property
-    def moments(self) -> Array:
-        """Moments of inertia (3,) [m²] about the object's axes, per mass."""
-        aside = self.radius**2 / 4.0 + self.height**2 / 12.0
-        return np.array([aside, aside, self.radius**2 / 2.0])
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3)."""
@@ -262,10 +257,8 @@ class Cylinder(Shape):
 
         return trimesh.creation.cylinder(self.radius, self.height, sections=corners)
 
-    def lines(self, eye_world: Array) -> list[Array]:
-        """Lines (M, 3) [m] that draw the cylinder: both rims, and the sides of the mantle."""
-        T = self.T_world_object
-        eye = transforms.transform(transforms.invert(T), eye_world)
+    def _drawn(self, eye: Array) -> list[Array]:
+        """Both rims, and the sides of the mantle."""
         ends = np.array([[0.0, 0.0, -self.height / 2.0], [0.0, 0.0, self.height / 2.0]])
         found = [_circle(end, np.array([0.0, 0.0, 1.0]), self.radius) for end in ends]
         distance = float(np.hypot(eye[0], eye[1]))
@@ -274,7 +267,7 @@ class Cylinder(Shape):
             for angle in (towards - reach, towards + reach):
                 foot = self.radius * np.array([np.cos(angle), np.sin(angle), 0.0])
                 found.append(np.linspace(ends[0] + foot, ends[1] + foot, 33))
-        return [transforms.transform(T, line) for line in found]
+        return found
 
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
@@ -293,6 +286,8 @@ class Sphere(Shape):
     code: ClassVar[int] = SPHERE
     ties: ClassVar[tuple[int, int, int]] = (0, 0, 0)
     parameters: ClassVar[int] = 4
+    fill: ClassVar[float] = np.pi / 6.0
+    spread: ClassVar[tuple[float, float, float]] = (0.05, 0.05, 0.05)
 
     @property
     def extents(self) -> Array:
@@ -303,16 +298,6 @@ class Sphere(Shape):
     def from_extents(cls, T_world_object: Array, extents: Array) -> Sphere:
         """Build a ball with a pose (4, 4) and full extents (3,) [m]: the first is its diameter."""
         return cls(T_world_object, float(extents[0]) / 2.0)
-
-    @property
-    def volume(self) -> float:
-        """Volume [m³]."""
-        return float(4.0 / 3.0 * np.pi * self.radius**3)
-
-    @property
-    def moments(self) -> Array:
-        """Moments of inertia (3,) [m²] about the object's axes, per mass."""
-        return np.full(3, 0.4 * self.radius**2)
 
     def support(self, directions_world: Array) -> Array:
         """Extent (N,) [m] from the centre along unit directions (N, 3)."""
@@ -328,17 +313,32 @@ class Sphere(Shape):
 
         return trimesh.creation.icosphere(subdivisions=3, radius=self.radius)
 
-    def lines(self, eye_world: Array) -> list[Array]:
-        """Lines (M, 3) [m] that draw the ball: three great circles and the silhouette."""
-        T = self.T_world_object
+    def _drawn(self, eye: Array) -> list[Array]:
+        """Three great circles and the silhouette."""
         found = [_circle(np.zeros(3), axis, self.radius) for axis in np.eye(3)]
-        eye = transforms.transform(transforms.invert(T), eye_world)
         distance = float(np.linalg.norm(eye))
         if distance > self.radius:
             share = self.radius / distance
             rim = self.radius * np.sqrt(1.0 - share**2)
             found.append(_circle(self.radius * share * eye / distance, eye / distance, rim))
-        return [transforms.transform(T, line) for line in found]
+        return found
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Uncertainty:
+    """Standard deviations of a fitted shape, along and about the object's own axes.
+
+    Attributes:
+        position: Of the centre (3,) [m].
+        rotation: (3,) [rad]; large about an axis of symmetry.
+        sizes: Of the full extents (3,) [m] along x, y, z.
+        sides: Of the position of the sides -x, +x, -y, +y, -z, +z (6,) [m] along their normals.
+    """
+
+    position: Array
+    rotation: Array
+    sizes: Array
+    sides: Array
 
 
 class Primitives(NamedTuple):

@@ -11,8 +11,7 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Le
 
 from caryatid.errors import InputError
-from caryatid.fitting.uncertainty import Uncertainty
-from caryatid.geometry.shapes import from_size
+from caryatid.geometry.shapes import Uncertainty, from_size
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind, Role, SceneObject, Stability, Support, SupportGraph
 from caryatid.io.json_files import Numbers, json_text, parse_json, plain, read_json

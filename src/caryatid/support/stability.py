@@ -79,9 +79,6 @@ def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
     Points all over the lower side of the one and the upper side of the other march to the opposite shape by
     its signed distance.
     """
-    apart = float(np.linalg.norm(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3]))
-    if apart > (np.linalg.norm(shape.extents) + np.linalg.norm(other.extents)) / 2.0:
-        return float(np.inf)
     return min(_march(shape, other, -_UP, limit), _march(other, shape, _UP, limit))
 
 
