@@ -1,140 +1,111 @@
+"""Frames over time: what is asked between any two of them is what was said, interpolated or refused."""
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from caryatid.errors import InputError
 from caryatid.geometry import transforms
+from caryatid.io.video import SECOND, TransformTree, is_pose
+
+NOW = 1_700_000_000 * SECOND
+"""Large enough that a float would lose the nanoseconds."""
 
 
-@pytest.fixture
-def rng():
-    return np.random.default_rng(3)
-
-
-@pytest.fixture
-def T_a_b(rng):
+def random_pose(rng):
     return transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3))
 
 
-def test_a_rigid_transform_is_taken_as_it_is_also_from_lists(T_a_b):
-    taken = transforms.as_rigid(T_a_b.tolist())
-    assert taken.dtype == np.float64
-    np.testing.assert_array_equal(taken, T_a_b)
-    transforms.as_rigid(np.round(T_a_b, 6))  # A text file rounds.
+def tree_with(*links, gap=1.0):
+    tree = TransformTree(gap)
+    for parent, child, time, pose, *fixed in links:
+        numbers = [*pose[:3, 3], *Rotation.from_matrix(pose[:3, :3]).as_quat()]
+        tree.add(parent, child, time, numbers, fixed=bool(fixed))
+    return tree
 
 
-def broken(change):
-    T = np.eye(4)
-    change(T)
-    return T
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=30, deadline=None)
+def test_chains_up_and_down_the_tree_multiply(seed):
+    rng = np.random.default_rng(seed)
+    A, B, C, D = (random_pose(rng) for _ in range(4))
+    tree = tree_with(
+        ("map", "odom", NOW, A),
+        ("odom", "base", NOW, B),
+        ("base", "eye", 0, C, True),
+        ("odom", "hand", NOW, D),
+    )
+    assert np.allclose(tree.between("map", "eye", NOW), A @ B @ C)
+    assert np.allclose(tree.between("eye", "map", NOW), np.linalg.inv(A @ B @ C))
+    assert np.allclose(tree.between("hand", "eye", NOW), np.linalg.inv(D) @ B @ C)
+    assert np.allclose(tree.between("odom", "odom", NOW), np.eye(4))
 
 
-@pytest.mark.parametrize(
-    ("T", "reason"),
-    [
-        (np.eye(3), r"shape \(3, 3\)"),
-        (broken(lambda T: T.__setitem__((0, 3), np.nan)), "NaN"),
-        (broken(lambda T: T.__setitem__((0, 3), np.inf)), "infinity"),
-        (broken(lambda T: T.__setitem__((3, 0), 0.1)), "last row"),
-        (broken(lambda T: T.__setitem__((0, 0), 1.01)), "no rotation"),
-        (np.diag([1.0, 1.0, -1.0, 1.0]), "mirrored"),
-        (np.zeros((4, 4)), "last row"),
-    ],
-)
-def test_what_is_no_rigid_transform_is_refused_by_name_and_reason(T, reason):
-    with pytest.raises(InputError, match=reason) as caught:
-        transforms.as_rigid(T, "frame 7")
-    assert str(caught.value).startswith("frame 7: ")
-    assert caught.value.remedy
+@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0))
+@settings(max_examples=30, deadline=None)
+def test_between_two_poses_the_path_is_straight_and_the_turn_even(seed, share):
+    rng = np.random.default_rng(seed)
+    start = random_pose(rng)
+    axis, angle, way = transforms.unit(rng.normal(size=3)), rng.uniform(0.0, 3.0), rng.normal(size=3)
+
+    def after(part):
+        R = start[:3, :3] @ transforms.rotation_from_vector(part * angle * axis)
+        return transforms.rigid(R, start[:3, 3] + part * way)
+
+    tree = tree_with(("map", "eye", NOW, start), ("map", "eye", NOW + SECOND // 2, after(1.0)))
+    nanoseconds = round(share * (SECOND // 2))
+    exact = after(nanoseconds / (SECOND // 2))
+    assert np.allclose(tree.between("map", "eye", NOW + nanoseconds), exact, atol=1e-7)
 
 
-def test_inverting_a_transform_undoes_it_also_for_many_at_once(rng):
-    many = np.array([transforms.rigid(transforms.random_rotation(rng), rng.normal(size=3)) for _ in range(5)])
-    np.testing.assert_allclose(transforms.invert(many) @ many, np.tile(np.eye(4), (5, 1, 1)), atol=1e-14)
-    np.testing.assert_array_equal(transforms.invert(many[2]), transforms.invert(many)[2])
-
-
-def test_points_are_moved_and_vectors_only_turned(T_a_b, rng):
-    points = rng.normal(size=(4, 5, 3))
-    by_matrix = np.concatenate([points, np.ones((4, 5, 1))], axis=-1) @ T_a_b.T
-    np.testing.assert_allclose(transforms.transform(T_a_b, points), by_matrix[..., :3], atol=1e-14)
-    difference = transforms.transform(T_a_b, points) - transforms.transform(T_a_b, np.zeros(3))
-    np.testing.assert_allclose(transforms.rotate(T_a_b, points), difference, atol=1e-14)
-
-
-def test_units_have_length_one_and_zero_stays_zero():
-    vectors = transforms.unit([[3.0, 0.0, 4.0], [0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(vectors, [[0.6, 0.0, 0.8], [0.0, 0.0, 0.0]])
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, np.pi / 2, np.pi - 1e-9, np.pi])
-def test_angles_are_exact_where_the_arc_cosine_is_not(angle):
-    turned = [np.cos(angle), np.sin(angle), 0.0]
-    assert transforms.angle_between([2.0, 0.0, 0.0], turned) == pytest.approx(angle, rel=1e-6, abs=1e-15)
-
-
-def test_perpendicular_vectors_are_perpendicular_units_for_every_axis(rng):
-    axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(20, 3))])
-    across = transforms.perpendicular(axes)
-    np.testing.assert_allclose(np.sum(across * axes, axis=1), 0.0, atol=1e-14)
-    np.testing.assert_allclose(np.linalg.norm(across, axis=1), 1.0)
-
-
-@pytest.mark.parametrize("length", [0.0, 1e-15, 1e-7, 5e-4, 0.3, 3.0])
-def test_rotation_vectors_follow_rodrigues(length, rng):
-    vector = length * transforms.unit(rng.normal(size=3))
-    expected = Rotation.from_rotvec(vector).as_matrix()
-    np.testing.assert_allclose(transforms.rotation_from_vector(vector), expected, atol=1e-14)
-
-
-def test_random_rotations_are_rotations_spread_over_all_of_them():
+def test_poses_may_come_in_any_order_and_the_last_of_a_time_counts():
     rng = np.random.default_rng(0)
-    many = np.array([transforms.random_rotation(rng) for _ in range(3000)])
-    np.testing.assert_allclose(np.swapaxes(many, 1, 2) @ many, np.tile(np.eye(3), (3000, 1, 1)), atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(many), 1.0)
-    # Uniform over SO(3): every entry has mean 0 and variance 1/3.
-    np.testing.assert_allclose(many.mean(axis=0), 0.0, atol=4.0 * np.sqrt(1.0 / 3.0 / 3000))
-    np.testing.assert_allclose(many.var(axis=0), 1.0 / 3.0, atol=0.03)
+    first, last, other = (random_pose(rng) for _ in range(3))
+    tree = tree_with(
+        ("map", "eye", NOW + SECOND, last), ("map", "eye", NOW, other), ("map", "eye", NOW, first)
+    )
+    assert np.allclose(tree.between("map", "eye", NOW), first)
+    assert np.allclose(tree.between("map", "eye", NOW + SECOND), last)
 
 
-def test_looking_at_a_point_puts_it_on_the_axis_with_up_upwards(rng):
-    for _ in range(20):
-        eye, target = rng.normal(size=(2, 3))
-        T_world_camera = transforms.as_rigid(transforms.look_at(eye, target))
-        target_camera = transforms.transform(transforms.invert(T_world_camera), target)
-        np.testing.assert_allclose(target_camera, [0.0, 0.0, np.linalg.norm(target - eye)], atol=1e-12)
-        np.testing.assert_allclose(T_world_camera[:3, 3], eye)
-        up_camera = transforms.rotate(transforms.invert(T_world_camera), np.array([0.0, 0.0, 1.0]))
-        assert abs(up_camera[0]) < 1e-12
-        assert up_camera[1] < 0.0
+@pytest.mark.parametrize("late", [-1, SECOND + 1, 3 * SECOND])
+def test_outside_what_was_said_and_across_a_gap_nothing_is_made_up(late):
+    rng = np.random.default_rng(1)
+    links = [("map", "eye", NOW + k * SECOND, random_pose(rng)) for k in (0, 1)]
+    assert tree_with(*links).between("map", "eye", NOW + late) is None
+    assert tree_with(*links, gap=1.0).between("map", "eye", NOW + SECOND // 2).shape == (4, 4)
+    assert tree_with(*links, gap=0.9).between("map", "eye", NOW + SECOND // 2) is None
 
 
-@pytest.mark.parametrize("target", [(0.0, 0.0, -1.0), (0.0, 0.0, 1.0)])
-def test_looking_straight_down_or_up_has_a_roll_all_the_same(target):
-    T_world_camera = transforms.as_rigid(transforms.look_at((0.0, 0.0, 0.0), target))
-    np.testing.assert_allclose(T_world_camera[:3, 2], target)
-    np.testing.assert_allclose(-T_world_camera[:3, 1], (1.0, 0.0, 0.0), atol=1e-12)
-    along_up = transforms.as_rigid(transforms.look_at((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (1.0, 0.0, 0.0)))
-    np.testing.assert_allclose(along_up[:3, 2], (1.0, 0.0, 0.0))
-    with pytest.raises(InputError, match="same point"):
-        transforms.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
+def test_a_frame_that_changes_its_parent_has_no_pose_in_between():
+    rng = np.random.default_rng(3)
+    tree = tree_with(("map", "cup", NOW, random_pose(rng)), ("hand", "cup", NOW + SECOND, random_pose(rng)))
+    assert tree.between("map", "cup", NOW).shape == (4, 4)
+    for target in ("map", "hand"):
+        assert tree.between(target, "cup", NOW + 1) is None
 
 
-def test_a_level_world_has_the_plane_at_zero_below_the_camera(rng):
-    truth = transforms.look_at((0.4, -1.0, 1.2), (0.1, 0.2, 0.0))
-    T_camera_world = transforms.invert(truth)
-    normal = transforms.rotate(T_camera_world, np.array([0.0, 0.0, 1.0]))
-    on_plane = transforms.transform(T_camera_world, np.array([[0.3, 0.7, 0.0], [-2.0, 0.1, 0.0]]))
-    T_world_camera = transforms.as_rigid(transforms.level_world(normal, on_plane[0]))
-    np.testing.assert_allclose(transforms.transform(T_world_camera, on_plane)[:, 2], 0.0, atol=1e-12)
-    np.testing.assert_allclose(T_world_camera[:3, 3], (0.0, 0.0, 1.2), atol=1e-12)
-    np.testing.assert_allclose(transforms.rotate(T_world_camera, normal), (0.0, 0.0, 1.0), atol=1e-12)
-    forward = T_world_camera[:3, 2]
-    assert forward[0] > 0.0
-    assert abs(forward[1]) < 1e-12
-    # Whichever point of the plane is given.
-    np.testing.assert_allclose(transforms.level_world(normal, on_plane[1]), T_world_camera, atol=1e-12)
-    straight_down = transforms.as_rigid(transforms.level_world((0.0, 0.0, -1.0), (0.0, 0.0, 2.0)))
-    np.testing.assert_allclose(straight_down[:3, 3], (0.0, 0.0, 2.0))
+def test_frames_in_a_circle_and_frames_apart_are_refused():
+    tree = tree_with(("a", "b", NOW, np.eye(4)), ("b", "a", NOW, np.eye(4)), ("c", "d", NOW, np.eye(4)))
+    for target in ("c", "nowhere"):
+        assert tree.between(target, "a", NOW) is None
+    assert tree.frames == ["a", "b", "c", "d"]
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (np.nan, 0.0, 0.0, 1.0)])
+def test_numbers_that_are_no_rotation_make_no_pose(q):
+    assert not is_pose((0.0, 0.0, 0.0, *q))
+    assert not is_pose((np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
+    assert not is_pose((0.0, 0.0, 0.0, 1.0))
+
+
+def test_a_quaternion_need_not_have_length_one():
+    tree = TransformTree(1.0)
+    tree.add("map", "eye", NOW, (1.0, 1.0, 1.0, 0.0, 0.0, 2.0, 2.0))
+    T = tree.between("map", "eye", NOW)
+    assert np.allclose(
+        T, transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, np.pi / 2)), np.ones(3))
+    )

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numba
 import numpy as np
 import pytest
 from raycast import table_scene
@@ -162,6 +163,23 @@ def test_a_first_view_without_a_pose_gets_one_and_a_second_is_refused():
     with pytest.raises(InputError, match="no camera pose"):
         scene.update(view)
     assert (scene.graph, scene.views, len(scene.cloud)) == kept
+
+
+@pytest.mark.parametrize("segmentation", ["labels", "auto"])
+def test_a_scene_is_the_same_bytes_on_any_number_of_threads(segmentation):
+    views, before, texts = simulated_views("tower", noise="carmine")[:2], numba.get_num_threads(), []
+    try:
+        for threads in (1, numba.config.NUMBA_NUM_THREADS):
+            numba.set_num_threads(threads)
+            scene = model_of(
+                [replace(view, normals_camera=None) for view in views], segmentation=segmentation
+            )
+            solid = scene.voxels.solid([o.shape for o in scene.graph.objects])
+            arrays = (scene.labels, scene.cloud.points_world, scene.T_world_camera, solid.grid)
+            texts.append([graph_text(scene.graph), *(array.tobytes() for array in arrays)])
+    finally:
+        numba.set_num_threads(before)
+    assert texts[0] == texts[1]
 
 
 def test_a_view_of_nothing_leaves_the_model_as_it_was():

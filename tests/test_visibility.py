@@ -1,3 +1,5 @@
+"""What a view says of a shape that it should show."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -23,50 +25,37 @@ def view_of(*boxes, spheres=()):
     )
 
 
+def screen(share):
+    """A screen that hides this share of the crate's width."""
+    return box((-0.3, 0.3 + 0.05 - 0.1 * share, TABLE + 0.25), (0.02, 0.6, 0.5))
+
+
+def nearer(distance):
+    """The crate as a wrong registration has it, nearer to the camera [m]."""
+    return CRATE.moved(transforms.rigid(np.eye(3), -distance * EYE[:3, 2]))
+
+
 EMPTY = view_of()
+HALF = np.where(np.arange(640) % 2 == 0, 0.0, EMPTY.depth)
 
 
-def test_what_is_there_is_not_seen_through():
-    assert not seen_through(CRATE, view_of(CRATE))
-    assert not seen_through(BALL, view_of(spheres=[BALL]))
-
-
-@pytest.mark.parametrize("shape", [CRATE, BALL], ids=lambda s: s.kind)
-def test_what_is_gone_is_seen_through(shape):
-    assert seen_through(shape, EMPTY)
-
-
-def test_what_is_hidden_may_be_there_all_the_same():
-    screen = box((-0.25, 0.0, TABLE + 0.25), (0.02, 0.5, 0.5))
-    assert not seen_through(CRATE, view_of(screen))
-
-
-def test_half_hidden_and_half_gone_is_decided_by_the_larger_part():
-    def screen(share):
-        """A screen that hides this share of the crate's width."""
-        return box((-0.3, 0.3 + 0.05 - 0.1 * share, TABLE + 0.25), (0.02, 0.6, 0.5))
-
-    assert seen_through(CRATE, view_of(screen(0.2)))
-    assert not seen_through(CRATE, view_of(screen(0.8)))
-
-
-def test_an_error_of_registration_is_no_contradiction():
-    view = view_of(CRATE)
-    forward = EYE[:3, 2]
-    for share, contradicted in ((0.8, False), (1.6, True)):
-        nearer = CRATE.moved(transforms.rigid(np.eye(3), -share * 0.02 * forward))
-        assert seen_through(nearer, view) == contradicted
-
-
-def test_what_is_out_of_the_image_is_not_judged():
-    aside = box((0.0, 3.0, TABLE), (0.1, 0.1, 0.1))
-    behind = box((-3.0, 0.0, 2.5), (0.1, 0.1, 0.1))
-    assert not seen_through(aside, EMPTY)
-    assert not seen_through(behind, EMPTY)
-
-
-def test_pixels_without_a_reading_say_nothing():
-    assert not seen_through(CRATE, replace(EMPTY, depth=np.zeros_like(EMPTY.depth)))
-    half = EMPTY.depth.copy()
-    half[:, ::2] = 0.0
-    assert seen_through(CRATE, replace(EMPTY, depth=half))
+@pytest.mark.parametrize(
+    ("shape", "view", "expected"),
+    [
+        pytest.param(CRATE, view_of(CRATE), False, id="a crate is there"),
+        pytest.param(BALL, view_of(spheres=[BALL]), False, id="a ball is there"),
+        pytest.param(CRATE, EMPTY, True, id="a crate is gone"),
+        pytest.param(BALL, EMPTY, True, id="a ball is gone"),
+        pytest.param(CRATE, view_of(screen(1.0)), False, id="hidden"),
+        pytest.param(CRATE, view_of(screen(0.8)), False, id="most of it hidden"),
+        pytest.param(CRATE, view_of(screen(0.2)), True, id="little of it hidden"),
+        pytest.param(nearer(0.016), view_of(CRATE), False, id="an error of registration"),
+        pytest.param(nearer(0.032), view_of(CRATE), True, id="more than an error of registration"),
+        pytest.param(box((0.0, 3.0, TABLE), (0.1, 0.1, 0.1)), EMPTY, False, id="beside the image"),
+        pytest.param(box((-3.0, 0.0, 2.5), (0.1, 0.1, 0.1)), EMPTY, False, id="behind the camera"),
+        pytest.param(CRATE, replace(EMPTY, depth=0.0 * EMPTY.depth), False, id="no reading"),
+        pytest.param(CRATE, replace(EMPTY, depth=HALF), True, id="every other reading"),
+    ],
+)
+def test_a_shape_is_seen_through_where_most_readings_lie_behind_it(shape, view, expected):
+    assert seen_through(shape, view) == expected

@@ -1,16 +1,10 @@
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from caryatid.config import VoxelConfig
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Sphere
+from caryatid.geometry.shapes import Box, Sphere
 from caryatid.sensing.views import View
 from caryatid.sensing.voxel_map import FREE, OCCUPIED, UNKNOWN, VoxelMap
 
@@ -23,45 +17,6 @@ def wall_view(distance: float = 1.0, noise: np.ndarray | float = 0.0) -> View:
     T_world_camera = transforms.look_at((-1.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     depth = (np.full((120, 160), distance) + noise).astype(np.float32)
     return View(depth, K, T_world_camera)
-
-
-def shapes_about(rng: np.random.Generator) -> list:
-    """Shapes in and about the map of `random_counts`, turned; one far away."""
-    T = [transforms.rigid(transforms.random_rotation(rng), rng.uniform(-0.4, 0.5, 3)) for _ in range(6)]
-    boxes = [Box(t, rng.uniform(0.05, 0.5, 3)) for t in T[:2]]
-    cylinders = [Cylinder(t, 0.12, 0.3) for t in T[2:4]]
-    return [*boxes, *cylinders, Sphere(T[4], 0.15), Sphere(transforms.rigid(np.eye(3), (9.0, 0.0, 0.0)), 0.2)]
-
-
-THREADED = """
-import sys
-import numba
-import numpy as np
-from test_voxels import K, shapes_about, wall_view
-from caryatid.config import VoxelConfig
-from caryatid.sensing.voxel_map import VoxelMap
-voxels = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
-for depth in (1.0, 1.2):
-    voxels = voxels.integrate(wall_view(depth, np.random.default_rng(0).normal(0.0, 0.1, (120, 160))), 3.0)
-solid = voxels.solid(shapes_about(np.random.default_rng(0)))
-bytes_ = voxels.hits.tobytes() + voxels.passes.tobytes() + solid.grid.tobytes()
-sys.stdout.write(f"{numba.get_num_threads()} {hash(bytes_)} {voxels.passes.sum()}")
-"""
-
-
-@pytest.mark.slow
-def test_the_number_of_threads_changes_no_bit():
-    said = []
-    for threads in ("1", "3"):
-        path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-        env = os.environ | {"NUMBA_NUM_THREADS": threads, "PYTHONPATH": path, "PYTHONHASHSEED": "0"}
-        run = subprocess.run(
-            [sys.executable, "-c", THREADED], env=env, capture_output=True, text=True, check=True
-        )
-        said.append(run.stdout.split())
-    assert [n for n, *_ in said] == ["1", "3"]
-    assert said[0][1:] == said[1][1:]
-    assert int(said[0][2]) > 10_000
 
 
 def test_a_new_map_knows_nothing():
