@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -81,9 +81,7 @@ class Episode:
 
     def key(self, fingerprint: str) -> str:
         """Digest of the episode and of the code that runs it, wherever a scene's folder lies."""
-        known = {name: getattr(self, name) for name in self.__slots__}
-        if self.content:
-            known["scene"] = ""
+        known = asdict(self) | ({"scene": ""} if self.content else {})
         return hashlib.sha256(json.dumps([fingerprint, known], sort_keys=True).encode()).hexdigest()
 
 
@@ -154,12 +152,10 @@ def plugin_of(planner: str) -> str:
     if point is None:
         return ""
     spec = find_spec(point.module.split(".")[0])
-    places = [] if spec is None else spec.submodule_search_locations or [spec.origin or ""]
-    files = [
-        f
-        for place in map(Path, places)
-        for f in ([place] if place.is_file() else sorted(place.rglob("*.py")))
-    ]
+    folders = spec.submodule_search_locations if spec else None
+    files = [f for folder in folders or () for f in sorted(Path(folder).rglob("*.py"))]
+    if spec and spec.origin and not folders:
+        files = [Path(spec.origin)]
     return hashlib.sha256((point.value + _digest(files)).encode()).hexdigest()[:16]
 
 
@@ -187,14 +183,10 @@ def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene
     return simulated, true_scene_from_simulation(simulated)
 
 
-def take_apart(
+def _take_apart(
     scene: SimulatedScene, graph: SupportGraph, truth: TrueScene, order: OrderName, config: Config, seed: int
 ) -> dict[str, float]:
-    """Take a scene apart in physics; objects that were not extracted go last, the highest first.
-
-    Returns:
-        `unharmed`, whether nothing was disturbed (1 or 0), and the share of `lifts` that disturbed nothing.
-    """
+    """Whether taking a scene apart harms nothing; what was not extracted goes last, the highest first."""
     bodies = bodies_of(graph, truth)
     objects = [o for o in graph.objects if o.role == "object"]
     if objects and order in ("one hand", "two hands"):
@@ -232,7 +224,7 @@ def _rows(episode: Episode) -> list[Row]:
         found = score(step.graph, truth)
         view = step.index + 1
         if episode.order and view in REMOVAL_VIEWS:
-            removal = take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
+            removal = _take_apart(scene, step.graph, truth, episode.order, config, episode.seed)
         perceiving = [s for stage, s in step.timings.items() if stage not in ("capture", "plan")]
         travelled = {"angle": step.angle_travelled, "path": step.path_travelled}
         times = dict(zip(TIMES, (planning, sum(perceiving)), strict=True))

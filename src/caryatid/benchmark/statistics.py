@@ -77,7 +77,9 @@ def _compare(
             if method != reference and reference in known:
                 figures += _against(own, known[reference])
             if gap is not None and method not in gap and set(gap) <= set(known):
-                figures += _gap_closed(own, *(known[end] for end in gap))
+                ends = (own, *(known[end] for end in gap))
+                closed = bootstrap([frame["f1"] for frame in ends], _gap_closed)
+                figures += _named([("gap", view) for view in own["f1"].columns], closed)
         yield from ((method, figure) for figure in figures)
 
 
@@ -112,17 +114,8 @@ def bootstrap(frames: Sequence[pd.DataFrame], figures: Callable[..., Array]) -> 
     return np.stack([value, resampled[tail], resampled[-1 - tail]], axis=1)
 
 
-def first_reach(f1: Array, path: Array, threshold: float) -> tuple[Array, Array]:
-    """First view, and path there, at which F1 reaches a threshold; infinite where it does not.
-
-    Args:
-        f1: After each view (..., V) [1].
-        path: Up to each view (..., V) [m].
-        threshold: F1 [1].
-
-    Returns:
-        Number of the view (...,), from 1, and path (...,) [m].
-    """
+def _first_reach(f1: Array, path: Array, threshold: float) -> tuple[Array, Array]:
+    """First view (…), from 1, and path (…) [m] at which F1 (…, V) reaches a threshold; else infinite."""
     reached = f1 >= threshold - 1e-9  # sums of equal figures differ by less
     view = np.argmax(reached, axis=-1)
     length = np.take_along_axis(path, view[..., None], -1)[..., 0]
@@ -130,28 +123,15 @@ def first_reach(f1: Array, path: Array, threshold: float) -> tuple[Array, Array]
     return np.where(missed, np.inf, view + 1.0), np.where(missed, np.inf, length)
 
 
-def path_to(f1: Array, path: Array, threshold: float) -> Array:
-    """Path (...,) [m] at which F1, straight over the path between two views, reaches a threshold."""
-    view, end = first_reach(f1, path, threshold)
+def _path_to(f1: Array, path: Array, threshold: float) -> Array:
+    """Path (…) [m] at which F1 (…, V), straight over the path between two views, reaches a threshold."""
+    view, end = _first_reach(f1, path, threshold)
     index = np.where(np.isinf(view), 1.0, view).astype(int)[..., None] - 1
     before = np.maximum(index - 1, 0)
     start = np.take_along_axis(path, before, -1)[..., 0]
     below, above = (np.take_along_axis(f1, at, -1)[..., 0] for at in (before, index))
     share = np.divide(threshold - below, above - below, out=np.ones_like(end), where=above > below)
     return np.where(np.isinf(end), np.inf, start + np.clip(share, 0.0, 1.0) * (end - start))
-
-
-def area_over_path(f1: Array, path: Array, budget: float) -> Array:
-    """Mean F1 along the path up to a budget (E,) [1]; F1 holds from one view to the next.
-
-    Args:
-        f1: After each view (E, V) [1].
-        path: Up to each view (E, V), not descending [m].
-        budget: Length of path [m], above 0.
-    """
-    begins = np.minimum(path, budget)
-    begins[:, 0] = 0.0
-    return np.sum(f1 * np.diff(begins, append=budget), axis=1) / budget
 
 
 def _plain(quantity: str, at: float, value: float) -> Statistic:
@@ -172,12 +152,15 @@ def _alone(own: pd.DataFrame, budget: float) -> Iterator[Statistic]:
     f1, path = (own[name].to_numpy() for name in CURVE)
     means = own.copy()
     for threshold in CONFIG.thresholds:
-        seen, length = first_reach(f1, path, threshold)
+        seen, length = _first_reach(f1, path, threshold)
         means["share", threshold] = np.isfinite(seen).astype(float)
         yield _plain("median views", threshold, np.median(seen))
         yield _plain("median path", threshold, np.median(length))
     if budget:
-        means["area", 0.0] = area_over_path(f1, path, budget)
+        begins = np.minimum(path, budget)
+        begins[:, 0] = 0.0
+        # F1 holds from one view to the next.
+        means["area", 0.0] = np.sum(f1 * np.diff(begins, append=budget), axis=1) / budget
     yield _plain("budget", 0.0, budget)
     yield from _named(means.columns, bootstrap([means], lambda figures: figures))
     yield from _by_threshold("mean path", bootstrap([own[name] for name in CURVE], _paths))
@@ -203,19 +186,14 @@ def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Statistic]:
     yield from (row for row in _by_threshold("path ratio", found) if 0.0 < row[2] < np.inf)
 
 
-def _gap_closed(own: pd.DataFrame, low: pd.DataFrame, high: pd.DataFrame) -> list[Statistic]:
-    """(F1 − that of low) / (F1 of high − that of low) after each view."""
-
-    def closed(own: Array, low: Array, high: Array) -> Array:
-        return np.where(high == low, np.nan, (own - low) / (high - low))
-
-    found = bootstrap([frame["f1"] for frame in (own, low, high)], closed)
-    return _named([("gap", view) for view in own["f1"].columns], found)
+def _gap_closed(own: Array, low: Array, high: Array) -> Array:
+    """Share of the gap (…, V) between two methods' F1 that another one's closes."""
+    return np.where(high == low, np.nan, (own - low) / (high - low))
 
 
 def _paths(f1: Array, path: Array) -> Array:
     """Path (..., T) [m] at which mean curves (..., V) reach each threshold."""
-    return np.stack([path_to(f1, path, threshold) for threshold in CONFIG.thresholds], axis=-1)
+    return np.stack([_path_to(f1, path, threshold) for threshold in CONFIG.thresholds], axis=-1)
 
 
 def _by_threshold(quantity: str, found: Array) -> list[Statistic]:
