@@ -6,7 +6,6 @@ import json
 import re
 import tomllib
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -95,15 +94,10 @@ def test_every_view_has_its_graph_labels_pose_and_choice(kept_run):
 def test_a_built_in_scene_is_explored_by_name(tmp_path):
     """The tower without noise: every support of the settled scene, and nothing else."""
     run = explored("tower", tmp_path / "run", "--views", 3, "--no-report")
-    golden = json.loads((Path(__file__).parent / "golden" / "tower.json").read_text())
-    found = {(s.supporter, s.supported, s.kind) for s in run.graph.supports}
-    assert found == {(s["supporter"], s["supported"], s["kind"]) for s in golden["supports"]}
-    assert {o.id: o.shape.kind for o in run.graph.objects} == golden["shapes"]
-
     scene = load_scene("tower")
     labels = {"table": "o0"} | {body: f"o{k}" for k, body in scene.object_bodies.items()}
     truth = {(labels[a], labels[b]) for a, b in ground_truth(scene).pairs}
-    assert {(a, b) for a, b, _ in found} == truth
+    assert {s.pair for s in run.graph.supports} == truth
 
 
 def test_a_recording_is_explored_where_it_was_recorded(tmp_path, recording):
@@ -267,15 +261,3 @@ def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, c
     for number, (view, timing) in enumerate(zip(document["profile"], timings(), strict=True)):
         thought = sum(seconds for stage, seconds in timing.items() if stage != "capture")
         assert view == {"view": number, "turn": pytest.approx(thought), **timing}
-
-
-def test_an_older_run_is_replaced_and_other_folders_are_not(tmp_path, scene_file, capsys):
-    explored(scene_file, tmp_path / "run", "--views", 2, "--no-report")
-    explored(scene_file, tmp_path / "run", "--views", 1, "--no-report")
-    assert not (tmp_path / "run/views/01").exists()
-    capsys.readouterr()
-    (tmp_path / "notes").mkdir()
-    (tmp_path / "notes/dear.txt").write_text("mine")
-    assert run_command("explore", scene_file, "--out", tmp_path / "notes", *SMALL) == 1
-    assert "holds other files" in capsys.readouterr().err
-    assert (tmp_path / "notes/dear.txt").read_text() == "mine"

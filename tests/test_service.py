@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import socket
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -253,13 +252,6 @@ def test_this_machine_needs_no_token_and_every_other_address_demands_one(tmp_pat
     assert run_command("serve", tmp_path / "s", "--token", "short") == 1
     assert "has fewer than 16 characters" in capsys.readouterr().err
     assert not (tmp_path / "s").exists()
-
-
-def test_without_the_extra_one_sentence_says_so(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "uvicorn", None)
-    monkeypatch.delitem(sys.modules, "caryatid.service")
-    assert run_command("serve", tmp_path / "s") == 1
-    assert capsys.readouterr().err == 'error: serve: needs uvicorn; pip install "caryatid[serve]"\n'
 
 
 def test_a_port_that_is_taken_is_said_in_one_line(tmp_path, capsys):
