@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,15 +63,15 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
     curves, path = curves_of(group, measure), curves_of(group, "path")
     if curves:
         caption = f"{heading} after each view: mean over {scenes}, with intervals."
-        yield _figure(f"{measure} over views {family}", caption, 14, _lines(curves, heading))
+        yield _figure(f"{measure} over views {family}", caption, 14, partial(_lines, curves, None, heading))
     if curves and path and measure == "f1":
         caption = f"{heading} over the path travelled, a mark for each view: mean over {scenes}."
-        yield _figure(f"f1 over path {family}", caption, 14, _lines(curves, heading, path))
+        yield _figure(f"f1 over path {family}", caption, 14, partial(_lines, curves, path, heading))
     if differences := curves_of(group, f"{measure} difference"):
         label = f"{heading} minus that of {reference}"
         caption = f"{label} in {scenes}, paired: mean and interval. Pale: the interval holds 0."
-        rows = _rows(differences, label, zero=True)
-        yield _figure(f"{measure} differences {family}", caption, len(differences), rows)
+        plot = partial(_rows, differences, label, zero=True)
+        yield _figure(f"{measure} differences {family}", caption, len(differences), plot)
 
 
 def draw_conditions(summary: pd.DataFrame, measure: str, heading: str) -> Figure:
@@ -81,7 +82,7 @@ def draw_conditions(summary: pd.DataFrame, measure: str, heading: str) -> Figure
         for method, curve in curves_of(group, measure).items()
     }
     caption = f"{heading} under each condition: mean over scenes, with intervals."
-    return _figure(f"{measure} by condition", caption, len(curves), _rows(curves, heading))
+    return _figure(f"{measure} by condition", caption, len(curves), partial(_rows, curves, heading))
 
 
 def conditions_of(summary: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
@@ -100,53 +101,41 @@ def _figure(name: str, caption: str, rows: int, plot: Callable[[Any], None]) -> 
     return Figure(name, caption, 0.9 + 0.22 * max(rows, 2), plot)
 
 
-def _lines(curves: Curves, label: str, path: Curves | None = None) -> Callable[[Any], None]:
-    """Plots a line for each curve, over the views or over the path up to each."""
-
-    def plot(figure: Any) -> None:
-        axes = figure.subplots()
-        for index, (method, curve) in enumerate(curves.items()):
-            turn, place = divmod(index, len(COLOURS))
-            look = {
-                "color": COLOURS[place],
-                "marker": MARKERS[place],
-                "linestyle": DASHES[turn % len(DASHES)],
-            }
-            # Side by side, so that intervals at the same view do not hide each other.
-            at = curve.index + 0.4 * ((index + 0.5) / len(curves) - 0.5)
-            errors = {"yerr": _interval(curve)}
-            if path is not None:
-                at, errors["xerr"] = path[method]["value"], _interval(path[method])
-            axes.errorbar(at, curve["value"], elinewidth=0.9, label=method, **errors, **look)
-        axes.set(ylabel=label, xlabel="path over the floor [m]" if path else "views")
-        axes.set_ylim(None, min(1.0, axes.get_ylim()[1]))
-        axes.xaxis.get_major_locator().set_params(integer=path is None)
-        figure.legend(loc="outside right center")
-
-    return plot
+def _lines(curves: Curves, path: Curves | None, label: str, figure: Any) -> None:
+    """Plot a line for each curve, over the views or over the path up to each."""
+    axes = figure.subplots()
+    for index, (method, curve) in enumerate(curves.items()):
+        turn, place = divmod(index, len(COLOURS))
+        look = {"color": COLOURS[place], "marker": MARKERS[place], "linestyle": DASHES[turn % len(DASHES)]}
+        # Side by side, so that intervals at the same view do not hide each other.
+        at = curve.index + 0.4 * ((index + 0.5) / len(curves) - 0.5)
+        errors = {"yerr": _interval(curve)}
+        if path is not None:
+            at, errors["xerr"] = path[method]["value"], _interval(path[method])
+        axes.errorbar(at, curve["value"], elinewidth=0.9, label=method, **errors, **look)
+    axes.set(ylabel=label, xlabel="path over the floor [m]" if path else "views")
+    axes.set_ylim(None, min(1.0, axes.get_ylim()[1]))
+    axes.xaxis.get_major_locator().set_params(integer=path is None)
+    figure.legend(loc="outside right center")
 
 
-def _rows(curves: Curves, label: str, *, zero: bool = False) -> Callable[[Any], None]:
-    """Plots a panel for each of the last views a table has, a row for each curve."""
-
-    def plot(figure: Any) -> None:
-        last = max(curve.index.max() for curve in curves.values())
-        views = sorted({view for view in (2, 3, 5, 10, last) if view <= last})[-4:]
-        panels = figure.subplots(1, len(views), sharex=True, sharey=True, squeeze=False)[0]
-        for panel, view in zip(panels, views, strict=True):
-            for y, curve in enumerate(curves.values()):
-                row = curve[curve.index == view]
-                pale = zero and bool(((row["low"] <= 0.0) & (row["high"] >= 0.0)).any())
-                look = {"marker": "o", "elinewidth": 0.9, "alpha": 0.4 if pale else 1.0}
-                panel.errorbar(row["value"], [y] * len(row), xerr=_interval(row), color=COLOURS[0], **look)
-            if zero:
-                panel.axvline(0.0, color="#5d666f", linewidth=0.9, zorder=1)
-            panel.set_title(f"view {view:.0f}", fontsize=9.0)
-        panels[0].set(ylim=(len(curves) - 0.5, -0.5))
-        panels[0].set_yticks(range(len(curves)), list(curves))
-        figure.supxlabel(label, fontsize=9.0)
-
-    return plot
+def _rows(curves: Curves, label: str, figure: Any, *, zero: bool = False) -> None:
+    """Plot a panel for each of the last views a table has, a row for each curve."""
+    last = max(curve.index.max() for curve in curves.values())
+    views = sorted({view for view in (2, 3, 5, 10, last) if view <= last})[-4:]
+    panels = figure.subplots(1, len(views), sharex=True, sharey=True, squeeze=False)[0]
+    for panel, view in zip(panels, views, strict=True):
+        for y, curve in enumerate(curves.values()):
+            row = curve[curve.index == view]
+            pale = zero and bool(((row["low"] <= 0.0) & (row["high"] >= 0.0)).any())
+            look = {"marker": "o", "elinewidth": 0.9, "alpha": 0.4 if pale else 1.0}
+            panel.errorbar(row["value"], [y] * len(row), xerr=_interval(row), color=COLOURS[0], **look)
+        if zero:
+            panel.axvline(0.0, color="#5d666f", linewidth=0.9, zorder=1)
+        panel.set_title(f"view {view:.0f}", fontsize=9.0)
+    panels[0].set(ylim=(len(curves) - 0.5, -0.5))
+    panels[0].set_yticks(range(len(curves)), list(curves))
+    figure.supxlabel(label, fontsize=9.0)
 
 
 def _interval(curve: pd.DataFrame) -> Any:

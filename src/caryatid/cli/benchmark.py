@@ -76,6 +76,7 @@ class Benchmark(options.Command):
         from caryatid.benchmark.running import import_distributed
         from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
         from caryatid.benchmark.suites import SUITES, change_suite
+        from caryatid.cli.output import kept
         from caryatid.runtime.fingerprint import fingerprint
 
         import_pandas()
@@ -99,15 +100,16 @@ class Benchmark(options.Command):
             )
         )
         code = fingerprint() if suite else None
-        with ResultStore(self.out / RESULTS, code, collect_provenance()) as store:
-            try:
-                missing = store.plan(suite.name, suite.members(), retry=self.retry) if suite else []
-                check_reference(self.reference, store)
-                if suite and missing:
-                    self._run(suite.name, missing, store)
-                self._report(store)
-            except KeyboardInterrupt:
-                raise KeyboardInterrupt("what is done is kept, start again to continue") from None
+        about = collect_provenance()
+        with (
+            kept("what is done is kept, start again to continue"),
+            ResultStore(self.out / RESULTS, code, about) as store,
+        ):
+            missing = store.plan(suite.name, suite.members(), retry=self.retry) if suite else []
+            check_reference(self.reference, store)
+            if suite and missing:
+                self._run(suite.name, missing, store)
+            self._report(store)
 
     def _run(self, suite: str, missing: list[Episode], store: ResultStore) -> None:
         """Run the missing episodes with a progress bar; without a terminal, print a line every minute."""

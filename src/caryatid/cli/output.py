@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
@@ -82,6 +82,15 @@ class Output(logging.Handler):
             self.say(f"  next view: {step.decision.why}")
         if step.stop is not None:
             self.say(f"  done: {step.stop}")
+
+
+@contextmanager
+def kept(what: str) -> Iterator[None]:
+    """Let Ctrl-C say what is kept."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(what) from None
 
 
 def table(

@@ -281,11 +281,9 @@ def _record(
 
 def _draw_report(folder: Path, output: Output) -> None:
     """Draw the report of a run that is in its place already."""
+    from caryatid.cli.output import kept
     from caryatid.cli.results import write_report
 
-    try:
-        with output.working("drawing the report"):
-            write_report(folder)
-    except KeyboardInterrupt:
-        reason = f"the run is kept in {folder}; `caryatid report {folder}` makes the report"
-        raise KeyboardInterrupt(reason) from None
+    what = f"the run is kept in {folder}; `caryatid report {folder}` makes the report"
+    with kept(what), output.working("drawing the report"):
+        write_report(folder)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +15,7 @@ from caryatid.errors import InputError
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[Path | None, options.shown("FILE")]
+KEPT = "the session keeps every view that is in it"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,10 +82,11 @@ class Add(SessionStep):
     """Expected number of the view, from 0; a view that is already there is not added again."""
 
     def __call__(self) -> None:
+        from caryatid.cli.output import kept
         from caryatid.sessions import Capture, Session
         from caryatid.viz.tables import census
 
-        with _views_kept(), Session.open(self.folder) as session:
+        with kept(KEPT), Session.open(self.folder) as session:
             limits = session.beginning.settings.session
             images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
             capture = Capture.from_files(images, self.camera, limits)
@@ -147,11 +148,12 @@ class Undo(SessionStep):
     """
 
     def __call__(self) -> None:
+        from caryatid.cli.output import kept
         from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Session
         from caryatid.viz.tables import census, count_of
 
-        with _views_kept(), Session.open(self.folder) as session:
+        with kept(KEPT), Session.open(self.folder) as session:
             left = session.undo()
             document = {"views": left, "graph": graph_to_json(session.graph)}
             self.show(document, f"{count_of(left, 'view')} left: {census(session.graph)}")
@@ -227,11 +229,3 @@ class Serve(SessionStep):
         pool = SessionPool(self.folder, config, self.open_sessions, self.waiting)
         app = make_app(pool, token=token, max_request=self.max_request * 1_000_000, host=self.host)
         run_service(app, self.host, self.port, listening)
-
-
-@contextmanager
-def _views_kept() -> Iterator[None]:
-    try:
-        yield
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt("the session keeps every view that is in it") from None
