@@ -6,6 +6,7 @@ import numpy as np
 
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.robots import Posture
 
 LOW, HIGH = np.array([0.2, -0.2, 0.1]), np.array([0.6, 0.2, 0.4])
 """Where the gantry's camera can be [m]."""
@@ -41,6 +42,14 @@ def within_arms_length(T_base_camera: Array) -> np.ndarray:
 def sideways_only(T_base_camera: Array) -> np.ndarray:
     """The same arm with its camera mounted on its side: within 30° of lying."""
     return within_arms_length(T_base_camera) & (T_base_camera[:, 2, 0] > 0.5)
+
+
+def assert_gaze(posture: Posture, T_world_camera: Array) -> None:
+    """A posture looks along the axis of the camera, which is as high as it says."""
+    gaze, level = posture.platform_world[2] + posture.head_yaw, np.cos(posture.head_pitch)
+    axis = [level * np.cos(gaze), level * np.sin(gaze), np.sin(posture.head_pitch)]
+    np.testing.assert_allclose(axis, T_world_camera[:3, 2], atol=1e-9)
+    assert posture.camera_height == T_world_camera[2, 3]
 
 
 def base_at(x: float, y: float, z: float, yaw_deg: float = 0.0) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import run_command
+from conftest import SMALL, run_command
 from synthetic import SENSOR, simulated_scene
 
 from caryatid.config import ActiveVisionConfig, Config, OracleConfig
@@ -46,15 +46,14 @@ def truth_of(name):
     return true_scene_from_simulation(simulated_scene(name), ground_truth(simulated_scene(name)))
 
 
-def exploration(planner, name="hidden_stack", config=CONFIG, seed=3):
+def exploration(planner, name="hidden_stack", config=CONFIG):
     """Steps and their F1."""
-    stage = make_simulation(simulated_scene(name), config, noise="carmine", seed=seed)
-    truth = truth_of(name)
-    options = {"segmentation": "labels", "seed": seed}
-    chooser, camera = (planner, stage.camera)
+    stage = make_simulation(simulated_scene(name), config, noise="carmine", seed=3)
+    truth, camera = truth_of(name), stage.camera
+    options = {"segmentation": "labels", "seed": 3}
     if planner == "oracle":
-        chooser, camera = planner_for(planner, stage.camera, truth, config, **options)
-    steps = list(explore(camera, stage.robot, planner=chooser, config=config, early_stop=False, **options))
+        planner, camera = planner_for(planner, camera, truth, config, **options)
+    steps = list(explore(camera, stage.robot, planner=planner, config=config, early_stop=False, **options))
     return steps, [score(s.graph, truth).f1 for s in steps]
 
 
@@ -98,12 +97,9 @@ def test_none_of_the_views_it_tries_would_have_been_better(explored):
 def test_of_equal_views_it_takes_the_one_that_shows_most_unseen_surface():
     """Where any overlap makes an object a true one, F1 is 1 from everywhere."""
     config = replace(CONFIG, evaluation=replace(CONFIG.evaluation, min_iou=0.0))
-    stage = make_simulation(simulated_scene("tower"), config, noise="none", seed=0)
-    oracle = OraclePlanner(stage.camera, truth_of("tower"), config, segmentation="labels")
-    steps = list(explore(oracle.camera, stage.robot, planner=oracle, config=config, segmentation="labels"))
-    first = steps[0]
+    (first, second, _), _ = exploration("oracle", "tower", config)
     assert first.decision.saliency == 1.0
-    assert transforms.angle_between(first.visited[0], steps[1].visited[1]) > np.pi / 3.0
+    assert transforms.angle_between(first.visited[0], second.visited[1]) > np.pi / 3.0
 
 
 def test_views_to_try_are_spread_over_all_there_are():
@@ -132,9 +128,8 @@ def test_another_exploration_than_its_own_is_refused(wrong):
 @pytest.mark.slow
 def test_the_command_line_has_it_for_scenes_and_not_for_recordings(tmp_path, scene_file, recording, capsys):
     options = ["--planner", "oracle", "--views", 2, "--no-report", "--quiet", "--no-early-stop"]
-    small = ["--set=sensor.width=160", "--set=sensor.height=120", "--set=sensor.focal=131.25"]
-    few = ["--set=oracle.candidates=2"]
-    assert run_command("explore", scene_file, "--out", tmp_path / "a", *options, *small, *few) == 0
+    few = [*SMALL, "--set=oracle.candidates=2"]
+    assert run_command("explore", scene_file, "--out", tmp_path / "a", *options, *few) == 0
     assert "F1 goes from" in (tmp_path / "a/views/00/view.json").read_text()
     capsys.readouterr()
     assert run_command("explore", recording, "--out", tmp_path / "b", *options) == 1

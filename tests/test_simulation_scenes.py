@@ -144,10 +144,16 @@ def test_static_boxes_and_table_top():
     np.testing.assert_allclose(table_centre(scene), [0.0, 0.0, 0.75])
 
 
-def test_a_table_laid_on_its_side_axis_is_still_level():
-    lying = '<body name="table"><geom type="box" size="0.02 0.45 0.3" pos="0 0 0.73" euler="0 90 0"/></body>'
-    scene = scene_of(lying + CUBE)
-    np.testing.assert_allclose(table_centre(scene), [0.0, 0.0, 0.75], atol=1e-9)
+@pytest.mark.parametrize(
+    ("size", "turn", "middle"),
+    [
+        ("0.02 0.45 0.3", "0 90 0", [0.0, 0.0, 0.75]),
+        ("0.3 0.45 0.02", "5 0 0", [0.0, -0.02 * np.sin(np.pi / 36.0), 0.73 + 0.02 * np.cos(np.pi / 36.0)]),
+    ],
+)
+def test_the_middle_of_a_table_that_is_turned_is_in_its_upper_face(size, turn, middle):
+    scene = scene_of(TABLE.replace('size="0.3 0.45 0.02"', f'size="{size}" euler="{turn}"') + CUBE)
+    np.testing.assert_allclose(table_centre(scene), middle, atol=1e-9)
 
 
 @pytest.mark.parametrize(
