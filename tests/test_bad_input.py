@@ -2,67 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import SMALL, TWO_ON_A_TABLE, run_command, without_labels, without_poses
-from PIL import Image
 
 import caryatid as ct
 from caryatid.errors import InputError
 from caryatid.io import write_recording
 from caryatid.steps import read_run
 
-
-def edit(path, change):
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
-
-
-def change_image(path, change):
-    with Image.open(path) as image:
-        pixels = np.array(image)
-    Image.fromarray(change(pixels)).save(path)
-
-
-MASK = "mask_visib/000001_000001.png"
 BOTH = pytest.mark.parametrize("command", ["extract", "explore"])
 
 # Recordings
-
-
-def image(name, change):
-    return lambda folder: change_image(folder / name, change)
-
-
-def entry(name, change):
-    return lambda folder: edit(folder / name, change)
-
-
-def without_frames(folder):
-    for path in folder.rglob("*.*"):
-        path.write_text("{}") if path.suffix == ".json" else path.unlink()
-
-
-@pytest.mark.parametrize(
-    ("change", "names", "says"),
-    [
-        (image("rgb/000001.png", lambda p: p[::2, ::2]), "recording/000001", "rgb is 80×60, depth is 160"),
-        (image("depth/000000.png", np.zeros_like), "depth/000000.png", "the frame is empty"),
-        (image("depth/000000.png", lambda p: p * 0 + 50_000), "recording/000000", "no depth readings within"),
-        (without_frames, "recording", "has no frames"),
-        (image(MASK, lambda p: p * 0 + 255), MASK, "overlaps the mask of obj_id 1 in "),
-        (entry("scene_gt.json", lambda d: d["1"].pop()), MASK, "names no object"),
-        (entry("scene_gt.json", lambda d: d["0"][0].update(obj_id=0)), "scene_gt.json", "'obj_id' is 0"),
-    ],
-)
-def test_a_recording_that_is_broken(recording, refused, change, names, says):
-    change(recording)
-    refused("extract", recording, names=names, says=says)
 
 
 @BOTH
@@ -83,8 +37,8 @@ def test_no_plane(tmp_path, views, refused, command):
 
 def test_views_without_a_reading_or_a_second_one_without_a_pose(views):
     scene = ct.Scene()
-    for nothing in (0.0, np.nan):
-        with pytest.raises(ct.CaryatidError, match="view 7: holds no depth readings"):
+    for nothing in (0.0, np.nan, 50.0):
+        with pytest.raises(ct.CaryatidError, match=r"view 7: .*no depth readings"):
             scene.update(ct.View(np.full((120, 160), nothing), views[0].K, np.eye(4), name="view 7"))
     scene.update(views[0])
     with pytest.raises(InputError, match="has no camera pose"):

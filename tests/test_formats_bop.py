@@ -124,12 +124,20 @@ def test_a_truncated_jpeg_is_refused(folder):
     ("name", "image", "said"),
     [
         ("mask_visib/000001_000001.png", Image.new("L", (63, 48)), "63×48 pixels, the depth image is 64"),
+        ("mask_visib/000001_000001.png", Image.new("L", (64, 48), 255), "overlaps the mask of obj_id 7 in"),
         ("depth/000002.png", Image.new("L", (64, 48), 1), "mode L, not a 16-bit grey PNG"),
+        ("depth/000002.png", Image.new("I;16", (64, 48)), "the frame is empty"),
     ],
 )
 def test_images_of_another_size_or_kind_are_refused(folder, name, image, said):
     image.save(folder / name)
     assert name in refused(folder, said)
+
+
+def test_colour_of_another_size_is_refused(folder):
+    Image.new("RGB", (32, 24)).save(folder / "rgb/000001.png")
+    with pytest.raises(InputError, match="scene/000001: rgb is 32×24, depth is 64×48"):
+        list(read_recording(folder))
 
 
 def test_an_empty_mask_is_an_object_out_of_sight(folder):
@@ -146,10 +154,13 @@ def test_an_empty_mask_is_an_object_out_of_sight(folder):
         ("scene_camera.json", lambda d: d["1"].pop("cam_t_w2c"), "'cam_t_w2c' is missing"),
         ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[0.0] * 9), "no rotation"),
         ("scene_camera.json", lambda d: d.pop("1"), "no entry in scene_camera.json"),
+        ("scene_camera.json", dict.clear, "has no frames"),
         ("scene_camera.json", lambda d: d.update({"first": d["1"]}), "must be a valid integer"),
         ("scene_gt.json", lambda d: d["1"][0].update(obj_id=300), "two masks have obj_id 300"),
         ("scene_gt.json", lambda d: d.update({"1": {"obj_id": 1}}), "must be a valid array"),
         ("scene_gt.json", lambda d: d.update({"8": []}), "not in scene_camera.json"),
+        ("scene_gt.json", lambda d: d["1"].pop(), "names no object"),
+        ("scene_gt.json", lambda d: d["1"][0].update(obj_id=0), "'obj_id' is 0"),
     ],
 )
 def test_bad_cameras_and_object_tables_are_refused(folder, name, change, said):

@@ -88,11 +88,6 @@ def test_a_bag_that_does_not_say_how_messages_are_laid_out(tmp_path, views):
     same_views(imported(tmp_path, folder, *ALL), views)
 
 
-def test_transforms_of_the_first_kind(tmp_path, views):
-    bag = plain_bag(tmp_path, views)
-    same_views(imported(tmp_path, bag, *TOPICS, "--tf", WORLD), views, colour=False)
-
-
 def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views, capsys):
     recording = imported(tmp_path, bag_of(tmp_path, views), *TOPICS)
     assert len(recording) == 1

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caryatid.benchmark.figures import Figure, conditions_of, curves_of, draw_conditions, draw_group
-from caryatid.benchmark.statistics import CONFIG, summarise
+from caryatid.benchmark.statistics import CONFIDENCE, RESAMPLES, summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES
 from caryatid.errors import InputError
@@ -268,7 +268,7 @@ def _markdown(
                 block = f"![{caption}]({keep(result.name, block)})\n\n*{caption}*"
             blocks.append(block)
     blocks.append("## How to read it")
-    blocks += [n.format(confidence=100.0 * CONFIG.confidence, resamples=CONFIG.resamples) for n in NOTES]
+    blocks += [n.format(confidence=100.0 * CONFIDENCE, resamples=RESAMPLES) for n in NOTES]
     return "\n\n".join(blocks) + "\n"
 
 

@@ -17,7 +17,7 @@ __all__ = [
     "LiftConfig", "MaskConfig", "NoiseConfig", "NoiseModel", "OracleConfig", "PhysicsConfig",
     "PlausibilityConfig", "RecordingConfig", "RegistrationConfig", "RehearsalConfig", "ReportConfig",
     "RobotConfig", "SegmentationConfig", "SegmentationMethod", "SensorConfig", "SessionConfig", "ShapeKind",
-    "SplitConfig", "StatisticsConfig", "SupportConfig", "SurfaceConfig", "VoxelConfig",
+    "SplitConfig", "SupportConfig", "SurfaceConfig", "VoxelConfig",
 ]  # fmt: skip
 
 if TYPE_CHECKING:

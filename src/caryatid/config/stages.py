@@ -511,18 +511,6 @@ class ReportConfig:
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
-class StatisticsConfig:
-    """Statistics of a benchmark's episodes; nothing here changes an episode."""
-
-    resamples: Count = 2000
-    """Bootstrap resamples of the scenes [1]; the ends of an interval then move by 3 % of its half width."""
-    confidence: Likelihood = 0.95
-    """Probability with which an interval covers the true mean [1]."""
-    thresholds: tuple[Share, ...] = (0.94, 0.90)
-    """F1 for which views and path length are reported [1]; the paper's, and one nearly all methods reach."""
-
-
-@dataclass(frozen=True, slots=True, config=CHECKED)
 class RecordingConfig:
     """Which frames of a recording become views."""
 
