@@ -95,25 +95,6 @@ def test_the_outline_spans_the_shape(shape):
     assert shape.signed_distance(shape.outline()).max() < 1e-9
 
 
-@each
-def test_a_moved_shape_is_the_same_shape_elsewhere(shape):
-    motion = random_motion(np.random.default_rng(2))
-    points, _ = around(shape, 100)
-    there = shape.moved(motion)
-    assert there.size == shape.size
-    np.testing.assert_allclose(
-        there.signed_distance(transforms.transform(motion, points)), shape.signed_distance(points), atol=1e-12
-    )
-
-
-@each
-def test_name_and_size_give_the_shape_again(shape):
-    again = from_size(shape.kind, shape.T_world_object, shape.size, "graph.json")
-    assert type(again) is type(shape)
-    np.testing.assert_array_equal(again.extents, shape.extents)
-    np.testing.assert_array_equal(again.T_world_object, shape.T_world_object)
-
-
 @pytest.mark.parametrize(
     ("kind", "size"),
     [
@@ -241,11 +222,6 @@ def random_polygon(rng, middle=(0.0, 0.0)):
     return hull(rng.normal(size=(int(rng.integers(3, 40)), 2)) + middle)
 
 
-def turned(polygon):
-    """The same polygon, its corners counted from another one."""
-    return np.roll(polygon, len(polygon) // 2, axis=0)
-
-
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 50, 300])
 def test_the_hull_is_the_one_of_shapely(count):
     rng = np.random.default_rng(count)
@@ -274,26 +250,19 @@ def test_hulls_without_area_and_with_points_on_their_sides():
     assert area(hull(line)) == area(hull(np.ones((5, 2)))) == area(np.empty((0, 2))) == 0.0
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_the_intersection_is_the_one_of_shapely(seed):
-    rng = np.random.default_rng(seed)
-    a, b = random_polygon(rng), random_polygon(rng, rng.uniform(-3.0, 3.0, 2))
-    expected = shapely.Polygon(a).intersection(shapely.Polygon(b))
-    for common in (intersection(a, b), intersection(b, a), intersection(turned(a), turned(b))):
-        assert area(common) == pytest.approx(expected.area, abs=1e-12)
-        if expected.area > 0.0:
-            assert shapely.Polygon(common).symmetric_difference(expected).area < 1e-9
-
-
-def test_intersections_of_polygons_inside_beside_and_equal():
-    inner = 0.5 * SQUARE + 0.2
-    for common in (intersection(SQUARE, inner), intersection(inner, SQUARE)):
-        assert area(common) == pytest.approx(0.25)
-    assert area(intersection(SQUARE, SQUARE)) == pytest.approx(1.0)
-    assert area(intersection(SQUARE, SQUARE + (1.0, 0.0))) == 0.0
-    assert len(intersection(SQUARE, SQUARE + 2.0)) == 0
-    for nothing in (SQUARE[:0], SQUARE[:1], SQUARE[:2]):
-        assert area(intersection(SQUARE, nothing)) == area(intersection(nothing, SQUARE)) == 0.0
+def test_the_intersection_is_the_one_of_shapely():
+    rng = np.random.default_rng(0)
+    polygons = [SQUARE, 0.5 * SQUARE + 0.2, SQUARE + (1.0, 0.0), SQUARE + 2.0]
+    polygons += [random_polygon(rng, rng.uniform(-1.5, 1.5, 2)) for _ in range(6)]
+    for a in polygons:
+        for b in polygons:
+            expected = shapely.Polygon(a).intersection(shapely.Polygon(b))
+            for common in (intersection(a, b), intersection(np.roll(a, 2, axis=0), np.roll(b, 2, axis=0))):
+                assert area(common) == pytest.approx(expected.area, abs=1e-12)
+                if expected.area > 0.0:
+                    assert shapely.Polygon(common).symmetric_difference(expected).area < 1e-9
+        for nothing in (SQUARE[:0], SQUARE[:1], SQUARE[:2]):
+            assert area(intersection(a, nothing)) == area(intersection(nothing, a)) == 0.0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -314,11 +283,11 @@ def test_the_nearest_point_of_the_border_is_the_one_of_shapely(seed):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_cap_is_what_lies_near_the_outermost_point(seed):
-    """Against the hull of all segments between corners, cut off by the plane."""
+    """Against the hull of all segments between corners, cut off by the plane; one cap is all of the solid."""
     rng = np.random.default_rng(seed)
     corners = (CUBE * rng.uniform(0.02, 0.2, 3)) @ transforms.random_rotation(rng).T + rng.normal(size=3)
     direction = transforms.unit(rng.normal(size=3))
-    depth = rng.uniform(0.001, 0.2)
+    depth = rng.uniform(0.001, 0.2) if seed else 9.0
     reach = corners @ direction
     kept = [corners[reach >= reach.max() - depth]]
     for i in range(8):
@@ -329,11 +298,6 @@ def test_the_cap_is_what_lies_near_the_outermost_point(seed):
     expected = shapely.MultiPoint(np.concatenate(kept)[:, :2]).convex_hull
     found = shapely.Polygon(cap(corners, CUBE_EDGES, direction, depth))
     assert found.symmetric_difference(expected).area < 1e-9 * expected.area + 1e-15
-
-
-def test_a_cap_deeper_than_the_solid_is_all_of_it():
-    whole = cap(CUBE, CUBE_EDGES, np.array([0.6, 0.0, 0.8]), np.inf)
-    assert area(whole) == pytest.approx(4.0)
 
 
 GRID = (13, 17, 11)

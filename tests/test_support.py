@@ -19,7 +19,7 @@ from caryatid.geometry.polygons import area, hull
 from caryatid.geometry.shapes import Box, Cylinder, Primitives, Sphere, Uncertainty
 from caryatid.geometry.transforms import rigid
 from caryatid.graph import SceneObject
-from caryatid.support.contacts import find_contacts, find_gap, local_frames
+from caryatid.support.contacts import find_contacts, find_gap
 from caryatid.support.plausibility import closing, drawn, reconcile
 from caryatid.support.relations import explain, infer, predict_removal
 from caryatid.support.stability import (
@@ -171,22 +171,6 @@ class TestContacts:
         with ThreadPoolExecutor(4) as pool:
             assert list(pool.map(gaps, scenes)) == alone
 
-    def test_contacts_in_the_frames_of_both_shapes(self):
-        shapes = random_shapes(12, np.random.default_rng(13), 0.1)
-        contacts = find_contacts(shapes, 0.02)
-        pairs = np.array([(c.a, c.b) for c in contacts])
-        points_world = np.array([c.point_world for c in contacts])
-        normals_world = np.array([c.normal_world for c in contacts])
-        points, outward = local_frames(Primitives.of(shapes), pairs, points_world, normals_world)
-        for k, pair in enumerate(pairs):
-            for side, sign in ((0, 1.0), (1, -1.0)):
-                T = shapes[pair[side]].T_world_object
-                np.testing.assert_allclose(
-                    transforms.transform(T, points[k, side]), points_world[k], atol=1e-12
-                )
-                turned = transforms.rotate(T, outward[k, side])
-                np.testing.assert_allclose(turned, sign * normals_world[k], atol=1e-12)
-
     def test_gap_of_shapes_far_apart(self):
         assert find_gap(cube(0, 0, 0), cube(0.3, 0.02, 0)) == pytest.approx(0.2, abs=1e-4)
         assert find_gap(cube(0, 0, 0), Sphere(at(0.05, 0.0, 0.4), 0.03)) == pytest.approx(0.32, abs=1e-4)
@@ -205,20 +189,11 @@ class TestPolygons:
         patch = contact_patch(upper, lower, np.array([0.0, 0.0, 1.0]), np.zeros((1, 3)), CONFIG)
         assert (*patch.min(axis=0), *patch.max(axis=0)) == pytest.approx((0.01, -0.03, 0.05, 0.05))
         assert area(ground_outline(upper)) == pytest.approx(0.01)
-        verdict = assess(upper, find_tipping(upper, [patch]), CONFIG)
-        assert verdict.ratio == pytest.approx(0.32)
-        assert verdict.overhang == pytest.approx(0.01)
-        assert verdict.tips
-        assert not verdict.small_area
-
-    @pytest.mark.parametrize(("ratio", "overhang"), [(0.33, 0.0101), (0.31, 0.0099)])
-    def test_both_tests_have_a_limit(self, ratio, overhang):
-        upper = block(0.06, 0.02, 0.1, (0.1, 0.1, 0.05))
-        polygon = np.array([[0.01, -0.03], [0.05, -0.03], [0.05, 0.05], [0.01, 0.05]])
-        limits = replace(CONFIG, min_area_ratio=ratio, overhang=overhang)
-        verdict = assess(upper, find_tipping(upper, [polygon]), limits)
-        assert verdict.small_area == (ratio > 0.325)
-        assert verdict.tips == (overhang < 0.00995)
+        for ratio, overhang in ((0.33, 0.0101), (0.31, 0.0099)):
+            limits = replace(CONFIG, min_area_ratio=ratio, overhang=overhang)
+            verdict = assess(upper, find_tipping(upper, [patch]), limits)
+            assert (verdict.ratio, verdict.overhang) == pytest.approx((0.32, 0.01))
+            assert (verdict.small_area, verdict.tips) == (ratio > 0.32, overhang < 0.01)
 
     def test_contact_patch_of_a_ball_is_a_small_disc_and_its_outline_a_large_one(self):
         ball = Sphere(at(0.1, 0.2, 0.04), 0.04)
@@ -481,13 +456,6 @@ class TestInfer:
             explain(graph, "o1", "o9", CONFIG)
         with pytest.raises(InputError, match="itself"):
             explain(graph, "o1", "o1", CONFIG)
-
-    def test_inputs_stay_as_they_were(self):
-        objects = leaning_plank(0.004)
-        before = [o.shape.T_world_object.copy() for o in objects]
-        infer(objects, CONFIG)
-        for o, T in zip(objects, before, strict=True):
-            np.testing.assert_array_equal(o.shape.T_world_object, T)
 
 
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"

@@ -47,6 +47,8 @@ def close_hidden_faces(
     origin = points.mean(axis=0)
     kind, R, centre, half = Primitives.of([shape]).row(0)
     sides, centre, points = np.array(seen), centre - origin, points - origin
+    # Where no step of least squares was better yet, a shape may still be thinner than it may be.
+    half = np.maximum(half, config.min_extent / 2.0)
     # Unseen sides are moved out of the way, beyond all noise; a round side is seen as a whole, and a sphere
     # stays.
     opening = 0.05
