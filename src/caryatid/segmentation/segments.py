@@ -270,14 +270,16 @@ def _hidden_pairs(
     samples: Samples, part: Labels, inverse_depth: Array, config: SegmentationConfig
 ) -> list[tuple[int, int]]:
     """Pairs (small, large) of parts with something nearer between them, the best connected first."""
-    sizes, own = np.bincount(part), part > 0
+    sizes, own, image = np.bincount(part), part > 0, samples.image(part)
     usual = float(np.median(samples.points_camera[own, 2])) if own.any() else 1.0
     longest = int(config.merge_gap * samples.K[0, 0] / usual)
-    votes = occlusion_gaps(samples.image(part), inverse_depth, config.edge_jump, longest)
-    votes[votes < MEETING] = 0
-    first, second = np.nonzero(np.triu(votes[1:, 1:], k=1))
-    order = np.argsort(-votes[first + 1, second + 1], kind="stable")
-    pairs = ((int(first[k]) + 1, int(second[k]) + 1) for k in order)
+    votes = np.zeros((len(sizes), len(sizes)), dtype=np.intp)
+    for sides in ((image, inverse_depth), (image.T, inverse_depth.T)):
+        _count_gaps(*map(np.ascontiguousarray, sides), config.edge_jump, longest, votes)
+    votes = np.triu(votes + votes.T)
+    first, second = np.nonzero(votes >= MEETING)
+    order = np.argsort(-votes[first, second], kind="stable")
+    pairs = ((int(first[k]), int(second[k])) for k in order)
     return [(a, b) if (sizes[a], b) < (sizes[b], a) else (b, a) for a, b in pairs]
 
 
@@ -319,22 +321,14 @@ def _explained(shape: Shape, samples: Samples, own: Mask) -> float:
     return float(((np.abs(distance) < 0.006) & (cosine > 0.7)).mean())
 
 
-def occlusion_gaps(labels: Labels, inverse_depth: Array, jump: float, longest: int) -> NDArray[np.intp]:
-    """Count the rows and columns on which one part ends, another begins, and all between lies nearer.
-
-    Between, each reading of inverse depth (H, W) [1/m] must lie nearer than the line from end to beginning by
-    the jump [1/m]; a pixel without one, 0, says nothing, but one at least must be nearer. Gaps of up to
-    `longest` pixels are looked across. Of parts (H, W) 1 … N the counts are (N + 1, N + 1), symmetric.
-    """
-    votes = np.zeros((int(labels.max(initial=0)) + 1,) * 2, dtype=np.intp)
-    for image, depth in ((labels, inverse_depth), (labels.T, inverse_depth.T)):
-        _count_gaps(np.ascontiguousarray(image), np.ascontiguousarray(depth), jump, longest, votes)
-    return votes + votes.T
-
-
 @njit(cache=True)
 def _count_gaps(labels, inverse_depth, jump, longest, votes):  # type: ignore[no-untyped-def]
-    """Add one for each row and pair of parts; two pixels at either end of a gap mix both sides."""
+    """Add one for each row on which one part ends, another begins, and all between lies nearer.
+
+    Between, each reading of inverse depth (H, W) [1/m] must lie nearer than the line from end to beginning by
+    the jump [1/m]; a pixel without one, 0, says nothing, but one at least must be nearer. Two pixels at
+    either end of a gap mix both sides. Gaps of up to `longest` pixels are looked across.
+    """
     height, width = labels.shape
     for row in range(height):
         for i in range(width - 1):

@@ -88,6 +88,92 @@ class _Plane(NamedTuple):
     area: float
 
 
+class _Scene(NamedTuple):
+    """Points (N, 3) [m] and normals (N, 3) among which planes are sought, what is up (3,), and limits."""
+
+    points: Array
+    normals: Array
+    up: Array | None
+    config: SurfaceConfig
+
+    def largest_plane(self, among: Mask, rng: np.random.Generator) -> _Plane | None:
+        """MSAC over three-point hypotheses, and with `up` also one-point ones; refined on all the points.
+
+        400 hypotheses find a plane of a fifth of the points with confidence 0.96; 4000 points judge them.
+        """
+        points, normals, up, config = self
+        index = np.flatnonzero(among)
+        if len(index) < config.min_points:
+            return None
+        sample = index[np.linspace(0, len(index) - 1, min(4000, len(index))).astype(np.intp)]
+        p, n = points[sample], normals[sample]
+        triples = p[rng.integers(0, len(p), size=(400, 3))]
+        directions = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
+        proper = np.linalg.norm(directions, axis=-1) > 1e-9
+        directions, anchors = transforms.unit(directions[proper]), triples[proper, 0]
+        down = np.einsum("ij,ij->i", directions, anchors) > 0.0 if up is None else directions @ up < 0.0
+        directions = np.where(down[:, None], -directions, directions)
+        if up is None:
+            upright = directions[:, 1] < np.sin(np.radians(config.max_tilt))
+        else:
+            upright = directions @ up > np.cos(np.radians(config.max_tilt))
+        directions, anchors = directions[upright], anchors[upright]
+        if up is not None:
+            anchors = np.concatenate([anchors, p[rng.integers(0, len(p), size=100)]])
+            directions = np.concatenate([directions, np.tile(up, (100, 1))])
+        if len(directions) == 0:
+            return None
+        offsets = np.einsum("ij,ij->i", directions, anchors)
+        planes, gains = np.ascontiguousarray(np.column_stack([directions, offsets]).T), np.zeros(len(offsets))
+        agree, behind = np.cos(np.radians(config.max_deviation)), 0.0 if up is not None else 1.0
+        for_each(_score_planes, SHARES, (p, n, planes, config.tolerance, agree, behind, gains))
+        best = int(np.argmax(gains))
+        return self.refined(among, directions[best], float(offsets[best]))
+
+    def refined(self, among: Mask, normal: Array, offset: float) -> _Plane | None:
+        """Least squares on the inliers, a few times over; None if too few remain or the plane has tilted."""
+        points, normals, up, config = self
+        least_cosine = np.cos(np.radians(config.max_deviation))
+        inliers = np.zeros_like(among)
+        for _ in range(4):
+            before = inliers
+            inliers = among & (np.abs(points @ normal - offset) <= config.tolerance)
+            inliers &= normals @ normal > least_cosine
+            if np.count_nonzero(inliers) < max(config.min_points, 3):
+                return None
+            if np.array_equal(inliers, before):
+                break
+            on_plane = np.compress(inliers, points, axis=0)
+            centre = on_plane.mean(axis=0)
+            refined = np.linalg.eigh(np.cov(on_plane.T))[1][:, 0]
+            normal = refined if refined @ normal > 0 else -refined
+            offset = float(normal @ centre)
+        if up is not None and normal @ up < np.cos(np.radians(config.max_tilt)):
+            return None
+        inliers, area = self._main_part(normal, inliers)
+        return _Plane(normal, offset, inliers, area) if inliers.sum() >= config.min_points else None
+
+    def _main_part(self, normal: Array, inliers: Mask) -> tuple[Mask, float]:
+        """Keep the largest part of a plane that holds together over gaps; say how much of it is seen [m²]."""
+        index = np.flatnonzero(inliers)
+        flat = _basis(normal) @ np.take(self.points, index, axis=0).T
+        # Cells are wider than the points' spacing at 3 m; where a cloud is not in metres, they are no more
+        # than memory holds.
+        cell = max(0.03, float((flat.max(axis=1) - flat.min(axis=1)).max()) / 1000.0)
+        cells = np.floor(flat / cell).astype(np.intp)
+        cells -= cells.min(axis=1, keepdims=True)
+        size = cells.max(axis=1) + 1
+        owner = cells[0] * size[1] + cells[1]
+        count = np.bincount(owner, minlength=int(size.prod())).reshape(size)
+        reach = int(np.ceil(self.config.gap / cell / 2.0))
+        near = ndimage.distance_transform_edt(np.pad(count == 0, reach))[reach:-reach, reach:-reach] <= reach
+        part, _ = ndimage.label(near)
+        main = int(np.argmax(np.bincount(part.ravel(), weights=count.ravel())))
+        kept = np.zeros_like(inliers)
+        kept[index[part.ravel()[owner] == main]] = True
+        return kept, float(np.count_nonzero((count > 0) & (part == main))) * cell**2
+
+
 def find_support_surface(
     cloud_points: Array,
     normals: Array,
@@ -115,14 +201,15 @@ def find_support_surface(
         PerceptionError: No plane has enough points.
     """
     points, normals = np.asarray(cloud_points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
+    scene = _Scene(points, normals, up, config)
     if up is None:
-        largest = _largest_plane(points, normals, np.ones(len(points), dtype=bool), None, config, rng)
+        largest = scene.largest_plane(np.ones(len(points), dtype=bool), rng)
         up = None if largest is None else largest.normal
     planes: list[_Plane] = []
     if up is not None:
         up = transforms.unit(up)
-        left = normals @ up > np.cos(np.radians(config.max_deviation))
-        while len(planes) < max_planes and (plane := _largest_plane(points, normals, left, up, config, rng)):
+        scene, left = scene._replace(up=up), normals @ up > np.cos(np.radians(config.max_deviation))
+        while len(planes) < max_planes and (plane := scene.largest_plane(left, rng)):
             planes.append(plane)
             left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
     if up is None or not planes:
@@ -140,9 +227,9 @@ def refitted(
 
     None where too few are near it.
     """
-    normal = surface.normal_world
-    offset = float(normal @ surface.point_world)
-    plane = _refine(points, normals, np.ones(len(points), dtype=bool), normal, offset, up, config)
+    normal, everywhere = surface.normal_world, np.ones(len(points), dtype=bool)
+    scene = _Scene(points, normals, up, config)
+    plane = scene.refined(everywhere, normal, float(normal @ surface.point_world))
     return None if plane is None else _surface(points, plane)
 
 
@@ -158,99 +245,6 @@ def _choose_table(planes: list[_Plane], up: Array, config: SurfaceConfig) -> _Pl
         return any(heights[j] > heights[k] + config.storey and counts[j] >= 0.05 * counts[k] for j in tables)
 
     return planes[max(range(len(planes)), key=lambda k: (not is_floor(k), sizeable[k], counts[k]))]
-
-
-def _largest_plane(
-    points: Array,
-    normals: Array,
-    among: Mask,
-    up: Array | None,
-    config: SurfaceConfig,
-    rng: np.random.Generator,
-) -> _Plane | None:
-    """MSAC over three-point hypotheses, and with `up` also one-point ones; refined on all the points.
-
-    400 hypotheses find a plane of a fifth of the points with confidence 0.96; 4000 points will do to judge.
-    """
-    index = np.flatnonzero(among)
-    if len(index) < config.min_points:
-        return None
-    sample = index[np.linspace(0, len(index) - 1, min(4000, len(index))).astype(np.intp)]
-    p, n = points[sample], normals[sample]
-    triples = p[rng.integers(0, len(p), size=(400, 3))]
-    directions = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    proper = np.linalg.norm(directions, axis=-1) > 1e-9
-    directions, anchors = transforms.unit(directions[proper]), triples[proper, 0]
-    down = np.einsum("ij,ij->i", directions, anchors) > 0.0 if up is None else directions @ up < 0.0
-    directions = np.where(down[:, None], -directions, directions)
-    if up is None:
-        upright = directions[:, 1] < np.sin(np.radians(config.max_tilt))
-    else:
-        upright = directions @ up > np.cos(np.radians(config.max_tilt))
-    directions, anchors = directions[upright], anchors[upright]
-    if up is not None:
-        anchors = np.concatenate([anchors, p[rng.integers(0, len(p), size=100)]])
-        directions = np.concatenate([directions, np.tile(up, (100, 1))])
-    if len(directions) == 0:
-        return None
-    offsets = np.einsum("ij,ij->i", directions, anchors)
-    planes, gains = np.ascontiguousarray(np.column_stack([directions, offsets]).T), np.zeros(len(offsets))
-    agree, behind = np.cos(np.radians(config.max_deviation)), 0.0 if up is not None else 1.0
-    for_each(_score_planes, SHARES, (p, n, planes, config.tolerance, agree, behind, gains))
-    best = int(np.argmax(gains))
-    return _refine(points, normals, among, directions[best], float(offsets[best]), up, config)
-
-
-def _refine(
-    points: Array,
-    normals: Array,
-    among: Mask,
-    normal: Array,
-    offset: float,
-    up: Array | None,
-    config: SurfaceConfig,
-) -> _Plane | None:
-    """Least squares on the inliers, a few times over; None if too few remain or the plane has tilted."""
-    least_cosine = np.cos(np.radians(config.max_deviation))
-    inliers = np.zeros_like(among)
-    for _ in range(4):
-        before = inliers
-        inliers = among & (np.abs(points @ normal - offset) <= config.tolerance)
-        inliers &= normals @ normal > least_cosine
-        if np.count_nonzero(inliers) < max(config.min_points, 3):
-            return None
-        if np.array_equal(inliers, before):
-            break
-        on_plane = np.compress(inliers, points, axis=0)
-        centre = on_plane.mean(axis=0)
-        refined = np.linalg.eigh(np.cov(on_plane.T))[1][:, 0]
-        normal = refined if refined @ normal > 0 else -refined
-        offset = float(normal @ centre)
-    if up is not None and normal @ up < np.cos(np.radians(config.max_tilt)):
-        return None
-    inliers, area = _main_part(points, normal, inliers, config)
-    return _Plane(normal, offset, inliers, area) if inliers.sum() >= config.min_points else None
-
-
-def _main_part(points: Array, normal: Array, inliers: Mask, config: SurfaceConfig) -> tuple[Mask, float]:
-    """Keep the largest part of a plane that holds together over gaps, and say how much of it is seen [m²]."""
-    index = np.flatnonzero(inliers)
-    flat = _basis(normal) @ np.take(points, index, axis=0).T
-    # Cells are wider than the points' spacing at 3 m; where a cloud is not in metres, they are no more
-    # than memory holds.
-    cell = max(0.03, float((flat.max(axis=1) - flat.min(axis=1)).max()) / 1000.0)
-    cells = np.floor(flat / cell).astype(np.intp)
-    cells -= cells.min(axis=1, keepdims=True)
-    size = cells.max(axis=1) + 1
-    owner = cells[0] * size[1] + cells[1]
-    count = np.bincount(owner, minlength=int(size.prod())).reshape(size)
-    reach = int(np.ceil(config.gap / cell / 2.0))
-    near = ndimage.distance_transform_edt(np.pad(count == 0, reach))[reach:-reach, reach:-reach] <= reach
-    part, _ = ndimage.label(near)
-    main = int(np.argmax(np.bincount(part.ravel(), weights=count.ravel())))
-    kept = np.zeros_like(inliers)
-    kept[index[part.ravel()[owner] == main]] = True
-    return kept, float(np.count_nonzero((count > 0) & (part == main))) * cell**2
 
 
 def _surface(points: Array, plane: _Plane) -> SupportSurface:

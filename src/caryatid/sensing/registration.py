@@ -184,12 +184,8 @@ class ViewRegistration:
     def _descend(self, twists: Array, reach: float) -> tuple[Array, float, float]:
         """Move the newest view such that partners come to lie in each other's planes; the others stay.
 
-        Gauss–Newton on the robust, symmetric point-to-plane distance, maximum a posteriori. It starts from
-        `twists` (V, 6).
-
-        Returns:
-            Its twist (6,), and the mean distance [m] over the patches that looked for a partner, those
-            without one being outliers, before and after.
+        Gauss–Newton, maximum a posteriori, starts from `twists` (V, 6). It gives its twist (6,), and the mean
+        distance [m] over the patches that looked for a partner, an outlier's without one, before and after.
         """
         *others, new = self._views
         view, pairs = self._views[new], [(v, new) for v in others]

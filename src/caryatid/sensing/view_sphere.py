@@ -57,9 +57,7 @@ class ViewSphere:
         right = transforms.unit(right)
         T_world_camera = np.zeros((len(directions), 4, 4))
         T_world_camera[:, :3, 0] = right
-        for n in range(3):
-            a, b = (n + 1) % 3, (n + 2) % 3
-            T_world_camera[:, n, 1] = forward[:, a] * right[:, b] - forward[:, b] * right[:, a]
+        T_world_camera[:, :3, 1] = np.cross(forward, right)
         T_world_camera[:, :3, 2] = forward
         T_world_camera[:, :3, 3] = self.centre_world + self.radius * directions
         T_world_camera[:, 3, 3] = 1.0

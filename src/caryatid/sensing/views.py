@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,14 +146,11 @@ class Cloud(Pictured):
     def select(self, keep: NDArray[np.bool_] | NDArray[np.intp]) -> Cloud:
         """Return the points picked by a mask (N,) or by indices."""
         index = np.flatnonzero(keep) if keep.dtype == np.bool_ else keep
-        return Cloud(
-            np.take(self.points_world, index, axis=0),
-            np.take(self.normals_world, index, axis=0),
-            None if self.labels is None else np.take(self.labels, index),
-            None if self.rgb is None else np.take(self.rgb, index, axis=0),
-            self.viewpoint_world,
-            self.name,
-        )
+        taken: dict[str, Any] = {}
+        for name in ("points_world", "normals_world", "labels", "rgb"):
+            values = getattr(self, name)
+            taken[name] = None if values is None else np.take(values, index, axis=0)
+        return replace(self, **taken)
 
     def moved(self, T: Array) -> Cloud:
         """Return the cloud moved by a rigid transform (4, 4) of the world."""
