@@ -24,8 +24,8 @@ from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.support.relations import predict_removal
 from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene
-from caryatid.viz.colours import PALETTE, SALIENCY_STOPS, object_colour, scale
-from caryatid.viz.drawings import draw_layers
+from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
+from caryatid.viz.drawings import draw_chart, draw_layers
 from caryatid.viz.notebook import cell_html, draw_cell
 from caryatid.viz.report import Figure, Section
 from caryatid.viz.tables import census, object_table, support_table
@@ -75,6 +75,7 @@ class Page:
         self._shown, self._chosen = -1, ""
         self._staged: Step | None = None
         self._graph_drawn: SupportGraph | None = None
+        self._charted: list[float | None] = []
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
         self._build()
@@ -162,15 +163,7 @@ class Page:
         with panel.add_tab("supports"):
             self._graph = gui.add_html("")
         with panel.add_tab("F1"):
-            self._no_chart = gui.add_html(cell_html(Section("", "The ground truth is not known here.")))
-            self._chart = gui.add_uplot(
-                (np.zeros(1), np.zeros(1)),
-                ({"label": "view"}, {"label": "F1", "stroke": PALETTE[0], "width": 2, "points": {"size": 7}}),
-                title="F1 after each view",
-                scales={"x": {"time": False}, "y": {"range": (0.0, 1.05)}},
-                aspect=1.6,
-                visible=False,
-            )
+            self._chart = gui.add_html(cell_html(Section("", "The ground truth is not known here.")))
         with panel.add_tab("key"):
             gui.add_html(_describe_signs())
         with about.add_tab("object"):
@@ -196,7 +189,7 @@ class Page:
         camera.fov = 0.72  # Narrow, so that what is near does not hide what is far [rad].
 
     def _draw(self) -> None:
-        steps, scores, chosen = self.steps[: self._shown + 1], self.scores, self._chosen
+        steps, scores, chosen = self.steps[: self._shown + 1], [*self.scores], self._chosen
         if not steps:
             return
         step, f1 = steps[-1], scores[self._shown]
@@ -213,9 +206,12 @@ class Page:
         if graph is not self._graph_drawn:
             self._graph_drawn = graph
             self._graph.content = draw_cell(graph)
-        if any(f1 is not None for f1 in scores):
-            self._chart.data = np.arange(len(scores), dtype=np.float64), np.array(scores, dtype=np.float64)
-            self._chart.visible, self._no_chart.visible = True, False
+        if scores != self._charted and any(f1 is not None for f1 in scores):
+            self._charted = scores
+            chart = draw_chart(
+                "F1 after each view", "F1", {"F1": [np.nan if f1 is None else f1 for f1 in scores]}
+            )
+            self._chart.content = cell_html(Section("", figures=[Figure("", chart)]))
         if chosen:
             with self.working:
                 self._about.content = describe_object(graph, chosen, self._support)

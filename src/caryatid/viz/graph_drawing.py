@@ -141,10 +141,10 @@ def draw_graph(graph: SupportGraph) -> Picture:
         for support, points, word, place in zip(graph.supports, edges, words, plates_at, strict=True):
             _put_edge(axes, support, points, word, place)
         for item in graph.objects:
+            at, half = corner + PITCH * places[item.id], NODE / 2.0
             if item.id == table:
-                _put_table(axes, item, width, corner[1])
-            else:
-                _put_node(axes, item, corner + PITCH * places[item.id], graph)
+                at, half = np.array([width / 2.0, at[1] - 6.0]), np.array([width / 2.0 - 12.0, 14.0])
+            _put_node(axes, item, at, half, graph)
 
     return Picture("support graph, from the support surface upwards", width, height, draw)
 
@@ -186,8 +186,9 @@ def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Arr
     )
 
 
-def _put_node(axes: Axes, item: SceneObject, at: Array, graph: SupportGraph) -> None:
-    angle, half = np.linspace(0.0, np.pi, 24), NODE / 2.0
+def _put_node(axes: Axes, item: SceneObject, at: Array, half: Array, graph: SupportGraph) -> None:
+    """A vertex of half a width and height [px]; the table has no evidence and no supporter."""
+    angle, table = np.linspace(0.0, np.pi, 24), item.role == "support_surface"
     outline = half * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     if item.shape.kind == "cylinder":
         lid = half * np.stack([np.cos(angle), 0.25 * np.sin(angle)], axis=-1)
@@ -197,11 +198,9 @@ def _put_node(axes: Axes, item: SceneObject, at: Array, graph: SupportGraph) -> 
     elif item.shape.kind == "sphere":
         outline = half * np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], axis=-1)
     kind, rim = f"node {item.id}", {"edgecolor": INK, "linewidth": 1.2}
-    if not graph.supporters(item.id):
-        kind, rim = (
-            f"{kind} unsupported",
-            {"edgecolor": DOUBT, "linewidth": 2.4, "linestyle": (0, (2.1, 1.5))},
-        )
+    if not table and not graph.supporters(item.id):
+        kind += " unsupported"
+        rim = {"edgecolor": DOUBT, "linewidth": 2.4, "linestyle": (0, (2.1, 1.5))}
     colour = object_colour(item.label)
     stripes = "".join({1: "//", -1: "\\\\"}[turn] for turn in object_stripes(item.label))
     axes.fill(
@@ -209,17 +208,7 @@ def _put_node(axes: Axes, item: SceneObject, at: Array, graph: SupportGraph) -> 
         gid=f"{kind}|{item.id}: {item.shape.kind}", **rim,
     )  # fmt: skip
     text: dict[str, Any] = {"color": ink_on(colour), "ha": "center", "va": "center_baseline", "zorder": 4.0}
-    axes.text(at[0], at[1] - 3.0, item.id, fontsize=13.0, fontweight="bold", **text)
-    axes.text(at[0], at[1] + 11.0, f"{item.occurrences}/{item.opportunities}", fontsize=9.5, **text)
-
-
-def _put_table(axes: Axes, item: SceneObject, width: float, floor: float) -> None:
-    left, right, top = 12.0, width - 12.0, floor - NODE[1] / 2.0
-    gid = f"node {item.id} surface|{item.id}: the support surface"
-    colour, below = object_colour(item.label), top + 0.7 * NODE[1]
-    corners = ([left, right, right, left], [top, top, below, below])
-    axes.fill(*corners, facecolor=colour, edgecolor=INK, linewidth=1.2, gid=gid)
-    axes.text(
-        width / 2.0, floor - 0.15 * NODE[1], f"{item.id} · support surface", fontsize=13.0, fontweight="bold",
-        color=ink_on(colour), ha="center", va="center_baseline",
-    )  # fmt: skip
+    name, rise = (f"{item.id} · support surface", 0.0) if table else (item.id, 3.0)
+    axes.text(at[0], at[1] - rise, name, fontsize=13.0, fontweight="bold", **text)
+    if not table:
+        axes.text(at[0], at[1] + 11.0, f"{item.occurrences}/{item.opportunities}", fontsize=9.5, **text)
