@@ -119,17 +119,16 @@ class OrderCommand(options.Command):
         from caryatid.manipulation.order import plan_order
         from caryatid.runtime.parallel import cores
         from caryatid.steps import read_run
+        from caryatid.viz.tables import order_table
 
         config, seed, graph = self.settings.read(), self.settings.seed, read_run(self.run).graph
         with self.output.working("rehearsing"):
             order = plan_order(graph, config, goal=self.goal, hands=self.hands, seed=seed, threads=cores())
         outcome = "a safe order" if order.safe else "no safe order"
         goal = f" to reach {self.goal}" if self.goal else ""
-        rows = [
-            (str(number), step.object_id, ", ".join(step.hold), step.why if step.safe else f"! {step.why}")
-            for number, step in enumerate(order.steps, start=1)
-        ]
-        shown = table(f"{self.run}: {outcome}{goal}", ("", "take", "hold", "why"), rows)
+        steps = order_table(order)
+        rows = [[entry.text for entry in row] for row in steps.rows]
+        shown = table(f"{self.run}: {outcome}{goal}", steps.columns, rows)
         self.output.result(order.to_json(), shown, f"{order.refusal}\n" if order.refusal else "")
 
 
