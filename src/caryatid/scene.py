@@ -213,7 +213,7 @@ class Scene(Pictured):
         return observation.surface, newest
 
     def _fitted(self, observation: Observation, shown: set[int], given: bool) -> Observation:
-        """Fit what this view changed; automatic parts are divided and united as the shapes suggest."""
+        """Fit what this view changed; automatic segments are divided and united as the shapes suggest."""
         if self.config.fusion.method == "sg":
             self._models.fit_newest(shown)
             return observation

@@ -65,7 +65,7 @@ def open_source(
         source: What the user gave.
         config: All settings.
         noise: Noise of the simulated camera.
-        segmentation: Where parts are to come from.
+        segmentation: Which segmentation to use.
         seed: Seed of the noise.
         robot: Name of the simulated robot.
 
@@ -121,7 +121,7 @@ def extract(
     Args:
         source: What the user gave.
         config: All settings.
-        segmentation: Where parts are to come from.
+        segmentation: Which segmentation to use.
         seed: Seed of every random choice.
         label_divisor: For a cloud whose labels number parts of objects: object = label // this.
 

@@ -150,47 +150,31 @@ def _settled(
     Returns:
         What each start settles at; None where one side is left with too few points.
     """
+
+    def side_explained(sides: list[Mask], rngs: list[np.random.Generator], number: int) -> Explanation:
+        part, rng = evidence.select(sides[number]), rngs[number]
+        return explain(part, config.explanation, config.fit, rng, first_look=first_look)
+
     least = config.split.min_points
     settled: list[TwoObjects | None] = [None] * len(starts)
     moving = dict(enumerate(starts))
     for number in range(rounds + 1):
         moving = {k: second for k, second in moving.items() if min(second.sum(), (~second).sum()) >= least}
-        rngs = iter(rng.spawn(2 * len(moving)))
-        jobs = [(second, next(rngs), next(rngs)) for second in moving.values()]
-        explained = on_threads(partial(_sides_explained, evidence, jobs, config, first_look), len(jobs))
-        for k, pair in zip(list(moving), explained, strict=True):
-            second = moving[k] if number == rounds else _reassigned(evidence, pair, near, config)
+        sides = [side for second in moving.values() for side in (~second, second)]
+        explained = on_threads(partial(side_explained, sides, rng.spawn(len(sides))), len(sides))
+        for n, k in enumerate(list(moving)):
+            pair, second = (explained[2 * n], explained[2 * n + 1]), moving[k]
+            if number < rounds:
+                # To the shape that explains a point better, together with the points around it.
+                cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
+                cost = (cost + cost[:, near].mean(axis=2)) / 2.0
+                second = _connected(evidence.points, cost[1] < cost[0])
             if (second == moving[k]).all():
                 settled[k] = _two(evidence, second, pair, near, config)
                 del moving[k]
             else:
                 moving[k] = second
     return settled
-
-
-def _sides_explained(
-    evidence: Evidence,
-    jobs: Sequence[tuple[Mask, np.random.Generator, np.random.Generator]],
-    config: Config,
-    first_look: bool,
-    number: int,
-) -> tuple[Explanation, Explanation]:
-    """Explain the first side and the second of one of several divisions."""
-    second, *rngs = jobs[number]
-    first, other = (
-        explain(evidence.select(side), config.explanation, config.fit, rng, first_look=first_look)
-        for side, rng in zip((~second, second), rngs, strict=True)
-    )
-    return first, other
-
-
-def _reassigned(
-    evidence: Evidence, pair: tuple[Explanation, Explanation], near: Groups, config: Config
-) -> Mask:
-    """Points (N,) that the second of two shapes explains better, together with the points around them."""
-    cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
-    cost = (cost + cost[:, near].mean(axis=2)) / 2.0
-    return _connected(evidence.points, cost[1] < cost[0])
 
 
 def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> Iterator[Mask]:
