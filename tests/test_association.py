@@ -32,7 +32,9 @@ def names_of(*parts, known=KNOWN, shapes=SHAPES, config=CONFIG, **options):
 
 
 def test_a_part_is_the_object_in_whose_points_it_lies():
-    assert names_of(seen(BALL, seed=1), seen(CRATE, seed=1)) == {1: 7, 2: 3}
+    crate = seen(CRATE, seed=1)
+    left = crate[:, 1] < 0.0
+    assert names_of(seen(BALL, seed=1), crate[left], crate[~left]) == {1: 7, 2: 3, 3: 3}
 
 
 def test_a_part_of_a_side_never_seen_is_the_object_in_whose_shape_it_lies():
@@ -43,23 +45,13 @@ def test_a_part_of_a_side_never_seen_is_the_object_in_whose_shape_it_lies():
     assert names_of(behind, known={3: front}, shapes={}) == {1: 4}
 
 
-def test_what_lies_elsewhere_is_a_new_object_with_a_new_label():
+def test_what_lies_elsewhere_is_a_new_object_with_a_label_never_given():
     elsewhere = seen(box((0.0, 0.4, 0.8), (0.1, 0.1, 0.1)))
     farther = seen(box((0.0, -0.4, 0.8), (0.1, 0.1, 0.1)))
-    assert names_of(elsewhere, farther) == {1: 8, 2: 9}
-    assert names_of(elsewhere, known={}, shapes={}) == {1: 1}
-
-
-def test_a_label_once_given_is_not_given_again():
-    elsewhere = seen(box((0.0, 0.4, 0.8), (0.1, 0.1, 0.1)))
+    assert names_of(elsewhere, farther, labels_used=2) == {1: 8, 2: 9}
     assert names_of(elsewhere, labels_used=20) == {1: 21}
-    assert names_of(elsewhere, labels_used=2) == {1: 8}
-
-
-def test_two_parts_of_one_object_get_the_same_name():
-    crate = seen(CRATE, seed=1)
-    left = crate[:, 1] < 0.0
-    assert names_of(crate[left], crate[~left]) == {1: 3, 2: 3}
+    assert names_of(elsewhere, known={}, shapes={}) == {1: 1}
+    assert names_of() == {}
 
 
 @pytest.mark.parametrize(("share", "name"), [(0.2, 8), (0.5, 3)])
@@ -92,7 +84,3 @@ def test_a_few_points_beside_its_neighbour_do_not_divide_a_part():
     crate = seen(CRATE, seed=2)
     crate = crate[crate[:, 1] < 0.058]
     assert names_of(crate, known=known, shapes=SHAPES) == {1: 3}
-
-
-def test_no_parts_no_names():
-    assert names_of() == {}

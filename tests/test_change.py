@@ -47,18 +47,12 @@ def test_a_shape_changes_only_beyond_the_tolerance(change):
     assert not changed(BEFORE, with_crate(change(CRATE, MUCH)), replace(CONFIG, settled=2.0 * MUCH))
 
 
-def test_another_kind_of_shape_is_a_change():
+def test_the_kind_of_a_shape_is_a_change_and_the_names_of_its_axes_are_none():
     assert changed(BEFORE, with_crate(thing(1, cylinder((0.0, 0.0, 0.8), 0.05, 0.3))), CONFIG)
-
-
-def test_other_names_for_the_axes_are_no_change():
     x, y, z = np.eye(3)
     T = CRATE.shape.T_world_object @ transforms.rigid(np.stack([y, z, x], axis=1), np.zeros(3))
     renamed = Box(T, CRATE.shape.extents[[1, 2, 0]])
     assert not changed(BEFORE, with_crate(replace(CRATE, shape=renamed)), CONFIG)
-
-
-def test_a_ball_that_turned_is_the_same_ball():
     ball = thing(3, sphere((0.0, 0.0, 0.0), 0.05))
     assert not reshaped(ball, turned(ball, 0.05), CONFIG)
 

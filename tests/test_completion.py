@@ -56,62 +56,40 @@ HOVERING = [
     cylinder((0.1, 0.0, TABLE_TOP + 0.08), 0.03, 0.04),
 ]
 
-each = pytest.mark.parametrize("shape", HOVERING, ids=lambda s: s.kind)
+LIMIT = TABLE_TOP + 0.03
+BELOW = thing(2, box((0.1, 0.0, TABLE_TOP + 0.02), (0.15, 0.15, 0.04)))
 
 
-@each
-def test_what_hovers_over_unseen_space_reaches_down_to_the_table(shape):
-    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP))
-    assert lowest(done.shape) == pytest.approx(TABLE_TOP)
+@pytest.mark.parametrize("upright", [True, False])
+@pytest.mark.parametrize("shape", HOVERING, ids=lambda s: s.kind)
+@pytest.mark.parametrize(
+    ("free", "others", "bottom", "within", "why"),
+    [
+        (lambda p: p[:, 2] > 9.0, (), TABLE_TOP, 1e-9, "reach down to the table, 60 mm"),
+        (lambda p: np.hypot(p[:, 0] - 0.1, p[:, 1]) > 0.07, (), TABLE_TOP, 1e-9, "table"),
+        (lambda p: p[:, 2] < LIMIT, (), LIMIT, 1.5 * CONFIG.step, "free space"),
+        (lambda p: p[:, 2] < 2.0, (), TABLE_TOP + 0.06, 1e-9, ""),
+        (lambda p: p[:, 2] > 9.0, (BELOW,), TABLE_TOP + 0.04, CONFIG.overlap, "next object"),
+    ],
+    ids=["unseen space", "free beside", "free above the table", "free right below", "an object below"],
+)
+def test_a_hidden_lower_side_goes_down_to_what_bounds_it(shape, upright, free, others, bottom, within, why):
+    """Whichever way the axes of the shape point."""
+    hovering = thing(1, shape, seen=SIDES_AND_TOP)
+    if not upright:
+        hovering = thing(1, upside_down(shape), seen=(True, True, True, True, True, False))
+    done, *kept = completed(hovering, *others, voxels=seen_free(free))
+    assert lowest(done.shape) == pytest.approx(bottom, abs=within)
     assert highest(done.shape) == pytest.approx(highest(shape))
     np.testing.assert_allclose(done.shape.extents[:2], shape.extents[:2])
-    assert "table" in done.why
-    assert "60 mm" in done.why
+    assert why in done.why
+    assert [(o.id, o.shape) for o in kept] == [(o.id, o.shape) for o in others]
 
 
-@each
-def test_which_way_its_axes_point_makes_no_difference(shape):
-    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP))
-    turned = thing(1, upside_down(shape), seen=(True, True, True, True, True, False))
-    assert hausdorff(completed(turned)[0].shape, done.shape) < 1e-9
-
-
-@each
+@pytest.mark.parametrize("shape", HOVERING, ids=lambda s: s.kind)
 def test_a_lower_side_that_was_seen_stays_where_it_is(shape):
     (done,) = completed(thing(1, shape))
-    assert hausdorff(done.shape, shape) == 0.0
-    assert done.why == ""
-
-
-@each
-def test_nothing_reaches_into_space_that_was_seen_free(shape):
-    limit = TABLE_TOP + 0.03
-    voxels = seen_free(lambda p: p[:, 2] < limit)
-    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP), voxels=voxels)
-    assert limit - 0.5 * CONFIG.step <= lowest(done.shape) <= limit + 1.5 * CONFIG.step
-    assert "free" in done.why
-
-
-@each
-def test_free_space_right_below_leaves_it_as_it_is(shape):
-    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP), voxels=seen_free(lambda p: p[:, 2] < 2.0))
-    assert hausdorff(done.shape, shape) < 1e-9
-
-
-@each
-def test_free_space_beside_it_does_not_matter(shape):
-    beside = seen_free(lambda p: np.hypot(p[:, 0] - 0.1, p[:, 1]) > 0.07)
-    (done,) = completed(thing(1, shape, seen=SIDES_AND_TOP), voxels=beside)
-    assert lowest(done.shape) == pytest.approx(TABLE_TOP)
-
-
-@each
-def test_what_hovers_over_an_object_reaches_down_to_it(shape):
-    below = thing(2, box((0.1, 0.0, TABLE_TOP + 0.02), (0.15, 0.15, 0.04)))
-    upper, kept = completed(thing(1, shape, seen=SIDES_AND_TOP), below)
-    assert abs(lowest(upper.shape) - (TABLE_TOP + 0.04)) <= CONFIG.overlap
-    assert hausdorff(kept.shape, below.shape) == 0.0
-    assert (upper.id, kept.id) == ("o1", "o2")
+    assert (done.shape, done.why) == (shape, "")
 
 
 def test_objects_find_those_below_already_completed():

@@ -22,37 +22,26 @@ GRAPH = SupportGraph(
 )
 
 
-def test_objects_are_found_by_id():
-    assert GRAPH["o2"].label == 2
+def test_objects_and_edges_are_found_by_ids_and_the_support_surface_by_its_role():
+    assert GRAPH[object_id(2)].label == 2
     with pytest.raises(KeyError, match="no object 'o9'; there are o0, o1, o2"):
         GRAPH["o9"]
-
-
-def test_the_support_surface_is_found_by_its_role():
     assert GRAPH.support_surface.id == SUPPORT_SURFACE_ID
     assert SupportGraph(GRAPH.objects[1:]).support_surface is None
-    assert SupportGraph().support_surface is None
-
-
-def test_edges_are_found_by_their_ends_and_have_a_direction():
     assert GRAPH.support("o1", "o2").kind == "bottom-up"
     assert GRAPH.support("o2", "o1").kind == "top-down"
     assert GRAPH.support("o0", "o2") is None
     assert [s.supporter for s in GRAPH.supporters("o1")] == ["o0", "o2"]
     assert GRAPH.supporters("o0") == []
-    assert GRAPH.supports[1].pair == ("o1", "o2")
 
 
 def test_as_a_networkx_graph_it_points_from_supporter_to_supported():
     directed = GRAPH.to_networkx()
-    assert set(directed.nodes) == {"o0", "o1", "o2"}
-    assert set(directed.edges) == {("o0", "o1"), ("o1", "o2"), ("o2", "o1")}
-    assert directed.nodes["o2"]["data"] is GRAPH["o2"]
-    assert directed.nodes["o2"]["shape"] == "cylinder"
+    assert directed.nodes["o2"] == {"data": GRAPH["o2"], "role": "object", "shape": "cylinder"}
     assert directed.nodes["o0"]["role"] == "support_surface"
-    assert directed.edges["o2", "o1"]["certain"] is False
-    assert directed.edges["o2", "o1"]["kind"] == "top-down"
-    assert directed.edges["o1", "o2"]["data"] is GRAPH.supports[1]
+    assert set(directed.edges) == {s.pair for s in GRAPH.supports}
+    expected = {"data": GRAPH.supports[2], "kind": "top-down", "certain": False}
+    assert directed.edges["o2", "o1"] == expected
 
 
 @pytest.mark.parametrize(
@@ -61,7 +50,3 @@ def test_as_a_networkx_graph_it_points_from_supporter_to_supported():
 )
 def test_what_no_test_doubts_is_stable(small_area, tips, stable):
     assert Stability(0.5, 0.0, small_area, tips).stable == stable
-
-
-def test_ids_are_made_of_labels():
-    assert object_id(12) == "o12"
