@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -38,13 +38,6 @@ def steps():
     return exploration(early_stop=False)
 
 
-def test_it_looks_until_the_views_are_used_up(steps):
-    assert [s.index for s in steps] == [0, 1, 2]
-    assert [s.stop for s in steps] == [None, None, "3 views were asked for"]
-    assert [s.decision is None for s in steps] == [False, False, True]
-    assert [s.candidates is None for s in steps] == [False, False, True]
-
-
 def test_it_ends_where_a_view_changes_nothing():
     config = replace(CONFIG, active=replace(CONFIG.active, max_views=8))
     config = replace(config, fusion=replace(config.fusion, settled=1.0))
@@ -71,8 +64,11 @@ def test_each_view_is_taken_where_the_one_before_decided(steps):
     assert steps[-1].angle_travelled > 0.5
 
 
-def test_a_step_tells_all_of_a_turn_and_cannot_be_changed(steps):
+def test_a_step_tells_all_of_a_turn_and_the_last_why_it_stopped(steps):
+    assert [s.index for s in steps] == [0, 1, 2]
+    assert [s.stop for s in steps] == [None, None, "3 views were asked for"]
     for step in steps:
+        assert (step.decision is None) == (step.candidates is None) == (step.stop is not None)
         assert isinstance(step, Step)
         assert step.labels.shape == step.view.depth.shape
         assert len(step.visited) == step.index + 1
@@ -80,8 +76,6 @@ def test_a_step_tells_all_of_a_turn_and_cannot_be_changed(steps):
         assert ("plan" in step.timings) == (step.stop is None)
         assert step.decision is None or step.decision.why
     assert 0 < len(steps[0].cloud) < len(steps[-1].cloud)
-    with pytest.raises(FrozenInstanceError):
-        steps[0].index = 7
 
 
 def test_anyone_can_bring_a_planner():
@@ -145,13 +139,6 @@ def test_the_next_view_can_be_asked_for_alone():
         next_best_view(scene, None, visited)
     with pytest.raises(PlanningError, match="nothing has been seen yet"):
         next_best_view(Scene(), stage().robot)
-
-
-def test_labels_that_are_demanded_and_missing_end_the_loop():
-    views = [replace(v, labels=None) for v in simulated_views("tower")]
-    robot = RecordingRobot([v.pose for v in views])
-    with pytest.raises(InputError, match="has no labels"):
-        next(explore(Playback(views), robot, config=CONFIG, segmentation="labels"))
 
 
 def test_a_person_may_choose_another_view_and_another_planner():

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from synthetic import box, cylinder, surface_points
@@ -110,13 +108,6 @@ def test_a_pair_is_looked_at_again_when_one_of_them_has_been_divided(models, mon
     assert sorted(o.shape.kind for o in models.objects()) == ["box", "cylinder"]
 
 
-def test_labels_of_the_observation_are_required():
-    observation = observation_of((1, 2))
-    bare = replace(observation, cloud=replace(observation.cloud, labels=None))
-    with pytest.raises(ValueError, match="labelled"):
-        _ = bare.labels
-
-
 def cloud(count, label, at=0.0):
     points = np.full((count, 3), at) + np.arange(count)[:, None]
     return Cloud(points, np.tile((0.0, 0.0, 1.0), (count, 1)), np.full(count, label, dtype=np.int32))
@@ -134,37 +125,21 @@ def two_views():
     return points
 
 
-def test_views_add_up():
+def test_views_add_up_and_dividing_and_merging_keep_every_point():
     points = two_views()
-    assert points.objects == [1, 3]
-    assert points.labels_used == 3
-    assert len(points.of(3)) == 12
-    assert len(points.newest(3)) == 6
-    assert points.newest(3).points_world[0, 0] == 100.0
-    assert len(points.everything()) == 30
+    assert (points.objects, points.labels_used) == ([1, 3], 3)
+    assert points.newest(3).points_world[:, 0].tolist() == list(range(100, 106))
     assert set(points.everything().labels) == {1, 3, SUPPORT_LABEL}
     assert len(points.of(7)) == 0
-
-
-def test_merging_keeps_every_point_under_the_new_label():
-    points = two_views()
-    points.merge(1, 3)
-    assert points.objects == [3]
-    assert len(points.of(3)) == 20
-    assert set(points.of(3).labels) == {3}
-    assert len(points.everything()) == 30
-
-
-def test_dividing_gives_each_group_its_points_and_new_labels_only():
-    points = two_views()
-    groups = np.tile([0, 1, 2], 4)
-    before = points.of(3).points_world
-    names = points.divide(3, groups)
-    assert names == [3, 4, 5]
-    assert points.labels_used == 5
-    for number, name in enumerate(names):
+    before, groups = points.of(3).points_world, np.tile([0, 1, 2], 4)
+    assert points.divide(3, groups) == [3, 4, 5]
+    for number, name in enumerate((3, 4, 5)):
         np.testing.assert_array_equal(points.of(name).points_world, before[groups == number])
         assert set(points.of(name).labels) == {name}
+    points.merge(5, 1)
+    assert points.objects == [1, 3, 4]
+    assert (len(points.of(1)), set(points.of(1).labels)) == (12, {1})
+    assert points.divide(1, np.arange(12) % 2) == [1, 6], "a label given up is not given again"
     assert len(points.everything()) == 30
 
 
@@ -197,12 +172,6 @@ def test_many_views_leave_no_more_than_the_newest_points_of_a_place():
     np.testing.assert_array_equal(left, [0.05, 0.06, 0.07, 0.08])
     points.move({8: transforms.rigid(np.eye(3), (0.2, 0.0, 0.0))})
     assert (points.of(1).points_world[:, 0] % 1.0 > 0.2).sum() == 20
-
-
-def test_a_label_given_up_is_not_given_again():
-    points = two_views()
-    points.merge(3, 1)
-    assert points.divide(1, np.arange(20) % 2) == [1, 4]
 
 
 def test_colours_stay_only_where_all_have_them():
