@@ -13,7 +13,6 @@ from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import Explorer, Step, explore, next_best_view
 from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
-from caryatid.planning.decision import go_to
 from caryatid.robots.recording import RecordingRobot
 from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation
@@ -76,18 +75,6 @@ def test_a_step_tells_all_of_a_turn_and_the_last_why_it_stopped(steps):
         assert ("plan" in step.timings) == (step.stop is None)
         assert step.decision is None or step.decision.why
     assert 0 < len(steps[0].cloud) < len(steps[-1].cloud)
-
-
-def test_anyone_can_bring_a_planner():
-    class Farthest:
-        def plan(self, state, rng):
-            nearness = state.candidates.directions @ state.visited[-1]
-            return go_to(state, int(np.argmin(nearness)), "far away")
-
-    steps = exploration(planner=Farthest(), early_stop=False)
-    directions = steps[0].candidates.directions
-    nearest = (directions @ steps[0].visited[0]).min()
-    assert steps[1].visited[1] @ steps[0].visited[0] == pytest.approx(nearest, abs=1e-6)
 
 
 @pytest.mark.parametrize("noise", ["none", "carmine"])

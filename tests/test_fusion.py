@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, edges, hausdorff, sphere, table_object, thing, vertices
+from synthetic import box, cylinder, edges, sphere, table_object, thing, vertices
 
 from caryatid.config import FusionConfig
 from caryatid.geometry.shapes import Uncertainty
@@ -194,16 +194,6 @@ def test_an_edge_is_certain_where_a_view_was_certain_of_it():
         assert fused_of(*order).support("o1", "o2").certain
     assert not fused_of(unsure, unsure).support("o1", "o2").certain
     assert not fused_of(FULL, unsure, config=BOTH).support("o1", "o2").certain
-
-
-@pytest.mark.parametrize("config", [PC, SG, BOTH], ids=lambda c: c.method)
-@pytest.mark.parametrize("same_labels", [True, False])
-def test_a_graph_fused_with_itself_stays_as_it_is(config, same_labels):
-    once, often = (fused_of(*[FULL] * views, config=config, same_labels=same_labels) for views in (1, 4))
-    assert (vertices(often), edges(often)) == (vertices(once), edges(once))
-    for o in once.objects:
-        assert hausdorff(often[o.id].shape, o.shape) < 1e-12
-    assert {s.occurrences for s in often.supports} == {4}
 
 
 def test_the_table_comes_first_and_edges_in_the_order_of_their_ends():

@@ -416,17 +416,6 @@ class TestSaliency:
         assert self.run("attention", 3, **LITERAL) == self.run("paper", 3)
         assert self.run("attention", 3) != self.run("paper", 3)
 
-    def test_its_score_is_the_papers_formula(self):
-        decision = plan("paper", [CUBE], (ON_TABLE,))
-        chosen = OPEN.directions[decision.index]
-        midpoint = (TABLE.centre_world + CUBE.centre_world) / 2.0 - SPHERE.centre_world
-
-        def bump(top):
-            return float(np.exp(-0.5 * (degrees_between(top, chosen) / CONFIG.spread) ** 2))
-
-        assert decision.cost == pytest.approx(np.sin(transforms.angle_between(HOME, chosen) / 2.0))
-        assert abs(decision.saliency + bump(HOME)) == pytest.approx(bump(midpoint), abs=1e-6)
-
     def test_without_propagation_one_candidate_a_point_has_saliency(self):
         settings = {"inhibition": 0.0, "occlusion": "ignore"}
         alone = plan("attention", list(self.HEAP), self.SUPPORTS, propagation=False, **settings)
@@ -758,14 +747,3 @@ class TestAPlannerOfAnotherPackage:
         assert done.returncode == 0, done.stderr
         assert "from above" in (tmp_path / "run/views/00/view.json").read_text()
         assert f'"planner": "{NAME}"' in (tmp_path / "run/run.json").read_text()
-
-    def test_it_looks_from_above_and_then_all_around(self, monkeypatch):
-        monkeypatch.syspath_prepend(PACKAGE / "src")
-        planner, visited = EntryPoint(NAME, VALUE, "caryatid.planners").load()(), HOME[None]
-        for _ in range(4):
-            decision = planner.plan(state([CUBE], visited=visited), np.random.default_rng(0))
-            visited = np.vstack([visited, OPEN.directions[decision.index]])
-        assert visited[1, 2] == OPEN.directions[:, 2].max()
-        flat = transforms.unit(np.delete(visited, 1, axis=0) * (1.0, 1.0, 0.0))
-        assert degrees_between(flat[:, None], flat[None])[~np.eye(len(flat), dtype=bool)].min() > 80.0
-        assert f"--planner {NAME}" in (PACKAGE / "README.md").read_text()
