@@ -15,7 +15,6 @@ os.environ.setdefault("OPENBLAS_CORETYPE", "Haswell")
 import numba
 import numpy as np
 import pytest
-from pypcd4 import Encoding, PointCloud
 
 from caryatid import cli
 from caryatid.config import Config, SensorConfig
@@ -155,17 +154,26 @@ def points(views):
     return views[0].points_camera[seen], views[0].labels[seen]
 
 
+def pcd_text(points, labels=None, count=None) -> str:
+    """An ascii PCD, `count` points promised in its header."""
+    table = points if labels is None else np.column_stack([points, labels])
+    count = len(points) if count is None else count
+    label = "" if labels is None else " label"
+    header = (
+        f"VERSION .7\nFIELDS x y z{label}\nSIZE 4 4 4{' 4' if label else ''}\n"
+        f"TYPE F F F{' U' if label else ''}\nCOUNT 1 1 1{' 1' if label else ''}\n"
+        f"WIDTH {count}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA ascii\n"
+    )
+    return header + "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in table)
+
+
 @pytest.fixture
 def write_pcd(tmp_path):
-    """Write an ascii PCD."""
+    """Write an ascii PCD, and return its path."""
 
-    def write(points, labels=None, name="cloud.pcd"):
-        columns = [*points.T] if labels is None else [*points.T, labels]
-        types = (np.float32, np.float32, np.float32, np.uint32)
-        names = ("x", "y", "z", "label")
-        cloud = PointCloud.from_points(columns, names[: len(columns)], types[: len(columns)])
-        cloud.save(tmp_path / name, encoding=Encoding.ASCII)
-        return tmp_path / name
+    def write(*cloud, count=None):
+        (tmp_path / "cloud.pcd").write_text(pcd_text(*cloud, count=count))
+        return tmp_path / "cloud.pcd"
 
     return write
 

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from arms import SLIDES, gantry
 from bag_files import write_bag, write_tum
-from conftest import SMALL, run_command, without_labels
+from conftest import SMALL, pcd_text, run_command, without_labels
 
 import caryatid as ct
 from caryatid.config.settings import write_settings
@@ -83,11 +83,7 @@ RUNNING = [page for page in PAGES if runs(page)]
 def prepared(tmp_path_factory, kept_recording, scene_file, points, views):
     """The files the pages speak of."""
     folder = tmp_path_factory.mktemp("pages")
-    positions, labels = points
-    header = "VERSION .7\nFIELDS x y z label\nSIZE 4 4 4 4\nTYPE F F F U\nCOUNT 1 1 1 1\n"
-    header += f"WIDTH {len(labels)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(labels)}\nDATA ascii\n"
-    rows = "".join(" ".join(f"{v:.6g}" for v in row) + "\n" for row in np.column_stack([positions, labels]))
-    (folder / "table.pcd").write_text(header + rows)
+    (folder / "table.pcd").write_text(pcd_text(*points))
     write_bag(folder / "pour.bag", views)
     write_tum(
         folder / "rgbd_dataset_freiburg1_desk",

@@ -96,12 +96,6 @@ def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_service_stops_as_soon_as_it_has_said_where_it_is(tmp_path):
-    command = Command("serve", tmp_path / "s", "--port", 0)
-    assert command._process.stdout.readline().startswith("serving ")
-    assert command.interrupt() == (0, "", "")
-
-
 def test_two_interrupts_end_it_too(tmp_path, scene_file):
     words = ["explore", scene_file, "--out", tmp_path / "run", "--views", 50, "--no-early-stop", *SMALL]
     command = Command(*words)

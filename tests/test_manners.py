@@ -184,17 +184,6 @@ def test_with_json_stdout_is_one_document_and_stderr_is_empty(command, words, ca
     assert said.out.endswith("\n")
 
 
-@pytest.mark.parametrize("command", ["explore", "extract", "evaluate", "order", "import", "session add"])
-def test_with_json_an_error_is_one_line_and_no_document(command, words, capfd):
-    spelled = words(command)
-    spelled[len(command.split())] += "-not-there"
-    assert run_command(*spelled, "--json") == 1
-    said = capfd.readouterr()
-    assert said.out == ""
-    assert said.err.startswith("error: ")
-    assert said.err.count("\n") == 1
-
-
 # Colours, and what moves
 
 

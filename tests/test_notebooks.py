@@ -12,7 +12,6 @@ import pytest
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[1]
-MOSD = ROOT.parent / "shared/data/mosd"
 NOTEBOOKS = sorted((ROOT / "docs/notebooks").glob("*.ipynb"))
 NAMED = [path.stem for path in NOTEBOOKS]
 QUICK = {
@@ -63,12 +62,3 @@ def test_it_runs(path, executing):
     assert kinds == [[o.output_type for o in cell.get("outputs", [])] for cell in stored.cells]
     assert all("<svg" in shown or "<dl" in shown for shown in html(notebook))
     assert path.read_bytes() == before
-
-
-@pytest.mark.skipif(not MOSD.is_dir(), reason="the recorded frames of ../shared are not here")
-def test_a_real_frame_goes_the_same_way(executing):
-    folder = sorted(path for path in MOSD.iterdir() if path.is_dir())[0]
-    path = ROOT / "docs/notebooks/from-a-frame-to-a-graph.ipynb"
-    notebook = executing.execute(path, QUICK[path.stem] | {"RECORDING": str(folder)})
-    assert folder.name in html(notebook)[0]
-    assert html(notebook)[1].count("<svg") == 2
