@@ -36,7 +36,15 @@ def labels_from_masks(
     """
     config = config or MaskConfig()
     stack = _stack(masks)
-    quality = _scores(scores, len(stack))
+    quality = np.full(len(stack), np.inf)
+    if scores is not None:
+        quality = np.asarray(scores, dtype=np.float64)
+        if quality.shape != (len(stack),) or not np.isfinite(quality).all():
+            raise InputError(
+                "scores",
+                f"have shape {quality.shape} or hold NaN for {len(stack)} masks",
+                "give one finite score a mask, or none at all",
+            )
     pixels = stack.sum(axis=(1, 2))
     kept = (pixels >= config.min_pixels) & (pixels <= config.max_share * stack[0].size)
     kept &= quality >= config.min_score
@@ -67,19 +75,6 @@ def _stack(masks: ArrayLike | Sequence[ArrayLike]) -> Masks:
         if not np.isin(values, (0, 1)).all() and not np.isin(values, (0, 255)).all():
             raise InputError("masks", "hold values beside true and false", "threshold them first: masks > 0")
     return stack.astype(bool)
-
-
-def _scores(scores: ArrayLike | None, count: int) -> NDArray[np.float64]:
-    if scores is None:
-        return np.full(count, np.inf)
-    quality = np.asarray(scores, dtype=np.float64)
-    if quality.shape != (count,) or not np.isfinite(quality).all():
-        raise InputError(
-            "scores",
-            f"have shape {quality.shape} or hold NaN for {count} masks",
-            "give one finite score a mask, or none at all",
-        )
-    return quality
 
 
 def _iou(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
