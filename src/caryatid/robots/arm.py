@@ -14,7 +14,15 @@ from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
 from caryatid.robots.floor import FloorGrid
-from caryatid.robots.protocol import OwnViews, Posture, SimulatedRobot, Unreachable, count_reasons, posture_at
+from caryatid.robots.protocol import (
+    OwnViews,
+    Posture,
+    SimulatedRobot,
+    Unreachable,
+    count_reasons,
+    posture_at,
+    straight_lengths,
+)
 from caryatid.sensing.view_sphere import ViewSphere
 
 Reachable = Callable[[Array], NDArray[np.bool_]]
@@ -123,17 +131,13 @@ class ArmRobot(SimulatedRobot, OwnViews):
         if self._offer is None or self._offer[0] is not sphere:
             self._offer = sphere, self._offered(sphere)
         views = self._offer[1]
-        return views.from_elsewhere(self._distances(views.T_world_camera))
+        return views.from_elsewhere(straight_lengths(self._T_world_camera, views.T_world_camera))
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
         """Look closer whether the arm can go to a candidate (4, 4); None = it can."""
         if self._confirm is None or self._confirm(transforms.invert(self.T_world_base) @ T_world_camera):
             return None
         return Unreachable(UNCONFIRMED)
-
-    def _go(self, posture: Posture, T_world_camera: Array) -> float:
-        """The straight distance from where the camera was [m]."""
-        return float(self._distances(T_world_camera[None])[0])
 
     def _radius_around(self, centre_world: Array) -> float:
         smallest, largest = self._config.radius
@@ -147,12 +151,6 @@ class ArmRobot(SimulatedRobot, OwnViews):
 
     def _sphere_around(self, centre_world: Array, radius: float, count: int) -> ViewSphere:
         return ViewSphere(centre_world, radius, transforms.rotate(self.T_world_base, fibonacci_sphere(count)))
-
-    def _distances(self, T_world_camera: Array) -> Array:
-        """Straight distance (N,) [m] from the camera to poses (N, 4, 4)."""
-        if self._T_world_camera is None:
-            return np.zeros(len(T_world_camera))
-        return np.linalg.norm(T_world_camera[:, :3, 3] - self._T_world_camera[:3, 3], axis=1)
 
     def _offered(self, sphere: ViewSphere) -> Candidates:
         poses = sphere.poses(sphere.directions)

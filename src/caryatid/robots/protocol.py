@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
+
 from caryatid.errors import PlanningError
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from caryatid.geometry.transforms import Array
@@ -110,7 +111,7 @@ class SimulatedRobot(Robot):
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
         """Take a posture that `solve` gave; return the path length [m] from where the robot was."""
-        raise NotImplementedError
+        return float(straight_lengths(self._T_world_camera, T_world_camera))
 
     def move_to(self, T_world_camera: Array) -> float:
         """Go there and return the path length [m].
@@ -124,6 +125,13 @@ class SimulatedRobot(Robot):
         length = self._go(posture, T_world_camera)
         self._T_world_camera = T_world_camera.copy()
         return length
+
+
+def straight_lengths(T_world_from: Array | None, T_world_camera: Array) -> Array:
+    """Straight path length (...) [m] from one camera pose (4, 4) to others (..., 4, 4); 0 from nowhere."""
+    eyes = T_world_camera[..., :3, 3]
+    start = eyes if T_world_from is None else T_world_from[:3, 3]
+    return np.linalg.norm(eyes - start, axis=-1)
 
 
 def posture_at(T_world_camera: Array, platform_world: Array) -> Posture:

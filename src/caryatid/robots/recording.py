@@ -11,7 +11,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io.datasets import Dataset
 from caryatid.planning.candidates import Candidates
-from caryatid.robots.protocol import Posture, SimulatedRobot, Unreachable, posture_at
+from caryatid.robots.protocol import Posture, SimulatedRobot, Unreachable, posture_at, straight_lengths
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import View
 
@@ -26,7 +26,7 @@ class RecordingRobot(SimulatedRobot):
     def __init__(self, T_world_cameras: Array | Sequence[Array]) -> None:
         self._recorded = np.array(T_world_cameras, dtype=np.float64)
         self._T_world_camera = self._recorded[0]
-        self._used = [0]
+        self._used: list[int | None] = [0]
 
     def _index_of(self, T_world_camera: Array) -> int | None:
         """Which recorded view has this pose (4, 4) to 1 mm and 1 mrad; of several the first not used yet."""
@@ -48,19 +48,16 @@ class RecordingRobot(SimulatedRobot):
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the recorded views that have not been used; paths are straight lines between cameras."""
-        left = np.setdiff1d(np.arange(len(self._recorded)), self._used)
+        left = [index for index in range(len(self._recorded)) if index not in self._used]
         poses = self._recorded[left]
-        path_length = np.linalg.norm(poses[:, :3, 3] - self.T_world_camera[:3, 3], axis=-1)
-        nowhere = len(sphere.directions)
+        lengths, nowhere = straight_lengths(self._T_world_camera, poses), len(sphere.directions)
         rejected = {"already used": len(self._used), "the recording has no view from there": nowhere}
-        return Candidates(poses, sphere.direction_of(poses), path_length, rejected)
+        return Candidates(poses, sphere.direction_of(poses), lengths, rejected)
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
         """The straight distance to a recorded view [m], which is then used."""
-        index = self._index_of(T_world_camera)
-        assert index is not None
-        self._used.append(index)
-        return float(np.linalg.norm(self._recorded[index, :3, 3] - self.T_world_camera[:3, 3]))
+        self._used.append(self._index_of(T_world_camera))
+        return super()._go(posture, T_world_camera)
 
 
 class RecordingCamera:

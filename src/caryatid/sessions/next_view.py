@@ -17,6 +17,7 @@ from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.robots import Posture, Robot
 from caryatid.robots.floor import STEP, FloorGrid
+from caryatid.robots.protocol import straight_lengths
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 
@@ -95,7 +96,7 @@ def given_candidates(
     named = enumerate(np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4))
     rigid = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
     if path_length is None:
-        path_length = _straight(T_world_camera, rigid)
+        path_length = straight_lengths(T_world_camera, rigid)
     lengths = np.asarray(path_length, dtype=np.float64)
     if lengths.shape != (len(rigid),) or not (lengths >= 0.0).all():
         remedy = "give as many as candidates, 0 or more"
@@ -115,9 +116,4 @@ def reached_candidates(
             robot.move_to(T)
             return robot.candidates(sphere)
     found = robot.candidates(sphere)
-    return found.from_elsewhere(_straight(T_world_camera, found.T_world_camera))
-
-
-def _straight(T_world_camera: Array, poses: Array) -> Array:
-    """Straight path length (N,) [m] from one camera pose to others (N, 4, 4)."""
-    return np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=-1)
+    return found.from_elsewhere(straight_lengths(T_world_camera, found.T_world_camera))

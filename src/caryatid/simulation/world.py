@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import ConvexHull
 
 from caryatid.config import PhysicsConfig
@@ -269,9 +269,26 @@ def build_spec(
     spec = empty_spec(name)
     spec.worldbody.add_geom(name="floor", type=_GEOM.mjGEOM_PLANE, size=[10.0, 10.0, 0.1])
     table = spec.worldbody.add_body(name=TABLE)
-    for part, centre, half, colour in _furniture(table_size, walls):
-        owner = spec.worldbody if part.startswith("wall") else table
-        owner.add_geom(name=part, type=_GEOM.mjGEOM_BOX, pos=centre, size=half, rgba=(*colour, 1.0))
+
+    def put(body: Any, part: str, centre: ArrayLike, half: ArrayLike, colour: Vector) -> None:
+        body.add_geom(name=part, type=_GEOM.mjGEOM_BOX, pos=centre, size=half, rgba=(*colour, 1.0))
+
+    # 3.2 m long, 2 m high and 6 cm thick.
+    half = np.array([0.03, 1.6, 1.0])
+    for index, side in enumerate(walls):
+        across = "xy".index(side[1])
+        away = table_size[across] / 2.0 + (0.24, 0.32)[across] + half[0]
+        order = [1, 0, 2] if across else [0, 1, 2]
+        centre = np.array([away if side[0] == "+" else -away, 0.0, half[2]])
+        put(spec.worldbody, f"wall{index}", centre[order], half[order], (0.85, 0.85, 0.82))
+    # The top is 4 cm thick; the legs of 4 cm by 4 cm stand a little inside its corners.
+    x, y, thick = table_size[0] / 2.0, table_size[1] / 2.0, 0.04
+    under = TABLE_HEIGHT - thick
+    middle = (0.0, 0.0, TABLE_HEIGHT - thick / 2.0)
+    put(table, "table_top", middle, (x, y, thick / 2.0), (0.72, 0.58, 0.42))
+    for index, (sign_x, sign_y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
+        foot = (sign_x * (x - 0.75 * thick), sign_y * (y - 0.75 * thick), under / 2.0)
+        put(table, f"table_leg{index}", foot, np.array([thick, thick, under]) / 2.0, (0.6, 0.48, 0.35))
     for index, solid in enumerate(solids):
         add_solid(spec, f"object{index}", solid, palette(index))
     return spec
@@ -294,30 +311,6 @@ def quaternion(R: Array) -> Array:
 def _placed(at: Vector, turn: Vector = (0.0, 0.0, 0.0)) -> Array:
     R = transforms.rotation_from_vector(np.deg2rad(turn))
     return transforms.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
-
-
-def _furniture(
-    size: tuple[float, float], walls: Sequence[Side]
-) -> Iterator[tuple[str, Array, Array, Vector]]:
-    """Name, centre [m], half extents [m] and colour of the static boxes: walls, table top and its legs.
-
-    A wall is 3.2 m long, 2 m high and 6 cm thick. The top is 4 cm thick; the legs of 4 cm by 4 cm stand a
-    little inside its corners.
-    """
-    half = np.array([0.03, 1.6, 1.0])
-    for index, side in enumerate(walls):
-        across = "xy".index(side[1])
-        away = size[across] / 2.0 + (0.24, 0.32)[across] + half[0]
-        order = [1, 0, 2] if across else [0, 1, 2]
-        centre = np.array([away if side[0] == "+" else -away, 0.0, half[2]])
-        yield f"wall{index}", centre[order], half[order], (0.85, 0.85, 0.82)
-    x, y, thick, leg = size[0] / 2.0, size[1] / 2.0, 0.04, 0.04
-    under = TABLE_HEIGHT - thick
-    top = np.array([0.0, 0.0, TABLE_HEIGHT - thick / 2.0])
-    yield "table_top", top, np.array([x, y, thick / 2.0]), (0.72, 0.58, 0.42)
-    for index, (sign_x, sign_y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
-        centre = np.array([sign_x * (x - 0.75 * leg), sign_y * (y - 0.75 * leg), under / 2.0])
-        yield f"table_leg{index}", centre, np.array([leg, leg, under]) / 2.0, (0.6, 0.48, 0.35)
 
 
 def add_solid(
