@@ -61,6 +61,8 @@ def test_a_segment_of_three_points(tmp_path, views, refused):
 
 # MJCF
 
+WEIGHT = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
+
 
 @pytest.mark.parametrize(
     ("old", "new", "says"),
@@ -72,6 +74,11 @@ def test_a_segment_of_three_points(tmp_path, views, refused):
         ('size="0.035 0.05"', 'size="-1 0.05"', "MuJoCo refuses it"),
         ('size="0.4 0.5 0.35"/>', 'size="0.4 0.5 0.35"/><freejoint/>', "'table' can move"),
         ('type="cylinder" size="0.035 0.05"', 'type="mesh" mesh="lost"', "lost"),
+        ('<geom type="box" size="0.4 0.5 0.35"/>', "", "body 'table' has no geom"),
+        (' name="crate"', "", "has no name"),
+        ('<geom type="box" size="0.08 0.09 0.05"/>', WEIGHT, "body 'crate' has no geom"),
+        ('pos="0 0 0.75"', 'pos="0 nan 0.75"', "NaN"),
+        ("<worldbody>", '<option gravity="0 0 -1e15"/><worldbody>', "unstable"),
     ],
 )
 def test_a_scene_that_cannot_be_simulated(tmp_path, refused, old, new, says):

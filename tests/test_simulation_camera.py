@@ -5,8 +5,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from conftest import SMALL_SENSOR, TWO_ON_A_TABLE
 
-from caryatid.config import NoiseConfig, SensorConfig
+from caryatid.config import NoiseConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.simulation import SimulatedCamera, load_scene, true_shapes
@@ -14,7 +15,6 @@ from caryatid.simulation.camera import add_depth_noise, axial_sigma, misregister
 from caryatid.simulation.world import SimulatedScene, scene_from_spec
 
 FROM_THE_ROBOT = transforms.look_at((-1.2, 0.1, 1.6), (0.0, 0.0, 0.8))
-SMALL = SensorConfig(width=160, height=120, focal=131.0)
 CONFIG = NoiseConfig()
 
 
@@ -24,14 +24,11 @@ def clutter() -> SimulatedScene:
 
 
 def camera(scene: SimulatedScene, noise="none", seed: int = 0) -> SimulatedCamera:
-    return SimulatedCamera(scene, noise, rng=np.random.default_rng(seed), sensor=SMALL)
+    return SimulatedCamera(scene, noise, rng=np.random.default_rng(seed), sensor=SMALL_SENSOR)
 
 
 def table_scene(extra: str = "") -> SimulatedScene:
-    xml = f"""<mujoco><worldbody>
-      <body name="table"><geom type="box" size="0.3 0.45 0.02" pos="0 0 0.73"/></body>
-      <body name="can" pos="0 0 0.8"><freejoint/><geom type="cylinder" size="0.04 0.05"/></body>
-      {extra}</worldbody></mujoco>"""
+    xml = TWO_ON_A_TABLE.replace("</worldbody>", f"{extra}</worldbody>")
     return scene_from_spec(mujoco.MjSpec.from_string(xml), "test", "test.xml")
 
 
@@ -62,11 +59,11 @@ def test_points_lie_on_the_shapes_their_labels_name(clutter):
 
 
 def test_the_default_sensor_sees_the_table_at_its_depth_straight_down():
-    T = transforms.look_at((0.2, 0.3, 1.75), (0.2, 0.3, 0.75))
+    T = transforms.look_at((0.2, 0.3, 1.7), (0.2, 0.3, 0.7))
     view = SimulatedCamera(table_scene()).capture(T)
     assert view.depth.shape == (480, 640)
     np.testing.assert_array_equal(view.K, [[525, 0, 319.5], [0, 525, 239.5], [0, 0, 1]])
-    on_table = np.abs(transforms.transform(T, view.points_camera)[..., 2] - 0.75) < 1e-6
+    on_table = np.abs(transforms.transform(T, view.points_camera)[..., 2] - 0.7) < 1e-6
     assert on_table.sum() > 1000
     np.testing.assert_allclose(view.depth[on_table], 1.0, atol=1e-6)
     assert (view.labels[on_table] == 0).all()
@@ -86,7 +83,7 @@ def test_group_3_is_not_seen_and_nothing_is_nothing():
 
 
 def test_colours_are_the_geoms_and_the_lamp_shades(clutter):
-    image = render(clutter, FROM_THE_ROBOT, camera(clutter).K, SMALL)
+    image = render(clutter, FROM_THE_ROBOT, camera(clutter).K, SMALL_SENSOR)
     red = clutter.model.geom_rgba[clutter.geoms(1)[0], :3] * 255.0
     pixels = image.rgb[image.labels == 1].astype(float)
     hue = pixels / pixels.max(axis=1, keepdims=True)
@@ -142,7 +139,6 @@ def test_misregistration_has_the_configured_size():
     traces = np.clip((np.trace(turns, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)
     rms = np.sqrt(np.mean(np.rad2deg(np.arccos(traces)) ** 2))
     assert rms == pytest.approx(CONFIG.rotation, rel=0.06)
-    assert all(transforms.as_rigid(T) is not None for T in draws[:20])
 
 
 @pytest.mark.parametrize("z", [0.6, 1.5, 2.5])
