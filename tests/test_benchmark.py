@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import sys
 from dataclasses import replace
 from itertools import product
 
@@ -334,9 +333,3 @@ def test_a_document_can_be_made_again_of_the_summary(tmp_path):
     assert [file.name for file in one] == [file.name for file in other]
     assert one[-1].read_text() == other[-1].read_text() != ""
     assert len(one) > 3
-
-
-def test_without_pandas_the_remedy_is_told(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    assert run_command("benchmark", "--out", tmp_path) == 1
-    assert 'pip install "caryatid[benchmark]"' in capsys.readouterr().err

@@ -108,7 +108,7 @@ MODULES = {
     "view": ["viser"],
     "serve": ["fastapi", "starlette", "uvicorn"],
     "ros": ["rosbags"],
-    "benchmark": ["pyarrow"],
+    "benchmark": ["pandas", "pyarrow"],
     "cluster": ["distributed", "dask"],
 }
 
@@ -153,6 +153,7 @@ WORDS = {
     "view": "view {run}",
     "serve": "serve {folder}/sessions",
     "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
+    "benchmark": "benchmark --out {folder}/bench",
     "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",
 }
 
