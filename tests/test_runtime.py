@@ -163,31 +163,17 @@ def test_only_what_changed_and_what_calls_it_is_compiled_again(package, tmp_path
     assert caplog.messages == ["compiling kernels, once after installation: about 30 s"] * 3
 
 
-def test_an_interrupted_rehearsal_is_repeated(package, monkeypatch):
-    rehearse = compiling._run_processes
-
-    def interrupted():
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(compiling, "_run_processes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        compile_kernels()
-    monkeypatch.setattr(compiling, "_run_processes", rehearse)
-    compile_kernels()
-    assert package == [[]]
-
-
-@pytest.mark.parametrize("reason", ["no compiler", "rehearsing", "frozen", "no python"])
-def test_where_nothing_can_be_compiled_beforehand_nothing_is(package, monkeypatch, reason):
-    match reason:
-        case "no compiler":
-            monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
-        case "rehearsing":
-            monkeypatch.setenv(compiling.MARK, "1")
-        case "frozen":
-            monkeypatch.setattr(sys, "frozen", True, raising=False)
-        case "no python":
-            monkeypatch.setattr(sys, "executable", "")
+@pytest.mark.parametrize(
+    "prevent",
+    [
+        lambda patch: patch.setattr(numba.config, "DISABLE_JIT", 1),
+        lambda patch: patch.setenv(compiling.MARK, "1"),
+        lambda patch: patch.setattr(sys, "frozen", True, raising=False),
+        lambda patch: patch.setattr(sys, "executable", ""),
+    ],
+)
+def test_where_nothing_can_be_compiled_beforehand_nothing_is(package, monkeypatch, prevent):
+    prevent(monkeypatch)
     compile_kernels()
     assert package == []
 
