@@ -7,7 +7,6 @@ import textwrap
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,8 @@ from pydantic import TypeAdapter, ValidationError
 
 from caryatid.config.stages import Config
 from caryatid.errors import InputError
+
+_ADAPTER = TypeAdapter(Config)
 
 
 def read_settings(file: Path | None, flags: Sequence[str], base: Config | None = None) -> Config:
@@ -58,7 +59,7 @@ def changed_settings(base: Config, document: Mapping[str, Any], source: str) -> 
         known = isinstance(values, Mapping) and stage in settings
         settings[stage] = settings[stage] | dict(values) if known else values
     try:
-        return _adapter().validate_json(json.dumps(settings, default=str), strict=True)
+        return _ADAPTER.validate_json(json.dumps(settings, default=str), strict=True)
     except ValidationError as error:
         raise _refusal(error, settings, source) from None
 
@@ -93,11 +94,6 @@ def _parse_flag(flag: str) -> dict[str, Any]:
         except tomllib.TOMLDecodeError:
             continue
     raise InputError("--set", f"'{value}' is not a TOML value", "write it as in TOML")
-
-
-@cache
-def _adapter() -> TypeAdapter[Config]:
-    return TypeAdapter(Config)
 
 
 def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -> InputError:

@@ -107,10 +107,6 @@ class _Bag:
         if not self._reader.message_count:
             raise InputError(path, "the bag is empty: it holds no message", "record it again")
 
-    def source(self, topic: str) -> str:
-        """What to call a topic in errors."""
-        return f"{self.path}: {topic}"
-
     def topics(self, kind: str) -> list[str]:
         """Topics with messages of a kind of `TYPES`, by name."""
         return sorted(topic for topic, type_ in self._types.items() if type_ in TYPES[kind])
@@ -157,13 +153,13 @@ class _Bag:
     ) -> NDArray[Any]:
         for _, _, message in self.messages([topic], received, received + 1):
             if _stamp(message.header, received) == time:
-                return decode(message, self.source(topic))
+                return decode(message, f"{self.path}: {topic}")
         raise InputError(self.path, "has been changed while it was read", "import it again")
 
 
 def _read_cameras(bag: _Bag, topic: str) -> tuple[list[TimedCamera], bool]:
     """The cameras of a topic, and whether a lens distorts."""
-    cameras, distorts, source = [], False, bag.source(topic)
+    cameras, distorts, source = [], False, f"{bag.path}: {topic}"
     for _, received, message in bag.messages([topic]):
         # ROS 1 names the matrices in capitals.
         K, D = (message.K, message.D) if hasattr(message, "K") else (message.k, message.d)

@@ -104,14 +104,12 @@ def given_candidates(
     return Candidates(rigid, sphere.direction_of(rigid), lengths, {})
 
 
-def reached_candidates(
-    robot: Robot, T_world_camera: Array, sphere: ViewSphere, centre_world: Array
-) -> Candidates:
+def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
     """What a robot reaches from where its camera (4, 4) is, as it is held or without roll.
 
     Where it cannot stand there, paths are straight lines.
     """
-    for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], centre_world)):
+    for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
         if isinstance(robot.solve(T), Posture):
             robot.move_to(T)
             return robot.candidates(sphere)

@@ -287,12 +287,10 @@ class Session:
         if candidates is not None:
             reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
         else:
-            centre_world, config = sphere.centre_world, self.scene.config
-            robot = find_robot(self.beginning.robot)(
-                Surroundings(centre_world, table_floor(self.scene), config)
-            )
+            place = Surroundings(sphere.centre_world, table_floor(self.scene), self.scene.config)
+            robot = find_robot(self.beginning.robot)(place)
             sphere = view_sphere_of(robot, sphere)
-            reachable = reached_candidates(robot, T_world_cameras[-1], sphere, centre_world)
+            reachable = reached_candidates(robot, T_world_cameras[-1], sphere)
         visited = sphere.direction_of(T_world_cameras)
         decision = next_best_view(
             self.scene, robot, visited, candidates=reachable, planner=self.beginning.planner
