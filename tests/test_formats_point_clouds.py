@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from contextlib import suppress
-from pathlib import Path
 
 import lzf
 import numpy as np
@@ -14,9 +13,8 @@ from hypothesis import strategies as st
 
 from caryatid.config import CloudConfig
 from caryatid.errors import InputError
-from caryatid.io import read_recording, read_stored_cloud
+from caryatid.io import read_stored_cloud
 
-SHARED = Path(__file__).parents[2] / "shared"
 DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgba", "<u4"), ("label", "<u4")])
 
 
@@ -242,14 +240,3 @@ def test_what_is_no_ply_is_refused(tmp_path, content):
     path = tmp_path / "a.ply"
     path.write_bytes(content)
     refused(path, "a.ply")
-
-
-@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared")
-def test_a_real_organised_cloud_agrees_with_its_recording():
-    stored = read_stored_cloud(SHARED / "data/clouds/learn22.pcd", label_divisor=10)
-    view = read_recording(SHARED / "data/mosd/learn22")[0]
-    assert len(stored.points) == 307200
-    assert (stored.labels == view.labels.ravel()).mean() > 0.999
-    kept = stored.kept & view.valid.ravel()
-    assert kept.sum() > 0.99 * stored.kept.sum()
-    assert np.abs(stored.points[kept] - view.points_camera.reshape(-1, 3)[kept]).max() < 0.002
