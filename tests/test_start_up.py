@@ -12,6 +12,7 @@ import pytest
 
 import caryatid
 import caryatid.io
+import caryatid.viz
 
 pytestmark = pytest.mark.slow
 
@@ -73,7 +74,7 @@ def declared(package):
     return {alias.name: node.module for node in imports for alias in node.names}
 
 
-@pytest.mark.parametrize("package", [caryatid, caryatid.io])
+@pytest.mark.parametrize("package", [caryatid, caryatid.io, caryatid.viz])
 def test_names_come_from_where_type_checkers_are_told(package):
     names = declared(package)
     assert names

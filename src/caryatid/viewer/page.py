@@ -217,6 +217,25 @@ class Page:
                 self._about.content = describe_object(graph, chosen, self._support)
 
 
+def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
+    """Open a page that shows what a scene knows.
+
+    Args:
+        scene: Of any number of views.
+        host: Address to listen at; at 127.0.0.1 only programs on this machine can connect.
+        port: Port to listen at, or the next free one; 0 = any that is free.
+
+    Returns:
+        The page with its `url`, `update(scene)` and `close()`; within a notebook it shows itself.
+
+    Raises:
+        InputError: viser is not installed.
+    """
+    page = Page("caryatid", scene.config.support, host=host, port=port, small=True)
+    page.update(scene)
+    return page
+
+
 # What is said beside the scene
 
 
