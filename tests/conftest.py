@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ import pytest
 
 from caryatid import cli
 from caryatid.config import Config, SensorConfig
+from caryatid.errors import InputError
 from caryatid.exploration import Step
 from caryatid.geometry import transforms
 from caryatid.io import write_recording
@@ -94,6 +96,18 @@ def step_of(graph, labels, name="a") -> Step:
     none = np.zeros((0, 3))
     sphere, cloud = ViewSphere(np.zeros(3), 1.0, none), Cloud(none, none)
     return Step(0, name, None, labels, graph, cloud, sphere, none, None, None, {}, 0.0, 0.0, None)
+
+
+@contextmanager
+def refusal(*said: object):
+    """Demand an `InputError` in one line that says all of this, and what to do."""
+    with pytest.raises(InputError) as caught:
+        yield
+    message = str(caught.value)
+    assert "\n" not in message
+    assert caught.value.remedy
+    for text in said:
+        assert str(text) in message
 
 
 def run_command(*arguments: object) -> int:

@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+from conftest import refusal
 from PIL import Image
 
 from caryatid.errors import InputError
@@ -44,15 +45,9 @@ def edit(folder, name, change):
     path.write_text(json.dumps(document))
 
 
-def refused(folder, said):
-    with pytest.raises(InputError) as caught:
+def refused(folder, *said):
+    with refusal(folder, *said):
         list(read_recording(folder))
-    message = str(caught.value)
-    assert said in message
-    assert "\n" not in message
-    assert caught.value.remedy
-    assert str(folder) in message
-    return message
 
 
 def test_what_is_written_is_read_back(folder):
@@ -103,9 +98,9 @@ def test_an_image_that_is_missing_or_truncated_is_refused(folder, name):
     content = path.read_bytes()
     for keep in (0.0, 0.3, 0.9):
         path.write_bytes(content[: int(len(content) * keep)])
-        assert name in refused(folder, "000001")
+        refused(folder, name, "000001")
     path.unlink()
-    assert name in refused(folder, "missing")
+    refused(folder, name, "missing")
 
 
 def test_a_truncated_jpeg_is_refused(folder):
@@ -129,7 +124,7 @@ def test_a_truncated_jpeg_is_refused(folder):
 )
 def test_images_of_another_size_or_kind_are_refused(folder, name, image, said):
     image.save(folder / name)
-    assert name in refused(folder, said)
+    refused(folder, name, said)
 
 
 def test_colour_of_another_size_is_refused(folder):
@@ -169,9 +164,9 @@ def test_bad_cameras_and_object_tables_are_refused(folder, name, change, said):
 @pytest.mark.parametrize("name", ["scene_camera.json", "scene_gt.json"])
 def test_broken_and_missing_json_is_refused(folder, name):
     (folder / name).write_text('{"0": ')
-    assert name in refused(folder, "broken JSON")
+    refused(folder, name, "broken JSON")
     (folder / name).unlink()
-    assert name in refused(folder, "missing")
+    refused(folder, name, "missing")
 
 
 def test_a_rotation_that_drifted_is_made_a_rotation(folder):

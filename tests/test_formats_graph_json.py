@@ -8,6 +8,7 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
+from conftest import refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -138,12 +139,8 @@ def test_a_bad_file_is_refused_with_its_name_and_the_reason(where, said):
     document = graph_to_json(SupportGraph((table, box), (Support("o0", "o1", contact_world=np.ones(3)),)))
     graph_from_json(copy.deepcopy(document), "right.json")
     change(document, *where)
-    with pytest.raises(InputError) as caught:
+    with refusal("wrong.json", said):
         graph_from_json(document, "wrong.json")
-    assert "wrong.json" in str(caught.value)
-    assert said in str(caught.value)
-    assert "\n" not in str(caught.value)
-    assert caught.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -159,11 +156,8 @@ def test_a_bad_file_is_refused_with_its_name_and_the_reason(where, said):
 def test_broken_json_is_refused_in_one_line(tmp_path, content, said):
     path = tmp_path / "graph.json"
     path.write_bytes(content)
-    with pytest.raises(InputError) as caught:
+    with refusal(path, said):
         read_graph(path)
-    assert str(path) in str(caught.value)
-    assert said in str(caught.value)
-    assert len(str(caught.value)) < 400 + len(str(path))
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import step_of
+from conftest import refusal, step_of
 
 from caryatid.config import Config
 from caryatid.errors import InputError
@@ -137,9 +137,8 @@ def test_what_is_no_run_is_never_touched(tmp_path, name):
     folder = tmp_path / "thesis"
     folder.mkdir()
     (folder / name).write_text('{"format": "something else"}')
-    with pytest.raises(InputError, match="holds other files") as caught:
+    with refusal(folder, "holds other files"):
         writer(folder)
-    assert str(folder) in str(caught.value)
     assert (folder / name).read_text() == '{"format": "something else"}'
     assert [p.name for p in tmp_path.iterdir()] == ["thesis"]
 
@@ -174,10 +173,8 @@ def test_a_disk_that_refuses_is_said_clearly_and_nothing_is_left(tmp_path, monke
         return write(path, data)
 
     monkeypatch.setattr(Path, "write_bytes", refuse)
-    with pytest.raises(InputError, match=said) as caught:
+    with refusal(tmp_path / "RUN", said):
         write_run(tmp_path / "RUN")
-    assert str(tmp_path / "RUN") in str(caught.value)
-    assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -198,6 +195,5 @@ def test_a_broken_run_is_refused(tmp_path, name, content, said):
     write_run(tmp_path / "RUN")
     path = tmp_path / "RUN" / name
     path.unlink() if content is None else path.write_bytes(content)
-    with pytest.raises(InputError, match=said) as caught:
+    with refusal(tmp_path / "RUN", said):
         read_run(tmp_path / "RUN").views[1].load_labels()
-    assert str(tmp_path / "RUN") in str(caught.value)
