@@ -41,7 +41,7 @@ def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converge
         # What is further off than 2.5 robust standard deviations loses most of its weight.
         scale = 2.5 * max(1.4826 * quantile(absolute, 0.5), NOISE_FLOOR)
         normal_equations(kind, shape, points, scale, H_all, g_all)
-        cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, shape[4])
+        cost = _cost(distance, scale, shrink, shape, columns[:size])
         improved = False
         trial_cost = cost
         for _ in range(6):
@@ -53,7 +53,7 @@ def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converge
             step = solve_positive(H, g)
             _stepped(kind, shape, step, columns, min_extent, trial)
             distance = signed_distances(kind, trial[:3], trial[3], trial[4], points)
-            trial_cost = _robust_cost(distance, scale) + shrink * _sum_of_sizes(kind, trial[4])
+            trial_cost = _cost(distance, scale, shrink, trial, columns[:size])
             if trial_cost < cost:
                 improved = True
                 shape[:] = trial
@@ -131,18 +131,12 @@ def _stepped(kind, shape, step, columns, min_extent, trial):  # type: ignore[no-
 
 
 @njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _robust_cost(distance, scale):  # type: ignore[no-untyped-def]
-    total = 0.0
+def _cost(distance, scale, shrink, shape, columns):  # type: ignore[no-untyped-def]
+    """The Geman–McClure cost of distances (N,), and the pull on the half extents, each once."""
+    total = sizes = 0.0
     for d in distance:
         squared = (d / scale) ** 2
         total += squared / (1.0 + squared)
-    return total / len(distance) * scale**2
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _sum_of_sizes(kind, half):  # type: ignore[no-untyped-def]
-    if kind == SPHERE:
-        return half[0]
-    if kind == CYLINDER:
-        return half[0] + half[2]
-    return half[0] + half[1] + half[2]
+    for column in columns[6:]:
+        sizes += shape[4, column - 6]
+    return total / len(distance) * scale**2 + shrink * sizes

@@ -114,7 +114,9 @@ class Shape(Pictured):
 
     def surface(self, spacing: float) -> tuple[Array, Array]:
         """Points (N, 3) [m] about `spacing` metres apart all over the surface, and outward normals (N, 3)."""
-        points, normals, _ = Primitives.of([self]).surface(np.array([spacing]))
+        from caryatid.geometry.signed_distance import sample_surface
+
+        points, normals = sample_surface(*Primitives.of([self]).row(0), float(spacing))
         return points, normals
 
     def mesh(self, corners: int = 48) -> Any:
@@ -383,18 +385,6 @@ class Primitives(NamedTuple):
         points = np.ascontiguousarray(points_world, np.float64)
         distances, outward = distances_and_gradients(*self.row(index), points)
         return distances, outward @ self.R[index].T
-
-    def surface(self, spacings: NDArray[np.float64]) -> tuple[Array, Array, NDArray[np.intp]]:
-        """Spread points over the surfaces, about as far apart on each as `spacings` (N,) [m] says.
-
-        Returns:
-            Points (M, 3) [m], one shape after the other, outward unit normals (M, 3), and how many are on
-            each shape (N,).
-        """
-        from caryatid.geometry.signed_distance import sample_surfaces
-
-        points, normals, counts = sample_surfaces(*self, spacings)
-        return points, normals, counts
 
     def row(self, index: int) -> tuple[int, Array, Array, Array]:
         """Code, axes (3, 3), centre (3,) [m] and half extents (3,) [m] of one shape."""

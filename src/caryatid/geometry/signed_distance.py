@@ -89,43 +89,29 @@ def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy")
-def sample_surfaces(kinds, R, centres, half, spacings):  # type: ignore[no-untyped-def]
-    """Spread points over the surfaces of S shapes, about as far apart on each as `spacings` (S,) [m] says.
-
-    Returns:
-        Points (N, 3) [m], one shape after the other, outward unit normals (N, 3), and how many are on each
-        shape (S,).
-    """
-    most = 0
-    for s in range(len(kinds)):
-        # A box has the most points of all shapes with its extents.
-        i, j = _cells(half[s, 0], spacings[s]), _cells(half[s, 1], spacings[s])
-        k = _cells(half[s, 2], spacings[s])
-        most += 2 * (i * j + j * k + k * i)
+def sample_surface(kind, R, centre, half, spacing):  # type: ignore[no-untyped-def]
+    """Points (N, 3) [m] about `spacing` metres apart all over a surface, and outward normals (N, 3)."""
+    # A box has the most points of all shapes with its extents.
+    i, j, k = _cells(half[0], spacing), _cells(half[1], spacing), _cells(half[2], spacing)
+    most, count = 2 * (i * j + j * k + k * i), 0
     points, normals = np.empty((most, 3)), np.empty((most, 3))
-    ends = np.zeros(len(kinds) + 1, dtype=np.intp)
-    for s in range(len(kinds)):
-        start = ends[s]
-        end = start
-        round_ = kinds[s] == CYLINDER
-        if kinds[s] == SPHERE:
-            end = _ball(points, normals, start, half[s, 0], spacings[s])
-        elif round_:
-            end = _mantle(points, normals, start, half[s, 0], half[s, 2], spacings[s])
-            for face in range(5, 3, -1):
-                end = _face(points, normals, end, half[s], face, spacings[s], round_)
-        else:
-            for face in range(6):
-                end = _face(points, normals, end, half[s], face, spacings[s], round_)
-        for n in range(start, end):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            u, v, w = normals[n, 0], normals[n, 1], normals[n, 2]
-            for axis in range(3):
-                a, b, c = R[s, axis, 0], R[s, axis, 1], R[s, axis, 2]
-                points[n, axis] = a * x + b * y + c * z + centres[s, axis]
-                normals[n, axis] = a * u + b * v + c * w
-        ends[s + 1] = end
-    return points[: ends[-1]], normals[: ends[-1]], ends[1:] - ends[:-1]
+    if kind == SPHERE:
+        count = _ball(points, normals, half[0], spacing)
+    elif kind == CYLINDER:
+        count = _mantle(points, normals, half[0], half[2], spacing)
+        for face in range(5, 3, -1):
+            count = _face(points, normals, count, half, face, spacing, True)
+    else:
+        for face in range(6):
+            count = _face(points, normals, count, half, face, spacing, False)
+    for n in range(count):
+        x, y, z = points[n]
+        u, v, w = normals[n]
+        for axis in range(3):
+            a, b, c = R[axis]
+            points[n, axis] = a * x + b * y + c * z + centre[axis]
+            normals[n, axis] = a * u + b * v + c * w
+    return points[:count], normals[:count]
 
 
 @njit(cache=True, error_model="numpy")
@@ -153,9 +139,9 @@ def _face(points, normals, start, half, face, spacing, disc):  # type: ignore[no
 
 
 @njit(cache=True, error_model="numpy")
-def _mantle(points, normals, start, radius, half_height, spacing):  # type: ignore[no-untyped-def]
-    """Write the points of a cylinder's mantle and return the row after the last."""
-    n, around = start, max(8, int(np.rint(2.0 * np.pi * radius / spacing)))
+def _mantle(points, normals, radius, half_height, spacing):  # type: ignore[no-untyped-def]
+    """Write the points of a cylinder's mantle and return how many they are."""
+    n, around = 0, max(8, int(np.rint(2.0 * np.pi * radius / spacing)))
     up = _cells(half_height, spacing)
     for k in range(up):
         z = half_height * (2.0 * (k + 0.5) / up - 1.0)
@@ -169,13 +155,13 @@ def _mantle(points, normals, start, radius, half_height, spacing):  # type: igno
 
 
 @njit(cache=True, error_model="numpy")
-def _ball(points, normals, start, radius, spacing):  # type: ignore[no-untyped-def]
-    """Write the points of a ball from a row on and return the row after the last."""
+def _ball(points, normals, radius, spacing):  # type: ignore[no-untyped-def]
+    """Write the points of a ball and return how many they are."""
     count = max(20, int(np.rint(4.0 * np.pi * (radius / spacing) ** 2)))
     for n in range(count):
         z = 1.0 - (2.0 * n + 1.0) / count
         ring = np.sqrt(1.0 - z * z)
         x, y = ring * np.cos(GOLDEN * n), ring * np.sin(GOLDEN * n)
-        normals[start + n, 0], normals[start + n, 1], normals[start + n, 2] = x, y, z
-        points[start + n, 0], points[start + n, 1], points[start + n, 2] = radius * x, radius * y, radius * z
-    return start + count
+        normals[n, 0], normals[n, 1], normals[n, 2] = x, y, z
+        points[n, 0], points[n, 1], points[n, 2] = radius * x, radius * y, radius * z
+    return count

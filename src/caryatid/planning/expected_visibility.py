@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry.polygons import hull
-from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
@@ -68,7 +67,10 @@ def surface_samples(graph: SupportGraph, solid: Solid) -> Samples:
     x, y, z = np.array([o.shape.extents for o in objects]).reshape(-1, 3).T
     areas = 2.0 * (x * y + y * z + z * x)
     spacings = np.maximum(np.sqrt(areas * len(objects) / SURFACE_SAMPLES), size)
-    points, normals, counts = Primitives.of([o.shape for o in objects]).surface(spacings)
+    nothing = np.zeros((0, 3))
+    surfaces = [o.shape.surface(spacing) for o, spacing in zip(objects, spacings, strict=True)]
+    points, normals = map(np.concatenate, zip((nothing, nothing), *surfaces, strict=True))
+    counts = np.array([len(found) for found, _ in surfaces], dtype=np.intp)
     subjects = np.repeat(np.arange(len(objects)), counts)
     open_ = np.flatnonzero(~solid.holds(points + 1.5 * size * normals))
     subjects = subjects[open_]

@@ -45,29 +45,24 @@ class Contact:
     distance: float
 
 
-def find_contacts(shapes: Sequence[Shape], margin: float | Sequence[float]) -> list[Contact]:
+def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
     """Find every pair of shapes whose gap is at most the margin.
 
     Args:
         shapes: In the world frame.
-        margin: Largest gap [m]; one for each shape counts by the mean of the pair.
+        margin: Largest gap [m].
 
     Returns:
         One contact a pair, sorted by (a, b).
 
     Raises:
-        InputError: A margin is negative, or there is not one for each shape.
+        InputError: The margin is negative.
     """
-    margins = np.asarray(margin, dtype=np.float64)
-    if margins.ndim and margins.shape != (len(shapes),):
-        raise InputError(
-            "margin", f"{margins.size} margins for {len(shapes)} shapes", "give one for each or one for all"
-        )
-    if not (margins >= 0.0).all():
+    if not margin >= 0.0:
         raise InputError("margin", "is negative or NaN", "give the largest gap of a contact in metres")
     if len(shapes) < 2:
         return []
-    found = _collide(shapes, np.broadcast_to(margins, len(shapes))).contact
+    found = _collide(shapes, margin).contact
     geoms = np.sort(found.geom, axis=1)
     if not len(geoms):
         return []
@@ -113,13 +108,13 @@ def find_gap(a: Shape, b: Shape) -> float:
         a: The one.
         b: The other.
     """
-    data = _collide([a, b], np.zeros(2))
+    data = _collide([a, b], 0.0)
     apart = float(np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3]))
     return float(mujoco.mj_geomDistance(data.model, data, 0, 1, apart, np.empty(6)))
 
 
-def _collide(shapes: Sequence[Shape], margins: Array) -> mujoco.MjData:
-    """Run MuJoCo's collision detection on shapes with margins (N,) [m].
+def _collide(shapes: Sequence[Shape], margin: float) -> mujoco.MjData:
+    """Run MuJoCo's collision detection on shapes up to gaps of a margin [m].
 
     The result holds until the next call in the same thread.
     """
@@ -131,7 +126,7 @@ def _collide(shapes: Sequence[Shape], margins: Array) -> mujoco.MjData:
     model.geom_rbound[:count] = np.linalg.norm(half, axis=1)
     model.geom_aabb[:count, 3:] = half
     # A pair's margin is the sum of its two geoms'.
-    model.geom_margin[:count] = model.body_margin[1 : count + 1] = margins / 2.0
+    model.geom_margin[:count] = model.body_margin[1 : count + 1] = margin / 2.0
     taken = np.arange(model.ngeom) < count
     model.geom_contype[:], model.geom_conaffinity[:] = taken, taken
     model.body_contype[1:], model.body_conaffinity[1:] = taken, taken
