@@ -125,6 +125,15 @@ def test_a_table_alone_leaves_what_it_does_not_show_as_reported():
     assert abs(twist[5]) < np.radians(0.03)
 
 
+def test_another_label_is_never_the_same_surface():
+    error = motion(translation_mm=(4.0, -3.0, 0.0))
+    first, second = seen_from(180.0, seed=1), put_right(seen_from(120.0, seed=2), error)
+    renamed = np.where(second.labels == SUPPORT_LABEL, SUPPORT_LABEL, second.labels + 10)
+    views = [first, replace(second, labels=renamed)]
+    assert left(registered(views), 1, error) > 0.004
+    assert left(registered(views, same_labels=False), 1, error) < 0.002
+
+
 def test_exact_views_stay_exact():
     views = [seen_from(a, sigma=0.0, seed=k) for k, a in enumerate((180.0, 100.0, 20.0))]
     result = registered(views)
