@@ -32,21 +32,18 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
         file = Path(scene.source).parent / TRUTH_FILE
         known = file.is_file() and not is_builtin(scene.source)
         truth = read_truth(file) if known else ground_truth(scene)
-    labels = {body: label for label, body in scene.object_bodies.items()}
-    objects = []
-    for name in truth.vertices:
-        if name in labels:
-            contains = partial(world.contains, scene, labels[name])
-            objects.append(TrueObject(name, contains, np.stack(world.bounds(scene, labels[name]))))
-        elif name != scene.table:
-            raise InputError(
-                scene.source,
-                f"gt.json names '{name}', which is no body of the scene",
-                f"the bodies are {', '.join((scene.table, *labels))}",
-            )
+    labels = {scene.table: 0} | {body: label for label, body in scene.object_bodies.items()}
+    if strange := [name for name in truth.vertices if name not in labels]:
+        why = f"gt.json names '{strange[0]}', which is no body of the scene"
+        raise InputError(scene.source, why, f"the bodies are {', '.join(labels)}")
+    solids = [(name, labels[name]) for name in truth.vertices if name != scene.table]
+    objects = tuple(
+        TrueObject(name, partial(world.contains, scene, label), np.stack(world.bounds(scene, label)))
+        for name, label in solids
+    )
     table = scene.table if scene.table in truth.vertices else None
     height = float(world.table_centre(scene)[2])
-    return TrueScene(truth.vertices, frozenset(truth.pairs), tuple(objects), table, height)
+    return TrueScene(truth.vertices, frozenset(truth.pairs), objects, table, height)
 
 
 def evaluate_run(

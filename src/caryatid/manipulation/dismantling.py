@@ -82,7 +82,7 @@ def dismantle(
             yield Taken(step, None, held, (), np.zeros((0, len(names), 7)))
             continue
         lift = lifting.lift(state, names.index(body), config.lift, held=[names.index(h) for h in held])
-        state = lift.state
+        state = lift.film[-1]
         gone.add(body)
         yield Taken(step, body, held, tuple(names[k] for k in np.flatnonzero(lift.disturbed)), lift.film)
 

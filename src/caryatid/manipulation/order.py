@@ -8,7 +8,7 @@ not seen: there it is held, and the support graph alone says what it needs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -150,19 +150,15 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
         tried.append(trial)
     tried.sort(key=lambda t: (t.risk, len(t.harmed)))
     best = tried[0]
-    for trial in _with_hold(rehearsal, tried) if hands > 1 else ():
+    # The other hand holds one of those that were disturbed, the most often first.
+    holds = ((t.object_id, held) for t in tried for held in sorted(t.harmed, key=lambda i: (-t.harmed[i], i)))
+    for object_id, held in holds if hands > 1 else ():
+        trial = rehearsal.try_lift(object_id, [held])
         if trial.risk < best.risk:
             best = trial
         if best.risk == 0.0:
             break
     return best, tried
-
-
-def _with_hold(rehearsal: _Rehearsal, tried: Sequence[_Trial]) -> Iterator[_Trial]:
-    """The same lifts while the other hand holds one of those that were disturbed, the most often first."""
-    for trial in tried:
-        for held in sorted(trial.harmed, key=lambda i: (-trial.harmed[i], i)):
-            yield rehearsal.try_lift(trial.object_id, [held])
 
 
 def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], draws: int) -> TakeStep:
@@ -225,7 +221,14 @@ class _Rehearsal:
         """Lift an object in every scene, others being held; nothing changes, and it is done only once."""
         asked = (object_id, *sorted(hold))
         if asked not in self._trials:
-            lifts = self._each(lambda k: self._lift(k, object_id, hold))
+            index, held = self.ids.index(object_id), {self.ids.index(i) for i in hold}
+
+            def lift(k: int) -> Lift:
+                also = set(np.flatnonzero(self._restless[k]).tolist()) - {index}
+                state, how = self._states[k], self._config.lift
+                return self._liftings[k].lift(state, index, how, held=held | also, to_the_end=False)
+
+            lifts = self._each(lift)
             harm = np.stack([lift.disturbed for lift in lifts])
             # What is held in a scene, because it does not stay there, must not lose a support of the graph.
             needs = {s.supported for s in self._graph.supports if s.supporter == object_id} - set(hold)
@@ -242,16 +245,9 @@ class _Rehearsal:
         self._trials.clear()
         moved = np.array([lift.disturbed.any() for lift in trial.lifts])
         stays = self._restless | moved[:, None]
-        after = np.stack([lift.state for lift in trial.lifts])
+        after = np.stack([lift.film[-1] for lift in trial.lifts])
         self._states = np.where(stays[..., None], self._states, after)
         self._states[:, index, :3] = (0.0, 0.0, ASIDE + index)
-
-    def _lift(self, k: int, object_id: str, hold: Collection[str]) -> Lift:
-        index = self.ids.index(object_id)
-        held = {self.ids.index(i) for i in hold} | set(np.flatnonzero(self._restless[k]).tolist())
-        return self._liftings[k].lift(
-            self._states[k], index, self._config.lift, held=held - {index}, to_the_end=False
-        )
 
     def _each(self, do: Callable[[int], Any]) -> list[Any]:
         """Do something for every scene, in order."""

@@ -37,16 +37,11 @@ class Lift:
 
     Attributes:
         disturbed: Which objects (N,) were moved or turned beyond the limits; not what was lifted or gone.
-        film: States (T, N, 7) on the way, one each quarter of a second.
+        film: States (T, N, 7) on the way, one each quarter of a second; the last one is that afterwards.
     """
 
     disturbed: NDArray[np.bool_]
     film: Array
-
-    @property
-    def state(self) -> Array:
-        """State (N, 7) afterwards."""
-        return np.asarray(self.film[-1])
 
 
 class Lifting:
