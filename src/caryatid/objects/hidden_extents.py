@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -22,23 +22,8 @@ LEAST = 0.0005
 """Gaps below this are none [m]."""
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Face:
-    """One side of a box, or one end of a cylinder.
-
-    Attributes:
-        axis: Of the object, which the face is across.
-        sign: Of the axis, along which the face is outermost.
-        outward_world: Its normal (3,).
-        points_world: Points (N, 3) [m] all over it, rim included.
-        rim_world: Its rim (M, 3) [m], drawn in to lie inside the shape's walls.
-    """
-
-    axis: int
-    sign: float
-    outward_world: Array
-    points_world: Array
-    rim_world: Array
+Face = tuple[Array, Array]
+"""Points (N, 3) [m] all over a side, and its rim (M, 3), drawn in to lie inside the shape's walls."""
 
 
 def complete(
@@ -79,51 +64,53 @@ def _extended(
     down_world = sign * shape.T_world_object[:3, axis]
     upright = -down_world[2] >= np.cos(np.radians(config.max_tilt))
     if upright and not candidate.seen[2 * axis + (sign > 0)]:
-        bottom = _face(shape, axis, sign, config)
-        lowest = float(surface.height(bottom.points_world).min())
+        bottom = _face(shape, axis, sign)
+        lowest = float(surface.height(bottom[0]).min())
         to_table = lowest / -float(down_world @ surface.normal_world)
         if to_table <= 0.0:
             candidate = replace(candidate, shape=_lengthened(shape, axis, sign, to_table))
         else:
             aim = "down to the table"
-            candidate = _moved_out(candidate, bottom, to_table, aim, others, voxels, config)
-    hidden = _depth_side(candidate, config)
-    if hidden is None or isinstance(candidate.shape, Sphere) or (upright and hidden[0] == axis):
+            candidate = _moved_out(candidate, (axis, sign), bottom, to_table, aim, others, voxels, config)
+    hidden = _depth_side(candidate)
+    if hidden is None or (upright and hidden[0] == axis):
         return candidate
     extents = candidate.shape.extents
     guess = float(np.delete(extents, hidden[0]).min()) - float(extents[hidden[0]])
-    back = _face(candidate.shape, *hidden, config)
-    return _moved_out(candidate, back, guess, "as deep as it is wide", others, voxels, config)
+    back = _face(candidate.shape, *hidden)
+    return _moved_out(candidate, hidden, back, guess, "as deep as it is wide", others, voxels, config)
 
 
 def _moved_out(
     candidate: SceneObject,
-    face: _Face,
+    side: tuple[int, float],
+    face: Face,
     limit: float,
     aim: str,
     others: Sequence[Shape],
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
-    """Move one side outwards up to a limit [m], another shape or free space, whichever comes first."""
-    shape = candidate.shape
-    if isinstance(shape, Sphere) or limit < LEAST:
+    """Move a side (axis, sign) outwards up to a limit [m], another shape or free space: what comes first."""
+    if limit < LEAST:
         return candidate
+    (axis, sign), (points, rim) = side, face
+    outward = sign * candidate.shape.T_world_object[:3, axis]
     length, reason = limit, f"is taken to reach {aim}"
-    to_object = _way_to_others(face, limit, others, config)
+    to_object = _way_to_others(points, outward, limit, others, config)
     if to_object < length:
         length, reason = to_object, "ends at the next object"
-    to_free = _free_before(face, length, voxels, config)
+    to_free = _free_before(rim, outward, length, voxels, config)
     if to_free < length:
         length, reason = to_free, "ends where free space was seen"
     if length < LEAST:
         return candidate
     why = f"a side that was not seen {reason}, {1000 * length:.0f} mm further"
     why = f"{candidate.why}; {why}" if candidate.why else why
-    return replace(candidate, shape=_lengthened(shape, face.axis, face.sign, length), why=why)
+    return replace(candidate, shape=_lengthened(candidate.shape, axis, sign, length), why=why)
 
 
-def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, float] | None:
+def _depth_side(candidate: SceneObject) -> tuple[int, float] | None:
     """The hidden side (axis, sign) opposite the only one seen, where the points say nothing of the depth."""
     seen = np.flatnonzero(candidate.seen)
     if len(seen) != 1:
@@ -135,10 +122,11 @@ def _depth_side(candidate: SceneObject, config: CompletionConfig) -> tuple[int, 
     return (axis, -1.0 if side else 1.0) if candidate.shape.extents[axis] <= 0.02 else None
 
 
-def _way_to_others(face: _Face, limit: float, others: Sequence[Shape], config: CompletionConfig) -> float:
-    """How far [m] a face can move before it meets another shape, by sphere tracing."""
-    points, outward, shapes = face.points_world, face.outward_world, Primitives.of(others)
-    middle = points.mean(axis=0)
+def _way_to_others(
+    points: Array, outward: Array, limit: float, others: Sequence[Shape], config: CompletionConfig
+) -> float:
+    """How far [m] points (N, 3) can move before they meet another shape, by sphere tracing."""
+    shapes, middle = Primitives.of(others), points.mean(axis=0)
     # No ball around a shape that is further than the limit from the one around the face bounds a step.
     to_centres = shapes.centres - middle
     ahead = np.clip(to_centres @ outward, 0.0, limit)
@@ -155,13 +143,15 @@ def _way_to_others(face: _Face, limit: float, others: Sequence[Shape], config: C
     return limit
 
 
-def _free_before(face: _Face, limit: float, voxels: VoxelMap, config: CompletionConfig) -> float:
-    """How far [m] a face can move before its rim lies in space seen free."""
+def _free_before(
+    rim: Array, outward: Array, limit: float, voxels: VoxelMap, config: CompletionConfig
+) -> float:
+    """How far [m] a rim (M, 3) can move before it lies in space seen free."""
     lengths = np.append(0.0, np.cumsum(np.full(int(limit / config.step) + 1, config.step)))
     lengths = lengths[limit - lengths > config.step]
     if not len(lengths):
         return limit
-    middles = face.rim_world + (lengths[:, None] + config.step / 2.0)[:, None] * face.outward_world
+    middles = rim + (lengths[:, None] + config.step / 2.0)[:, None] * outward
     free = voxels.state_at(middles.reshape(-1, 3)).reshape(len(lengths), -1) == FREE
     stops = np.flatnonzero(free.mean(axis=1) > config.max_free)
     return float(lengths[stops[0]]) if len(stops) else limit
@@ -173,7 +163,7 @@ def _downward_side(shape: Shape) -> tuple[int, float]:
     return axis, 1.0 if down[axis] >= 0.0 else -1.0
 
 
-def _face(shape: Shape, axis: int, sign: float, config: CompletionConfig) -> _Face:
+def _face(shape: Shape, axis: int, sign: float) -> Face:
     across = [(axis + 1) % 3, (axis + 2) % 3]
     half = shape.extents / 2.0
     u, v = (_ticks(half[k], SPACING) for k in across)
@@ -189,9 +179,7 @@ def _face(shape: Shape, axis: int, sign: float, config: CompletionConfig) -> _Fa
     # A voxel inside the walls, so that their noise says nothing.
     rim[:, across] *= np.maximum(1.0 - 0.01 / half[across], 0.0)
     T = shape.T_world_object
-    return _Face(
-        axis, sign, sign * T[:3, axis], transforms.transform(T, points), transforms.transform(T, rim)
-    )
+    return transforms.transform(T, points), transforms.transform(T, rim)
 
 
 def _ticks(half: float, spacing: float) -> Array:

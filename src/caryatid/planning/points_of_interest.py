@@ -11,7 +11,7 @@ import numpy as np
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.graph import SceneObject, SupportGraph
 from caryatid.sensing.view_sphere import ViewSphere, spread
 
 
@@ -63,7 +63,13 @@ def points_of_interest(
             position = (centres[support.supporter] + centres[support.supported]) / 2.0
             if config.edge_point == "contact" and support.contact_world is not None:
                 position = support.contact_world
-            points.append(_relation(support, position, sphere, len(visited), config))
+            offset = position - sphere.centre_world
+            length = math.sqrt(offset @ offset)
+            direction = offset / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
+            saliency = relation_saliency(support.occurrences, len(visited), config)
+            found = f"found in {support.occurrences} of {len(visited)} views"
+            why = f"{support.supporter} supports {support.supported}: {found}"
+            points.append(PointOfInterest(position, direction, saliency, support.pair, why))
     return points
 
 
@@ -132,14 +138,3 @@ def _looked_at(subject: SceneObject, sphere: ViewSphere, azimuth: float, reason:
     gap = f"the largest gap between views is at {np.rad2deg(azimuth):.0f}°"
     # Its saliency is the largest eq. 2 can give.
     return PointOfInterest(position, middle, 1.0, (subject.id,), f"{reason}; {gap}")
-
-
-def _relation(
-    support: Support, position: Array, sphere: ViewSphere, views: int, config: ActiveVisionConfig
-) -> PointOfInterest:
-    offset = position - sphere.centre_world
-    length = math.sqrt(offset @ offset)
-    direction = offset / length if length > 1e-6 else np.array([0.0, 0.0, 1.0])
-    saliency = relation_saliency(support.occurrences, views, config)
-    why = f"{support.supporter} supports {support.supported}: found in {support.occurrences} of {views} views"
-    return PointOfInterest(position, direction, saliency, support.pair, why)
