@@ -7,7 +7,7 @@ import pytest
 from synthetic import box, sphere, surface_points
 
 from caryatid.config import SegmentationConfig
-from caryatid.objects.association import associate
+from caryatid.objects.models import associate
 
 CONFIG = SegmentationConfig()
 CRATE, BALL = box((0.0, 0.0, 0.8), (0.1, 0.12, 0.1)), sphere((0.3, 0.0, 0.79), 0.04)
