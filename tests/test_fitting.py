@@ -400,14 +400,13 @@ def map_with(free) -> VoxelMap:
     return replace(nothing, passes=passes)
 
 
-@pytest.mark.parametrize("kind", ["box", "cylinder", "sphere"])
-def test_half_of_a_shape_in_free_space_is_half_free(kind):
-    at = (0.0, 0.0, 0.2)
-    shape = {
-        "box": box(at, (0.2, 0.1, 0.12)),
-        "cylinder": cylinder(at, 0.07, 0.12),
-        "sphere": sphere(at, 0.08),
-    }[kind]
+MIDDLE = (0.0, 0.0, 0.2)
+
+
+@pytest.mark.parametrize(
+    "shape", [box(MIDDLE, (0.2, 0.1, 0.12)), cylinder(MIDDLE, 0.07, 0.12), sphere(MIDDLE, 0.08)]
+)
+def test_half_of_a_shape_in_free_space_is_half_free(shape):
     assert free_share(shape, map_with(lambda p: p[:, 0] > 0.0), INSET) == pytest.approx(0.5, abs=0.1)
     assert free_share(shape, map_with(lambda p: p[:, 0] > 1.0), INSET) == 0.0
     assert free_share(shape, map_with(lambda p: p[:, 0] > -9.0), INSET) == 1.0

@@ -124,17 +124,12 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
     Raises:
         InputError: There is no object with one of the ids, or both are the same.
     """
-    for name in (supporter, supported):
-        if name not in {o.id for o in graph.objects}:
-            raise InputError(
-                name, "no such object in the graph", f"there are {', '.join(o.id for o in graph.objects)}"
-            )
+    a, b = _known(graph, supporter), _known(graph, supported)
     if supporter == supported:
         raise InputError(supporter, "an object does not support itself", "ask about two different objects")
     edge = graph.support(supporter, supported)
     if edge is not None:
         return edge.why
-    a, b = graph[supporter], graph[supported]
     if b.role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
     touch = next(iter(_find_touches([a, b], config.reach, config)[b.id]), None)
@@ -172,10 +167,7 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
     Raises:
         InputError: There is no such object, or it is the support surface.
     """
-    ids = {o.id: o for o in graph.objects}
-    if object_id not in ids:
-        raise InputError(object_id, "no such object in the graph", f"there are {', '.join(ids)}")
-    if ids[object_id].role == "support_surface":
+    if _known(graph, object_id).role == "support_surface":
         raise InputError(object_id, "is the support surface", "ask about one of the objects on it")
     effects: dict[str, Effect] = {}
     for certain in (True, False):
@@ -189,12 +181,17 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
     return tuple(effects.values())
 
 
+def _known(graph: SupportGraph, object_id: str) -> SceneObject:
+    """The object of that id; an InputError where there is none."""
+    for o in graph.objects:
+        if o.id == object_id:
+            return o
+    there = ", ".join(o.id for o in graph.objects)
+    raise InputError(object_id, "no such object in the graph", f"there are {there}")
+
+
 def _next_effect(
-    graph: SupportGraph,
-    gone: Collection[str],
-    known: Collection[str],
-    certain: bool,
-    config: SupportConfig,
+    graph: SupportGraph, gone: Collection[str], known: Collection[str], certain: bool, config: SupportConfig
 ) -> Effect | None:
     """One more object that moves once some are gone: for certain, or perhaps."""
     staying = [o for o in graph.objects if o.id not in gone]
