@@ -5,7 +5,8 @@ import pytest
 
 from caryatid.config import MaskConfig
 from caryatid.errors import InputError
-from caryatid.segmentation.masks import labels_from_masks
+from caryatid.sensing.masks import labels_from_masks
+from caryatid.sensing.views import View
 
 
 def square(first, last, size=60):
@@ -44,6 +45,17 @@ def test_a_mask_nearly_covered_by_smaller_ones_leaves_no_crumbs():
     assert np.unique(labels).tolist() == [0, 2, 3]
 
 
+def test_of_overlapping_scores_the_largest_is_on_top():
+    """Columns 22 to 27 are in both, where the second is surer; a pixel below one half is in neither."""
+    scores = np.zeros((2, 60, 60))
+    scores[0, :, 5:28], scores[1, :, 22:45], scores[1, :, 45:] = 0.7, 0.8, 0.4
+    labels = labels_from_masks(scores)
+    assert labels[30, [4, 5, 21, 22, 44, 45]].tolist() == [0, 1, 1, 2, 2, 0]
+    view = View(np.ones((60, 60)), np.array([[60.0, 0, 30], [0, 60, 30], [0, 0, 1]]), labels=scores)
+    np.testing.assert_array_equal(view.labels, labels)
+    assert view.labels_are == "segments"
+
+
 def test_bytes_are_masks_too_and_nothing_is_changed():
     masks = np.stack([square(5, 30), square(31, 50)])
     given = masks.astype(np.uint8) * 255
@@ -58,7 +70,7 @@ def test_bytes_are_masks_too_and_nothing_is_changed():
         ([], None, "shape"),
         (square(5, 30), None, "shape"),
         ([square(5, 30), square(5, 30, size=50)], None, "size"),
-        ([square(5, 30) * 0.7], None, "threshold"),
+        ([square(5, 30) * 7], None, "threshold"),
         ([square(5, 30)], [0.5, 0.6], "scores"),
         ([square(5, 30)], [np.nan], "scores"),
     ],

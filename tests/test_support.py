@@ -33,7 +33,7 @@ from caryatid.support.stability import (
 )
 
 CONFIG = SupportConfig()
-PAPER = replace(CONFIG, top_down="paper")
+PAPER = replace(CONFIG, stability="area")
 PLAUSIBLE = PlausibilityConfig()
 TABLE = Box(rigid(np.eye(3), (0.0, 0.0, -0.02)), np.array([1.0, 1.0, 0.04]))
 SURFACE = SceneObject("o0", 0, TABLE, "support_surface")
@@ -331,10 +331,17 @@ class TestInfer:
         assert "90.0 mm outside" in held.why
         assert "rests on it 50.0 mm behind the edge" in held.why
 
-    def test_a_load_on_the_tipping_side_helps_only_on_paper(self):
+    def test_on_paper_only_the_support_area_ratio_counts(self):
+        """The plank, 36 cm × 6 cm, touches its block over 9 cm × 6 cm: r_s = 9/36 = 0.25, eq. 1."""
         objects = counterweight(load_x=0.2)
         assert ("o3", "o2") not in edges(infer(objects, CONFIG))
-        assert edges(infer(objects, PAPER))["o3", "o2"] == "top-down"
+        stable = infer(objects, PAPER)
+        assert stable.stability["o2"].ratio == pytest.approx(0.25)
+        assert stable.stability["o2"].stable
+        assert ("o3", "o2") not in edges(stable)
+        unstable = infer(objects, replace(PAPER, min_area_ratio=0.26))
+        assert edges(unstable)["o3", "o2"] == "top-down"
+        assert not unstable.support("o3", "o2").certain
 
     def test_paper_goes_by_the_area_ratio_too(self):
         ball = scene(Sphere(at(0, 0, 0.1), 0.1), block(0, 0, 0.2, (0.1, 0.1, 0.02)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 from collections import Counter
 from dataclasses import replace
 from time import perf_counter
@@ -31,6 +32,9 @@ from caryatid.support.relations import Effect, explain, infer, predict_removal
 
 if TYPE_CHECKING:
     import networkx as nx
+
+
+log = logging.getLogger(__name__)
 
 
 class Scene(Pictured):
@@ -146,23 +150,28 @@ class Scene(Pictured):
         watch = Stopwatch()
         rng = np.random.default_rng([self.seed, self.views])
         given = source.labels is not None and self.segmentation != "auto"
+        named = given and self._named(source)
         observation = observe(
             source, self.config, segmentation=self.segmentation, known=self.surface, rng=rng
         )
         watch.lap("segment")
-        observation, moved = self._registered(observation, given)
+        observation, moved = self._registered(observation, named)
         watch.lap("register")
-        if not given and self.config.fusion.method != "sg":
-            observation = self._models.associate(observation)
+        if not named and (given or self.config.fusion.method != "sg"):
+            observation = self._models.associate(observation, masks=given)
+        if named and self.views:
+            self._check_identity(observation, source.name)
         shown = self._models.add(observation, self.views) | moved
         self.surface = self._fused_surface(observation)
         surface, voxels = self._bounds(observation)
         watch.lap("map")
-        observation = self._fitted(observation, shown, given)
+        observation = self._fitted(observation, shown, given, named)
         watch.lap("fit")
-        completed = complete(self._models.objects(), surface, voxels, self.config.completion)
+        fitted = self._models.objects()
+        if self.config.completion.enabled:
+            fitted = complete(fitted, surface, voxels, self.config.completion)
         table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
-        plausible = reconcile([table, *completed], self.config.plausibility)
+        plausible = reconcile([table, *fitted], self.config.plausibility)
         newest = infer(plausible, self.config.support)
         watch.lap("infer")
         observation = self._fused(observation, newest, given)
@@ -173,7 +182,23 @@ class Scene(Pictured):
         self.timings = watch.laps
         return self.graph
 
-    def _registered(self, observation: Observation, given: bool) -> tuple[Observation, set[int]]:
+    def _named(self, source: View | Cloud) -> bool:
+        """Whether a label means the same object in all views."""
+        if isinstance(source, View) and source.labels_are == "segments":
+            return False
+        return self.config.fusion.matching == "points" and self.config.masks.identity == "scene"
+
+    def _check_identity(self, observation: Observation, name: str) -> None:
+        """Warn where most masks lie on other objects than earlier masks of the same number."""
+        elsewhere, known = self._models.misplaced(observation)
+        if 2 * elsewhere > known:
+            log.warning(
+                "%s: %d of %d masks lie on objects that had other numbers; if a number means nothing in "
+                "another view, use --masks per-view",
+                name, elsewhere, known,
+            )  # fmt: skip
+
+    def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:
         """Lay the view onto the earlier ones and move those by what it shows of them.
 
         Returns:
@@ -183,7 +208,7 @@ class Scene(Pictured):
             return observation, set()
         if self._registration is None:
             self._registration = ViewRegistration(observation.surface.point_world, self.config.registration)
-        moves = self._registration.add(observation.cloud, same_labels=given)
+        moves = self._registration.add(observation.cloud, same_labels=named)
         moved = self._models.move({v: T for v, T in moves.items() if v < self.views})
         return observation.moved(moves[self.views]), moved
 
@@ -212,26 +237,27 @@ class Scene(Pictured):
             newest = newest.integrate(observation.view, max_depth)
         return observation.surface, newest
 
-    def _fitted(self, observation: Observation, shown: set[int], given: bool) -> Observation:
+    def _fitted(self, observation: Observation, shown: set[int], given: bool, named: bool) -> Observation:
         """Fit what this view changed; automatic segments are divided and united as the shapes suggest."""
         if self.config.fusion.method == "sg":
-            self._models.fit_newest(shown)
+            self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL})
             return observation
         self._models.fit_all(shown, self.voxels)
-        if given:
+        if named:
             return observation
-        changed = self._models.divide(shown, self.voxels)
+        changed = set() if given else self._models.divide(shown, self.voxels)
         if changed:
             observation = self._models.nearest(observation, changed)
         given_up = self._models.unite(shown | changed, self.voxels)
-        names = {object_id(old): object_id(new) for old, new in given_up.items()}
-        self._graphs = tuple(renamed(graph, names) for graph in self._graphs) if names else self._graphs
+        if given_up and self.config.fusion.matching == "points":
+            names = {object_id(old): object_id(new) for old, new in given_up.items()}
+            self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
         return observation.relabelled(given_up)
 
     def _fused(self, observation: Observation, newest: SupportGraph, given: bool) -> Observation:
         """Add the newest graph to the earlier ones; its labels become those of the fused objects."""
         config = self.config.fusion
-        same_labels = given or config.method != "sg"
+        same_labels = config.matching == "points" and (given or config.method != "sg")
         self._graphs, names = fuse(self._graphs, newest, config, same_labels=same_labels)
         observation = observation.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
         seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}

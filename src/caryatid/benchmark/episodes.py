@@ -14,8 +14,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
-from caryatid.config.settings import read_settings
+from caryatid.config import Config, FusionMethod, NoiseModel, Preset, SegmentationMethod
+from caryatid.config.settings import preset, read_settings
 from caryatid.errors import InputError, in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, TrueScene, score
@@ -61,7 +61,8 @@ class Episode:
         plugin: Digest of the package that offers the planner; empty for built-in planners.
         segmentation: Where segments come from.
         noise: Noise of the camera.
-        settings: Changes of the default settings, `stage.name=value`.
+        preset: Settings to start from.
+        settings: Changes of these, `stage.name=value`.
         views: Number of views, including the first.
         seed: Seed of the noise and of every choice.
         order: How the objects are ordered for removal; empty where nothing is removed.
@@ -74,6 +75,7 @@ class Episode:
     plugin: str = ""
     segmentation: SegmentationMethod = "labels"
     noise: NoiseModel = "carmine"
+    preset: Preset = "default"
     settings: tuple[str, ...] = ()
     views: int = 5
     seed: int = 0
@@ -111,7 +113,7 @@ def settings_of(episode: Episode) -> Config:
         InputError: A setting does not exist or its value is not valid.
     """
     own = f"fusion.method={episode.fusion}", f"active.max_views={episode.views}"
-    return read_settings(None, (*own, *episode.settings))
+    return read_settings(None, (*own, *episode.settings), preset(episode.preset))
 
 
 def find_scenes(sources: Iterable[str]) -> list[str]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from caryatid.benchmark.episodes import ORDERS, Episode, content_of, family, find_scenes, plugin_of
 from caryatid.benchmark.store import Member
-from caryatid.config import Config, FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config import Config, FusionMethod, NoiseModel, Preset, SegmentationMethod
 from caryatid.config.settings import read_settings
 from caryatid.errors import InputError
 from caryatid.planning.planners import VOLUMETRIC
@@ -81,6 +81,7 @@ def change_suite(
     fusions: Sequence[FusionMethod] = (),
     segmentations: Sequence[SegmentationMethod] = (),
     noises: Sequence[NoiseModel] = (),
+    preset: Preset | None = None,
     settings: Sequence[str] = (),
     scenes: Sequence[str] = (),
     seeds: int | None = None,
@@ -94,6 +95,7 @@ def change_suite(
         fusions: How each of its planners fuses; methods that differ in their fusion alone become one.
         segmentations: Take the place of its conditions, together with every noise.
         noises: Of the camera.
+        preset: Settings to start from in all episodes.
         settings: Changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
         scenes: Built-in names, scene folders and folders of them.
         seeds: Number of seeds.
@@ -119,6 +121,8 @@ def change_suite(
             f"{segments[s]}, {cameras[n]}": {"segmentation": s, "noise": n}
             for s, n in product(segmentations or ("labels",), noises or ("carmine",))
         }
+    if preset is not None:
+        methods = {label: {**own, "preset": preset} for label, own in methods.items()}
     options = {"fusion.method": "--fusion", "active.max_views": "--views"}
     for setting in settings:
         if option := options.get(setting.partition("=")[0].strip()):
@@ -175,9 +179,20 @@ _SUPPORT = _BOTH | {
     "effort 0": "active.effort=0.0",
     "effort 0.15": "active.effort=0.15",
 }
+_PAPER: dict[str, Any] = {"planner": "paper", "preset": "paper"}
+_DEPARTURES = {
+    "with registration": ("registration.enabled=true",),
+    "with completion": ("completion.enabled=true",),
+    "with plausibility": ("plausibility.rounds=3",),
+    "with balance": ("support.stability=balance", "support.max_drop=0.04"),
+    "with contact margins": ("support.margin_sigma=2.0", "support.reach=0.012", "support.gentle_tilt=25.0"),
+    "matched by points": ("fusion.matching=points",),
+    "edges kept by share": ("fusion.keep_share=0.5",),
+}
+"""What the default settings do otherwise than the paper, one at a time."""
 _TOP_DOWN: Changes = {  # only the paper's rule asks for the ratio
     f"top-down by r_s,min {ratio:g}": {
-        "settings": ("support.top_down=paper", f"support.min_area_ratio={ratio:g}")
+        "settings": ("support.stability=area", f"support.min_area_ratio={ratio:g}")
     }
     for ratio in (0.05, 0.1, 0.2)
 }
@@ -220,6 +235,26 @@ _ALL = (
         _FIG5,
         (*DESIGNED, *PILES, *DENSE[:16]),
         views=10,
+    ),
+    Suite(
+        "fig5-paper",
+        "The paper's Fig. 5 by the paper's own system: its preset and planner, against random views.",
+        {label: {"planner": "paper", "preset": "paper", **own} for label, own in _FIG5.items()},
+        MIXED,
+        seeds=1,
+        views=10,
+    ),
+    Suite(
+        "presets",
+        "What the departures from the paper change, over the same scenes.",
+        {
+            "default": {},
+            "paper": _PAPER,
+            **{f"paper, {label}": {**_PAPER, "settings": own} for label, own in _DEPARTURES.items()},
+        },
+        MIXED,
+        seeds=1,
+        reference="paper",
     ),
     Suite(
         "planners",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from caryatid.cli import options
-from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config.choices import FusionMethod, NoiseModel, Preset, SegmentationMethod
 from caryatid.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from caryatid.benchmark.store import ResultStore
 
 SUITES = (
-    "smoke", "fig5", "planners", "path", "ablation", "ablation-attention", "poses", "noise", "dismantle",
-    "full",
+    "smoke", "fig5", "fig5-paper", "presets", "planners", "path", "ablation", "ablation-attention", "poses",
+    "noise", "dismantle", "full",
 )  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
 
@@ -54,6 +54,8 @@ class Benchmark(options.Command):
     """Segmentation instead of the suite's conditions; may be repeated. Default: labels."""
     noise: options.Several[NoiseModel] = ()
     """Noise of the camera, instead of the suite's conditions; may be repeated. Default: carmine."""
+    preset: Annotated[Preset | None, options.one_of(Preset), options.shown(default="the suite's")] = None
+    """Settings to start from in all episodes: caryatid's own, or those of the paper."""
     set: Annotated[options.Words, options.shown("STAGE.NAME=VALUE")] = ()
     """One setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
     seeds: Annotated[options.OptionalCount, options.shown(default="the suite's")] = None
@@ -93,6 +95,7 @@ class Benchmark(options.Command):
                 fusions=self.fusion,
                 segmentations=self.segmentation,
                 noises=self.noise,
+                preset=self.preset,
                 settings=self.set,
                 scenes=self.scenes,
                 seeds=self.seeds,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from caryatid.config.choices import FusionMethod, NoiseModel, SegmentationMethod
+from caryatid.config.choices import FusionMethod, MaskIdentity, NoiseModel, Preset, SegmentationMethod
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
@@ -130,14 +130,23 @@ class Settings:
 class Modelling(Settings):
     """How views become a scene model."""
 
+    preset: Annotated[Preset, one_of(Preset)] = "default"
+    """Settings to start from: caryatid's own, or those of the paper."""
     fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
     """What to fuse over views: points, graphs, or both."""
+    masks: Annotated[MaskIdentity | None, one_of(MaskIdentity), default_of("masks.identity")] = None
+    """What the number of a mask means: an object in all views, or a segment of one view."""
     seed: Annotated[int, whole_number(0)] = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""
 
     def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
-        """The configuration, as `Settings.read` returns it, with --fusion."""
-        return super().read({"fusion.method": self.fusion, **(options or {})}, base)
+        """The configuration, as `Settings.read` returns it, with the options here."""
+        from caryatid.config.settings import preset
+
+        base = base or preset(self.preset)
+        return super().read(
+            {"fusion.method": self.fusion, "masks.identity": self.masks, **(options or {})}, base
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,10 +178,15 @@ class LookingCommand(Command):
 class PlanningCommand(LookingCommand):
     """A command that plans where to look next."""
 
-    planner: Annotated[str, planner_name()] = "support"
+    planner: Annotated[str | None, planner_name(), shown(default="support, or paper with that preset")] = None
     """Planner of the next view; oracle knows the ground truth and needs a simulation."""
     robot: Annotated[str, tyro.conf.arg(metavar="NAME")] = "humanoid"
     """Robot that carries the camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
+
+    @property
+    def chosen_planner(self) -> str:
+        """The planner, where none is given that of the preset."""
+        return self.planner or ("paper" if self.settings.preset == "paper" else "support")
 
 
 @dataclass(frozen=True, kw_only=True)

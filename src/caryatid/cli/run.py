@@ -80,7 +80,7 @@ class Exploring(options.ExploringCommand):
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         with self.output.working("opening"):
             source = open_source(self.source, config, noise=self.noise, robot=self.robot, **known)
-        planner, camera = planner_for(self.planner, source.camera, source.truth, config, **known)
+        planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "early_stop": not self.no_early_stop}
         return source, explore(camera, source.robot, **known)
 
@@ -248,9 +248,11 @@ class Dismantle(Exploring):
 
 def _about(command: RunCommand | Dismantle) -> dict[str, Any]:
     """What run.json says of the command."""
-    names = ("planner", "robot", "segmentation", "noise", "label_divisor")
+    names = ("robot", "segmentation", "noise", "label_divisor")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
+    options["preset"] = command.settings.preset
     if isinstance(command, Exploring):
+        options["planner"] = command.chosen_planner
         options["early_stop"] = not command.no_early_stop
     name, seed = type(command).__name__.lower(), command.settings.seed
     return {"command": name, "source": command.source, "seed": seed, "options": options}

@@ -52,7 +52,7 @@ class New(SessionStep, options.PlanningCommand):
             self.settings.read(),
             segmentation=self.segmentation,
             seed=self.settings.seed,
-            planner=self.planner,
+            planner=self.chosen_planner,
             robot=located(self.robot),
         )
         with session:

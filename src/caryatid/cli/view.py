@@ -82,7 +82,7 @@ class View(options.ExploringCommand):
 
         shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         opening = partial(open_source, self.source, noise=self.noise, robot=self.robot, **shared)
-        shared |= {"planner": self.planner, "host": self.host, "port": self.port}
+        shared |= {"planner": self.chosen_planner, "host": self.host, "port": self.port}
         with self.output.working("opening"):
             page = LoopPage(opening, config, **shared)
         page.start()

@@ -8,16 +8,25 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from caryatid.config.choices import ExportFormat, FusionMethod, NoiseModel, SegmentationMethod, ShapeKind
+from caryatid.config.choices import (
+    ExportFormat,
+    FusionMethod,
+    MaskIdentity,
+    NoiseModel,
+    Preset,
+    SegmentationMethod,
+    ShapeKind,
+)
 from caryatid.runtime import imported_late
 
 __all__ = [
     "ActiveVisionConfig", "ArmConfig", "CloudConfig", "CompletionConfig", "Config", "EvaluationConfig",
     "ExplanationConfig", "ExportConfig", "ExportFormat", "FitConfig", "FusionConfig", "FusionMethod",
-    "LiftConfig", "MaskConfig", "NoiseConfig", "NoiseModel", "OracleConfig", "PhysicsConfig",
-    "PlausibilityConfig", "RecordingConfig", "RegistrationConfig", "RehearsalConfig", "ReportConfig",
-    "RobotConfig", "SegmentationConfig", "SegmentationMethod", "SensorConfig", "SessionConfig", "ShapeKind",
-    "SplitConfig", "SupportConfig", "SurfaceConfig", "VoxelConfig",
+    "LiftConfig", "MaskConfig", "MaskIdentity", "NoiseConfig", "NoiseModel", "OracleConfig",
+    "PhysicsConfig", "PlausibilityConfig", "Preset", "RecordingConfig", "RegistrationConfig",
+    "RehearsalConfig", "ReportConfig", "RobotConfig", "SegmentationConfig", "SegmentationMethod",
+    "SensorConfig", "SessionConfig", "ShapeKind", "SplitConfig", "SupportConfig", "SurfaceConfig",
+    "VoxelConfig",
 ]  # fmt: skip
 
 if TYPE_CHECKING:

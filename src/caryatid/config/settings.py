@@ -12,6 +12,7 @@ from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
+from caryatid.config.choices import Preset
 from caryatid.config.stages import Config
 from caryatid.errors import InputError
 
@@ -41,6 +42,11 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
     for flag in flags:
         config = changed_settings(config, _parse_flag(flag), f"--set {flag}")
     return config
+
+
+def preset(name: Preset) -> Config:
+    """The settings of a preset."""
+    return Config.paper() if name == "paper" else Config()
 
 
 def changed_settings(base: Config, document: Mapping[str, Any], source: str) -> Config:

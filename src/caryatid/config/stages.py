@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
-from caryatid.config.choices import FusionMethod, ShapeKind
+from caryatid.config.choices import FusionMethod, MaskIdentity, ShapeKind
 
 CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
@@ -159,8 +159,10 @@ class SegmentationConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class MaskConfig:
-    """Masks of a learned segmenter."""
+    """Masks given with a view."""
 
+    identity: MaskIdentity = "scene"
+    """A mask's number is its object's in all views (`scene`), or means nothing in another view."""
     min_pixels: WholeNumber = 200
     """Masks with fewer pixels, before or after smaller ones are laid over them, are left out [px]."""
     max_share: Share = 0.4
@@ -249,6 +251,8 @@ class ExplanationConfig:
 class CompletionConfig:
     """How far shapes reach into unseen space below them."""
 
+    enabled: bool = True
+    """Whether they do."""
     max_tilt: Angle = 30.0
     """An unseen side that faces down within this angle may be extended [deg]; what rests on a face does."""
     step: Positive = 0.01
@@ -293,10 +297,12 @@ class SupportConfig:
     """r_s,min of eq. 1 [1]."""
     overhang: NotNegative = 0.003
     """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
-    top_down: Literal["paper", "balance"] = "balance"
-    """All that rests on an unstable object holds it (`paper`), or only what weighs against its tipping."""
+    stability: Literal["area", "balance"] = "balance"
+    """An object is unstable by r_s of eq. 1 over its contact points, and all that rests on it may hold it
+    (`area`, the paper's); or also by its centre of mass, and only what weighs against its tipping does."""
     max_drop: NotNegative = 0.04
-    """How far below an unsupported object its supporter may lie, hidden gap between them [m]."""
+    """How far below an unsupported object its supporter may lie, hidden gap between them [m]; 0 is not at
+    all."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -305,6 +311,8 @@ class FusionConfig:
 
     method: FusionMethod = "pc+sg"
     """What is fused: points (`pc`), graphs (`sg`) or both (Table I)."""
+    matching: Literal["points", "shapes"] = "points"
+    """What tells that a vertex is known: its points, or as in the paper its shape, pose and extent."""
     max_distance: NotNegative = 0.05
     """Centres further apart are two objects [m], beside half the smaller object's size."""
     max_angle: Angle = 20.0
@@ -314,7 +322,7 @@ class FusionConfig:
     settled: NotNegative = 0.005
     """A shape that moves, grows or turns by less than this is unchanged [m]; σ of registration error."""
     keep_share: Share = 0.5
-    """A support is kept while occurrences / opportunities is at least this [1]."""
+    """A support is kept while occurrences / opportunities is at least this [1]; 0 is the union of Table I."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -599,6 +607,7 @@ class Config:
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
+    masks: MaskConfig = field(default_factory=MaskConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
     explanation: ExplanationConfig = field(default_factory=ExplanationConfig)
@@ -621,3 +630,22 @@ class Config:
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     oracle: OracleConfig = field(default_factory=OracleConfig)
     session: SessionConfig = field(default_factory=SessionConfig)
+
+    @classmethod
+    def paper(cls) -> Config:
+        """The settings of the paper; every departure of the defaults is left out.
+
+        Eq. 1 over contact points, without the centre of mass (III-A); vertices matched by shape and the union
+        of graphs (III-B, Table I); eqs. 2 and 3 as printed (IV); poses as they are given; shapes as they are
+        fitted.
+        """
+        return cls(
+            registration=RegistrationConfig(enabled=False),
+            completion=CompletionConfig(enabled=False),
+            plausibility=PlausibilityConfig(rounds=0),
+            support=SupportConfig(
+                stability="area", margin_sigma=0.0, reach=0.005, gentle_tilt=75.0, max_drop=0.0
+            ),
+            fusion=FusionConfig(matching="shapes", keep_share=0.0),
+            active=ActiveVisionConfig(saliency="paper", edge_point="midpoint", path_cost="angle"),
+        )

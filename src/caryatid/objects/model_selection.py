@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import combinations
@@ -233,6 +233,7 @@ def best_merge(
     changed: set[int],
     apart: MutableMapping[Pair, int],
     *,
+    distinct: Set[Pair] = frozenset(),
     config: Config,
     seed: int,
 ) -> Pair | None:
@@ -243,6 +244,7 @@ def best_merge(
         changed: Only pairs with one of these are looked at.
         apart: Pairs found to be two, with the number of points they had then; they are looked at again when
             they have grown. Added to.
+        distinct: Pairs known to be two whatever their points say.
         config: What explanations cost, and how shapes are fitted.
         seed: Seed of the fits.
 
@@ -255,6 +257,7 @@ def best_merge(
         (a, b)
         for a, b in combinations(sorted(known), 2)
         if {a, b} & changed
+        and (a, b) not in distinct
         and sizes[a] + sizes[b] >= GROWTH * apart.get((a, b), 0)
         and trees[a].count_neighbors(trees[b], config.explanation.reach) > 0
     ]

@@ -6,9 +6,12 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from caryatid.config import Config, SegmentationConfig
@@ -169,6 +172,7 @@ class ObjectModels:
         self._undivided: dict[int, int] = {}
         self._segments: list[tuple[cKDTree, NDArray[np.int32]]] = []
         self._apart: dict[tuple[int, int], int] = {}
+        self._distinct: set[tuple[int, int]] = set()
 
     def copy(self) -> ObjectModels:
         """Return models that know the same and go on by themselves; clouds, trees and shapes are shared."""
@@ -178,10 +182,16 @@ class ObjectModels:
         other._undivided = self._undivided.copy()
         other._segments = self._segments.copy()
         other._apart = self._apart.copy()
+        other._distinct = self._distinct.copy()
         return other
 
-    def associate(self, observation: Observation) -> Observation:
-        """Give a view's automatic segments the labels of the objects they belong to, or new ones."""
+    def associate(self, observation: Observation, *, masks: bool = False) -> Observation:
+        """Give a view's segments the labels of the objects they belong to, or new ones.
+
+        Args:
+            observation: The view.
+            masks: Its segments are given; two of one view are two objects for good.
+        """
         points, labels = observation.cloud.points_world, observation.labels
         segments = np.where(labels == SUPPORT_LABEL, 0, labels)
         kept = np.flatnonzero(segments)
@@ -194,8 +204,27 @@ class ObjectModels:
             {k: o.shape for k, o in self.fits.items()},
             self._config.segmentation,
             self.points.labels_used,
+            masks=masks,
         )
+        if masks:
+            self._distinct |= set(combinations(np.unique(named[named > 0]).tolist(), 2))
         return observation.with_labels(np.where(labels == SUPPORT_LABEL, labels, named))
+
+    def misplaced(self, observation: Observation) -> tuple[int, int]:
+        """How many labels of a view lie on objects that had other labels before, and how many there are."""
+        config, labels = self._config.segmentation, observation.labels
+        shown = [k for k in observation.shown if k not in (0, SUPPORT_LABEL)]
+        elsewhere = 0
+        for label in shown:
+            rows = np.flatnonzero(labels == label)
+            points = observation.cloud.points_world[rows[:: len(rows) // 100 + 1]]
+            on = {
+                k: np.mean(np.abs(o.shape.signed_distance(points)) < config.overlap_reach)
+                for k, o in self.fits.items()
+            }
+            own = on.pop(label, 0.0)
+            elsewhere += bool(own < config.overlap and max(on.values(), default=0.0) >= 0.5)
+        return elsewhere, len(shown)
 
     def add(self, observation: Observation, view: int) -> set[int]:
         """Add a view's points, thinned, and return the labels of the objects among them."""
@@ -266,9 +295,12 @@ class ObjectModels:
         """
         noise, given_up = self._noise(), dict[int, int]()
         known = {k: self._explained(k, noise, voxels) for k in sorted(self.fits)}
-        while pair := best_merge(known, labels, self._apart, config=self._config, seed=self._seed):
+        figures: dict[str, Any] = {"config": self._config, "seed": self._seed}
+        while pair := best_merge(known, labels, self._apart, distinct=self._distinct, **figures):
             new, old = pair
             self.points.merge(old, new)
+            named = [(new if a == old else a, new if b == old else b) for a, b in self._distinct]
+            self._distinct = {(min(pair), max(pair)) for pair in named}
             self._forget(set(pair))
             given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
             del self.fits[old], known[old], known[new]
@@ -358,11 +390,14 @@ def associate(
     known_shapes: Mapping[int, Shape],
     config: SegmentationConfig,
     labels_used: int = 0,
+    *,
+    masks: bool = False,
 ) -> NDArray[np.int32]:
     """Give the points of each new segment the label of the object they belong to, or one never used before.
 
-    A segment that lies at several known objects, with a tenth of its points or more, is divided among them:
-    each point goes to the nearest.
+    An automatic segment that lies at several known objects, with a tenth of its points or more, is divided
+    among them: each point goes to the nearest. A mask is all that a view shows of one object: masks and
+    objects are matched one to one, so that they share as many points as possible.
 
     Args:
         points_world: (N, 3) [m].
@@ -371,6 +406,7 @@ def associate(
         known_shapes: Fitted shape of each known object that has one.
         config: Share that must overlap, and the distance that counts as overlap.
         labels_used: Highest label ever given; new objects are numbered from the next one.
+        masks: Whether the segments are masks.
 
     Returns:
         Label of the object (N,) of each point; 0 where there was no segment.
@@ -385,19 +421,22 @@ def associate(
     counts = np.bincount(labels, minlength=1)
     kept = most_central(points_world, labels, np.where(np.arange(len(counts)) > 0, spacing, 0.0))
     owner = _nearest_objects(points_world[kept], points, owners, shapes, config.overlap_reach)
+    segments = np.flatnonzero(counts[1:]) + 1
+    shared = np.zeros((len(segments), len(names)), dtype=np.intp)
+    near = owner >= 0
+    np.add.at(shared, (np.searchsorted(segments, labels[kept][near]), owner[near]), 1)
+    shares = shared / np.bincount(labels[kept], minlength=len(counts))[segments, None]
+    chosen = _one_to_one(shared, shares, config.overlap) if masks else _all_near(shares, config.overlap)
     fresh = max(labels_used, int(names.max(initial=0)))
     result = np.zeros(len(labels), dtype=np.int32)
-    for segment in np.flatnonzero(counts[1:]) + 1:
-        own = owner[labels[kept] == segment]
+    for segment, among in zip(segments, chosen, strict=True):
         index = np.flatnonzero(labels == segment)
-        shares = np.bincount(own[own >= 0], minlength=len(names)) / len(own)
-        if shares.sum() < config.overlap or not (own >= 0).any():
+        if not len(among):
             fresh += 1
             result[index] = fresh
-            continue
-        among = np.flatnonzero(shares >= min(0.1, shares.max()))
-        result[index] = names[among[0]]
-        if len(among) > 1:
+        elif len(among) == 1:
+            result[index] = names[among[0]]
+        else:
             theirs = np.isin(owners, among)
             some = [shape if k in among else None for k, shape in enumerate(shapes)]
             nearest = _nearest_objects(
@@ -408,6 +447,22 @@ def associate(
                 nearest[far] = owners[theirs][cKDTree(points[theirs]).query(points_world[index[far]])[1]]
             result[index] = names[nearest]
     return result
+
+
+def _all_near(shares: Array, least: float) -> list[NDArray[np.intp]]:
+    """Objects that hold a tenth of each segment's points or more; none where all together hold too few."""
+    enough = (shares.sum(axis=1) >= least) & (shares > 0.0).any(axis=1)
+    return [
+        np.flatnonzero(own >= min(0.1, own.max())) if held else np.zeros(0, dtype=np.intp)
+        for own, held in zip(shares, enough, strict=True)
+    ]
+
+
+def _one_to_one(shared: NDArray[np.intp], shares: Array, least: float) -> list[NDArray[np.intp]]:
+    """The one object of each mask, or none: the match that shares most points."""
+    worth = np.where((shares >= least) & (shared > 0), shared, 0)
+    matched = {m: k for m, k in zip(*linear_sum_assignment(-worth), strict=True) if worth[m, k]}
+    return [np.array([matched[m]] if m in matched else [], dtype=np.intp) for m in range(len(worth))]
 
 
 def _nearest_objects(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.display import Pictured
+from caryatid.sensing.masks import labels_from_masks
 
 SUPPORT_LABEL = 65535
 """The label of the support surface in label images: the last of 16 bits, so that given labels stay."""
@@ -30,9 +31,12 @@ class View(Pictured):
         K: Pinhole matrix (3, 3) [px].
         T_world_camera: Camera pose (4, 4), OpenCV camera frame, or None where it is not known.
         rgb: Colour (H, W, 3) uint8, or None.
-        labels: Object number of each pixel (H, W), 0 = nothing, or None where no segmentation is given.
+        labels: Object number of each pixel (H, W), 0 = nothing, or None where no segmentation is given. A
+            stack of masks (N, H, W), boolean or scores in [0, 1], becomes such an image of segments.
         normals_camera: Surface normals (H, W, 3) in the camera frame, or None to estimate them from depth.
         name: What to call the view in messages.
+        labels_are: Whether a label is an object's in all views (`objects`) or a segment's in this view alone
+            (`segments`).
 
     Raises:
         InputError: Sizes differ, depth is negative or infinite, K or the pose is not valid.
@@ -45,6 +49,7 @@ class View(Pictured):
     labels: NDArray[np.int32] | None = None
     normals_camera: NDArray[np.float32] | None = None
     name: str = "view"
+    labels_are: Literal["objects", "segments"] = "objects"
 
     def __post_init__(self) -> None:
         depth = np.asarray(self.depth, dtype=np.float32)
@@ -61,6 +66,9 @@ class View(Pictured):
         if self.T_world_camera is not None:
             T = transforms.as_rigid(self.T_world_camera, f"{self.name}: T_world_camera")
             object.__setattr__(self, "T_world_camera", T)
+        if self.labels is not None and np.ndim(self.labels) == 3:
+            object.__setattr__(self, "labels", labels_from_masks(self.labels))
+            object.__setattr__(self, "labels_are", "segments")
         for field, dtype in (("rgb", np.uint8), ("labels", np.int32), ("normals_camera", np.float32)):
             image = getattr(self, field)
             if image is None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
-from caryatid.geometry import transforms
+from caryatid.geometry import polygons, transforms
 from caryatid.geometry.shapes import Primitives
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
@@ -91,7 +91,7 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
     stability: dict[str, Stability] = {}
     for o in supported:
         supports, patches = _from_below(o, touches[o.id], config)
-        if not supports:
+        if not supports and config.max_drop > 0.0:
             near = [ordered[k] for k in beneath(shapes, ordered.index(o), config.max_drop)]
             supports, patches = _let_down(o, near, config)
         tipping = find_tipping(o.shape, patches)
@@ -255,7 +255,9 @@ def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array
 
 
 def _patch(t: Touch, o: SceneObject, config: SupportConfig) -> Array:
-    """Contact area projected to the ground: a polygon (M, 2) [m]."""
+    """Contact area projected to the ground, or the hull of the contact points: a polygon (M, 2) [m]."""
+    if config.stability == "area":
+        return polygons.hull(t.points_world)
     return contact_patch(o.shape, t.other.shape, t.normal_world, t.points_world, config)
 
 
@@ -326,7 +328,7 @@ def _weighed_down(
     for t in riders:
         why = f"{head}; {t.other.id} rests on it"
         lever = float((tipping.pivot_xy - centroid(_patch(t, o, config))) @ tipping.direction_xy)
-        if config.top_down == "paper":
+        if config.stability == "area":
             found.append(_support(t, o, "top-down", False, f"{why}."))
         elif stability.tips and lever > 0.0:
             why = f"{why} {_mm(lever)} behind the edge it tips over."

@@ -104,10 +104,11 @@ def find_tipping(shape: Shape, patches: Sequence[Array]) -> Tipping:
 
 
 def assess(shape: Shape, tipping: Tipping, config: SupportConfig) -> Stability:
-    """Both tests of an object on its support polygon: r_s of eq. 1 and the centre of mass."""
+    """The tests of an object on its support polygon: r_s of eq. 1 and, unless `area`, the centre of mass."""
     ratio = min(1.0, polygons.area(tipping.polygon) / polygons.area(ground_outline(shape)))
     overhang = tipping.overhang
-    return Stability(ratio, overhang, ratio < config.min_area_ratio, overhang > config.overhang)
+    tips = config.stability == "balance" and overhang > config.overhang
+    return Stability(ratio, overhang, ratio < config.min_area_ratio, tips)
 
 
 def centroid(polygon: Array) -> Array:

@@ -1,9 +1,8 @@
-"""Algorithm 2: saliency on the view sphere, as the settings read it (`attention`) or as printed (`paper`)."""
+"""Saliency on the view sphere, Algorithm 2 as the settings read it (`attention`)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -52,26 +51,6 @@ class AttentionPlanner:
             points=tuple(points),
             elsewhere=partial(_on_sphere, tuple(points), visited, state.sphere.directions, config),
         )
-
-
-class PaperPlanner:
-    """Algorithm 2 as printed: the planner `attention` with the settings that are the paper's.
-
-    Whatever the configuration says, it takes eq. 2 with 2π, midpoints, saliency that spreads, the occlusion
-    test and h = sin(α/2); it shares λ_s, the spread and the depth of the inhibition with the other planners.
-    """
-
-    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
-        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first."""
-        literal = replace(
-            state.config,
-            saliency="paper",
-            edge_point="midpoint",
-            path_cost="angle",
-            occlusion="invert",
-            propagation=True,
-        )
-        return AttentionPlanner().plan(replace(state, config=literal), rng)
 
 
 def _on_sphere(

@@ -9,7 +9,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import MaskConfig
 from caryatid.errors import InputError
-from caryatid.sensing.views import SUPPORT_LABEL
 
 Masks = NDArray[np.bool_]
 
@@ -19,11 +18,13 @@ def labels_from_masks(
 ) -> NDArray[np.int32]:
     """Lay masks that may overlap over each other, the smallest on top, into one label image.
 
+    A pixel with a score is in a mask from 0.5 on; where such masks overlap the largest score is on top.
+
     Masks that are too small, as large as a background, doubted by the segmenter, or another mask once more
     are left out; of two that are the same the one with the better score stays, without scores the first.
 
     Args:
-        masks: N masks (N, H, W), or a sequence of (H, W): true where the object is.
+        masks: N masks (N, H, W), or a sequence of (H, W): true where the object is, or its score in [0, 1].
         scores: The segmenter's confidence in each mask (N,), or None where it gives none.
         config: What is left out.
 
@@ -31,11 +32,11 @@ def labels_from_masks(
         Label image (H, W) int32: k where mask k − 1 is on top, 0 where none is.
 
     Raises:
-        InputError: The masks are no stack of images of one size, hold other values than true and false, or
-            are more than labels; or there is not one finite score a mask.
+        InputError: The masks are no stack of images of one size, or hold values that are neither true and
+            false nor scores in [0, 1]; or there is not one finite score a mask.
     """
     config = config or MaskConfig()
-    stack = _stack(masks)
+    stack, certainty = _stack(masks)
     quality = np.full(len(stack), np.inf)
     if scores is not None:
         quality = np.asarray(scores, dtype=np.float64)
@@ -54,27 +55,32 @@ def labels_from_masks(
         if all(_iou(stack[k], stack[other]) <= 0.8 for other in chosen):
             chosen.append(k)
     labels = np.zeros(stack.shape[1:], dtype=np.int32)
-    for k in sorted(chosen, key=lambda k: (-pixels[k], k)):
-        labels[stack[k]] = k + 1
+    if certainty is None:
+        for k in sorted(chosen, key=lambda k: (-pixels[k], k)):
+            labels[stack[k]] = k + 1
+    elif chosen:
+        surest = np.array(chosen)[certainty[chosen].argmax(axis=0)]
+        labels = np.where(stack[chosen].any(axis=0), surest + 1, 0).astype(np.int32)
     left = np.bincount(labels.ravel(), minlength=len(stack) + 1)
     labels[left[labels] < config.min_pixels] = 0
     return labels
 
 
-def _stack(masks: ArrayLike | Sequence[ArrayLike]) -> Masks:
+def _stack(masks: ArrayLike | Sequence[ArrayLike]) -> tuple[Masks, NDArray[np.floating] | None]:
+    """The masks (N, H, W), and the score of each of their pixels where scores were given."""
     try:
         stack = np.asarray(masks)
     except ValueError:
         raise InputError("masks", "differ in size", "give masks of the size of the depth image") from None
     if stack.ndim != 3 or 0 in stack.shape:
         raise InputError("masks", f"have shape {stack.shape}", "give a stack (N, H, W) of at least one mask")
-    if len(stack) >= SUPPORT_LABEL:
-        raise InputError("masks", f"are {len(stack)}", f"give fewer than {SUPPORT_LABEL}")
-    if stack.dtype != np.bool_:
-        values = np.unique(stack)
-        if not np.isin(values, (0, 1)).all() and not np.isin(values, (0, 255)).all():
-            raise InputError("masks", "hold values beside true and false", "threshold them first: masks > 0")
-    return stack.astype(bool)
+    if stack.dtype == np.bool_ or np.isin(stack, (0, 1)).all() or np.isin(stack, (0, 255)).all():
+        return stack.astype(bool), None
+    if not np.issubdtype(stack.dtype, np.floating) or not ((stack >= 0.0) & (stack <= 1.0)).all():
+        raise InputError(
+            "masks", "hold neither true and false nor scores in [0, 1]", "threshold them first: masks > 0"
+        )
+    return stack >= 0.5, stack
 
 
 def _iou(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:

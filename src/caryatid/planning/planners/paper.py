@@ -1,0 +1,105 @@
+"""Algorithms 1 and 2 as printed (`paper`)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from caryatid.config import ActiveVisionConfig
+from caryatid.geometry.transforms import Array
+from caryatid.planning.candidates import Candidates
+from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
+from caryatid.planning.points_of_interest import (
+    PointOfInterest,
+    inhibition_of_return,
+    painted,
+    points_of_interest,
+)
+
+
+class PaperPlanner:
+    """Next best view selection, Algorithm 2 line by line.
+
+    Whatever the configuration says, relations are rated by eq. 2 with 2π at the midpoint of their objects
+    and a view costs h = sin(α/2). λ_s, the spread and the depth of the inhibition are the configuration's.
+    """
+
+    def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
+        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
+
+        A point of interest counts where the robot reaches its projection on the view sphere. It raises the
+        saliency of the views around it, or lowers it where something stands in the line of sight.
+        """
+        check_candidates(state)
+        config = replace(state.config, saliency="paper", edge_point="midpoint", path_cost="angle")
+        state = replace(state, config=config)
+        points = points_of_interest(state.graph, state.sphere, state.visited, config)
+        points = [_at_reachable_height(point, state.candidates) for point in points]
+        added = [p for p in points if _reachable(p.direction, state)]
+        hidden = _hidden(added, state)
+        saliency, strongest = _saliency(added, hidden, state.visited, state.candidates.directions, config)
+
+        def why(best: int) -> str:
+            if strongest[best] < 0:
+                return "no point of interest is in reach; the nearest new view"
+            return added[strongest[best]].why
+
+        elsewhere = partial(_saliency, added, hidden, state.visited, state.sphere.directions, config)
+        return decide(
+            state.candidates,
+            saliency,
+            path_cost(state),
+            why,
+            points=tuple(points),
+            elsewhere=lambda: elsewhere()[0],
+        )
+
+
+def _at_reachable_height(point: PointOfInterest, candidates: Candidates) -> PointOfInterest:
+    """An object without support asks for an azimuth alone: look from the middle of the reachable heights."""
+    if len(point.subject) > 1:
+        return point
+    height = float(np.median(candidates.directions[:, 2]))
+    across = point.direction[:2] * np.sqrt(1.0 - height**2)
+    return replace(point, direction=np.append(across, height))
+
+
+def _reachable(direction: Array, state: PlanningState) -> bool:
+    """Whether the point of the view sphere nearest to a direction (3,) is a candidate."""
+    candidates = state.candidates
+    nearest = int(np.argmax(candidates.directions @ direction))
+    if candidates.indices is not None:
+        return int(np.argmax(state.sphere.directions @ direction)) == int(candidates.indices[nearest])
+    # Elsewhere than at its points: within their mean spacing.
+    angle = np.arccos(np.clip(candidates.directions[nearest] @ direction, -1.0, 1.0))
+    return bool(angle <= np.sqrt(4.0 * np.pi / len(state.sphere.directions)))
+
+
+def _hidden(points: list[PointOfInterest], state: PlanningState) -> NDArray[np.bool_]:
+    """Whether something stands between each point (K,) and its projection on the view sphere."""
+    positions = np.array([p.position_world for p in points]).reshape(-1, 3)
+    directions = np.array([p.direction for p in points]).reshape(-1, 3)
+    eyes_world = state.sphere.centre_world + state.sphere.radius * directions
+    # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
+    return np.diag(state.voxels.solid().blocked(positions, eyes_world, 0.05))
+
+
+def _saliency(
+    points: list[PointOfInterest],
+    hidden: NDArray[np.bool_],
+    visited: Array,
+    directions: Array,
+    config: ActiveVisionConfig,
+) -> tuple[Array, NDArray[np.intp]]:
+    """Saliency (M,) of views in directions (M, 3), and the point it is of (M,); −1 where none adds any."""
+    given = painted(points, directions, float(np.deg2rad(config.spread)))
+    raised = np.where(hidden, 0.0, given)
+    lowered = np.where(hidden, given, 0.0).max(axis=1, initial=0.0)
+    saliency = raised.max(axis=1, initial=0.0)
+    strongest = raised.argmax(axis=1) if raised.shape[1] else np.full(len(directions), -1)
+    strongest = np.where(saliency > 0.0, strongest, -1)
+    inhibited = inhibition_of_return(visited, directions, config)
+    return saliency + np.minimum(-lowered, inhibited), strongest
