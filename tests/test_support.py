@@ -352,6 +352,13 @@ class TestInfer:
         assert ("o2", "o1") not in edges(infer(ball, CONFIG))
         assert edges(infer(tower(), PAPER)) == edges(infer(tower(), CONFIG))
 
+    def test_a_plank_leans_on_what_it_touches_not_on_what_is_near(self):
+        board, block_ahead = (o.shape for o in leaning_plank()[1:])
+        near, beside = (block_ahead.moved(at(*by)) for by in ((0.008, 0.06, 0), (0.0, -0.06, 0)))
+        held = edges(infer(scene(board, near, beside), CONFIG))
+        assert held["o3", "o1"] == "lean"
+        assert ("o2", "o1") not in held
+
     @pytest.mark.parametrize("gap", [0.0, 0.004, 0.01])
     def test_a_plank_leans(self, gap):
         graph = infer(leaning_plank(gap), CONFIG)
