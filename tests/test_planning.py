@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 import tomllib
@@ -398,6 +399,7 @@ class TestSaliency:
         and h = sin(α/2). Opposite the view at the same elevation of 35°, α = 110° and h = sin 55° = 0.819.
         """
         decision, beta, alpha = self.paper([CUBE])
+        decision = pickle.loads(pickle.dumps(decision))  # a step goes to the viewer's process
         sigma = np.deg2rad(20.0)
         saliency = np.exp(-0.5 * (beta / sigma) ** 2) - np.exp(-0.5 * (alpha / sigma) ** 2)
         np.testing.assert_allclose(decision.candidate_saliency, saliency, atol=1e-9)

@@ -19,7 +19,7 @@ from synthetic import (
     vertices,
 )
 
-from caryatid.config import Config, MaskConfig, RegistrationConfig
+from caryatid.config import Config, FusionConfig, RegistrationConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
@@ -103,7 +103,9 @@ def test_masks_whose_numbers_mean_nothing_are_noticed(caplog):
     model_of(renumbered(views, np.random.default_rng(0)))
     assert "masks lie on objects that had other numbers" in caplog.text
     caplog.clear()
-    model_of(renumbered(views, np.random.default_rng(0)), replace(Config(), masks=MaskConfig("per-view")))
+    model_of(
+        renumbered(views, np.random.default_rng(0)), replace(Config(), fusion=FusionConfig(masks="per-view"))
+    )
     assert not caplog.records
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import fields, replace
 
 import pytest
-from conftest import refusal
+from conftest import SMALL, refusal, run_command
 
 from caryatid.config import Config, FitConfig
 from caryatid.config.settings import field_docs, read_settings, write_settings
@@ -81,8 +82,18 @@ def test_a_value_of_the_wrong_type_or_range_says_what_is_wanted(flag, wanted):
     assert wanted in caught.value.remedy
 
 
+def test_a_demo_starts_from_the_preset_and_flags_change_it(tmp_path):
+    options = ("--preset", "paper", "--masks", "per-view", "--views", 1, "--no-report", "--quiet")
+    assert run_command("demo", "--out", tmp_path / "run", *options, *SMALL) == 0
+    run = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert run["options"]["planner"] == "paper"
+    assert run["settings"]["support"]["stability"] == "area"
+    assert run["settings"]["fusion"]["matching"] == "shapes"
+    assert run["settings"]["fusion"]["masks"] == "per-view"
+
+
 def test_every_number_has_a_range_a_unit_and_a_reason():
-    unlimited = {"sensor.light", "arm.base", "masks.min_score"}  # a direction, a place, another's unit
+    unlimited = {"sensor.light", "arm.base"}  # a direction, and a place
     for stage in fields(Config):
         kind = type(getattr(Config(), stage.name))
         assert all(field_docs(kind).values()), stage.name

@@ -186,16 +186,16 @@ class Scene(Pictured):
         """Whether a label means the same object in all views."""
         if isinstance(source, View) and source.labels_are == "segments":
             return False
-        return self.config.fusion.matching == "points" and self.config.masks.identity == "scene"
+        return self.config.fusion.matching == "points" and self.config.fusion.masks == "scene"
 
     def _check_identity(self, observation: Observation, name: str) -> None:
-        """Warn where most masks lie on other objects than earlier masks of the same number."""
-        elsewhere, known = self._models.misplaced(observation)
-        if 2 * elsewhere > known:
+        """Warn where most masks lie on objects that earlier masks gave other numbers."""
+        wrong, shown = self._models.mislabelled(observation)
+        if 2 * wrong > shown:
             log.warning(
                 "%s: %d of %d masks lie on objects that had other numbers; if a number means nothing in "
-                "another view, use --masks per-view",
-                name, elsewhere, known,
+                'another view, use --masks per-view or View(labels_are="segments")',
+                name, wrong, shown,
             )  # fmt: skip
 
     def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:

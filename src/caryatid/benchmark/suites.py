@@ -239,7 +239,7 @@ _ALL = (
     Suite(
         "fig5-paper",
         "The paper's Fig. 5 by the paper's own system: its preset and planner, against random views.",
-        {label: {"planner": "paper", "preset": "paper", **own} for label, own in _FIG5.items()},
+        {label: {**_PAPER, **own} for label, own in _FIG5.items()},
         MIXED,
         seeds=1,
         views=10,

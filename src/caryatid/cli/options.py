@@ -134,7 +134,7 @@ class Modelling(Settings):
     """Settings to start from: caryatid's own, or those of the paper."""
     fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
     """What to fuse over views: points, graphs, or both."""
-    masks: Annotated[MaskIdentity | None, one_of(MaskIdentity), default_of("masks.identity")] = None
+    masks: Annotated[MaskIdentity | None, one_of(MaskIdentity), default_of("fusion.masks")] = None
     """What the number of a mask means: an object in all views, or a segment of one view."""
     seed: Annotated[int, whole_number(0)] = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""
@@ -145,7 +145,7 @@ class Modelling(Settings):
 
         base = base or preset(self.preset)
         return super().read(
-            {"fusion.method": self.fusion, "masks.identity": self.masks, **(options or {})}, base
+            {"fusion.method": self.fusion, "fusion.masks": self.masks, **(options or {})}, base
         )
 
 

@@ -136,11 +136,10 @@ class Demo(RunCommand):
     """Show every view in the browser; the page then stays until Ctrl-C."""
 
     def __call__(self) -> None:
-        from caryatid.config import ActiveVisionConfig, Config
+        from caryatid.config.settings import changed_settings, preset
 
-        config = self.settings.read(
-            {"active.max_views": self.views}, Config(active=ActiveVisionConfig(max_views=5))
-        )
+        fewer = changed_settings(preset(self.settings.preset), {"active": {"max_views": 5}}, "demo")
+        config = self.settings.read({"active.max_views": self.views}, fewer)
         shared = {field.name: getattr(self, field.name) for field in fields(self)}
         Explore(**shared | {"noise": "carmine"})(config)
 

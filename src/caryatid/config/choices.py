@@ -7,7 +7,7 @@ from typing import Literal
 FusionMethod = Literal["pc", "sg", "pc+sg"]
 """What is fused over views: points, graphs, or both; section III-B."""
 SegmentationMethod = Literal["labels", "auto"]
-"""Where parts come from: given labels, or local convexity."""
+"""Where segments come from: given labels, or local convexity."""
 MaskIdentity = Literal["scene", "per-view"]
 """What the number of a mask means: an object in all views, or a segment of one view."""
 Preset = Literal["default", "paper"]

@@ -159,10 +159,8 @@ class SegmentationConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class MaskConfig:
-    """Masks given with a view."""
+    """Masks of a learned segmenter."""
 
-    identity: MaskIdentity = "scene"
-    """A mask's number is its object's in all views (`scene`), or means nothing in another view."""
     min_pixels: WholeNumber = 200
     """Masks with fewer pixels, before or after smaller ones are laid over them, are left out [px]."""
     max_share: Share = 0.4
@@ -252,7 +250,7 @@ class CompletionConfig:
     """How far shapes reach into unseen space below them."""
 
     enabled: bool = True
-    """Whether they do."""
+    """Whether unseen sides are extended."""
     max_tilt: Angle = 30.0
     """An unseen side that faces down within this angle may be extended [deg]; what rests on a face does."""
     step: Positive = 0.01
@@ -301,8 +299,8 @@ class SupportConfig:
     """An object is unstable by r_s of eq. 1 over its contact points, and all that rests on it may hold it
     (`area`, the paper's); or also by its centre of mass, and only what weighs against its tipping does."""
     max_drop: NotNegative = 0.04
-    """How far below an unsupported object its supporter may lie, hidden gap between them [m]; 0 is not at
-    all."""
+    """How far below an unsupported object its supporter may lie, hidden gap between them [m]; with 0
+    it stays unsupported."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -312,7 +310,9 @@ class FusionConfig:
     method: FusionMethod = "pc+sg"
     """What is fused: points (`pc`), graphs (`sg`) or both (Table I)."""
     matching: Literal["points", "shapes"] = "points"
-    """What tells that a vertex is known: its points, or as in the paper its shape, pose and extent."""
+    """How a known vertex is recognised: by its points, or as in the paper by its shape, pose and extent."""
+    masks: MaskIdentity = "scene"
+    """The number of a mask names an object in all views (`scene`), or a segment of one view (`per-view`)."""
     max_distance: NotNegative = 0.05
     """Centres further apart are two objects [m], beside half the smaller object's size."""
     max_angle: Angle = 20.0
@@ -607,7 +607,6 @@ class Config:
     surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     segmentation: SegmentationConfig = field(default_factory=SegmentationConfig)
-    masks: MaskConfig = field(default_factory=MaskConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
     explanation: ExplanationConfig = field(default_factory=ExplanationConfig)

@@ -233,7 +233,7 @@ def best_merge(
     changed: set[int],
     apart: MutableMapping[Pair, int],
     *,
-    distinct: Set[Pair] = frozenset(),
+    distinct: Set[frozenset[int]] = frozenset(),
     config: Config,
     seed: int,
 ) -> Pair | None:
@@ -257,7 +257,7 @@ def best_merge(
         (a, b)
         for a, b in combinations(sorted(known), 2)
         if {a, b} & changed
-        and (a, b) not in distinct
+        and frozenset((a, b)) not in distinct
         and sizes[a] + sizes[b] >= GROWTH * apart.get((a, b), 0)
         and trees[a].count_neighbors(trees[b], config.explanation.reach) > 0
     ]

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,7 +171,7 @@ class ObjectModels:
         self._undivided: dict[int, int] = {}
         self._segments: list[tuple[cKDTree, NDArray[np.int32]]] = []
         self._apart: dict[tuple[int, int], int] = {}
-        self._distinct: set[tuple[int, int]] = set()
+        self._distinct: set[frozenset[int]] = set()
 
     def copy(self) -> ObjectModels:
         """Return models that know the same and go on by themselves; clouds, trees and shapes are shared."""
@@ -194,9 +193,10 @@ class ObjectModels:
         """
         points, labels = observation.cloud.points_world, observation.labels
         segments = np.where(labels == SUPPORT_LABEL, 0, labels)
-        kept = np.flatnonzero(segments)
-        kept = kept[thin(points[kept], self._config.explanation.spacing)]
-        self._segments.append((cKDTree(points[kept]), labels[kept]))
+        if not masks:
+            kept = np.flatnonzero(segments)
+            kept = kept[thin(points[kept], self._config.explanation.spacing)]
+            self._segments.append((cKDTree(points[kept]), labels[kept]))
         named = associate(
             points,
             segments,
@@ -207,23 +207,23 @@ class ObjectModels:
             masks=masks,
         )
         if masks:
-            self._distinct |= set(combinations(np.unique(named[named > 0]).tolist(), 2))
+            self._distinct |= set(map(frozenset, combinations(np.unique(named[named > 0]).tolist(), 2)))
         return observation.with_labels(np.where(labels == SUPPORT_LABEL, labels, named))
 
-    def misplaced(self, observation: Observation) -> tuple[int, int]:
+    def mislabelled(self, observation: Observation) -> tuple[int, int]:
         """How many labels of a view lie on objects that had other labels before, and how many there are."""
         config = self._config.segmentation
         rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
         rows = rows[:: len(rows) // 1000 + 1]  # some are enough to tell where a mask lies
         points = observation.cloud.points_world[rows]
         shown, index, count = np.unique(observation.labels[rows], return_inverse=True, return_counts=True)
-        own, elsewhere = np.zeros(len(shown)), np.zeros(len(shown), dtype=bool)
+        own, on_another = np.zeros(len(shown)), np.zeros(len(shown), dtype=bool)
         for label, o in self.fits.items():
             near = np.abs(o.shape.signed_distance(points)) < config.overlap_reach
             share = np.bincount(index[near], minlength=len(shown)) / count
             own += np.where(shown == label, share, 0.0)
-            elsewhere |= (shown != label) & (share >= 0.5)
-        return int(np.count_nonzero(elsewhere & (own < config.overlap))), len(shown)
+            on_another |= (shown != label) & (share >= 0.5)
+        return int(np.count_nonzero(on_another & (own < config.overlap))), len(shown)
 
     def add(self, observation: Observation, view: int) -> set[int]:
         """Add a view's points, thinned, and return the labels of the objects among them."""
@@ -294,12 +294,12 @@ class ObjectModels:
         """
         noise, given_up = self._noise(), dict[int, int]()
         known = {k: self._explained(k, noise, voxels) for k in sorted(self.fits)}
-        figures: dict[str, Any] = {"config": self._config, "seed": self._seed}
-        while pair := best_merge(known, labels, self._apart, distinct=self._distinct, **figures):
+        while pair := best_merge(
+            known, labels, self._apart, distinct=self._distinct, config=self._config, seed=self._seed
+        ):
             new, old = pair
             self.points.merge(old, new)
-            named = [(new if a == old else a, new if b == old else b) for a, b in self._distinct]
-            self._distinct = {(min(pair), max(pair)) for pair in named}
+            self._distinct = {frozenset(new if k == old else k for k in two) for two in self._distinct}
             self._forget(set(pair))
             given_up = {k: new if v == old else v for k, v in given_up.items()} | {old: new}
             del self.fits[old], known[old], known[new]

@@ -18,7 +18,7 @@ def labels_from_masks(
 ) -> NDArray[np.int32]:
     """Lay masks that may overlap over each other, the smallest on top, into one label image.
 
-    A pixel with a score is in a mask from 0.5 on; where such masks overlap the largest score is on top.
+    A pixel belongs to a mask of scores where its score is at least 0.5; of overlapping ones the largest wins.
 
     Masks that are too small, as large as a background, doubted by the segmenter, or another mask once more
     are left out; of two that are the same the one with the better score stays, without scores the first.

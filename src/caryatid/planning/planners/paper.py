@@ -47,14 +47,13 @@ class PaperPlanner:
                 return "no point of interest is in reach; the nearest new view"
             return added[strongest[best]].why
 
-        elsewhere = partial(_saliency, added, hidden, state.visited, state.sphere.directions, config)
         return decide(
             state.candidates,
             saliency,
             path_cost(state),
             why,
             points=tuple(points),
-            elsewhere=lambda: elsewhere()[0],
+            elsewhere=partial(_on_sphere, added, hidden, state.visited, state.sphere.directions, config),
         )
 
 
@@ -85,6 +84,17 @@ def _hidden(points: list[PointOfInterest], state: PlanningState) -> NDArray[np.b
     eyes_world = state.sphere.centre_world + state.sphere.radius * directions
     # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
     return np.diag(state.voxels.solid().blocked(positions, eyes_world, 0.05))
+
+
+def _on_sphere(
+    points: list[PointOfInterest],
+    hidden: NDArray[np.bool_],
+    visited: Array,
+    directions: Array,
+    config: ActiveVisionConfig,
+) -> Array:
+    """Saliency (M,) of all directions (M, 3); a function that can be pickled, since most never draw it."""
+    return _saliency(points, hidden, visited, directions, config)[0]
 
 
 def _saliency(
