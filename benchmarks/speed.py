@@ -42,8 +42,8 @@ from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.world import (
     TABLE_HEIGHT,
+    Body,
     SimulatedScene,
-    Solid,
     build_spec,
     scene_from_spec,
     table_centre,
@@ -125,7 +125,7 @@ def table_of(count: int) -> SimulatedScene:
     below = [_standing(xy, 0.0, rng, flat=k < stacked) for k, xy in enumerate(places)]
     above = [_standing(b.T_world_object[:2, 3], b.extents[2], rng) for b in below[:stacked]]
     name = f"table-of-{count}"
-    return scene_from_spec(build_spec([Solid(s) for s in (*below, *above)], name, (1.2, 1.2)), name, name)
+    return scene_from_spec(build_spec([Body(s) for s in (*below, *above)], name, (1.2, 1.2)), name, name)
 
 
 def _standing(xy: Array, height: float, rng: np.random.Generator, *, flat: bool = False) -> Shape:

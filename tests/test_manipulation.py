@@ -20,7 +20,7 @@ from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.truth import ground_truth
-from caryatid.simulation.world import TABLE_HEIGHT, Solid, build_spec, scene_from_spec
+from caryatid.simulation.world import TABLE_HEIGHT, Body, build_spec, scene_from_spec
 from caryatid.steps import read_run
 from caryatid.support.relations import infer
 
@@ -100,7 +100,7 @@ class TestOrder:
 
 
 def in_physics(*shapes):
-    return scene_from_spec(build_spec([Solid(shape) for shape in shapes], "test"), "test", "test")
+    return scene_from_spec(build_spec([Body(shape) for shape in shapes], "test"), "test", "test")
 
 
 def take(object_id, *hold):

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+import numpy as np
+
 from caryatid.config import ExportConfig
 from caryatid.config.choices import ExportFormat
 from caryatid.errors import InputError
-from caryatid.geometry.shapes import Cylinder, Sphere
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.geometry.solids import Solid
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.staging import write_file
 from caryatid.viz.colours import ink_on, object_colour, rgb
@@ -79,13 +84,13 @@ def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
     """
     import mujoco
 
-    from caryatid.simulation.world import TABLE, Solid, add_solid, empty_spec, quaternion
+    from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion
 
     spec = empty_spec("caryatid")
     try:
         for item in graph.objects:
             if item.role == "object":
-                add_solid(spec, item.id, Solid(item.shape, config.density, config.friction), _rgba(item))
+                add_body(spec, item.id, Body(item.shape, config.density, config.friction), _rgba(item))
                 continue
             R, size = item.shape.T_world_object[:3, :3], item.shape.extents / 2.0
             table = spec.worldbody.add_body(name=TABLE, pos=item.centre_world, quat=quaternion(R))
@@ -100,9 +105,7 @@ def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
 
 
 def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
-    """A link for each object, called as its id, fixed to the link `world`."""
-    from scipy.spatial.transform import Rotation
-
+    """A link for each object, called as its id, fixed to the link `world`; parts of a solid as boxes."""
     robot = Element("robot", name="caryatid")
     SubElement(robot, "link", name="world")
     for item in graph.objects:
@@ -114,27 +117,53 @@ def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
         SubElement(inertial, "mass", value=_numbers(mass))
         diagonal = {name: _numbers(mass * m) for name, m in zip(("ixx", "iyy", "izz"), moments, strict=True)}
         SubElement(inertial, "inertia", diagonal | dict.fromkeys(("ixy", "ixz", "iyz"), "0"))
-        for part in ("visual", "collision"):
-            geometry = SubElement(SubElement(link, part), "geometry")
-            match item.shape:
-                case Cylinder(radius=radius, height=height):
-                    SubElement(geometry, "cylinder", radius=_numbers(radius), length=_numbers(height))
-                case Sphere(radius=radius):
-                    SubElement(geometry, "sphere", radius=_numbers(radius))
-                case _:
-                    SubElement(geometry, "box", size=_numbers(*item.shape.extents))
-        material = SubElement(link[1], "material", name=f"colour of {item.id}")
-        SubElement(material, "color", rgba=_numbers(*_rgba(item)))
+        for what in ("visual", "collision"):
+            for T_object_part, shape in _boxes(item.shape):
+                element = SubElement(link, what)
+                if shape is not item.shape:
+                    SubElement(element, "origin", _pose(T_object_part))
+                geometry = SubElement(element, "geometry")
+                match shape:
+                    case Cylinder(radius=radius, height=height):
+                        SubElement(geometry, "cylinder", radius=_numbers(radius), length=_numbers(height))
+                    case Sphere(radius=radius):
+                        SubElement(geometry, "sphere", radius=_numbers(radius))
+                    case _:
+                        SubElement(geometry, "box", size=_numbers(*shape.extents))
+                if what == "visual":
+                    material = SubElement(element, "material", name=f"colour of {item.id}")
+                    SubElement(material, "color", rgba=_numbers(*_rgba(item)))
         joint = SubElement(robot, "joint", name=f"world_to_{item.id}", type="fixed")
         SubElement(joint, "parent", link="world")
         SubElement(joint, "child", link=item.id)
-        with warnings.catch_warnings():
-            # Straight up or down there are many roll-pitch-yaw angles; SciPy warns and takes one.
-            warnings.simplefilter("ignore", UserWarning)
-            angles = Rotation.from_matrix(item.shape.T_world_object[:3, :3]).as_euler("xyz")
-        SubElement(joint, "origin", xyz=_numbers(*item.centre_world), rpy=_numbers(*angles))
+        SubElement(joint, "origin", _pose(item.shape.T_world_object))
     indent(robot)
     return tostring(robot, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _boxes(shape: Shape) -> Sequence[tuple[Array, Shape]]:
+    """What URDF can say of a shape: itself, or the least box around each part, with poses (4, 4) in it."""
+    if not isinstance(shape, Solid):
+        return [(np.eye(4), shape)]
+    import trimesh
+
+    boxes = []
+    for part in shape.polytopes:
+        T_box_object, extents = trimesh.bounds.oriented_bounds(part.vertices)
+        T_object_box = transforms.invert(T_box_object)
+        boxes.append((T_object_box, Box(T_object_box, extents)))
+    return boxes
+
+
+def _pose(T: Array) -> dict[str, str]:
+    """A pose (4, 4) as URDF writes it."""
+    from scipy.spatial.transform import Rotation
+
+    with warnings.catch_warnings():
+        # Straight up or down there are many roll-pitch-yaw angles; SciPy warns and takes one.
+        warnings.simplefilter("ignore", UserWarning)
+        angles = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
+    return {"xyz": _numbers(*T[:3, 3]), "rpy": _numbers(*angles)}
 
 
 def _rgba(item: SceneObject) -> tuple[float, float, float, float]:
@@ -179,7 +208,7 @@ def _graphml(graph: SupportGraph) -> str:
     plain = nx.DiGraph()
     for item in graph.objects:
         x, y, z = item.centre_world.tolist()
-        size = item.shape.size
+        size = list(item.shape.extents) if isinstance(item.shape, Solid) else item.shape.size
         lengths = size.values() if isinstance(size, Mapping) else size
         attributes: dict[str, Any] = {"role": item.role, "label": item.label, "shape": item.shape.kind}
         attributes |= {"size": " ".join(f"{length:.6g}" for length in lengths), "x": x, "y": y, "z": z}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.geometry.shapes import Box, Shape
+from caryatid.geometry.solids import in_hull
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.sensing.views import SUPPORT_LABEL
@@ -271,6 +273,12 @@ def _top_height(shape: Shape) -> float:
 
 
 def _solid(name: str, shape: Shape) -> TrueObject:
+    if len(shape.parts) > 1:
+        # Hollow things count with their inside, here as in the truth.
+        corners = shape.outline()
+        return TrueObject(
+            name, partial(in_hull, corners), np.stack([corners.min(axis=0), corners.max(axis=0)])
+        )
     reach = shape.support(np.eye(3))
     centre = shape.T_world_object[:3, 3]
     return TrueObject(

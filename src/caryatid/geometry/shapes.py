@@ -23,10 +23,11 @@ KINDS: dict[str, type[Shape]] = {}
 
 
 class Shape(Pictured):
-    """A convex solid whose pose is at its centre: a frozen dataclass of `T_world_object` and named sizes.
+    """A convex form whose pose is at its centre: a frozen dataclass of `T_world_object` and named sizes.
 
     A kind has to give its `kind`, `extents` and `from_extents`, and an `outline` that spans it. Everything
     else follows; what compiled kernels, MuJoCo or URDF do not know by its `code` is the box around it there.
+    One that is not convex is the union of its convex `parts`.
 
     Attributes:
         kind: Name of the kind, as in graph.json.
@@ -66,6 +67,20 @@ class Shape(Pictured):
     def outline(self) -> Array:
         """Points (N, 3) [m] whose convex hull is the shape (to 1 % for round ones)."""
 
+    def resized(self, T_world_object: Array, extents: Array) -> Self:
+        """Return the shape with another pose (4, 4) and full extents (3,) [m]."""
+        return self.from_extents(T_world_object, extents)
+
+    @property
+    def parts(self) -> tuple[Shape, ...]:
+        """Convex shapes whose union it is: itself alone where it is convex."""
+        return (self,)
+
+    @property
+    def centre_of_mass(self) -> Array:
+        """Centre of mass (3,) [m] in the world, of a uniform density."""
+        return self.T_world_object[:3, 3]
+
     @classmethod
     def from_size(cls, T_world_object: Array, size: Any) -> Self:
         """Build the shape with a pose (4, 4) and sizes [m] as graph.json writes them.
@@ -84,7 +99,7 @@ class Shape(Pictured):
         return f"{{{', '.join(cls._size_names())}}}"
 
     @property
-    def size(self) -> dict[str, float] | list[float]:
+    def size(self) -> dict[str, Any] | list[float]:
         """Sizes [m] as graph.json writes them."""
         return {name: float(getattr(self, name)) for name in self._size_names()}
 

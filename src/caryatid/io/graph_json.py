@@ -12,6 +12,7 @@ from annotated_types import Ge, Le
 
 from caryatid.errors import InputError
 from caryatid.geometry.shapes import Uncertainty, from_size
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind, Role, SceneObject, Stability, Support, SupportGraph
 from caryatid.io.json_files import Numbers, json_text, parse_json, plain, read_json
@@ -37,7 +38,7 @@ class _Object:
     label: Annotated[int, Ge(0), Le(SUPPORT_LABEL)]
     shape: str
     T_world_object: Annotated[Array, Numbers(4, 4, rigid=True)]
-    size: dict[str, float] | list[float]
+    size: dict[str, float] | dict[Literal["parts"], list[list[tuple[float, float, float]]]] | list[float]
     occurrences: Count = 1
     opportunities: Count = 1
     residual: float = 0.0
@@ -50,7 +51,9 @@ class _Object:
     def decoded(self, source: str) -> SceneObject:
         source = f"{source} ('{self.id}')"
         lengths = self.size.values() if isinstance(self.size, dict) else self.size
-        if not all(length > 0.0 for length in lengths):
+        if self.shape != Solid.kind and not all(
+            isinstance(length, float) and length > 0.0 for length in lengths
+        ):
             raise InputError(source, f"size {self.size} is not positive", "give sizes in metres")
         given = dict(vars(self))
         given["shape"] = from_size(self.shape, given.pop("T_world_object"), given.pop("size"), source)

@@ -24,7 +24,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.runtime.display import Pictured
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
-from caryatid.simulation.world import TABLE, Solid, add_solid, empty_spec, quaternion, strayed
+from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion, strayed
 from caryatid.support.plausibility import drawn, reconcile
 
 
@@ -273,7 +273,7 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
         if o.role == "support_surface":
             _add_table(spec, o)
         else:
-            add_solid(spec, o.id, Solid(o.shape, density, friction))
+            add_body(spec, o.id, Body(o.shape, density, friction))
     return spec
 
 

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from caryatid.config import FusionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, Support, SupportGraph, object_id
 
@@ -208,9 +209,9 @@ def _fresh_id(o: SceneObject, taken: set[str]) -> str:
 def merged_sightings(sightings: Sequence[SceneObject]) -> SceneObject:
     """Merge sightings of one object into a vertex whose shape is better than each.
 
-    The kind is the one with the most evidence. Poses and radii are averaged with the evidence as weight; each
-    side is averaged over the sightings that saw it, and lies farthest out where none did. The result does not
-    depend on the order of the sightings but for rounding.
+    The kind is the one with the most evidence; of solids the best is taken as it is. Poses and radii are
+    averaged with the evidence as weight; each side is averaged over the sightings that saw it, and lies
+    farthest out where none did. The result does not depend on the order of the sightings but for rounding.
 
     Args:
         sightings: At least one; the first lends id, label and role.
@@ -229,7 +230,7 @@ def merged_sightings(sightings: Sequence[SceneObject]) -> SceneObject:
         centre = np.average([o.centre_world for o in same], axis=0, weights=w)
         radius = float(np.average([o.shape.extents[0] / 2.0 for o in same], weights=w))
         shape = Sphere(transforms.rigid(np.eye(3), centre), radius)
-    elif len(same) > 1:
+    elif len(same) > 1 and not isinstance(shape, Solid):
         shape, seen = _merged_sides(same, w, best)
     return replace(
         sightings[0],
@@ -253,6 +254,8 @@ def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
     if isinstance(shape, Sphere):
         return np.eye(3), 0.0
     R, R_reference = shape.T_world_object[:3, :3], reference.T_world_object[:3, :3]
+    if isinstance(shape, Solid):
+        return np.eye(3), float(Rotation.from_matrix(R_reference.T @ R).magnitude())
     round_ = isinstance(shape, Cylinder)
     turn = _turns(R[None], R_reference, round_)[0]
     if round_:

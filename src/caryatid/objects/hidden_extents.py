@@ -10,7 +10,7 @@ import numpy as np
 from caryatid.config import CompletionConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Cylinder, Primitives, Shape, Sphere
-from caryatid.geometry.signed_distance import signed_distances
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject
 from caryatid.segmentation.support_plane import SupportSurface
@@ -58,7 +58,7 @@ def _extended(
 ) -> SceneObject:
     """Extend an object among the shapes of the others."""
     shape = candidate.shape
-    if isinstance(shape, Sphere):
+    if isinstance(shape, (Sphere, Solid)):
         return candidate
     axis, sign = _downward_side(shape)
     down_world = sign * shape.T_world_object[:3, axis]
@@ -136,7 +136,7 @@ def _way_to_others(
     length = 0.0
     while near and length < limit:
         moved = points + length * outward
-        gap = min(signed_distances(*shapes.row(k), moved).min() for k in near) + config.overlap
+        gap = min(others[k].signed_distance(moved).min() for k in near) + config.overlap
         if gap < LEAST:
             return max(length - config.overlap, 0.0)
         length += gap

@@ -124,7 +124,16 @@ class VoxelMap:
         grid = np.zeros(np.maximum(highest - lowest, 0), dtype=np.uint8)
         grid[tuple(self.occupied - lowest[:, None])] = 1
         origin_world = self.origin_world + size * lowest
-        for_each(_fill_layer, len(grid), (*arrays, low - lowest, high - lowest, grid, origin_world, size))
+        low, high = low - lowest, high - lowest
+        for number, shape in enumerate(shapes):
+            if len(shape.parts) > 1:
+                # Kernels know no parts.
+                axes = [np.arange(a, b) for a, b in zip(low[number], high[number], strict=True)]
+                index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+                inside = shape.signed_distance(origin_world + size * (index + 0.5)) < 0.0
+                grid[tuple(index[inside].T)] = 1
+                high[number] = low[number]
+        for_each(_fill_layer, len(grid), (*arrays, low, high, grid, origin_world, size))
         return Solid(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:

@@ -1,4 +1,4 @@
-"""Random scenes by size and seed: piles, dense heaps between screens and walls, and packed objects."""
+"""Random scenes by size and seed: piles, dense heaps between screens and walls, packed and household ones."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import Array
+from caryatid.simulation.household import thing
 from caryatid.simulation.world import (
     TABLE_HEIGHT,
     TABLE_SIZE,
+    Body,
     Side,
     SimulatedScene,
-    Solid,
     body_poses,
     bounds,
     build_spec,
@@ -29,8 +30,13 @@ from caryatid.simulation.world import (
     true_shapes,
 )
 
-GeneratedKind = Literal["pile", "dense", "packed"]
-SIZES: dict[GeneratedKind, tuple[int, int]] = {"pile": (1, 25), "dense": (10, 25), "packed": (2, 25)}
+GeneratedKind = Literal["pile", "dense", "packed", "house"]
+SIZES: dict[GeneratedKind, tuple[int, int]] = {
+    "pile": (1, 25),
+    "dense": (10, 25),
+    "packed": (2, 25),
+    "house": (1, 14),
+}
 """Kind of a scene → fewest and most objects, the screens of a dense one among them."""
 GAP = 0.002
 """Height over what is below from which an object is let go [m]."""
@@ -38,7 +44,7 @@ TRIES = 10
 """Times an object is set down again while it falls off, rolls away or upsets others; then the one before it
 is taken up again as well."""
 
-_Drop = tuple[Solid, bool]
+_Drop = tuple[Body, bool]
 """A solid where it is let go, and whether it is meant to stay on another one."""
 
 
@@ -47,7 +53,7 @@ class _Plan:
     """How a scene is set up: what draws each object, solids from the start, size of the table [m], walls."""
 
     draw: Callable[[SimulatedScene | None], _Drop]
-    screens: tuple[Solid, ...] = ()
+    screens: tuple[Body, ...] = ()
     table: tuple[float, float] = TABLE_SIZE
     walls: tuple[Side, ...] = ()
 
@@ -55,10 +61,11 @@ class _Plan:
 def generate(
     kind: GeneratedKind, size: int, seed: int, physics: PhysicsConfig | None = None
 ) -> SimulatedScene:
-    """Set down random primitives one by one, each when all are at rest.
+    """Set down random objects one by one, each when all are at rest.
 
     A `pile` has most of them on what is there already, `dense` heaps them between tall free screens with
-    walls that close part of the circle for a robot, `packed` pushes them together until they touch.
+    walls that close part of the circle for a robot, `packed` pushes them together until they touch. All these
+    are of primitives; `house` has trays, bowls, mugs, plates, books and the like on and in each other.
 
     Args:
         kind: Kind of scene.
@@ -76,7 +83,7 @@ def generate(
     if seed < 0:
         raise InputError(name, f"seed {seed} is negative", "give 0 or more")
     rng = np.random.default_rng([list(SIZES).index(kind), size, seed])
-    plan = {"pile": _pile, "dense": _dense, "packed": _packed}[kind](rng, size)
+    plan = {"pile": _pile, "dense": _dense, "packed": _packed, "house": _house}[kind](rng, size)
     return _set_down(name, size, plan, physics or PhysicsConfig())
 
 
@@ -127,7 +134,20 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
             return _on_another(rng, shape, scene), True
         azimuth = rng.uniform(-np.pi, np.pi)
         outward_world = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-        return Solid(_pushed(shape, outward_world, list(true_shapes(scene).values()))), False
+        return Body(_pushed(shape, outward_world, list(true_shapes(scene).values()))), False
+
+    return _Plan(draw)
+
+
+def _house(rng: np.random.Generator, size: int) -> _Plan:
+    """Seven in ten things are set down on another one, or in it, the others anywhere on the table."""
+
+    def draw(scene: SimulatedScene | None) -> _Drop:
+        shape = thing(rng)
+        if scene is None or rng.random() >= 0.7:
+            half = np.array(TABLE_SIZE) / 2.0 - 0.12
+            return _let_go(shape, rng.uniform(-half, half), scene), False
+        return _on_another(rng, shape, scene), True
 
     return _Plan(draw)
 
@@ -139,7 +159,7 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
     any more, the last solid is taken up again too; after 40 drops for each object the scene is given up.
     """
 
-    def build(solids: Sequence[Solid], config: PhysicsConfig = physics, least: float = 0.0) -> SimulatedScene:
+    def build(solids: Sequence[Body], config: PhysicsConfig = physics, least: float = 0.0) -> SimulatedScene:
         spec = build_spec(solids, name, plan.table, plan.walls)
         return scene_from_spec(spec, name, name, config, least=least)
 
@@ -167,7 +187,7 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
     raise InputError(name, f"object{len(solids)} would not stay on the table", "choose another seed")
 
 
-def _stands(scene: SimulatedScene, firm: Sequence[Solid], plan: _Plan, physics: PhysicsConfig) -> bool:
+def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: PhysicsConfig) -> bool:
     """All objects are at rest on or over the table, and the firm ones, the first, about where they were.
 
     An object whose middle is within a centimetre of the table's edge has as good as fallen; none may reach
@@ -194,7 +214,7 @@ def _stands(scene: SimulatedScene, firm: Sequence[Solid], plan: _Plan, physics: 
     return not strayed(body_poses(scene.data), body_poses(data), *limits).any()
 
 
-def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Solid:
+def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
     """Put a shape at the origin a little over whatever is below a place (2,) [m], by boxes around objects."""
     over = shape.moved(transforms.rigid(np.eye(3), (*xy, 0.0)))
     tops = [TABLE_HEIGHT]
@@ -202,10 +222,10 @@ def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Solid:
         others = true_shapes(scene).items()
         tops += [float(bounds(scene, label)[1][2]) for label, other in others if _overlap(over, other)]
     z = max(tops) + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + GAP
-    return Solid(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
+    return Body(over.moved(transforms.rigid(np.eye(3), (0.0, 0.0, z))))
 
 
-def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> Solid:
+def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> Body:
     """Put a shape at the origin over one of the scene's objects, off its middle by 0.3 of its half extent."""
     below = list(true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
     reach = 0.3 * below.support(np.eye(3))[:2]
@@ -238,7 +258,7 @@ def _shape(rng: np.random.Generator, R: Array) -> Shape:
     return Sphere(T, radius)
 
 
-def _screens(rng: np.random.Generator) -> list[Solid]:
+def _screens(rng: np.random.Generator) -> list[Body]:
     """Two to four thin boxes, taller than most of a heap, all around it, their broad sides to the middle."""
     count = int(rng.integers(2, 5))
     step = 2.0 * np.pi / count
@@ -249,7 +269,7 @@ def _screens(rng: np.random.Generator) -> list[Solid]:
         width, height = rng.uniform(0.12, 0.18), rng.uniform(0.23, 0.32)
         at = (distance * np.cos(azimuth), distance * np.sin(azimuth), TABLE_HEIGHT + height / 2.0)
         T = transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, azimuth)), at)
-        screens.append(Solid(Box(T, np.array([0.05, width, height])), density=1200.0))
+        screens.append(Body(Box(T, np.array([0.05, width, height])), density=1200.0))
     return screens
 
 

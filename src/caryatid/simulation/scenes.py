@@ -14,8 +14,8 @@ from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.simulation.generation import SIZES, GeneratedKind, generate
 from caryatid.simulation.world import (
+    Body,
     SimulatedScene,
-    Solid,
     box,
     build_spec,
     cylinder,
@@ -24,7 +24,7 @@ from caryatid.simulation.world import (
     sphere,
 )
 
-DESIGNED: Final = MappingProxyType[str, tuple[Solid, ...]](
+DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
     {
         # Four on top of each other: each is held by the one below alone.
         "tower": (
@@ -88,7 +88,7 @@ DESIGNED: Final = MappingProxyType[str, tuple[Solid, ...]](
         ),
     }
 )
-"""Solids of each designed scene, by name; heights count from the table top."""
+"""Bodies of each designed scene, by name; heights count from the table top."""
 
 
 SCENE_FILE = "scene.xml"
@@ -97,15 +97,15 @@ SCENE_FILE = "scene.xml"
 TRUTH_FILE = "gt.json"
 """Name of the ground truth beside it."""
 
-_GENERATED = re.compile(r"(pile|dense|packed)-(\d+)-(\d+)")
+_GENERATED = re.compile(r"(pile|dense|packed|house)-(\d+)-(\d+)")
 
 
 def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None) -> SimulatedScene:
     """Load a scene and let it come to rest.
 
     Built-in names come before files: a designed scene (`tower`, `bridge`, …), or `pile-SIZE-SEED`,
-    `dense-SIZE-SEED` and `packed-SIZE-SEED` for a generated one, say `pile-8-3`. A folder of such a name is
-    reached as `./tower`.
+    `dense-SIZE-SEED`, `packed-SIZE-SEED` and `house-SIZE-SEED` for a generated one, say `pile-8-3`. A folder
+    of such a name is reached as `./tower`.
 
     Args:
         source: A built-in name, an MJCF file, or a folder with a `scene.xml`.

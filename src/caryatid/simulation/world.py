@@ -11,12 +11,12 @@ from typing import Any, Literal
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull
 
 from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
-from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
+from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
+from caryatid.geometry.solids import Polytope, Solid, in_hull
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import SUPPORT_LABEL
 
@@ -203,8 +203,8 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Solid:
-    """A free body of one primitive.
+class Body:
+    """A free body of one shape.
 
     Attributes:
         shape: Where it is set down and how large it is, in the world.
@@ -217,26 +217,26 @@ class Solid:
     friction: float = 0.8
 
 
-def box(size: Vector, at: Vector, turn: Vector = (0.0, 0.0, 0.0), **matter: float) -> Solid:
+def box(size: Vector, at: Vector, turn: Vector = (0.0, 0.0, 0.0), **matter: float) -> Body:
     """A cuboid.
 
     Args:
         size: Full edge lengths [m].
         at: Centre in x and y, and the height of the centre over the table top in z [m].
         turn: Rotation vector [deg].
-        **matter: Density and friction of a `Solid`.
+        **matter: Density and friction of a `Body`.
     """
-    return Solid(Box(_placed(at, turn), np.array(size)), **matter)
+    return Body(Box(_placed(at, turn), np.array(size)), **matter)
 
 
-def cylinder(radius: float, height: float, at: Vector, **matter: float) -> Solid:
+def cylinder(radius: float, height: float, at: Vector, **matter: float) -> Body:
     """An upright cylinder [m]; the other arguments are as in `box`."""
-    return Solid(Cylinder(_placed(at), radius, height), **matter)
+    return Body(Cylinder(_placed(at), radius, height), **matter)
 
 
-def sphere(radius: float, at: Vector) -> Solid:
+def sphere(radius: float, at: Vector) -> Body:
     """A ball [m]; `at` is as in `box`."""
-    return Solid(Sphere(_placed(at), radius))
+    return Body(Sphere(_placed(at), radius))
 
 
 def empty_spec(name: str) -> Any:
@@ -250,7 +250,7 @@ def empty_spec(name: str) -> Any:
 
 
 def build_spec(
-    solids: Sequence[Solid],
+    bodies: Sequence[Body],
     name: str,
     table_size: tuple[float, float] = TABLE_SIZE,
     walls: Sequence[Side] = (),
@@ -258,7 +258,7 @@ def build_spec(
     """Build a floor, a table with legs, walls beside it and free bodies `object0`, `object1`, … on it.
 
     Args:
-        solids: The free bodies, in order.
+        bodies: The free ones, in order.
         name: Name of the model.
         table_size: Depth along x and width along y of the top [m].
         walls: Sides of the table where a wall stands.
@@ -289,8 +289,8 @@ def build_spec(
     for index, (sign_x, sign_y) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
         foot = (sign_x * (x - 0.75 * thick), sign_y * (y - 0.75 * thick), under / 2.0)
         put(table, f"table_leg{index}", foot, np.array([thick, thick, under]) / 2.0, (0.6, 0.48, 0.35))
-    for index, solid in enumerate(solids):
-        add_solid(spec, f"object{index}", solid, palette(index))
+    for index, body in enumerate(bodies):
+        add_body(spec, f"object{index}", body, palette(index))
     return spec
 
 
@@ -313,42 +313,50 @@ def _placed(at: Vector, turn: Vector = (0.0, 0.0, 0.0)) -> Array:
     return transforms.rigid(R, (at[0], at[1], TABLE_HEIGHT + at[2]))
 
 
-def add_solid(
-    spec: Any, name: str, solid: Solid, rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
+def add_body(
+    spec: Any, name: str, body: Body, rgba: tuple[float, float, float, float] = (0.7, 0.7, 0.7, 1.0)
 ) -> None:
-    """Add a free body of one primitive to a MuJoCo spec.
+    """Add a free body to a MuJoCo spec: a geom for each convex part, those of a solid as meshes.
 
     Args:
         spec: `mujoco.MjSpec`, changed in place.
         name: Of the body.
-        solid: What it is and where.
+        body: What it is and where.
         rgba: Its colour.
     """
-    shape = solid.shape
+    shape = body.shape
     T_world_body = shape.T_world_object
-    body = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
-    body.add_freejoint()
+    added = spec.worldbody.add_body(name=name, pos=T_world_body[:3, 3], quat=quaternion(T_world_body[:3, :3]))
+    added.add_freejoint()
     kind, size, torsional, rolling = _GEOM.mjGEOM_BOX, shape.extents / 2.0, 0.005, 0.001
     if isinstance(shape, Cylinder):
         kind, size = _GEOM.mjGEOM_CYLINDER, np.array([shape.radius, shape.height / 2.0, 0.0])
     elif isinstance(shape, Sphere):
         kind, size = _GEOM.mjGEOM_SPHERE, np.array([shape.radius, 0.0, 0.0])
+    elif isinstance(shape, Solid):
+        kind = _GEOM.mjGEOM_MESH
+    if isinstance(shape, Sphere | Solid):
         torsional, rolling = 0.01, 0.01
-    body.add_geom(
-        type=kind,
-        size=size,
-        condim=4 if kind == _GEOM.mjGEOM_BOX else 6,
-        friction=[solid.friction, torsional, rolling],
-        density=solid.density,
-        rgba=rgba,
-    )
+    matter: dict[str, Any] = {
+        "condim": 4 if kind == _GEOM.mjGEOM_BOX else 6,
+        "friction": [body.friction, torsional, rolling],
+        "density": body.density,
+        "rgba": rgba,
+    }
+    if not isinstance(shape, Solid):
+        added.add_geom(type=kind, size=size, **matter)
+        return
+    for number, part in enumerate(shape.polytopes):
+        mesh = f"{name}-{number}"
+        spec.add_mesh(name=mesh, uservert=part.vertices.ravel().tolist())
+        added.add_geom(type=kind, meshname=mesh, **matter)
 
 
 def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[np.bool_]:
     """Which points lie inside an object's true solid.
 
-    Primitives are tested as what they are, meshes as the convex hulls they collide as; an object of several
-    colliding geoms is their union.
+    Primitives are tested as what they are, meshes as the convex hulls they collide as. An object of several
+    colliding geoms is their common convex hull: what is hollow counts with its inside.
 
     Args:
         scene: The scene.
@@ -358,15 +366,32 @@ def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[
     Returns:
         (N,) bool.
     """
-    inside = np.zeros(len(points_world), dtype=bool)
-    for geom in _solid_geoms(scene, label):
-        shape = _primitive(scene, geom)
-        if shape is not None:
-            inside |= shape.signed_distance(points_world) <= 0.0
-        else:
-            T_geom_world = transforms.invert(_geom_pose(scene, geom))
-            inside |= _inside_geom(scene.model, geom, transforms.transform(T_geom_world, points_world))
-    return inside
+    geoms = _solid_geoms(scene, label)
+    if len(geoms) > 1:
+        return in_hull(np.concatenate([_outline(scene, geom) for geom in geoms]), points_world)
+    shape = _primitive(scene, geoms[0])
+    if shape is not None:
+        return shape.signed_distance(points_world) <= 0.0
+    T_geom_world = transforms.invert(_geom_pose(scene, geoms[0]))
+    return _inside_geom(scene.model, geoms[0], transforms.transform(T_geom_world, points_world))
+
+
+def _outline(scene: SimulatedScene, geom: int) -> Array:
+    """Points (N, 3) [m] whose convex hull is a geom, to 1 % where it is round."""
+    shape, model, size = _primitive(scene, geom), scene.model, scene.model.geom_size[geom]
+    if shape is not None:
+        return shape.outline()
+    ball = fibonacci_sphere(400)
+    match model.geom_type[geom]:
+        case _GEOM.mjGEOM_ELLIPSOID:
+            points = ball * size
+        case _GEOM.mjGEOM_CAPSULE:
+            points = ball * size[0] + np.sign(ball[:, 2:]) * (0.0, 0.0, size[1])
+        case _GEOM.mjGEOM_MESH:
+            points = _mesh_vertices(model, geom)
+        case _:
+            raise _unsupported(model, geom)
+    return transforms.transform(_geom_pose(scene, geom), points)
 
 
 def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
@@ -376,10 +401,21 @@ def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
 
 
 def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
-    """Shape of every object, by label, that is a single box, cylinder or sphere; others are left out."""
-    geoms = {label: _solid_geoms(scene, label) for label in scene.object_bodies}
-    shapes = {label: _primitive(scene, own[0]) for label, own in geoms.items() if len(own) == 1}
-    return {label: shape for label, shape in shapes.items() if shape is not None}
+    """Shape of every object, by label: a box, cylinder or sphere, or else a solid of its geoms."""
+    return {label: _true_shape(scene, label) for label in scene.object_bodies}
+
+
+def _true_shape(scene: SimulatedScene, label: int) -> Shape:
+    geoms = _solid_geoms(scene, label)
+    shape = _primitive(scene, geoms[0]) if len(geoms) == 1 else None
+    if shape is not None:
+        return shape
+    T_world_body = transforms.rigid(
+        scene.data.xmat[scene.body_id(label)].reshape(3, 3), scene.data.xpos[scene.body_id(label)]
+    )
+    T_body_world = transforms.invert(T_world_body)
+    parts = [Polytope.around(transforms.transform(T_body_world, _outline(scene, geom))) for geom in geoms]
+    return Solid(T_world_body, tuple(part for part in parts if part is not None))
 
 
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
@@ -439,8 +475,7 @@ def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:
             along = np.clip(points[:, 2], -size[1], size[1])
             return np.linalg.norm(points - along[:, None] * (0.0, 0.0, 1.0), axis=-1) <= size[0]
         case _GEOM.mjGEOM_MESH:
-            faces = ConvexHull(_mesh_vertices(model, geom)).equations
-            return (points @ faces[:, :3].T + faces[:, 3] <= 1e-9).all(axis=-1)
+            return in_hull(_mesh_vertices(model, geom), points)
     raise _unsupported(model, geom)
 
 

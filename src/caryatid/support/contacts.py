@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from caryatid.errors import InputError
 from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
-from caryatid.geometry.shapes import Primitives, Shape
+from caryatid.geometry.shapes import Primitives, Shape, fibonacci_sphere
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 
 _GEOM_TYPES = {
@@ -26,11 +27,12 @@ _GEOM_TYPES = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Contact:
-    """Two shapes that touch, nearly touch or overlap.
+    """Two shapes that touch, nearly touch or overlap, by a convex part of each.
 
     Attributes:
         a: Index of the first shape.
         b: Index of the second shape; a < b.
+        parts: The convex parts of both; of most shapes the shape itself.
         points_world: Contact points (K, 3) [m], midway between the two surfaces.
         point_world: Their centre (3,) [m].
         normal_world: Unit normal (3,) of the separating plane, from a to b.
@@ -39,6 +41,7 @@ class Contact:
 
     a: int
     b: int
+    parts: tuple[Shape, Shape]
     points_world: Array
     point_world: Array
     normal_world: Array
@@ -53,7 +56,7 @@ def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
         margin: Largest gap [m].
 
     Returns:
-        One contact a pair, sorted by (a, b).
+        One contact a pair of convex parts, sorted by (a, b) and the parts' numbers.
 
     Raises:
         InputError: The margin is negative.
@@ -62,11 +65,14 @@ def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
         raise InputError("margin", "is negative or NaN", "give the largest gap of a contact in metres")
     if len(shapes) < 2:
         return []
-    found = _collide(shapes, margin).contact
+    parts = [part for shape in shapes for part in shape.parts]
+    owners = np.repeat(np.arange(len(shapes)), [len(shape.parts) for shape in shapes])
+    found = _collide(parts, owners, margin).contact
     geoms = np.sort(found.geom, axis=1)
-    if not len(geoms):
-        return []
     rows = np.lexsort((geoms[:, 1], geoms[:, 0]))
+    rows = rows[owners[geoms[rows, 0]] != owners[geoms[rows, 1]]]
+    if not len(rows):
+        return []
     geoms, points_world = geoms[rows], found.pos[rows]
     starts = np.flatnonzero(np.append(True, (geoms[1:] != geoms[:-1]).any(axis=1)))
     counts = np.diff(starts, append=len(rows))[:, None]
@@ -78,7 +84,10 @@ def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
         transforms.unit(normals_world),
         np.minimum.reduceat(found.dist[rows], starts).tolist(),
     )
-    return [Contact(a, b, *rest) for (a, b), *rest in zip(geoms[starts].tolist(), *columns, strict=True)]
+    return [
+        Contact(int(owners[a]), int(owners[b]), (parts[a], parts[b]), *rest)
+        for (a, b), *rest in zip(geoms[starts].tolist(), *columns, strict=True)
+    ]
 
 
 def local_frames(
@@ -108,28 +117,47 @@ def find_gap(a: Shape, b: Shape) -> float:
         a: The one.
         b: The other.
     """
-    data = _collide([a, b], 0.0)
+    parts, count = [*a.parts, *b.parts], len(a.parts)
+    data = _collide(parts, np.arange(len(parts)), 0.0)
     apart = float(np.linalg.norm(a.T_world_object[:3, 3] - b.T_world_object[:3, 3]))
-    return float(mujoco.mj_geomDistance(data.model, data, 0, 1, apart, np.empty(6)))
+    return min(
+        float(mujoco.mj_geomDistance(data.model, data, i, j, apart, np.empty(6)))
+        for i in range(count)
+        for j in range(count, len(parts))
+    )
 
 
-def _collide(shapes: Sequence[Shape], margin: float) -> mujoco.MjData:
-    """Run MuJoCo's collision detection on shapes up to gaps of a margin [m].
+def _collide(parts: Sequence[Shape], owners: NDArray[np.intp], margin: float) -> mujoco.MjData:
+    """Run MuJoCo's collision detection on convex parts up to gaps of a margin [m].
 
-    The result holds until the next call in the same thread.
+    Parts with the same owner need not be told apart; most are not. The result holds until the next call in
+    the same thread.
     """
-    count, (kinds, R, centres, half) = len(shapes), Primitives.of(shapes)
-    model, data = _engine(max(16, 1 << (count - 1).bit_length()), threading.get_ident())
+    count, (kinds, R, centres, half) = len(parts), Primitives.of(parts)
+    forms = [(k, part.polytopes[0].vertices) for k, part in enumerate(parts) if isinstance(part, Solid)]
+    corners = max((len(vertices) for _, vertices in forms), default=0)
+    model, data = _engine(_room(count, 16), _room(corners, 64) if forms else 0, threading.get_ident())
     size = half.copy()
     size[kinds == CYLINDER, 1] = half[kinds == CYLINDER, 2]
     model.geom_type[:count], model.geom_size[:count] = [_GEOM_TYPES[kind] for kind in kinds.tolist()], size
     model.geom_rbound[:count] = np.linalg.norm(half, axis=1)
-    model.geom_aabb[:count, 3:] = half
+    model.geom_aabb[:count, :3], model.geom_aabb[:count, 3:] = 0.0, half
+    for mesh, (k, vertices) in enumerate(forms):
+        first = model.mesh_vertadr[mesh]
+        model.mesh_vert[first : first + len(vertices)] = vertices
+        model.mesh_vertnum[mesh], model.mesh_graphadr[mesh] = len(vertices), -1
+        model.geom_type[k], model.geom_dataid[k] = mujoco.mjtGeom.mjGEOM_MESH, mesh
     # A pair's margin is the sum of its two geoms'.
     model.geom_margin[:count] = model.body_margin[1 : count + 1] = margin / 2.0
     taken = np.arange(model.ngeom) < count
-    model.geom_contype[:], model.geom_conaffinity[:] = taken, taken
-    model.body_contype[1:], model.body_conaffinity[1:] = taken, taken
+    collides, with_what = taken.astype(np.int32), np.where(taken, np.int32(-1), np.int32(0))
+    own = np.unique(owners[[k for k, _ in forms]])
+    for bit, owner in enumerate(own.tolist()[:30], start=1):
+        # Parts of one solid do not collide.
+        collides[:count][owners == owner] = 1 << bit
+        with_what[:count][owners == owner] = ~(1 << bit)
+    model.geom_contype[:], model.geom_conaffinity[:] = collides, with_what
+    model.body_contype[1:], model.body_conaffinity[1:] = collides, with_what
     poses = data.qpos[: 7 * count].reshape(count, 7)
     poses[:, :3] = centres
     for pose, axes in zip(poses, R.reshape(count, 9), strict=True):
@@ -140,13 +168,24 @@ def _collide(shapes: Sequence[Shape], margin: float) -> mujoco.MjData:
     return data
 
 
+def _room(count: int, least: int) -> int:
+    """A power of two that is enough."""
+    return max(least, 1 << (count - 1).bit_length())
+
+
 @lru_cache(maxsize=8)
-def _engine(capacity: int, thread: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Free bodies with a geom each, set before each use; one per thread, as two must not write to it."""
+def _engine(capacity: int, corners: int, thread: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    """Free bodies with a geom and a mesh each, set before each use; one per thread, as two must not write."""
     spec = mujoco.MjSpec()
-    for _ in range(capacity):
+    ball = fibonacci_sphere(corners).ravel().tolist() if corners else []
+    for number in range(capacity):
         body = spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True)
         body.add_freejoint()
-        body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=np.ones(3))
+        if corners:
+            spec.add_mesh(name=f"mesh{number}", uservert=ball)
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=f"mesh{number}")
+        else:
+            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=np.ones(3))
     model = spec.compile()
+    model.geom_pos[:], model.geom_quat[:] = 0.0, (1.0, 0.0, 0.0, 0.0)
     return model, mujoco.MjData(model)

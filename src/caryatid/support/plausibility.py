@@ -158,7 +158,7 @@ def _changed(shape: Shape, change: Array) -> Shape:
     change = _effect(shape.ties) @ change
     T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(change[3:6]), change[:3])
     extents = np.maximum(shape.extents + 2.0 * change[6:9], 0.008)  # As of the fits.
-    return shape.from_extents(T, extents)
+    return shape.resized(T, extents)
 
 
 def _doubts(objects: Sequence[SceneObject], contacts: Sequence[Contact]) -> dict[int, str]:

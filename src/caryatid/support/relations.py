@@ -10,7 +10,7 @@ import numpy as np
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
 from caryatid.geometry import polygons, transforms
-from caryatid.geometry.shapes import Primitives
+from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_contacts, find_gap, local_frames
@@ -31,6 +31,7 @@ class Touch:
 
     Attributes:
         other: The object that touches it.
+        parts: The convex part of the object that is touched, and that of the other.
         normal_world: Unit normal (3,) of the separating plane, pointing away from `other`.
         gap: [m], negative where they overlap.
         tilt: Angle of the normal to the vertical [deg]; below 90 where `other` is the lower one.
@@ -40,6 +41,7 @@ class Touch:
     """
 
     other: SceneObject
+    parts: tuple[Shape, Shape]
     normal_world: Array
     gap: float
     tilt: float
@@ -109,7 +111,9 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
         edges += _weighed_down(o, riders, stability[o.id], tipping, config)
     rank = {o.id: i for i, o in enumerate(ordered)}
     edges.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))
-    return SupportGraph(ordered, tuple(edges), stability)
+    # Solids touch by several parts.
+    once = {s.pair: s for s in reversed(edges)}
+    return SupportGraph(ordered, tuple(reversed(once.values())), stability)
 
 
 def explain(graph: SupportGraph, supporter: str, supported: str, config: SupportConfig) -> str:
@@ -132,7 +136,8 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
         return edge.why
     if b.role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
-    touch = next(iter(_find_touches([a, b], config.reach, config)[b.id]), None)
+    touches = _find_touches([a, b], config.reach, config)[b.id]
+    touch = min(touches, key=lambda t: (t.tilt > config.max_tilt, t.gap), default=None)
     head = f"{supporter} does not support {supported}: "
     if touch is None:
         gap = _gap(find_gap(a.shape, b.shape))
@@ -239,8 +244,8 @@ def _find_touches(
         contacts, normals_world, tilts.tolist(), margins.tolist(), strict=True
     ):
         a, b, place = objects[c.a], objects[c.b], (c.points_world, c.point_world, margin)
-        touches[b.id].append(Touch(a, normal_world, c.distance, tilt, *place))
-        touches[a.id].append(Touch(b, -normal_world, c.distance, 180.0 - tilt, *place))
+        touches[b.id].append(Touch(a, c.parts[::-1], normal_world, c.distance, tilt, *place))
+        touches[a.id].append(Touch(b, c.parts, -normal_world, c.distance, 180.0 - tilt, *place))
     return touches
 
 
@@ -254,11 +259,11 @@ def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array
     return contact.normal_world
 
 
-def _patch(t: Touch, o: SceneObject, config: SupportConfig) -> Array:
+def _patch(t: Touch, config: SupportConfig) -> Array:
     """Contact area projected to the ground, or the hull of the contact points: a polygon (M, 2) [m]."""
     if config.stability == "area":
         return polygons.hull(t.points_world)
-    return contact_patch(o.shape, t.other.shape, t.normal_world, t.points_world, config)
+    return contact_patch(*t.parts, t.normal_world, t.points_world, config)
 
 
 def _from_below(
@@ -268,13 +273,13 @@ def _from_below(
     below = [t for t in touches if t.tilt <= config.max_tilt]
     sure = [t for t in below if t.gap <= (t.margin if t.tilt <= config.gentle_tilt else 0.0)]
     supports = [_support(t, o, "bottom-up", True, f"{_below_text(t, o)}.") for t in sure]
-    patches = [_patch(t, o, config) for t in sure]
+    patches = [_patch(t, config) for t in sure]
     doubtful = sorted((t for t in below if t not in sure), key=lambda t: t.gap)
     overhang = find_tipping(o.shape, patches).overhang if doubtful else 0.0
     for t in doubtful:
         if overhang <= config.overhang:
             break
-        patch = _patch(t, o, config)
+        patch = _patch(t, config)
         gained = find_tipping(o.shape, [*patches, patch]).overhang
         if gained < overhang:
             why = f"{_below_text(t, o)}; without it {_overhang_text(o.id, overhang)}."
@@ -304,7 +309,7 @@ def _let_down(
         )
         for drop, _, t in landings
     ]
-    return supports, [_patch(t, lowered, config) for _, lowered, t in landings]
+    return supports, [_patch(t, config) for _, _, t in landings]
 
 
 def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
@@ -327,7 +332,7 @@ def _weighed_down(
     head, found = _verdict(o.id, stability, config), []
     for t in riders:
         why = f"{head}; {t.other.id} rests on it"
-        lever = float((tipping.pivot_xy - centroid(_patch(t, o, config))) @ tipping.direction_xy)
+        lever = float((tipping.pivot_xy - centroid(_patch(t, config))) @ tipping.direction_xy)
         if config.stability == "area":
             found.append(_support(t, o, "top-down", False, f"{why}."))
         elif stability.tips and lever > 0.0:

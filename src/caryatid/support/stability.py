@@ -12,7 +12,7 @@ import numpy as np
 from caryatid.config import SupportConfig
 from caryatid.geometry import polygons
 from caryatid.geometry.shapes import Box, Primitives, Shape
-from caryatid.geometry.signed_distance import signed_distances
+from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Stability
 
@@ -49,6 +49,8 @@ class Tipping:
 
 def ground_outline(shape: Shape) -> Array:
     """P_A: the polygon (M, 2) [m] the shape's extent projects to on the ground."""
+    if isinstance(shape, Solid):
+        return polygons.hull(_outline(shape))
     return _cap(shape, _UP, np.inf)
 
 
@@ -92,9 +94,9 @@ def beneath(shapes: Primitives, index: int, limit: float) -> list[int]:
 
 
 def find_tipping(shape: Shape, patches: Sequence[Array]) -> Tipping:
-    """Where the centre of mass (the shape's centre) projects against the contact areas, each (M, 2) [m]."""
+    """Where the centre of mass projects against the contact areas, each (M, 2) [m]."""
     polygon = polygons.hull(np.concatenate([np.empty((0, 2)), *patches]))
-    centre_xy = shape.T_world_object[:2, 3]
+    centre_xy = shape.centre_of_mass[:2]
     if not len(polygon):
         return Tipping(polygon, np.inf, centre_xy, np.zeros(2))
     distance, x, y, inside = polygons.nearest_on_border(polygon, centre_xy[0], centre_xy[1])
@@ -130,16 +132,15 @@ def _touching_depth(shape: Shape, config: SupportConfig) -> float:
 
 def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) -> float:
     """Way [m] until the first surface point meets the target; what touches at once lies beside it."""
-    own, aim = zip(*Primitives.of([shape, target]), strict=True)
     spacing = float(shape.extents.max()) / 16.0
     corners_world = shape.outline() if shape.kind != "sphere" else np.empty((0, 3))
     points_world = np.concatenate([shape.surface(spacing)[0], corners_world])
-    in_front = signed_distances(*own, points_world + 2.0 * _HIT * direction_world) > _HIT
-    points_world = points_world[in_front & (signed_distances(*aim, points_world) > _HIT)]
+    in_front = shape.signed_distance(points_world + 2.0 * _HIT * direction_world) > _HIT
+    points_world = points_world[in_front & (target.signed_distance(points_world) > _HIT)]
     travelled = np.zeros(len(points_world))
     step = np.full(len(points_world), np.inf)
     for _ in range(40):  # Enough to come within a hair wherever the way is not along a wall.
-        step = signed_distances(*aim, points_world + travelled[:, None] * direction_world)
+        step = target.signed_distance(points_world + travelled[:, None] * direction_world)
         on_its_way = (travelled + step <= limit) & (step > -_HIT)
         points_world, step = points_world[on_its_way], step[on_its_way]
         travelled = travelled[on_its_way] + step
@@ -152,6 +153,8 @@ def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
     """Outline on the ground (M, 2) [m] of what lies within `depth` of a shape's extreme point that way."""
     if shape.kind == "sphere":
         return polygons.hull(_ball_cap(shape, direction_world, depth))
+    if isinstance(shape, Solid):
+        return polygons.cap(_outline(shape), shape.polytopes[0].edges, direction_world, depth)
     if shape.kind not in _EDGES:
         shape = Box(shape.T_world_object, shape.extents)
     return polygons.cap(_outline(shape), _EDGES[shape.kind], direction_world, depth)

@@ -1,0 +1,276 @@
+"""Solid: a shape of any form, as the convex parts that make it up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Shape
+from caryatid.geometry.transforms import Array
+
+LEAST_VOLUME = 1e-9
+"""What is smaller is flat, and no part [m³]; a cubic millimetre."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Polytope:
+    """The convex hull of some points.
+
+    Attributes:
+        vertices: Its corners (V, 3) [m].
+        triangles: Indices (F, 3) of the corners of its faces, cut into triangles.
+        faces: Outward unit normal and offset of each triangle (F, 4): normal · x + offset ≤ 0 inside [m].
+        edges: Indices (E, 2) of the ends of its edges, cuts across flat faces among them.
+        volume: [m³].
+    """
+
+    vertices: Array
+    triangles: NDArray[np.intp]
+    faces: Array
+    edges: NDArray[np.intp]
+    volume: float
+
+    @classmethod
+    def around(cls, points: Array) -> Polytope | None:
+        """The hull of points (N, 3) [m], or None where they have no volume."""
+        try:
+            hull = ConvexHull(points)
+        except (QhullError, ValueError):
+            return None
+        if hull.volume < LEAST_VOLUME:
+            return None
+        number = np.full(len(points), -1)
+        number[hull.vertices] = np.arange(len(hull.vertices))
+        triangles = number[hull.simplices]
+        vertices = np.ascontiguousarray(points[hull.vertices], dtype=np.float64)
+        a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+        inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), hull.equations[:, :3]) < 0.0
+        triangles[inward] = triangles[inward][:, ::-1]
+        edges = np.unique(np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
+        return cls(vertices, triangles, hull.equations.copy(), edges, float(hull.volume))
+
+    @property
+    def middle(self) -> Array:
+        """Centre of mass (3,) [m]."""
+        corners = self.vertices[self.triangles] - self.vertices[0]
+        volumes = np.linalg.det(corners)
+        middle: Array = self.vertices[0] + volumes @ corners.sum(axis=1) / (4.0 * volumes.sum())
+        return middle
+
+    def cut(self, normal: Array, offset: float) -> tuple[Polytope | None, Polytope | None]:
+        """The parts on which normal · x is at most, and at least, an offset [m]; None where there is none."""
+        height = self.vertices @ normal - offset
+        if height.max() <= 0.0 or height.min() >= 0.0:
+            return (self, None) if height.max() <= 0.0 else (None, self)
+        low, high = height[self.edges[:, 0]], height[self.edges[:, 1]]
+        crossing = (low < 0.0) != (high < 0.0)
+        share = (low / (low - high + (low == high)))[crossing, None]
+        ends = self.vertices[self.edges[crossing]]
+        section = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
+        below, above = (
+            Polytope.around(np.concatenate([self.vertices[side], section]))
+            for side in (height <= 0.0, height >= 0.0)
+        )
+        return below, above
+
+
+@dataclass(frozen=True, eq=False, slots=True, repr=False)
+class Solid(Shape):
+    """The union of convex parts: what is no box, no cylinder and no ball, and what is hollow.
+
+    Its axes are the world's where it was first seen; its centre is that of the box around it.
+
+    Attributes:
+        kind: `solid`, as in graph.json.
+        T_world_object: Pose (4, 4) of its frame.
+        polytopes: The parts, in the solid's frame.
+    """
+
+    T_world_object: Array
+    polytopes: tuple[Polytope, ...]
+    kind: ClassVar[str] = "solid"
+    ties: ClassVar[tuple[int, int, int]] = (0, 0, 0)
+
+    @classmethod
+    def of(cls, polytopes: Sequence[Polytope]) -> Solid:
+        """Build a solid of parts in the world frame."""
+        vertices = np.concatenate([p.vertices for p in polytopes])
+        centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+        return cls(
+            transforms.rigid(np.eye(3), centre),
+            tuple(_moved(p, transforms.rigid(np.eye(3), -centre)) for p in polytopes),
+        )
+
+    @classmethod
+    def from_extents(cls, T_world_object: Array, extents: Array) -> Solid:
+        """Build a cuboid with a pose (4, 4) and edge lengths (3,) [m]."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+        return cls.from_size(T_world_object, {"parts": [signs * extents / 2.0]})
+
+    @classmethod
+    def from_size(cls, T_world_object: Array, size: Any) -> Solid:
+        """Build a solid with a pose (4, 4) and `parts`, the corners [m] of each part in the solid's frame."""
+        parts = [Polytope.around(np.array(part, dtype=np.float64).reshape(-1, 3)) for part in size["parts"]]
+        if not parts or None in parts:
+            raise ValueError("a part has no volume")
+        return cls(T_world_object, tuple(part for part in parts if part is not None))
+
+    @classmethod
+    def _size_format(cls) -> str:
+        return "{parts: [[[x, y, z], …], …]}"
+
+    @property
+    def size(self) -> dict[str, Any]:
+        """Corners [m] of each part in the solid's frame."""
+        return {"parts": [p.vertices.tolist() for p in self.polytopes]}
+
+    @property
+    def parts(self) -> tuple[Shape, ...]:
+        """Its convex parts, each as a solid."""
+        return tuple(Solid(self.T_world_object, (p,)) for p in self.polytopes)
+
+    @property
+    def extents(self) -> Array:
+        """Full extents (3,) [m] of the box around it along its own axes."""
+        return 2.0 * np.abs(np.concatenate([p.vertices for p in self.polytopes])).max(axis=0)
+
+    @property
+    def volume(self) -> float:
+        """Volume [m³]; where parts overlap it counts as often."""
+        return float(sum(p.volume for p in self.polytopes))
+
+    @property
+    def centre_of_mass(self) -> Array:
+        """Centre of mass (3,) [m] in the world, of a uniform density."""
+        middles = np.array([p.middle for p in self.polytopes])
+        weights = np.array([p.volume for p in self.polytopes])
+        return transforms.transform(self.T_world_object, (weights @ middles / weights.sum())[None])[0]
+
+    def resized(self, T_world_object: Array, extents: Array) -> Solid:
+        """The same form with another pose (4, 4), as long (3,) [m] along its axes."""
+        scale = extents / self.extents
+        if np.allclose(scale, 1.0, atol=1e-9):
+            return replace(self, T_world_object=T_world_object)
+        return Solid.from_size(T_world_object, {"parts": [p.vertices * scale for p in self.polytopes]})
+
+    def signed_distance(self, points_world: Array) -> Array:
+        """Distance (N,) [m] of points (N, 3) to the surface, negative inside.
+
+        Outside, where an edge or a corner is nearest, it is that to the farthest of the planes there: less.
+        """
+        points = transforms.transform(transforms.invert(self.T_world_object), points_world)
+        faces = np.concatenate([p.faces for p in self.polytopes])
+        ends = np.cumsum([len(p.faces) for p in self.polytopes])
+        distances: Array = _distances(np.ascontiguousarray(points), faces, ends)
+        return distances
+
+    def outline(self) -> Array:
+        """Corners (N, 3) [m] of all parts."""
+        return transforms.transform(self.T_world_object, np.concatenate([p.vertices for p in self.polytopes]))
+
+    def surface(self, spacing: float) -> tuple[Array, Array]:
+        """Points (N, 3) [m] about `spacing` metres apart all over the surface, and outward normals (N, 3)."""
+        points, normals = zip(*(_spread(p, spacing) for p in self.polytopes), strict=True)
+        owner = np.repeat(np.arange(len(points)), [len(p) for p in points])
+        local, outward = np.concatenate(points), np.concatenate(normals)
+        inside = np.zeros(len(local), dtype=np.bool_)
+        for number, part in enumerate(self.polytopes):
+            # Where two parts touch there is no surface, to a tenth of a millimetre.
+            depth = (local @ part.faces[:, :3].T + part.faces[:, 3]).max(axis=1)
+            inside |= (depth < 1e-4) & (owner != number)
+        R = self.T_world_object[:3, :3]
+        return transforms.transform(self.T_world_object, local[~inside]), outward[~inside] @ R.T
+
+    def mesh(self, corners: int = 48) -> Any:
+        """All parts as one `trimesh.Trimesh` in the solid's frame."""
+        import trimesh
+
+        return trimesh.util.concatenate(
+            [trimesh.Trimesh(p.vertices, p.triangles, process=False) for p in self.polytopes]
+        )
+
+    def _drawn(self, eye: Array) -> list[Array]:
+        """Edges and silhouette of the parts, where they do not lie within another one."""
+        mesh = self.mesh()
+        faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
+        drawn = mesh.face_adjacency_angles > np.radians(30.0)
+        drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
+        ends = mesh.vertices[mesh.face_adjacency_edges[drawn]]
+        local = Solid(np.eye(4), self.polytopes)
+        lines = np.linspace(ends[:, 0], ends[:, 1], 9, axis=1)
+        hidden = local.signed_distance(lines.mean(axis=1)) < -1e-3
+        return list(lines[~hidden])
+
+    def __repr__(self) -> str:
+        x, y, z = self.T_world_object[:3, 3]
+        return f"Solid({len(self.polytopes)} parts at ({x:.3f}, {y:.3f}, {z:.3f}))"
+
+
+def in_hull(corners: Array, points: Array) -> NDArray[np.bool_]:
+    """Which points (M, 3) lie inside the convex hull of corners (N, 3): (M,) bool."""
+    faces = ConvexHull(corners).equations
+    inside: NDArray[np.bool_] = (points @ faces[:, :3].T + faces[:, 3] <= 1e-9).all(axis=-1)
+    return inside
+
+
+def hollowed(part: Polytope, cavity: Sequence[tuple[Array, float]]) -> list[Polytope]:
+    """What is left of a part without a convex cavity, in convex pieces that do not overlap.
+
+    Args:
+        part: The part.
+        cavity: Its planes, unit normal (3,) into the cavity and offset [m]: in it is what lies before all.
+    """
+    pieces, rest = [], part
+    for normal, offset in cavity:
+        behind, before = rest.cut(normal, offset)
+        if behind is not None:
+            pieces.append(behind)
+        if before is None:
+            break
+        rest = before
+    return pieces
+
+
+def _moved(polytope: Polytope, T: Array) -> Polytope:
+    vertices = transforms.transform(T, polytope.vertices)
+    normals = polytope.faces[:, :3] @ T[:3, :3].T
+    offsets = polytope.faces[:, 3] - normals @ T[:3, 3]
+    return replace(polytope, vertices=vertices, faces=np.column_stack([normals, offsets]))
+
+
+def _spread(polytope: Polytope, spacing: float) -> tuple[Array, Array]:
+    """Points (N, 3) [m] evenly over a polytope's faces, and their normals (N, 3)."""
+    a, b, c = np.moveaxis(polytope.vertices[polytope.triangles], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2.0
+    number = max(20, int(areas.sum() / spacing**2))
+    place = (np.arange(number) + 0.5) / number
+    face = np.searchsorted(np.cumsum(areas) / areas.sum(), place).clip(max=len(areas) - 1)
+    # The first two coordinates of the additive recurrence that fills a square most evenly.
+    u, v = (np.arange(number)[:, None] * (0.7548776662466927, 0.5698402909980532) % 1.0).T
+    u, v = np.where(u + v > 1.0, 1.0 - u, u)[:, None], np.where(u + v > 1.0, 1.0 - v, v)[:, None]
+    return a[face] + u * (b - a)[face] + v * (c - a)[face], polytope.faces[face, :3]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _distances(points, faces, ends):  # type: ignore[no-untyped-def]
+    """Distances (N,) [m] of points (N, 3) to the nearest of several parts, by the planes (F, 4) of each."""
+    found = np.empty(len(points))
+    for i in range(len(points)):
+        x, y, z = points[i]
+        least, start = np.inf, 0
+        for end in ends:
+            most = -np.inf
+            for f in range(start, end):
+                most = max(most, faces[f, 0] * x + faces[f, 1] * y + faces[f, 2] * z + faces[f, 3])
+                if most >= least:
+                    break
+            least, start = min(least, most), end
+        found[i] = least
+    return found
