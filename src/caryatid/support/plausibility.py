@@ -100,7 +100,7 @@ def _sigma(o: SceneObject) -> Array:
     sigma[0:3], sigma[3:6], sigma[6:9] = known.sides[0::2], known.rotation, known.sides[1::2]
     round_ = sum(_round(o.shape.ties))
     if round_:
-        sigma[:round_], sigma[6 : 6 + round_] = known.position[:round_], 0.0
+        sigma[:round_] = known.position[:round_]
         sigma[6] = known.sizes[0] / 2.0
     return sigma
 
