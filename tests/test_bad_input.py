@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 from conftest import SMALL, TWO_ON_A_TABLE, run_command, without_labels, without_poses
 
-import caryatid as ct
-from caryatid.errors import InputError
 from caryatid.io import write_recording
 from caryatid.steps import read_run
 
@@ -26,23 +24,6 @@ def test_a_recording_that_does_not_say_enough(tmp_path, views, refused, command)
     write_recording(tmp_path / "bare", without_labels(views))
     said = refused(command, tmp_path / "bare", "--segmentation", "labels", says="has no masks")
     assert "--segmentation auto" in said
-
-
-@BOTH
-def test_no_plane(tmp_path, views, refused, command):
-    depth = np.random.default_rng(0).uniform(0.5, 2.5, views[0].depth.shape).astype(np.float32)
-    write_recording(tmp_path / "noise", [replace(views[0], depth=depth, labels=None)])
-    refused(command, tmp_path / "noise", names="noise/000000", says="no support surface")
-
-
-def test_views_without_a_reading_or_a_second_one_without_a_pose(views):
-    scene = ct.Scene()
-    for nothing in (0.0, np.nan, 50.0):
-        with pytest.raises(ct.CaryatidError, match=r"view 7: .*no depth readings"):
-            scene.update(ct.View(np.full((120, 160), nothing), views[0].K, np.eye(4), name="view 7"))
-    scene.update(views[0])
-    with pytest.raises(InputError, match="has no camera pose"):
-        scene.update(without_poses(views)[1])
 
 
 def test_a_segment_of_three_points(tmp_path, views, refused):

@@ -16,7 +16,6 @@ from caryatid.fitting.primitives import Fit, FitFailure, candidates, fit, free_i
 from caryatid.geometry import BOX as BOX_CODE
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
-from caryatid.runtime.parallel import on_threads
 from caryatid.sensing.voxel_map import VoxelMap
 
 CONFIG = FitConfig()
@@ -158,12 +157,6 @@ def same(a, b):
         and np.array_equal(a.uncertainty.sides, b.uncertainty.sides)
         and (a.residual, a.inliers, a.seen, a.cost) == (b.residual, b.inliers, b.seen, b.cost)
     )
-
-
-def test_fits_on_threads_are_those_of_one_thread():
-    parts = [surface_points(shape, np.random.default_rng(0), eye=EYE, sigma=0.001) for shape in SHAPES]
-    together = on_threads(lambda k: fit_of(*parts[k]), len(parts))
-    assert all(same(fit_of(*part), found) for part, found in zip(parts, together, strict=True))
 
 
 # Only some of the shapes

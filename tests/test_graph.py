@@ -42,11 +42,3 @@ def test_as_a_networkx_graph_it_points_from_supporter_to_supported():
     assert set(directed.edges) == {s.pair for s in GRAPH.supports}
     expected = {"data": GRAPH.supports[2], "kind": "top-down", "certain": False}
     assert directed.edges["o2", "o1"] == expected
-
-
-@pytest.mark.parametrize(
-    ("small_area", "tips", "stable"),
-    [(False, False, True), (True, False, False), (False, True, False), (True, True, False)],
-)
-def test_what_no_test_doubts_is_stable(small_area, tips, stable):
-    assert Stability(0.5, 0.0, small_area, tips).stable == stable

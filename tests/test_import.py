@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -308,12 +307,6 @@ def test_a_bag_that_was_cut_off_or_has_wrong_bytes_is_read_or_refused_in_one_lin
         assert (tmp_path / "out").exists() == (status == 0)
         assert status == 0 or told.count("\n") == 1
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
-
-
-def test_without_the_library_the_extra_is_named(tmp_path, views, unfit, monkeypatch):
-    bag = bag_of(tmp_path, views)
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    unfit(bag, *ALL, says='reading bags needs rosbags; pip install "caryatid[ros]"')
 
 
 # Folders of the TUM RGB-D benchmark

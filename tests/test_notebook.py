@@ -16,7 +16,6 @@ from caryatid.geometry.shapes import KINDS
 from caryatid.geometry.transforms import look_at
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.manipulation.order import Order, TakeStep
-from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.runtime.display import Pictured
 from caryatid.sensing.views import Cloud, View
@@ -167,8 +166,6 @@ def test_plain_lines_tell_one_from_another():
     many = repr(SupportGraph((SceneObject("o1", 1, ct.Sphere(upright, 0.1)),), edges))
     assert many.startswith("SupportGraph(vertices=1, edges=28: o1 → o2, ")
     assert many.endswith("…)")
-    candidates = Candidates(np.empty((0, 4, 4)), np.empty((0, 3)), np.empty(0), {"too low": 3})
-    assert repr(candidates) == "Candidates(0; refused: 3 too low)"
 
 
 @pytest.mark.slow

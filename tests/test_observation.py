@@ -95,12 +95,6 @@ def test_labels_that_are_demanded_and_missing_are_an_error(source):
     assert "auto" in caught.value.remedy
 
 
-def test_only_the_first_view_may_lack_a_pose():
-    known = observation_of(VIEW).surface
-    with pytest.raises(InputError, match="no camera pose"):
-        observation_of(without_pose(VIEW), known=known)
-
-
 @pytest.mark.parametrize("pose", [VIEW.T_world_camera, None], ids=["posed", "not posed"])
 def test_nothing_is_an_error_that_names_it(pose):
     with pytest.raises(PerceptionError, match="frame 7: holds no depth readings"):

@@ -196,17 +196,6 @@ def test_a_scene_is_the_same_bytes_on_any_number_of_threads(segmentation):
     assert texts[0] == texts[1]
 
 
-def test_a_segment_of_three_points_is_no_object_and_no_obstacle():
-    view = simulated_views("tower")[0]
-    labels = view.labels.copy()
-    table = np.argwhere((labels == 0) & (view.depth > 0.0))[2000:2003]
-    labels[tuple(table.T)] = 9
-    scene = Scene(segmentation="labels")
-    graph = scene.update(replace(view, labels=labels))
-    assert "o9" not in vertices(graph)
-    assert {"o1", "o2", "o5"} <= vertices(graph)
-
-
 def test_a_cloud_is_taken_in_like_a_view():
     scene = Scene(segmentation="labels")
     graph = scene.update(simulated_cloud("tower"))

@@ -1,11 +1,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from raycast import TABLE, K, from_the_side, table_scene
 from scipy.optimize import linear_sum_assignment
 
@@ -16,10 +14,9 @@ from caryatid.segmentation.lccp import convex_parts
 from caryatid.segmentation.segments import cut_by_colour, segment, segment_cloud
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points, thin
-from caryatid.sensing.views import Cloud, View
+from caryatid.sensing.views import Cloud
 
 UP = np.array([0.0, 0.0, 1.0])
-MOSD = Path(__file__).parents[2] / "shared" / "data" / "mosd"
 STACK = [
     (np.array([0.0, -0.1, TABLE + 0.04]), np.array([0.18, 0.2, 0.08])),
     (np.array([-0.02, -0.1, TABLE + 0.12]), np.array([0.08, 0.1, 0.08])),
@@ -267,19 +264,3 @@ def test_what_is_over_the_table_goes_by_height_and_outline():
     points = np.array([[0, 0, 0.8], [0, 0, 0.751], [0, 0, 0.5], [0, 0, 1.6], [0.6, 0, 0.8], [0.32, 0, 0.8]])
     kept = surface.over(points, 0.008, 0.6, 0.05)
     assert kept.tolist() == [True, False, False, False, False, True]
-
-
-@pytest.mark.skipif(not MOSD.is_dir(), reason="../shared/data/mosd is absent")
-def test_real_frames_of_stacked_objects():
-    totals = np.zeros(3, dtype=int)
-    for folder in sorted(MOSD.iterdir()):
-        if not folder.is_dir():
-            continue
-        depth = np.asarray(Image.open(folder / "depth" / "000000.png")).astype(np.float32) * 1e-4
-        truth = np.zeros(depth.shape, dtype=np.int32)
-        for number, path in enumerate(sorted((folder / "mask_visib").iterdir()), start=1):
-            truth[np.asarray(Image.open(path)) > 0] = number
-        view = View(depth=depth, K=K)
-        totals += found(parts(view, surface_of(view, up=None)), truth)
-    assert totals[0] >= 0.97 * totals[1]
-    assert totals[2] - totals[0] <= 0.07 * totals[2]

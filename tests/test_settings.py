@@ -10,7 +10,7 @@ import pytest
 from conftest import SMALL, refusal, run_command
 
 from caryatid.config import Config, FitConfig
-from caryatid.config.settings import field_docs, read_settings, write_settings
+from caryatid.config.settings import field_docs, read_settings
 from caryatid.errors import InputError
 
 
@@ -127,12 +127,3 @@ def test_a_file_is_named_when_something_in_it_is_wrong(tmp_path, content, reason
         path.write_bytes(content)
     with refusal(path, reason):
         read_settings(path, [])
-
-
-def test_what_is_written_is_read_back_as_it_was(file):
-    flags = ["fusion.method=sg", "registration.enabled=false", "robot.pitch=[-50.5, 10]"]
-    config = read_settings(None, flags)
-    text = write_settings(config)
-    assert read_settings(file(text), []) == config
-    assert all(f"[{stage.name}]" in text for stage in fields(Config))
-    assert "# An object displaced by more than this has been disturbed [m]" in text

@@ -202,6 +202,8 @@ class TestPolygons:
         steep = Sphere(rigid(np.eye(3), slope.T_world_object[:3, 3] + 0.05 * normal_world), 0.04)
         disc = contact_patch(steep, slope, normal_world, np.zeros((1, 3)), CONFIG)
         assert area(disc) == pytest.approx(area(patch) * normal_world[2], rel=1e-6)
+        touching = steep.T_world_object[:3, 3] - (0.04 - depth) * normal_world
+        np.testing.assert_allclose(disc.mean(axis=0), touching[:2], atol=1e-9)
         lying = Cylinder(at(0, 0, 0.03, (90, 0, 0)), 0.03, 0.2)
         np.testing.assert_allclose(np.ptp(ground_outline(lying), axis=0), (0.06, 0.2), atol=1e-3)
 
@@ -254,9 +256,24 @@ class TestPolygons:
         assert drop_distance(block(0.09, 0, 0.07, small), floor, 0.1) == np.inf
         assert drop_distance(block(0, 0, 0.2, small), floor, 0.1) == np.inf
 
+    @pytest.mark.parametrize(
+        ("other", "met"),
+        [
+            (block(0, 0, 0, (0.1, 0.1, 0.1495)), True),
+            (block(0, 0, 0, (0.1, 0.1, 0.1485)), False),
+            (block(0.1005, 0, 0, (0.1, 0.1, 0.19)), True),
+            (block(0, -0.1015, 0, (0.1, 0.1, 0.19)), False),
+            (block(0, 0, 0.3005, (0.1, 0.1, 0.1)), True),
+            (block(0, 0, 0.3015, (0.1, 0.1, 0.1)), False),
+        ],
+    )
+    def test_boxes_a_millimetre_larger_tell_what_lies_beneath(self, other, met):
+        """A cube from 0.2 to 0.3 m up, ±0.05 m wide, falls by 0.05 m."""
+        assert beneath(Primitives.of([cube(0, 0, 0.25), other]), 0, 0.05) == [1] * met
+
     def test_what_a_falling_shape_meets_lies_beneath_it(self):
         rng = np.random.default_rng(4)
-        met = spared = 0
+        met = 0
         for _ in range(3):
             shapes = random_shapes(8, rng, 0.12)
             for k, shape in enumerate(shapes):
@@ -265,9 +282,7 @@ class TestPolygons:
                 hit = {m for m, o in enumerate(shapes) if m != k and drop_distance(shape, o, 0.05) < np.inf}
                 assert hit <= set(below)
                 met += len(hit)
-                spared += len(shapes) - 1 - len(below)
         assert met > 10
-        assert spared > met
 
 
 class TestInfer:
@@ -575,14 +590,6 @@ class TestReconcile:
         beyond = replace(hovering, shape=hovering.shape.moved(at(0, 0, 0.007)))
         assert reconcile([SURFACE, beyond], PLAUSIBLE)[1] is beyond
 
-    def test_a_ball_that_overlaps_two_walls_shrinks(self):
-        walls = [block(x, 0, 0, (0.1, 0.2, 0.2)) for x in (-0.097, 0.097)]
-        sure = [SceneObject(f"o{k}", k, w, uncertainty=unsure(1e-4)) for k, w in enumerate(walls, 1)]
-        ball = SceneObject("o3", 3, Sphere(at(0, 0, 0.1), 0.05), uncertainty=unsure(0.003))
-        after = reconcile([SURFACE, *sure, ball], PLAUSIBLE)[3]
-        assert after.shape.extents[0] / 2.0 == pytest.approx(0.047, abs=0.0012)
-        np.testing.assert_allclose(after.centre_world, (0, 0, 0.1), atol=1e-3)
-
     @pytest.mark.parametrize(
         ("shape", "degrees", "away", "thinner"),
         [
@@ -591,7 +598,7 @@ class TestReconcile:
         ],
     )
     def test_an_overlap_is_shared_out_by_variance(self, shape, degrees, away, thinner):
-        """4 mm in a wall that is sure, contact sure to 1 mm²: of round shapes centre 16 mm², radius 8 mm².
+        """4 mm in a wall that is sure, contact sure to 1 mm²: of round shapes centre 16, radius 8 mm².
 
         The centre takes 4·16/25 = 2.56 mm, the radius 4·8/25 = 1.28 mm, to whichever side the wall is. A side
         of a box, 24 mm², takes 4·24/25 = 3.84 mm, by which the box is thinner, its centre half as far away.
@@ -599,7 +606,9 @@ class TestReconcile:
         towards = transforms.rotation_from_vector((0, 0, np.radians(degrees)))[:, 0]
         wall = Box(at(*(0.136 * towards[:2]), 0.1, (0, 0, degrees)), np.array([0.2, 0.4, 0.2]))
         level, radius = np.array([1.0, 1.0, 0.0]), np.sqrt(8e-6)
-        known = Uncertainty(0.004 * level, np.zeros(3), 2.0 * radius * level, np.repeat(level, 2) * 24e-6**0.5)
+        known = Uncertainty(
+            0.004 * level, np.zeros(3), 2.0 * radius * level, np.repeat(level, 2) * 24e-6**0.5
+        )
         before = SceneObject("o1", 1, shape, uncertainty=known)
         once = replace(PLAUSIBLE, rounds=1)
         _, after, _ = reconcile([SURFACE, before, SceneObject("o2", 2, wall)], once)

@@ -4,15 +4,9 @@ import numpy as np
 
 from caryatid.config import ActiveVisionConfig
 from caryatid.geometry import transforms
-from caryatid.sensing.view_sphere import ViewSphere, direction, spread
+from caryatid.sensing.view_sphere import ViewSphere
 
 SPHERE = ViewSphere.around((0.1, -0.2, 0.75), ActiveVisionConfig(sphere_points=2000))
-
-
-def test_the_default_is_the_papers_sphere():
-    sphere = ViewSphere.around((0.0, 0.0, 0.75), ActiveVisionConfig())
-    assert sphere.directions.shape == (40_000, 3)
-    assert sphere.radius == 1.5
 
 
 def test_views_lie_on_the_sphere_and_are_spread_evenly():
@@ -33,14 +27,3 @@ def test_direction_of_a_pose_is_where_it_came_from():
     poses = SPHERE.poses(SPHERE.directions[:100])
     np.testing.assert_allclose(SPHERE.direction_of(poses), SPHERE.directions[:100], atol=1e-12)
     np.testing.assert_allclose(SPHERE.direction_of(poses[7]), SPHERE.directions[7], atol=1e-12)
-
-
-def test_spread_is_one_at_the_top_and_falls_to_exp_minus_a_half_at_sigma():
-    sigma = np.deg2rad(20.0)
-    top = direction(0.3, 0.5)
-    ring = direction(0.3, 0.5 + sigma)
-    far = -top
-    value = spread(top[None], np.stack([top, ring, far]), sigma)
-    np.testing.assert_allclose(value[:, 0], [1.0, np.exp(-0.5), 0.0], atol=1e-9)
-    np.testing.assert_allclose(direction(np.pi, np.pi / 6.0), [-np.cos(np.pi / 6), 0.0, 0.5], atol=1e-12)
-    assert spread(SPHERE.directions[:3], SPHERE.directions[:5], sigma).shape == (5, 3)
