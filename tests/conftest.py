@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 from contextlib import contextmanager
@@ -23,6 +24,7 @@ from caryatid.errors import InputError
 from caryatid.exploration import Step
 from caryatid.geometry import transforms
 from caryatid.io import write_recording
+from caryatid.io.images import png
 from caryatid.runtime.compiling import compile_kernels
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud
@@ -81,6 +83,14 @@ def npy(array: np.ndarray, **options) -> bytes:
     file = io.BytesIO()
     np.save(file, array, **options)
     return file.getvalue()
+
+
+def write_view_files(folder: Path, view, **camera) -> None:
+    """`depth.png` in units of 0.1 mm, `labels.png` and `camera.json` of a view."""
+    (folder / "depth.png").write_bytes(png(np.round(1e4 * view.depth).astype(np.uint16)))
+    (folder / "labels.png").write_bytes(png(view.labels.astype(np.uint8)))
+    known = {"K": view.K.tolist(), "T_world_camera": view.pose.tolist(), "depth_scale": 0.1}
+    (folder / "camera.json").write_text(json.dumps(known | camera))
 
 
 def without_poses(views):
@@ -145,6 +155,14 @@ def views(scene_file):
 def kept_recording(tmp_path_factory, views) -> Path:
     folder = tmp_path_factory.mktemp("recordings") / "two"
     write_recording(folder, views)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def kept_run(tmp_path_factory, scene_file) -> Path:
+    """A run of two views of the two objects, with a report; not to be changed."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    assert run_command("explore", scene_file, "--out", folder, "--views", 2, "--seed", 5, *SMALL) == 0
     return folder
 
 

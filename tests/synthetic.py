@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 
-from caryatid.config import Config, FusionMethod, SensorConfig
+from caryatid.config import ActiveVisionConfig, Config, FusionMethod, SensorConfig, VoxelConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
 from caryatid.geometry.transforms import Array
@@ -16,11 +16,16 @@ from caryatid.scene import Scene
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.view_sphere import direction
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
+from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.scenes import load_scene
 
 SENSOR = SensorConfig(width=240, height=180, focal=197.0)
 """The Carmine's field of view with a seventh of its pixels: 8 mm between points at 1.5 m."""
+
+FEW_VIEWS = Config(
+    sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
+)
 
 TABLE_TOP = 0.75
 """Height of the table in the designed scenes [m]."""
@@ -92,6 +97,13 @@ def hausdorff(a: Shape, b: Shape, directions: Array = DIRECTIONS) -> float:
     """Hausdorff distance [m] of two convex shapes, in these directions: blind to axes' names and symmetry."""
     reach = [directions @ s.T_world_object[:3, 3] + s.support(directions) for s in (a, b)]
     return float(np.abs(reach[0] - reach[1]).max())
+
+
+def seen_free(where, centre_world=(0.0, 0.0, 0.0)) -> VoxelMap:
+    """A map that knows nothing but the free voxels, whose centres (N, 3) [m] satisfy a predicate."""
+    nothing = VoxelMap.around(centre_world, VoxelConfig())
+    centres = nothing.centres_world(np.indices(nothing.hits.shape).reshape(3, -1).T)
+    return replace(nothing, passes=where(centres).reshape(nothing.hits.shape).astype(np.uint8))
 
 
 def vertices(graph: SupportGraph) -> set[str]:

@@ -32,14 +32,6 @@ def graph_files(run):
     return {str(p.relative_to(run)): p.read_bytes() for p in sorted(run.rglob("graph.json"))}
 
 
-@pytest.fixture(scope="session")
-def kept_run(tmp_path_factory, scene_file):
-    """Two views of the two objects, with a report; not to be changed."""
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    explored(scene_file, folder, "--views", 2, "--seed", 5)
-    return folder
-
-
 # What a run folder holds
 
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic import TABLE_TOP, box, cylinder, hausdorff, sphere, thing
+from synthetic import TABLE_TOP, box, cylinder, hausdorff, seen_free, sphere, thing
 
 from caryatid.config import CompletionConfig, VoxelConfig
 from caryatid.geometry import transforms
@@ -24,13 +24,6 @@ def surface_at(height=TABLE_TOP):
     )
     top = box((0.0, 0.0, height - 0.02), (0.7, 1.0, 0.04))
     return SupportSurface(np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, height]), corners, top)
-
-
-def seen_free(where):
-    """A map in which the voxels whose centres satisfy a predicate have been looked through."""
-    index = np.indices(UNKNOWN.passes.shape).reshape(3, -1).T
-    free = where(UNKNOWN.centres_world(index)).reshape(UNKNOWN.passes.shape)
-    return VoxelMap(UNKNOWN.origin_world, UNKNOWN.hits, free.astype(np.uint8), UNKNOWN.config)
 
 
 def completed(*objects, voxels=UNKNOWN, surface=None):
@@ -78,7 +71,7 @@ def test_a_hidden_lower_side_goes_down_to_what_bounds_it(shape, upright, free, o
     hovering = thing(1, shape, seen=SIDES_AND_TOP)
     if not upright:
         hovering = thing(1, upside_down(shape), seen=(True, True, True, True, True, False))
-    done, *kept = completed(hovering, *others, voxels=seen_free(free))
+    done, *kept = completed(hovering, *others, voxels=seen_free(free, CENTRE))
     assert lowest(done.shape) == pytest.approx(bottom, abs=within)
     assert highest(done.shape) == pytest.approx(highest(shape))
     np.testing.assert_allclose(done.shape.extents[:2], shape.extents[:2])
@@ -132,7 +125,7 @@ def test_a_front_alone_is_taken_to_be_as_deep_as_wide_within_free_space():
     towards_unseen = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
     ends = deep.centre_world[0] + np.array([1.0, -1.0]) * deep.shape.support(towards_unseen)
     np.testing.assert_allclose(ends, (-0.005 + 0.08, -0.005))
-    behind_is_free = seen_free(lambda p: p[:, 0] > 0.04)
+    behind_is_free = seen_free(lambda p: p[:, 0] > 0.04, CENTRE)
     (bounded,) = completed(flat, voxels=behind_is_free)
     assert bounded.shape.extents[0] == pytest.approx(0.045, abs=1.5 * CONFIG.step)
 

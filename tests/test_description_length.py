@@ -8,15 +8,14 @@ from itertools import product
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
-from synthetic import box, cylinder, sphere, surface_points
+from synthetic import box, cylinder, seen_free, sphere, surface_points
 
-from caryatid.config import Config, ExplanationConfig, FitConfig, VoxelConfig
+from caryatid.config import Config, ExplanationConfig, FitConfig
 from caryatid.geometry import transforms
 from caryatid.objects.description_length import Evidence, best_explanation, explain, point_costs, price
 from caryatid.objects.model_selection import best_merge, split
 from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import Cloud
-from caryatid.sensing.voxel_map import VoxelMap
 
 CONFIG, COSTS, FIT = Config(), ExplanationConfig(), FitConfig()
 EYE = (-1.2, -0.6, 1.0)
@@ -167,15 +166,7 @@ CRATE = box((0.0, 0.0, 0.05), (0.1, 0.2, 0.1))
 def test_not_where_the_space_between_was_seen_free():
     left = cloud_of(box((0.0, -0.09, 0.05), (0.1, 0.12, 0.1)))
     right = cloud_of(box((0.0, 0.09, 0.05), (0.1, 0.12, 0.1)))
-    nothing = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
-    index = np.indices(nothing.hits.shape)
-    between = np.abs(nothing.centres_world(index.reshape(3, -1).T)[:, 1]) < 0.025
-    free = VoxelMap(
-        nothing.origin_world,
-        nothing.hits,
-        between.reshape(nothing.hits.shape).astype(np.uint8),
-        VoxelConfig(),
-    )
+    free = seen_free(lambda p: np.abs(p[:, 1]) < 0.025)
     near = replace(CONFIG, explanation=replace(COSTS, reach=0.1))
     assert pair_of({1: left, 2: right}, voxels=free, config=near) is None
 

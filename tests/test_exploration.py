@@ -6,9 +6,8 @@ from dataclasses import fields, is_dataclass
 
 import numpy as np
 import pytest
-from synthetic import SENSOR, model_of, simulated_scene, simulated_views
+from synthetic import FEW_VIEWS, model_of, simulated_scene, simulated_views
 
-from caryatid.config import ActiveVisionConfig, Config
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import Explorer, Step, explore, next_best_view
 from caryatid.geometry import transforms
@@ -18,16 +17,12 @@ from caryatid.scene import Scene
 from caryatid.simulation.setup import make_simulation
 from caryatid.steps import RunWriter, read_run, read_steps
 
-CONFIG = Config(
-    sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
-)
 
-
-def stage(config=CONFIG, noise="none"):
+def stage(config=FEW_VIEWS, noise="none"):
     return make_simulation(simulated_scene("tower"), config, noise=noise, seed=0)
 
 
-def exploration(config=CONFIG, noise="none", robot=None, **options):
+def exploration(config=FEW_VIEWS, noise="none", robot=None, **options):
     set_up = stage(config, noise)
     return list(explore(set_up.camera, robot or set_up.robot, config=config, **options))
 
@@ -74,7 +69,7 @@ def test_another_seed_sends_a_random_planner_elsewhere():
 def test_the_next_view_can_be_asked_for_alone():
     views = simulated_views("tower")
     robot = RecordingRobot([v.pose for v in views])
-    scene = model_of(views[:1], CONFIG)
+    scene = model_of(views[:1], FEW_VIEWS)
     decision = next_best_view(scene, robot)
     assert any(np.array_equal(decision.T_world_camera, v.pose) for v in views[1:])
     candidates = robot.candidates(scene.sphere)
@@ -89,7 +84,7 @@ def test_the_next_view_can_be_asked_for_alone():
 
 def test_a_person_may_choose_another_view_and_another_planner():
     set_up = stage()
-    explorer = Explorer(set_up.camera, set_up.robot, config=CONFIG, planner="support")
+    explorer = Explorer(set_up.camera, set_up.robot, config=FEW_VIEWS, planner="support")
     explorer.look()
     planned = explorer.plan()
     explorer.use_planner("farthest")
@@ -110,7 +105,7 @@ def test_a_person_may_choose_another_view_and_another_planner():
 
 
 def test_views_may_be_handed_in_without_camera_or_robot():
-    explorer = Explorer(config=CONFIG)
+    explorer = Explorer(config=FEW_VIEWS)
     with pytest.raises(PlanningError, match="no camera"):
         explorer.look()
     steps = [explorer.look(view) for view in simulated_views("tower")]
@@ -122,7 +117,7 @@ def test_views_may_be_handed_in_without_camera_or_robot():
 
 
 def written(folder, steps):
-    with RunWriter(folder, CONFIG, {}) as writer:
+    with RunWriter(folder, FEW_VIEWS, {}) as writer:
         for step in steps:
             writer.add(step)
     return read_run(folder)

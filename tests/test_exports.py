@@ -49,14 +49,6 @@ def graph():
     )
 
 
-@pytest.fixture(scope="session")
-def extracted(tmp_path_factory, kept_recording):
-    """A run: two objects on a table."""
-    run = tmp_path_factory.mktemp("exports") / "run"
-    assert run_command("extract", kept_recording, "--out", run, "--quiet", "--no-report") == 0
-    return run
-
-
 # Simulators
 
 
@@ -82,8 +74,8 @@ def test_mjcf_has_the_poses_and_sizes_of_the_model(tmp_path, graph):
             assert model.body(body.name).mass[0] == pytest.approx(600.0 * item.shape.volume, rel=1e-4)
 
 
-def test_an_extracted_model_is_a_scene_and_stays_where_it_is_in_mujoco(tmp_path, extracted):
-    assert run_command("export", extracted, "--format", "mjcf", "--out", tmp_path / "scene.xml") == 0
+def test_a_model_is_a_scene_and_stays_where_it_is_in_mujoco(tmp_path, kept_run):
+    assert run_command("export", kept_run, "--format", "mjcf", "--out", tmp_path / "scene.xml") == 0
     assert sorted(load_scene(tmp_path / "scene.xml").object_bodies.values()) == ["o1", "o2"]
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "scene.xml"))
     data = mujoco.MjData(model)
@@ -196,10 +188,10 @@ def test_any_name_of_an_object_stays_one_name(tmp_path, graph, name):
 
 
 @pytest.mark.parametrize("name", ["s.xml", "s.urdf", "s.glb", "s.gltf", "s.graphml", "s.gv"])
-def test_the_name_says_the_format_and_the_same_model_gives_the_same_bytes(tmp_path, extracted, name, capsys):
+def test_the_name_says_the_format_and_the_same_model_gives_the_same_bytes(tmp_path, kept_run, name, capsys):
     contents = set()
     for _ in range(2):
-        assert run_command("export", extracted, "--out", tmp_path / name, "--json") == 0
+        assert run_command("export", kept_run, "--out", tmp_path / name, "--json") == 0
         assert json.loads(capsys.readouterr().out)["file"] == str(tmp_path / name)
         contents.add((tmp_path / name).read_bytes())
     assert len(contents) == 1
@@ -222,11 +214,11 @@ def test_a_graph_file_alone_can_be_exported_and_settings_count(tmp_path, graph):
         (["--out", "folder.urdf"], "is a folder"),
     ],
 )
-def test_a_file_that_is_no_export_is_never_touched(tmp_path, extracted, monkeypatch, capsys, arguments, said):
+def test_a_file_that_is_no_export_is_never_touched(tmp_path, kept_run, monkeypatch, capsys, arguments, said):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "graph.json").write_text("mine")
     (tmp_path / "folder.urdf").mkdir()
-    assert run_command("export", extracted, *arguments) == 1
+    assert run_command("export", kept_run, *arguments) == 1
     told = capsys.readouterr().err
     assert said in told
     assert told.count("\n") == 1

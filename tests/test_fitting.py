@@ -7,16 +7,15 @@ from itertools import product
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, hausdorff, sphere, surface_points
+from synthetic import box, cylinder, hausdorff, seen_free, sphere, surface_points
 
-from caryatid.config import FitConfig, VoxelConfig
+from caryatid.config import FitConfig
 from caryatid.fitting import primitives
 from caryatid.fitting.hidden_faces import close_hidden_faces, deviations, likeliest_end
 from caryatid.fitting.primitives import Fit, FitFailure, candidates, fit, free_inside
 from caryatid.geometry import BOX as BOX_CODE
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder
-from caryatid.sensing.voxel_map import VoxelMap
 
 CONFIG = FitConfig()
 EYE = (-1.1, 0.35, 0.95)
@@ -385,14 +384,6 @@ def free_share(shape, voxels, inset):
     return free / inside
 
 
-def map_with(free) -> VoxelMap:
-    """A map around the origin whose voxels are free where `free` says so of their centres, else unknown."""
-    nothing = VoxelMap.around((0.0, 0.0, 0.0), VoxelConfig())
-    centres = nothing.centres_world(np.indices(nothing.hits.shape).reshape(3, -1).T)
-    passes = free(centres).reshape(nothing.hits.shape).astype(np.uint8)
-    return replace(nothing, passes=passes)
-
-
 MIDDLE = (0.0, 0.0, 0.2)
 
 
@@ -400,14 +391,14 @@ MIDDLE = (0.0, 0.0, 0.2)
     "shape", [box(MIDDLE, (0.2, 0.1, 0.12)), cylinder(MIDDLE, 0.07, 0.12), sphere(MIDDLE, 0.08)]
 )
 def test_half_of_a_shape_in_free_space_is_half_free(shape):
-    assert free_share(shape, map_with(lambda p: p[:, 0] > 0.0), INSET) == pytest.approx(0.5, abs=0.1)
-    assert free_share(shape, map_with(lambda p: p[:, 0] > 1.0), INSET) == 0.0
-    assert free_share(shape, map_with(lambda p: p[:, 0] > -9.0), INSET) == 1.0
+    assert free_share(shape, seen_free(lambda p: p[:, 0] > 0.0), INSET) == pytest.approx(0.5, abs=0.1)
+    assert free_share(shape, seen_free(lambda p: p[:, 0] > 1.0), INSET) == 0.0
+    assert free_share(shape, seen_free(lambda p: p[:, 0] > -9.0), INSET) == 1.0
 
 
 def test_the_surface_says_nothing():
     shape = box((0.0, 0.0, 0.2), (0.2, 0.2, 0.2))
-    skin = map_with(lambda p: np.abs(shape.signed_distance(p)) < 0.005)
+    skin = seen_free(lambda p: np.abs(shape.signed_distance(p)) < 0.005)
     inside, free = free_inside(shape, skin, INSET)
     assert inside > 1000
     assert free == 0
@@ -419,7 +410,7 @@ def test_of_shapes_that_explain_the_points_the_one_that_fills_no_space_seen_free
     can = cylinder((0.0, 0.0, 0.2), 0.06, 0.12)
     points, normals = surface_points(can, np.random.default_rng(0), eye=(-1.0, 0.3, 0.6), sigma=0.001)
     best, other, *_ = candidates_of(points, normals)
-    inside_best_alone = map_with(
+    inside_best_alone = seen_free(
         lambda p: (best.shape.signed_distance(p) < 0.0) & (other.shape.signed_distance(p) > -INSET)
     )
     assert free_share(best.shape, inside_best_alone, INSET) > free_share(

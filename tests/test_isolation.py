@@ -7,9 +7,8 @@ import types
 
 import numpy as np
 import pytest
-from synthetic import SENSOR, simulated_scene
+from synthetic import FEW_VIEWS, simulated_scene
 
-from caryatid.config import ActiveVisionConfig, Config
 from caryatid.evaluation.oracle import OraclePlanner
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
@@ -21,10 +20,6 @@ pytestmark = pytest.mark.slow
 
 FORBIDDEN = ("mujoco", "caryatid.simulation", "caryatid.evaluation")
 """Packages whose objects know the truth."""
-
-CONFIG = Config(
-    sensor=SENSOR, active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3)
-)
 
 
 def reachable(*roots: object) -> list[object]:
@@ -66,9 +61,9 @@ class Witness:
 
 
 def witnessed(planner):
-    stage = make_simulation(simulated_scene("hidden_stack"), CONFIG, noise="carmine", seed=0)
+    stage = make_simulation(simulated_scene("hidden_stack"), FEW_VIEWS, noise="carmine", seed=0)
     witness = Witness(planner)
-    steps = explore(stage.camera, stage.robot, planner=witness, config=CONFIG, early_stop=False)
+    steps = explore(stage.camera, stage.robot, planner=witness, config=FEW_VIEWS, early_stop=False)
     assert len(list(steps)) == 3
     return witness
 
@@ -83,9 +78,9 @@ def test_no_planner_can_reach_the_truth(name):
 def test_the_truth_would_be_found():
     """The oracle has it; so would have whoever is handed the camera, or a function that knows it."""
     scene = simulated_scene("hidden_stack")
-    camera = make_simulation(scene, CONFIG, noise="carmine", seed=0).camera
+    camera = make_simulation(scene, FEW_VIEWS, noise="carmine", seed=0).camera
     truth = true_scene_from_simulation(scene, ground_truth(scene))
-    oracle = OraclePlanner(camera, truth, CONFIG)
+    oracle = OraclePlanner(camera, truth, FEW_VIEWS)
     assert {"caryatid.simulation.world.SimulatedScene", "mujoco._structs.MjData"} <= forbidden(oracle)
     assert "caryatid.evaluation.scores.TrueScene" in forbidden({"hint": [lambda: truth]})
     assert "mujoco._structs.MjData" in forbidden(types.SimpleNamespace(look=camera.capture))

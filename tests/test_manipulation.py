@@ -156,19 +156,10 @@ class TestDismantling:
 QUICK = ["--set=rehearsal.draws=2", "--set=lift.watch=1.0"]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory, scene_file):
-    """A run on the crate o1 with the can o2 on it."""
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    command = ["explore", scene_file, "--views", 2, "--out", folder, "--no-report", "--quiet"]
-    assert run_command(*command, *SMALL) == 0
-    return folder
-
-
 @pytest.mark.slow
 class TestCommands:
-    def test_an_order_is_a_document_or_a_table(self, run, capsys):
-        assert run_command("order", run, "--json", *QUICK) == 0
+    def test_an_order_is_a_document_or_a_table(self, kept_run, capsys):
+        assert run_command("order", kept_run, "--json", *QUICK) == 0
         out = capsys.readouterr()
         document = json.loads(out.out)
         assert (out.err, document["safe"], document["refusal"]) == ("", True, None)
@@ -176,17 +167,17 @@ class TestCommands:
         for step in document["steps"]:
             assert step.keys() == {"object", "hold", "safe", "risk", "why"}
             assert (step["safe"], step["hold"]) == (True, [])
-        assert run_command("order", run, "--goal", "o2", *QUICK) == 0
+        assert run_command("order", kept_run, "--goal", "o2", *QUICK) == 0
         table = capsys.readouterr().out
         assert "a safe order" in table
         assert re.search(r"│ 1 │ o2 ", table)
 
-    def test_orders_that_cannot_be_are_errors(self, run, tmp_path, capsys):
-        assert run_command("order", run, "--goal", "o9", *QUICK) == 1
+    def test_orders_that_cannot_be_are_errors(self, kept_run, tmp_path, capsys):
+        assert run_command("order", kept_run, "--goal", "o9", *QUICK) == 1
         assert "o9: is not an object of the graph; there are o1, o2" in capsys.readouterr().err
         assert run_command("order", tmp_path, *QUICK) == 1
         assert "run.json" in capsys.readouterr().err
-        assert run_command("order", run, "--hands", 3) == 2
+        assert run_command("order", kept_run, "--hands", 3) == 2
 
     def test_a_scene_is_taken_apart(self, scene_file, tmp_path, capsys):
         command = ["dismantle", scene_file, "--views", 2, "--json", "--out", tmp_path / "run"]

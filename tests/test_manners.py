@@ -10,18 +10,17 @@ import shlex
 import shutil
 import sys
 
-import numpy as np
 import pytest
 from bag_files import write_tum
-from conftest import SMALL, run_command
+from conftest import SMALL, run_command, write_view_files
 from test_benchmark import fill
+from test_import import camera_file
 
 from caryatid import __version__
 from caryatid.benchmark.store import RESULTS
 from caryatid.cli import sessions
 from caryatid.cli.commands import COMMANDS as TOP
 from caryatid.cli.commands import find_command, read_command
-from caryatid.io.images import png
 
 ESCAPE = "\x1b"
 QUICK = ["--set", "rehearsal.draws=2"]
@@ -114,19 +113,13 @@ def test_the_version_is_told(capsys):
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory, scene_file, views):
-    """A run, a recording to import, results of a benchmark and a session, to be read."""
+def kept(tmp_path_factory, views):
+    """A recording to import, results of a benchmark and a session, to be read."""
     folder = tmp_path_factory.mktemp("kept")
-    words = ["explore", scene_file, "--out", folder / "run", "--views", 1, *SMALL, "--quiet"]
-    assert run_command(*words) == 0
     write_tum(folder / "tum", views)
-    camera = {"fx": views[0].K[0, 0], "fy": views[0].K[1, 1], "cx": views[0].K[0, 2], "cy": views[0].K[1, 2]}
-    (folder / "tum.json").write_text(json.dumps(camera))
+    camera_file(folder, views[0].K).rename(folder / "tum.json")
     fill(folder / "bench" / RESULTS, ("support", "random"), scenes=2)
-    (folder / "depth.png").write_bytes(png(np.round(1e4 * views[0].depth).astype(np.uint16)))
-    (folder / "labels.png").write_bytes(png(views[0].labels.astype(np.uint8)))
-    camera = {"K": views[0].K.tolist(), "T_world_camera": views[0].pose.tolist(), "depth_scale": 0.1}
-    (folder / "camera.json").write_text(json.dumps(camera))
+    write_view_files(folder, views[0])
     add = ["--depth", folder / "depth.png", "--labels", folder / "labels.png", "--camera"]
     assert run_command("session", "new", folder / "session", "--quiet") == 0
     assert run_command("session", "add", folder / "session", *add, folder / "camera.json", "--quiet") == 0
@@ -156,14 +149,14 @@ WORKING = {
 
 
 @pytest.fixture
-def words(tmp_path, kept, scene_file, recording):
+def words(tmp_path, kept, kept_run, scene_file, recording):
     """The words that make a command work, in a folder of its own."""
 
     def spelled(command):
         for name in ("session", "bench"):
             shutil.copytree(kept / name, tmp_path / name)
         places = {
-            "out": tmp_path / "out", "kept": kept, "run": kept / "run", "scene": scene_file,
+            "out": tmp_path / "out", "kept": kept, "run": kept_run, "scene": scene_file,
             "scenes": scene_file.parent, "recording": recording, "session": tmp_path / "session",
             "bench": tmp_path / "bench", "small": shlex.join(SMALL), "quick": shlex.join(QUICK),
             "view": f"--depth {kept}/depth.png --labels {kept}/labels.png --camera {kept}/camera.json",
@@ -228,8 +221,8 @@ def test_errors_are_coloured_for_a_person_who_has_not_said_no(words, said_on, tm
 
 
 @pytest.mark.slow
-def test_help_and_tables_are_plain_in_a_pipe(kept, said_on):
-    for words in (["--help"], ["order", "--help"], ["order", kept / "run", *QUICK]):
+def test_help_and_tables_are_plain_in_a_pipe(kept_run, said_on):
+    for words in (["--help"], ["order", "--help"], ["order", kept_run, *QUICK]):
         assert ESCAPE in "".join(said_on(words, out=True, err=True))
         out, err = said_on(words, out=False, err=False)
         assert out
@@ -238,8 +231,8 @@ def test_help_and_tables_are_plain_in_a_pipe(kept, said_on):
 
 
 @pytest.mark.slow
-def test_a_spinner_turns_on_a_terminal_only(kept, said_on):
-    words = ["order", kept / "run", *QUICK]
+def test_a_spinner_turns_on_a_terminal_only(kept_run, said_on):
+    words = ["order", kept_run, *QUICK]
     assert "rehearsing" in said_on(words, out=False, err=True)[1]
     assert said_on(words, out=True, err=False)[1] == ""
     assert said_on(words, out=True, err=False, FORCE_COLOR="1")[1] == ""

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import SMALL, run_command
-from synthetic import SENSOR, simulated_scene
+from synthetic import FEW_VIEWS, simulated_scene
 
-from caryatid.config import ActiveVisionConfig, Config, OracleConfig
+from caryatid.config import OracleConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.oracle import OraclePlanner, planner_for, spread_out
 from caryatid.evaluation.scores import score
@@ -23,11 +23,7 @@ from caryatid.planning.planners import make_planner
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
 
-CONFIG = Config(
-    sensor=SENSOR,
-    active=ActiveVisionConfig(sphere_points=4000, look_directions=200, max_views=3),
-    oracle=OracleConfig(candidates=8, stride=1),
-)
+CONFIG = replace(FEW_VIEWS, oracle=OracleConfig(candidates=8, stride=1))
 
 
 class Chosen:

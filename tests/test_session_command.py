@@ -6,11 +6,10 @@ import json
 
 import numpy as np
 import pytest
-from conftest import run_command
+from conftest import run_command, write_view_files
 
 from caryatid.config import Config
 from caryatid.io.graph_json import graph_text
-from caryatid.io.images import png
 from caryatid.scene import Scene
 from caryatid.sessions import Capture, Session
 
@@ -20,11 +19,7 @@ def files(tmp_path, views):
     """Files of each view: depth, camera, labels, as options of `session add`."""
 
     def write(number, **camera):
-        view = views[number]
-        (tmp_path / "depth.png").write_bytes(png(np.round(1e4 * view.depth).astype(np.uint16)))
-        (tmp_path / "labels.png").write_bytes(png(view.labels.astype(np.uint8)))
-        document = {"K": view.K.tolist(), "T_world_camera": view.pose.tolist(), "depth_scale": 0.1} | camera
-        (tmp_path / "camera.json").write_text(json.dumps(document))
+        write_view_files(tmp_path, views[number], **camera)
         return [f"--{name.split('.')[0]}={tmp_path / name}" for name in FILES]
 
     return write
