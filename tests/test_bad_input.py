@@ -107,11 +107,14 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     assert run_command("extract", recording, "--out", run, "--no-report", "--quiet") == 0
     shutil.copytree(run, broken)
     (broken / "views/01/graph.json").write_text("{")
+    strange = shutil.copytree(scene_file.parent, tmp_path / "strange")
+    (strange / "gt.json").write_text('{"vertices": ["table", "ghost"], "edges": []}')
     for scored, truth, says in (
         (tmp_path / "nowhere", scene_file.parent, "is not a folder"),
         (run, tmp_path / "nowhere", "is not a folder"),
         (recording, scene_file.parent, "run.json: the file is missing"),
         (run, recording, "gt.json: the file is missing"),
+        (run, strange, "gt.json names 'ghost', which is no body of the scene"),
         (run, tmp_path, "has neither scene.xml nor scene_camera.json"),
         (broken, scene_file.parent, str(broken / "views/01/graph.json")),
     ):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -80,6 +81,16 @@ def test_no_surface_is_an_error_that_says_so(up):
         find_support_surface(points, normals, up, config, rng)
     with pytest.raises(PerceptionError, match="no support surface"):
         find_support_surface(np.zeros((0, 3)), np.zeros((0, 3)), up, config, rng)
+
+
+@pytest.mark.parametrize(("degrees", "found"), [(8.0, True), (12.0, False)])
+def test_a_support_surface_leans_by_ten_degrees_at_the_most(degrees, found):
+    R = transforms.rotation_from_vector((np.radians(degrees), 0.0, 0.0))
+    grid = np.stack(np.meshgrid(np.arange(-0.3, 0.3, 0.01), np.arange(-0.4, 0.4, 0.01), [0.0]), axis=-1)
+    plane = grid.reshape(-1, 3) @ R.T, np.tile(R[:, 2], (grid.size // 3, 1))
+    options = UP, SurfaceConfig(), np.random.default_rng(0)
+    with nullcontext() if found else pytest.raises(PerceptionError, match="no support surface"):
+        np.testing.assert_allclose(find_support_surface(*plane, *options).normal_world, R[:, 2], atol=1e-6)
 
 
 def test_a_table_without_objects_and_a_view_without_readings_have_no_parts():
