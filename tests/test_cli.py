@@ -188,7 +188,14 @@ def test_config_writes_settings_that_read_back_as_they_are(tmp_path, capsys):
 
 def test_without_early_stop_it_looks_until_the_views_are_used_up(tmp_path, recording):
     stops, goes_on = (
-        explored(recording, tmp_path / name, "--no-report", "--set=fusion.settled=0.1", *options)
+        explored(
+            recording,
+            tmp_path / name,
+            "--no-report",
+            "--set=active.stop=unchanged",
+            "--set=fusion.settled=0.1",
+            *options,
+        )
         for name, options in (("stops", ()), ("goes-on", ("--no-early-stop",)))
     )
     assert len(stops.views) == 2

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -30,6 +30,19 @@ def exploration(config=FEW_VIEWS, noise="none", robot=None, **options):
 @pytest.fixture(scope="module")
 def steps():
     return exploration(early_stop=False)
+
+
+LONG = replace(FEW_VIEWS, active=replace(FEW_VIEWS.active, max_views=8))
+
+
+def test_it_ends_where_no_view_promises_more_than_its_path_costs():
+    steps = exploration(LONG)
+    assert 1 < len(steps) < 8
+    assert steps[-1].stop == "no view is expected to show more than its path costs"
+    scores = [s.decision.score for s in exploration(LONG, early_stop=False)[: len(steps)]]
+    assert min(scores[1:-1], default=1.0) > 0.0 >= scores[-1]
+    random = exploration(LONG, planner="random")
+    assert 1 < len(random) < 8, "what is left to see does not depend on who chooses"
 
 
 def test_each_view_is_taken_where_the_one_before_decided(steps):
@@ -76,6 +89,12 @@ def test_the_next_view_can_be_asked_for_alone():
     visited = scene.sphere.direction_of(views[0].pose)[None]
     given = next_best_view(scene, None, visited, candidates=candidates)
     assert (given.index, given.score) == (decision.index, decision.score)
+    scene.update(views[1])
+    robot.move_to(views[1].pose)
+    after_two = next_best_view(scene, robot)
+    assert {p.why.split("found in ")[1] for p in after_two.points_of_interest if "supports" in p.why} == {
+        "2 of 2 views"
+    }
     with pytest.raises(PlanningError, match="there is no robot"):
         next_best_view(scene, None, visited)
     with pytest.raises(PlanningError, match="nothing has been seen yet"):

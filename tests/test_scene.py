@@ -217,6 +217,13 @@ def test_an_object_taken_away_vanishes_once_views_look_through_where_it_was(meth
     assert edges(graph) == {("o0", "o1")}
 
 
+def test_of_one_view_all_ways_of_fusion_know_the_same():
+    """Each has the same points, and the same space seen free that shapes may not fill."""
+    view = simulated_views("tower", noise="carmine")[:1]
+    texts = {graph_text(model_of(view, config_for(method)).graph) for method in METHODS}
+    assert len(texts) == 1
+
+
 @pytest.mark.parametrize(("method", "segmentation"), [("pc+sg", "labels"), ("sg", "labels"), ("pc", "auto")])
 def test_what_a_copy_learns_the_original_does_not(method, segmentation):
     azimuths = (180.0, 60.0, 300.0, 0.0) if segmentation == "labels" else (180.0, 300.0, 0.0)

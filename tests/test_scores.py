@@ -43,6 +43,7 @@ def lone(*shapes):
 
 
 def test_equations_4_and_5_by_hand():
+    """Of 4 vertices 3 are true and of 3 edges 2; the truth has as many: both are (3 + 2)/(4 + 3) = 5/7."""
     truth, graph = as_scene(tower(3)), tower(2)
     wrong = Support("o2", "o9", certain=False)
     graph = SupportGraph((*graph.objects, thing(9, sphere((0.4, 0.0, 0.8), 0.05))), (*graph.supports, wrong))

@@ -119,7 +119,8 @@ def test_a_robot_may_say_itself_what_it_reaches(begun):
 
 
 def test_looking_on_stops_when_a_view_changes_nothing(folder, views):
-    with Session.begin(folder, segmentation="labels") as session:
+    settings = replace(Config(), active=replace(Config().active, stop="unchanged"))
+    with Session.begin(folder, settings, segmentation="labels") as session:
         with pytest.raises(PlanningError, match="nothing has been seen yet"):
             session.next()
         changed = [session.add(views[0]).changed for _ in range(3)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.config import ActiveVisionConfig, Config, SegmentationMethod
+from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
@@ -16,6 +16,7 @@ from caryatid.graph import SupportGraph
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
 from caryatid.planning.planners import make_planner
+from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of
 from caryatid.robots.arm import ArmRobot
 from caryatid.runtime.display import Pictured
@@ -203,6 +204,18 @@ class Explorer:
         self.step = replace(step, candidates=candidates, decision=decision, stop=stop, timings=timings)
         return self.step
 
+    def reason_to_stop(self) -> str | None:
+        """Say why looking further may not pay, after `plan`; None where it may.
+
+        Raises:
+            PlanningError: Nothing has been seen yet.
+        """
+        step = self._newest()
+        if step.decision is None or step.candidates is None:
+            return step.stop
+        state = _state(self.scene, step.sphere, step.visited, step.candidates)
+        return reason_to_stop(state, self.scene.changed, self._planner, step.decision)
+
     def choose(self, chosen: Decision | int) -> Step:
         """Take another view in place of the planner's choice.
 
@@ -277,7 +290,7 @@ def explore(
     seed: int = 0,
     early_stop: bool = True,
 ) -> Iterator[Step]:
-    """Look around until the graph does not change any more, or the views are used up.
+    """Look around until no view is expected to show more than its path costs, or the views are used up.
 
     Args:
         camera: Gives views.
@@ -286,7 +299,7 @@ def explore(
         config: Settings of all stages; `config.active.max_views` limits the views.
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
-        early_stop: Stop when a view did not change the graph.
+        early_stop: Stop before the views are used up, as `config.active.stop` says.
 
     Yields:
         A step after each view.
@@ -297,28 +310,42 @@ def explore(
     explorer = Explorer(camera, robot, planner=planner, config=config, segmentation=segmentation, seed=seed)
     while True:
         step = explorer.look()
-        changed = explorer.scene.changed or not early_stop
-        reason = reason_to_stop(step.index + 1, changed, explorer.scene.config.active)
-        step = explorer.plan() if reason is None else replace(step, stop=reason)
+        if step.index + 1 < explorer.scene.config.active.max_views:
+            step = explorer.plan()
+            reason = explorer.reason_to_stop() if early_stop else step.stop
+        else:
+            reason = _used_up(step.index + 1)
+        if reason is not None:
+            step = replace(step, candidates=None, decision=None, stop=reason)
         yield step
         if step.decision is None:
             return
         explorer.go()
 
 
-def reason_to_stop(views: int, changed: bool, config: ActiveVisionConfig) -> str | None:
-    """Why looking further may not pay, or None.
+def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decision: Decision) -> str | None:
+    """Say why looking further may not pay; None where it may.
 
     Args:
-        views: Number of views so far.
-        changed: Whether the newest one changed the graph.
-        config: Holds the maximum number of views.
+        state: What the planner looked at.
+        changed: Whether the newest view changed the graph.
+        planner: Chose the next view.
+        decision: Its choice.
     """
-    if views >= config.max_views:
-        return f"{views} views were asked for"
-    if views > 1 and not changed:
-        return "the last view changed nothing"
-    return None
+    views = len(state.visited)
+    if views >= state.config.max_views:
+        return _used_up(views)
+    if views == 1:
+        return None
+    if state.config.stop == "unchanged":
+        return None if changed else "the last view changed nothing"
+    if not isinstance(planner, SupportPlanner):
+        decision = SupportPlanner().plan(state, np.random.default_rng(0))
+    return "no view is expected to show more than its path costs" if decision.score <= 0.0 else None
+
+
+def _used_up(views: int) -> str:
+    return f"{views} views were asked for"
 
 
 def next_best_view(
@@ -335,7 +362,7 @@ def next_best_view(
         scene: What is known, of at least one view.
         robot: Says which views it can reach; None where they are given, with `visited`.
         visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
-            current one last; None = where the robot is.
+            current one last; None = those of the scene, or where the robot is if they have no poses.
         candidates: The views to choose from; None = those the robot reaches.
         planner: Chooses among them, or its name.
 
@@ -349,7 +376,7 @@ def next_best_view(
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
     sphere = view_sphere_of(robot, scene.sphere)
     if robot is not None and visited is None:
-        visited = sphere.direction_of(robot.T_world_camera)[None]
+        visited = sphere.direction_of(np.stack(scene.T_world_cameras or (robot.T_world_camera,)))
     if robot is not None and candidates is None:
         candidates = robot.candidates(sphere)
     if visited is None or candidates is None:

@@ -54,6 +54,7 @@ class Scene(Pictured):
         voxels: Free, occupied and unknown space, or None before the first view.
         sphere: The view sphere around the table top, or None before the first view.
         T_world_camera: Pose (4, 4) of the newest view after registration, or None for a cloud.
+        T_world_cameras: Poses (4, 4) of all views so far, each as it was when the view was new.
         views: How many views the model is made of.
         changed: Whether the newest view changed the graph.
         timings: Seconds the stages of the newest update took.
@@ -72,13 +73,14 @@ class Scene(Pictured):
         self.voxels: VoxelMap | None = None
         self.sphere: ViewSphere | None = None
         self.T_world_camera: Array | None = None
+        self.T_world_cameras: tuple[Array, ...] = ()
         self.views = 0
         self.changed = False
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
         self._registration: ViewRegistration | None = None
         self._graphs: tuple[SupportGraph, ...] = ()
-        self._shown: Counter[str] = Counter()
+        self._shown: tuple[frozenset[str], ...] = ()
         self._contradicted: Counter[str] = Counter()
 
     @property
@@ -135,7 +137,6 @@ class Scene(Pictured):
         other = copy.copy(self)
         other._models = self._models.copy()
         other._registration = None if self._registration is None else self._registration.copy()
-        other._shown = self._shown.copy()
         other._contradicted = self._contradicted.copy()
         return other
 
@@ -165,7 +166,7 @@ class Scene(Pictured):
         self.surface = self._fused_surface(observation)
         surface, voxels = self._bounds(observation)
         watch.lap("map")
-        observation = self._fitted(observation, shown, given, named)
+        observation = self._fitted(observation, shown, voxels, given, named)
         watch.lap("fit")
         fitted = self._models.objects()
         if self.config.completion.enabled:
@@ -177,6 +178,8 @@ class Scene(Pictured):
         observation = self._fused(observation, newest, given)
         self.labels = label_image(observation, source)
         self.T_world_camera = None if observation.view is None else observation.view.pose
+        if self.T_world_camera is not None:
+            self.T_world_cameras = (*self.T_world_cameras, self.T_world_camera)
         self.views += 1
         watch.lap("fuse")
         self.timings = watch.laps
@@ -237,21 +240,24 @@ class Scene(Pictured):
             newest = newest.integrate(observation.view, max_depth)
         return observation.surface, newest
 
-    def _fitted(self, observation: Observation, shown: set[int], given: bool, named: bool) -> Observation:
+    def _fitted(
+        self, observation: Observation, shown: set[int], voxels: VoxelMap, given: bool, named: bool
+    ) -> Observation:
         """Fit what this view changed; automatic segments are divided and united as the shapes suggest."""
         if self.config.fusion.method == "sg":
-            self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL})
+            self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
             return observation
-        self._models.fit_all(shown, self.voxels)
+        self._models.fit_all(shown, voxels)
         if named:
             return observation
-        changed = set() if given else self._models.divide(shown, self.voxels)
+        changed = set() if given else self._models.divide(shown, voxels)
         if changed:
             observation = self._models.nearest(observation, changed)
-        given_up = self._models.unite(shown | changed, self.voxels)
+        given_up = self._models.unite(shown | changed, voxels)
         if given_up and self.config.fusion.matching == "points":
             names = {object_id(old): object_id(new) for old, new in given_up.items()}
             self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
+            self._shown = tuple(frozenset(names.get(i, i) for i in ids) for ids in self._shown)
         return observation.relabelled(given_up)
 
     def _fused(self, observation: Observation, newest: SupportGraph, given: bool) -> Observation:
@@ -261,7 +267,7 @@ class Scene(Pictured):
         self._graphs, names = fuse(self._graphs, newest, config, same_labels=same_labels)
         observation = observation.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
         seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}
-        self._shown.update(seen)
+        self._shown = (*self._shown, frozenset(seen))
         if observation.view is not None:
             for o in self.graph.objects:
                 if o.role == "object" and o.id not in seen and seen_through(o.shape, observation.view):

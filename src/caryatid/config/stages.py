@@ -369,6 +369,9 @@ class ActiveVisionConfig:
     """Depth of the negative bump at every visited view [1]; 0 is no inhibition of return."""
     path_cost: Literal["angle", "path", "none"] = "path"
     """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path halves it."""
+    stop: Literal["gain", "unchanged"] = "gain"
+    """Looking ends where no view is expected to show more than its path costs: where c = s − h of planner
+    `support` is at most 0 everywhere. Or, as in the paper, after a view that does not modify the graph."""
     max_views: Count = 10
     """Maximum number of views, including the first; the paper's."""
     look_directions: Count = 1200
@@ -646,5 +649,7 @@ class Config:
                 stability="area", margin_sigma=0.0, reach=0.005, gentle_tilt=75.0, max_drop=0.0
             ),
             fusion=FusionConfig(matching="shapes", keep_share=0.0),
-            active=ActiveVisionConfig(saliency="paper", edge_point="midpoint", path_cost="angle"),
+            active=ActiveVisionConfig(
+                saliency="paper", edge_point="midpoint", path_cost="angle", stop="unchanged"
+            ),
         )

@@ -74,7 +74,7 @@ def fused_graph(
     graphs: Graphs,
     config: FusionConfig,
     *,
-    shown: Mapping[str, int] | None = None,
+    shown: Sequence[frozenset[str]] | None = None,
     contradicted: Mapping[str, int] | None = None,
 ) -> SupportGraph:
     """Read the fused graph off those of all views.
@@ -85,16 +85,21 @@ def fused_graph(
     Args:
         graphs: Of all views, with the ids of the fused objects.
         config: Method and the share an edge must keep.
-        shown: Per object id, in how many views it was seen; without it, in how many graphs it is.
+        shown: Ids of the objects each view showed; without it, those in its graph. Only a view that showed
+            both ends could have shown an edge.
         contradicted: Per object id, in how many views something behind it was seen instead.
     """
-    shown, contradicted = shown or {}, contradicted or {}
+    contradicted = contradicted or {}
     newest, (sightings, edges) = len(graphs) - 1, _by_view(graphs)
+    showing: dict[str, set[int]] = {i: set() for i in sightings}
+    for view, ids in enumerate(shown or [{o.id for o in graph.objects} for graph in graphs]):
+        for i in ids & showing.keys():
+            showing[i].add(view)
     objects: dict[str, SceneObject] = {}
     for i, seen in sightings.items():
         if config.method == "pc" and newest not in seen:
             continue
-        occurrences = shown.get(i, len(seen))
+        occurrences = len(showing[i])
         opportunities = occurrences + contradicted.get(i, 0)
         if occurrences >= config.keep_share * opportunities:
             vertex = _vertex(seen, config)
@@ -103,13 +108,13 @@ def fused_graph(
     for pair, found in edges.items():
         if pair[0] not in objects or pair[1] not in objects:
             continue
-        views = sightings[pair[0]].keys() & sightings[pair[1]].keys()
-        least = config.keep_share * len(views)
-        mostly = len(found) >= least if config.method == "sg" else len(found) > least
+        views = set.intersection(*(showing[i] & sightings[i].keys() for i in pair))
+        occurrences, least = len(views & found.keys()), config.keep_share * len(views)
+        mostly = occurrences >= least if config.method == "sg" else occurrences > least
         if (mostly and config.method != "pc") or (newest in found and config.method != "sg"):
             last = found[max(found)]
             certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
-            supports.append(replace(last, certain=certain, occurrences=len(found), opportunities=len(views)))
+            supports.append(replace(last, certain=certain, occurrences=occurrences, opportunities=len(views)))
     ordered = sorted(objects.values(), key=lambda o: (o.role != "support_surface", o.label))
     rank = {o.id: k for k, o in enumerate(ordered)}
     supports.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))

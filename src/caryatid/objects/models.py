@@ -242,10 +242,15 @@ class ObjectModels:
         """Move the points of some views (view → (4, 4)); returns the labels of the objects that have some."""
         return self.points.move(T) - {SUPPORT_LABEL}
 
-    def fit_newest(self, labels: set[int]) -> None:
-        """Fit objects to the newest view's points alone, and forget all other fits (`sg`)."""
+    def fit_newest(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
+        """Fit objects to the newest view's points alone, and forget all other fits (`sg`).
+
+        Args:
+            labels: Objects this view shows.
+            voxels: Space this view sees free, which no shape may fill.
+        """
         self.fits = {}
-        self._fit(labels, self.points.newest)
+        self._fit(labels, self.points.newest, voxels)
 
     def fit_all(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
         """Fit objects to all their points so far (`pc`, `pc+sg`), where shapes fill no space seen free."""

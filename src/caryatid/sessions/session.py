@@ -34,6 +34,7 @@ from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
+from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Posture, Surroundings, find_robot, view_sphere_of
 from caryatid.runtime.fingerprint import fingerprint
@@ -292,12 +293,15 @@ class Session:
             sphere = view_sphere_of(robot, sphere)
             reachable = reached_candidates(robot, T_world_cameras[-1], sphere)
         visited = sphere.direction_of(T_world_cameras)
-        decision = next_best_view(
-            self.scene, robot, visited, candidates=reachable, planner=self.beginning.planner
-        )
+        planner = make_planner(self.beginning.planner)
+        decision = next_best_view(self.scene, robot, visited, candidates=reachable, planner=planner)
         if robot is not None:
             posture = robot.solve(decision.T_world_camera)
-        stop = reason_to_stop(self.views, self.scene.changed, self.beginning.settings.active)
+        assert self.scene.voxels is not None
+        state = PlanningState(
+            self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
+        )
+        stop = reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, posture if isinstance(posture, Posture) else None, stop)
 
     def undo(self) -> int:

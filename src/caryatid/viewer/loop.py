@@ -17,7 +17,7 @@ from caryatid.config import Config, FusionMethod, SegmentationMethod
 from caryatid.errors import CaryatidError, PlanningError, in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
-from caryatid.exploration import Explorer, Step, reason_to_stop
+from caryatid.exploration import Explorer, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
@@ -110,7 +110,7 @@ class LoopPage(Page):
                 f1 = score(step.graph, truth, np.random.default_rng(0)).f1
         self._planned, self.ended = step.decision, step.stop
         self.add(step, f1)
-        return step.stop or reason_to_stop(step.index + 1, explorer.scene.changed, self._config.active)
+        return explorer.reason_to_stop()
 
     def use_planner(self, name: str) -> str:
         """Let another planner choose, already the next view; return what to say about it.
