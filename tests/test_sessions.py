@@ -406,13 +406,15 @@ def test_a_pose_that_is_a_little_off_is_no_jump(begun, views):
 def test_a_view_comes_back_bit_by_bit(tmp_path, views):
     rng = np.random.default_rng(0)
     rgb = rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
-    view = replace(views[0], rgb=rgb, normals_camera=rng.random((120, 160, 3), np.float32))
+    normals = rng.random((120, 160, 3), np.float32)
+    view = replace(views[0], rgb=rgb, normals_camera=normals, labels_are="segments")
     first = Capture.of(view)
     for name, content in first.files().items():
         (tmp_path / name).write_bytes(content)
     again = Capture.read(tmp_path).decode(Config().session)
     for field in ("depth", "K", "T_world_camera", "rgb", "labels", "normals_camera"):
         assert np.array_equal(getattr(again, field), getattr(view, field))
+    assert again.labels_are == "segments"
     assert Capture.read(tmp_path).record.digest == first.record.digest
 
 

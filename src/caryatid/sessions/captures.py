@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from annotated_types import Gt
@@ -51,6 +51,7 @@ class CameraRecord:
         T_world_camera: Camera pose (4, 4) [m]; OpenCV camera frame, world z up.
         depth_scale: Millimetres of one unit of a depth PNG.
         name: What to call the view in messages.
+        labels_are: Whether a label is an object's in all views or a segment's in this view alone.
         digest: Digest of camera and images; empty where the view is not kept yet.
     """
 
@@ -58,6 +59,7 @@ class CameraRecord:
     T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)]
     depth_scale: Annotated[float, Gt(0.0)] = 1.0
     name: str = "view"
+    labels_are: Literal["objects", "segments"] = "objects"
     digest: SkipJsonSchema[str] = ""
 
     @classmethod
@@ -93,7 +95,7 @@ class Capture:
         arrays = (view.depth, view.rgb, view.labels, view.normals_camera)
         named = zip(("depth", "rgb", "labels", "normals"), arrays, strict=True)
         images = {key: _npy(array) for key, array in named if array is not None}
-        return cls(images, CameraRecord(view.K, view.pose, name=view.name))
+        return cls(images, CameraRecord(view.K, view.pose, name=view.name, labels_are=view.labels_are))
 
     @classmethod
     def from_files(cls, files: Mapping[str, Path | None], camera: Path, config: SessionConfig) -> Capture:
@@ -127,9 +129,11 @@ class Capture:
 
     @property
     def record(self) -> CameraRecord:
-        """The camera with the digest of all but the name."""
+        """The record with the digest of all but the name."""
         c = self.camera
-        camera = {"K": c.K, "T_world_camera": c.T_world_camera, "depth_scale": c.depth_scale}
+        camera: dict[str, Any] = {"K": c.K, "T_world_camera": c.T_world_camera, "depth_scale": c.depth_scale}
+        if c.labels_are == "segments":  # sessions begun before masks could be segments have the same digests
+            camera["labels_are"] = c.labels_are
         digest = hashlib.sha256(json.dumps(camera, default=np.ndarray.tolist).encode())
         for key in sorted(self.images):
             digest.update(f"{key} {len(self.images[key])}\0".encode() + self.images[key])
@@ -157,7 +161,16 @@ class Capture:
         if depth.dtype.kind in "iu":
             depth = (depth.astype(np.float64) * (camera.depth_scale / 1000.0)).astype(np.float32)
         rgb, labels, normals_camera = (decoded.get(key) for key in ("rgb", "labels", "normals"))
-        return View(depth, camera.K, camera.T_world_camera, rgb, labels, normals_camera, camera.name)
+        return View(
+            depth,
+            camera.K,
+            camera.T_world_camera,
+            rgb,
+            labels,
+            normals_camera,
+            camera.name,
+            camera.labels_are,
+        )
 
 
 def _decoded(key: str, content: bytes, name: str, max_pixels: int) -> NDArray[Any]:
