@@ -69,7 +69,7 @@ class Exploring(options.ExploringCommand):
 
     source: str
     no_early_stop: options.Flag = False
-    """Continue to the maximum number of views; otherwise stop when a view changes nothing."""
+    """Continue to the maximum number of views; otherwise stop when no view is worth its path."""
 
     def explore(self, config: Config) -> tuple[Source, Iterator[Step]]:
         """Open the source; returns it and the steps of its exploration."""
