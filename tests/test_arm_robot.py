@@ -114,6 +114,18 @@ class TestCandidates:
         assert robot.move_to(found.T_world_camera[7]) == pytest.approx(found.path_length[7])
         np.testing.assert_array_equal(robot.T_world_camera, found.T_world_camera[7])
 
+    def test_waypoints_hold_the_joints_that_confirm_gives(self):
+        robot = arm(confirm=lambda T: T[:3, 3])
+        views = robot.candidates(robot.view_sphere(PROPOSED)).T_world_camera
+        assert robot.waypoints(views[0])[0].joints is None
+        robot.move_to(views[0])
+        assert robot.confirm(views[9]) is None
+        for posture, T in zip(robot.waypoints(views[9]), views[[0, 9]], strict=True):
+            np.testing.assert_array_equal(posture.joints, (transforms.invert(BASE) @ T)[:3, 3])
+            assert_gaze(posture, T)
+        assert [p.joints for p in (arm(T_world_camera=views[0])).waypoints(views[9])] == [None, None]
+        assert arm(confirm=lambda T: None).confirm(views[0]) is not None
+
     @pytest.mark.parametrize("seed", range(2))
     def test_base_and_table_moved_together_change_nothing(self, seed):
         rng = np.random.default_rng(seed)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import pickle
 from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
@@ -55,6 +56,8 @@ def test_each_view_is_taken_where_the_one_before_decided(steps):
         np.testing.assert_allclose(after.visited[-1], before.sphere.direction_of(decision.T_world_camera))
         angle = transforms.angle_between(after.visited[-2], after.visited[-1])
         assert after.angle_travelled - before.angle_travelled == pytest.approx(angle)
+        for end, step in ((decision.waypoints[0], before), (decision.waypoints[-1], after)):
+            np.testing.assert_array_equal(end.platform_world, step.robot.posture.platform_world)
         length = before.candidates.path_length[decision.index]
         assert after.path_travelled - before.path_travelled == pytest.approx(length)
     assert steps[-1].angle_travelled > 0.5
@@ -113,6 +116,8 @@ def test_a_person_may_choose_another_view_and_another_planner():
     chosen = explorer.choose(index)
     assert chosen.decision.why == "chosen by hand"
     assert chosen.decision.score == chosen.decision.saliency - chosen.decision.cost
+    there = set_up.robot.solve(chosen.decision.T_world_camera)
+    assert repr(pickle.loads(pickle.dumps(chosen.decision.waypoints[-1]))) == repr(there)
     explorer.go()
     seen = explorer.look()
     np.testing.assert_array_equal(seen.view.pose, chosen.decision.T_world_camera)
@@ -143,8 +148,11 @@ def written(folder, steps):
 
 
 def test_steps_come_back_from_a_run_folder_as_they_were(steps, tmp_path):
-    found = list(read_steps(written(tmp_path / "run", steps)))
+    run = written(tmp_path / "run", steps)
+    found = list(read_steps(run))
     assert len(found) == len(steps)
+    ends = run.views[0].record["next"]["waypoints"][-1]
+    np.testing.assert_allclose(ends["platform"], steps[0].decision.waypoints[-1].platform_world, atol=1e-8)
     for step, read in zip(steps, found, strict=True):
         assert repr(read) == repr(step)
         assert graph_text(read.graph) == graph_text(step.graph)

@@ -19,13 +19,14 @@ from PIL import Image
 from pypdf import PdfReader
 
 from caryatid.config import ReportConfig
-from caryatid.exploration import Step
+from caryatid.exploration import RobotPose, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere
 from caryatid.graph import SceneObject, Stability, Support, SupportGraph
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.planning.posture import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.viz import Figure, Report, make_report, render_html, render_pdf
@@ -199,6 +200,8 @@ def test_charts_need_several_views_or_scores_and_changes_are_said(make_step):
         return [figure.picture.name for figure in summary.figures]
 
     assert charts(steps, scores) == ["F1 over views", "Found so far"]
+    stood = RobotPose(Posture(np.array([-1.2, 0.0, 0.0]), 1.6, 0.0, -0.5), steps[0].view.pose, 0.35, False)
+    assert charts([replace(steps[0], robot=stood)]) == ["where the robot stood"]
     assert charts(steps[:1]) == []
     changed = make_report("t", steps, config=SMALL).sections[3].text
     assert "now: o1 (box) held by the table, o2 (cylinder) held by o1; gone: o7" in changed

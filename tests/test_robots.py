@@ -59,14 +59,14 @@ class TestFloorGrid:
 
     def test_path_length_in_the_open_is_the_octile_distance(self):
         grid = floor(TABLE)
-        lengths = grid.path_lengths((-2.0, -2.0))
-        cells, _ = grid.cells(np.array([[-1.0, -2.0], [-1.5, -1.5], [-2.0, -2.0]]))
-        np.testing.assert_allclose(lengths.ravel()[cells], [1.0, np.hypot(0.5, 0.5), 0.0], atol=1e-9)
+        paths = grid.paths_from((-1.975, -1.975))
+        ends = np.array([[-0.975, -1.975], [-1.475, -1.475], [-1.975, -1.975], [-1.975, -1.465]])
+        lengths = [1.0, np.hypot(0.5, 0.5), 0.0, 0.51]
+        np.testing.assert_allclose(paths.lengths(ends), lengths, atol=1e-9)
 
     def test_the_way_leads_around_a_wall(self):
         grid = floor(box((0.0, 0.0, 1.0), (0.05, 2.0, 1.0)))
-        cells, _ = grid.cells(np.array([[1.0, 0.0]]))
-        length = grid.path_lengths((-1.0, 0.0)).ravel()[cells[0]]
+        length = grid.paths_from((-1.0, 0.0)).lengths(np.array([[1.0, 0.0]]))[0]
         shortest = 2.0 * np.hypot(1.0 - 0.05, 2.0 + 0.35) + 0.1
         assert shortest - 0.15 < length < 1.15 * shortest
 
@@ -148,7 +148,8 @@ class TestHumanoidRobot:
         before = moved.candidates(SPHERE)
         there = int(np.argmax(before.directions @ direction(0.0, 0.6)))
         length = moved.move_to(before.T_world_camera[there])
-        assert length == before.path_length[there] > 2.0
+        assert length == pytest.approx(before.path_length[there], abs=1e-9)
+        assert length > 2.0
         np.testing.assert_array_equal(moved.T_world_camera, before.T_world_camera[there])
         after, fresh = moved.candidates(SPHERE), standing(grid, moved.T_world_camera).candidates(SPHERE)
         for field in ("T_world_camera", "directions", "path_length", "indices"):
@@ -157,6 +158,29 @@ class TestHumanoidRobot:
         assert after.looks(1000) is moved.candidates(SPHERE).looks(1000)
         assert moved.move_to(moved.T_world_camera) == 0.0
         assert moved.move_to(pose(180.0, 35.0)) == pytest.approx(length, abs=0.1)
+
+    def test_the_waypoints_lead_from_posture_to_posture_and_are_as_long_as_the_path(self):
+        robot = HumanoidRobot(floor(TABLE, WALL), CONFIG)
+        home = pose(180.0, 35.0)
+        (first,) = robot.waypoints(home)
+        np.testing.assert_array_equal(first.platform_world, robot.solve(home).platform_world)
+        robot.move_to(home)
+        candidates = robot.candidates(SPHERE)
+        rng = np.random.default_rng(5)
+        for there in rng.integers(0, len(candidates), 30).tolist():
+            T = candidates.T_world_camera[there]
+            here, ways = robot.solve(robot.T_world_camera), robot.waypoints(T)
+            for end, posture in ((ways[0], here), (ways[-1], robot.solve(T))):
+                np.testing.assert_array_equal(end.platform_world, posture.platform_world)
+                assert end.camera_height == posture.camera_height
+            heights = [p.camera_height for p in ways]
+            assert heights == sorted(heights, reverse=heights[-1] < heights[0])
+            turns = np.diff([p.platform_world[2] for p in ways])
+            assert np.abs(np.angle(np.exp(1j * turns)).sum()) <= np.pi + 1e-9
+            length = np.linalg.norm(np.diff([p.platform_world[:2] for p in ways], axis=0), axis=1).sum()
+            assert length == pytest.approx(candidates.path_length[there], abs=1e-9)
+            assert robot.move_to(T) == pytest.approx(length, abs=1e-9)
+            candidates = robot.candidates(SPHERE)
 
     def test_home_is_the_reachable_view_nearest_to_the_minus_x_side(self):
         robot = HumanoidRobot(floor(TABLE), CONFIG)

@@ -92,6 +92,7 @@ def test_a_session_over_http_is_the_session(client, views):
     assert following["view"] == 2
     assert np.array(following["T_world_camera"]).shape == (4, 4)
     assert len(following["platform"]) == 3
+    assert following["waypoints"][-1]["platform"] == following["platform"]
     assert following["why"]
     reach = {"T_world_camera": [v.pose.tolist() for v in views], "path_length": [0.0, 9.0, 9.0]}
     chosen = client.post("/sessions/a/next", json=reach).json()

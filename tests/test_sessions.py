@@ -96,6 +96,16 @@ def test_the_next_view_is_where_the_robot_can_be(begun):
     assert np.allclose(forward / np.linalg.norm(forward), (np.cos(yaw), np.sin(yaw)))
     assert robot.pitch[0] <= np.degrees(told["gaze"]["pitch"]) <= robot.pitch[1]
     assert told["why"]
+    (*_, last), names = told["waypoints"], ("platform", "camera_height", "gaze")
+    assert len(told["waypoints"]) > 1
+    assert [last[name] for name in names] == [told[name] for name in names]
+    with Session.open(begun, read_only=True) as session:
+        now = session.scene.T_world_camera
+    start = told["waypoints"][0]
+    assert np.hypot(*(np.array(start["platform"][:2]) - now[:2, 3])) < 0.15
+    legs = np.diff([w["platform"][:2] for w in told["waypoints"]], axis=0)
+    diameter, effort = 2.0 * Config().active.sphere_radius, Config().active.effort
+    assert np.linalg.norm(legs, axis=1).sum() == pytest.approx(told["cost"] / effort * diameter, abs=1e-9)
     # The platform stands beside the table, which reaches 0.4 m along x and 0.5 m along y.
     outside = np.abs(told["platform"][:2]) - (0.4, 0.5)
     assert outside.max() > robot.footprint - robot.cell - 0.02
@@ -109,6 +119,7 @@ def test_a_robot_may_say_itself_what_it_reaches(begun):
         told = session.next(poses, lengths).to_json()
         assert np.allclose(told["T_world_camera"], poses[told["candidate"]])
         assert told["platform"] is told["gaze"] is None
+        assert told["waypoints"] == []
         costs = [session.next([T], [length]).decision.cost for T, length in zip(poses, lengths, strict=True)]
         assert np.allclose(np.array(costs) / costs[0], lengths)
         with pytest.raises(PlanningError, match="no view is left"):

@@ -17,7 +17,7 @@ from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
 from caryatid.planning.planners import make_planner
 from caryatid.planning.planners.hidden_surface import SupportPlanner
-from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of
+from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of, waypoints_of
 from caryatid.robots.arm import ArmRobot
 from caryatid.runtime.display import Pictured
 from caryatid.runtime.parallel import one_blas_thread
@@ -223,15 +223,17 @@ class Explorer:
             chosen: A decision, or which of the newest step's candidates: then with the planner's figures.
 
         Returns:
-            The newest step, with this decision.
+            The newest step, with this decision and the way there.
 
         Raises:
             PlanningError: There is no such candidate, the robot cannot take it, or nothing has been planned.
         """
         decision = self._by_hand(chosen) if isinstance(chosen, int) else chosen
-        refused = refusal_of(self._moving(), decision.T_world_camera)
+        robot, T_world_camera = self._moving(), decision.T_world_camera
+        refused = refusal_of(robot, T_world_camera)
         if refused is not None:
             raise PlanningError(refused.reason)
+        decision = decision.by_way_of(waypoints_of(robot, T_world_camera))
         self.step = replace(self._newest(), decision=decision, stop=None)
         return self.step
 
@@ -367,7 +369,7 @@ def next_best_view(
         planner: Chooses among them, or its name.
 
     Returns:
-        The decision: `T_world_camera` is the view, `why` the reason.
+        The decision: `T_world_camera` is the view, `waypoints` the way there, `why` the reason.
 
     Raises:
         PlanningError: No view is known yet, or none can be reached.
@@ -395,7 +397,8 @@ def _decide(
         decision = planner.plan(state, rng)
         refused = refusal_of(robot, decision.T_world_camera)
         if refused is None:
-            return decision, state.candidates
+            waypoints = waypoints_of(robot, decision.T_world_camera)
+            return decision.by_way_of(waypoints), state.candidates
         why = refused.reason
         state = replace(state, candidates=state.candidates.without(decision.index, why))
     raise PlanningError(f"the robot could take none of {ATTEMPTS} views: {why}")

@@ -139,6 +139,15 @@ class Gaze(Document):
     pitch: float = Field(description="Upwards")
 
 
+class Waypoint(Document):
+    """How the robot stands on its way."""
+
+    platform: list[float] = Field(description="x, y, yaw [m, m, rad]")
+    camera_height: float = Field(description="Over the floor [m]")
+    gaze: Gaze = Field(description="How the head turns")
+    joints: list[float] | None = Field(description="Joint positions of an arm, or null where not known")
+
+
 class NextAnswer(Document):
     """Where to look next."""
 
@@ -148,6 +157,10 @@ class NextAnswer(Document):
     platform: list[float] | None = Field(description="x, y, yaw [m, rad]; null with candidates")
     camera_height: float | None = Field(description="Over the floor [m]; null with candidates")
     gaze: Gaze | None = Field(description="How the head turns; null with candidates")
+    joints: list[float] | None = Field(description="Joint positions of an arm, or null where not known")
+    waypoints: list[Waypoint] = Field(
+        description="The way there, from where the robot is; straight in between; empty with candidates"
+    )
     expected_gain: float = Field(description="Saliency s of eq. 3")
     cost: float = Field(description="Cost h of the path, eq. 3")
     score: float = Field(description="c = s − h, eq. 3")

@@ -265,6 +265,7 @@ def _summary(step: Step) -> dict[str, Any]:
         decision = step.decision
         names = ("T_world_camera", "saliency", "cost", "score", "why")
         record["next"] = {name: getattr(decision, name) for name in names}
+        record["next"]["waypoints"] = [posture.to_json() for posture in decision.waypoints]
         record["next"]["points_of_interest"] = [
             {"position": p.position_world, "saliency": p.saliency, "subject": p.subject, "why": p.why}
             for p in decision.points_of_interest
@@ -331,6 +332,8 @@ def _decoded(stored: dict[str, Any]) -> Step:
         if name == "points_of_interest":
             points = (_with_arrays(point) | {"subject": tuple(point["subject"])} for point in value)
             stored[f"decision.{name}"] = tuple(PointOfInterest(**point) for point in points)
+        elif name == "waypoints":
+            stored[f"decision.{name}"] = tuple(Posture(**_with_arrays(posture)) for posture in value)
     for part, kind in PARTS.items():
         given = {name: stored.pop(key) for key, name in _names(part, kind).items() if key in stored}
         stored[part] = kind(**given) if given else None

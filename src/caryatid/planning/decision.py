@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +18,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.candidates import Candidates, Looks
 from caryatid.planning.points_of_interest import PointOfInterest
+from caryatid.planning.posture import Posture
 from caryatid.runtime.display import Pictured
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.sensing.view_sphere import ViewSphere
@@ -78,6 +80,8 @@ class Decision(Pictured):
         candidate_saliency: s (N,) of every candidate, or None.
         sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None. A function may be
             given that returns it, since most pictures are never drawn.
+        waypoints: The way there: postures from the robot's own to the one at the view, straight in between.
+            Only the last where the robot says no more, none before a robot has been asked.
     """
 
     T_world_camera: Array
@@ -89,6 +93,13 @@ class Decision(Pictured):
     points_of_interest: tuple[PointOfInterest, ...] = ()
     candidate_saliency: Array | None = None
     sphere_saliency: PaintedLate = PaintedLate()
+    waypoints: tuple[Posture, ...] = ()
+
+    def by_way_of(self, waypoints: tuple[Posture, ...]) -> Decision:
+        """Return the same decision with the way there; its picture stays unpainted."""
+        decision = copy.copy(self)
+        object.__setattr__(decision, "waypoints", waypoints)
+        return decision
 
     def __repr__(self) -> str:
         return f"Decision(candidate {self.index}, score {self.score:.3f}: {self.why})"

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caryatid.errors import InputError, PlanningError
-from caryatid.robots.protocol import OwnViews, Posture, Robot, Unreachable, refusal_of, view_sphere_of
+from caryatid.planning.posture import Posture
+from caryatid.robots.protocol import OwnViews, Robot, Unreachable, refusal_of, view_sphere_of, waypoints_of
 
 if TYPE_CHECKING:
     from caryatid.config import Config, RobotConfig
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "OwnViews", "Posture", "Robot", "RobotMaker", "Surroundings", "Unreachable", "find_robot", "home_view",
-    "located", "offered", "refusal_of", "view_sphere_of",
+    "located", "offered", "refusal_of", "view_sphere_of", "waypoints_of",
 ]  # fmt: skip
 
 HUMANOID = "humanoid"

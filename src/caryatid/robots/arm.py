@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,10 +14,10 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
+from caryatid.planning.posture import Posture
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.protocol import (
     OwnViews,
-    Posture,
     SimulatedRobot,
     Unreachable,
     count_reasons,
@@ -62,7 +63,9 @@ class ArmRobot(SimulatedRobot, OwnViews):
         config: Radii to choose among, rolls, clearance over the table.
         confirm: Says of one pose (4, 4) in the frame of the base whether the arm can go there. It is asked
             about a view before it is taken, and where it says no another one is chosen: for slow but exact
-            inverse kinematics, or a motion planner, behind a coarse map. None takes `reachable` for true.
+            inverse kinematics, or a motion planner, behind a coarse map. For yes it may return the joint
+            positions (J,) there, which the waypoints then hold, and for no None; `reachable` knows none.
+            Without it `reachable` is taken for true.
         centre_world: Centre (3,) of its view sphere [m], or None for the middle of the table top.
         furniture: Knows the walls no view may look through, or None.
         T_world_camera: Where its camera is (4, 4), or None while it has not been put anywhere; then any view
@@ -78,7 +81,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         T_world_base: ArrayLike,
         config: ArmConfig | None = None,
         *,
-        confirm: Callable[[Array], bool] | None = None,
+        confirm: Callable[[Array], bool | Array | None] | None = None,
         centre_world: ArrayLike | None = None,
         furniture: FloorGrid | None = None,
         T_world_camera: ArrayLike | None = None,
@@ -88,6 +91,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         self._config = config or ArmConfig()
         self._centre = None if centre_world is None else np.array(centre_world, dtype=np.float64)
         self._confirm = confirm
+        self._confirmed: tuple[Array, Array | None] = np.zeros((4, 4)), None
         self._furniture = furniture
         self._sphere: ViewSphere | None = None
         self._offer: tuple[ViewSphere, Candidates] | None = None
@@ -110,7 +114,8 @@ class ArmRobot(SimulatedRobot, OwnViews):
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
         """Say how the arm would hold its camera at a pose (4, 4), with its roll, or why it cannot.
 
-        The platform of the posture is the base; its yaw and pitch are where the camera looks.
+        The platform of the posture is the base; its yaw and pitch are where the camera looks. Joint positions
+        are known where `confirm` gave them.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
         if not self._reaches(T[None])[0]:
@@ -120,8 +125,15 @@ class ArmRobot(SimulatedRobot, OwnViews):
         is_there = here is not None and np.array_equal(T, here)
         if not is_there and (refused := self.confirm(T)) is not None:
             return refused
-        base_yaw = float(np.arctan2(*self.T_world_base[[1, 0], 0]))
-        return posture_at(T, np.array([*self.T_world_base[:2, 3], base_yaw]))
+        return self._posture if is_there and self._posture is not None else self._posture_of(T)
+
+    def waypoints(self, T_world_camera: Array) -> tuple[Posture, ...]:
+        """Return the postures here and at a pose (4, 4); what lies between is the motion planner's.
+
+        Joint positions are known of a pose that was confirmed last, or gone to.
+        """
+        there, here = self._posture_of(T_world_camera), self._T_world_camera
+        return (there,) if here is None else (self._posture or self._posture_of(here), there)
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the views of the sphere within reach, clear of the table, that see its centre past walls.
@@ -135,9 +147,21 @@ class ArmRobot(SimulatedRobot, OwnViews):
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
         """Look closer whether the arm can go to a candidate (4, 4); None = it can."""
-        if self._confirm is None or self._confirm(transforms.invert(self.T_world_base) @ T_world_camera):
+        if self._confirm is None:
             return None
-        return Unreachable(UNCONFIRMED)
+        answer = self._confirm(transforms.invert(self.T_world_base) @ T_world_camera)
+        joints = answer if isinstance(answer, np.ndarray) else None
+        if joints is None and not answer:
+            return Unreachable(UNCONFIRMED)
+        self._confirmed = T_world_camera.copy(), joints
+        return None
+
+    def _posture_of(self, T_world_camera: Array) -> Posture:
+        """The posture at a pose (4, 4), with the joint positions `confirm` gave for it last."""
+        base_yaw = float(np.arctan2(*self.T_world_base[[1, 0], 0]))
+        posture = posture_at(T_world_camera, np.array([*self.T_world_base[:2, 3], base_yaw]))
+        T_confirmed, joints = self._confirmed
+        return replace(posture, joints=joints) if np.array_equal(T_confirmed, T_world_camera) else posture
 
     def _radius_around(self, centre_world: Array) -> float:
         smallest, largest = self._config.radius

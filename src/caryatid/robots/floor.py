@@ -29,7 +29,7 @@ class FloorGrid:
     """A grid over the floor, indexed [row along y, column along x].
 
     Attributes:
-        free: Cells (H, W) where the platform's centre may stand: obstacles are grown by its footprint.
+        free: Cells (H, W) in which the platform's centre may be anywhere: its footprint meets no obstacle.
         origin_world: Corner (2,) of cell [0, 0], x and y [m].
         cell: Edge of a cell [m].
         furniture: Static boxes, for lines of sight.
@@ -56,12 +56,15 @@ class FloorGrid:
         x, y = (low + config.cell * (np.arange(count) + 0.5) for low in origin)
         cells = shapely.points(*np.meshgrid(x, y))
         free = np.ones((count, count), dtype=np.bool_)
+        corners = 0.5 * config.cell * np.array([(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
         # What the head cannot meet, 15 cm above the highest camera centre, does not hinder.
         head = config.camera_height[1] + 0.15
         for box in furniture:
             middle, reach = box.T_world_object[2, 3], box.support(np.array([[0.0, 0.0, 1.0]]))[0]
             if middle + reach > STEP and middle - reach < head:
-                free &= shapely.distance(shapely.Polygon(ground_outline(box)), cells) >= config.footprint
+                # A cell is as far from an outline as its centre is from the outline grown by the cell.
+                grown = (ground_outline(box)[:, None] + corners).reshape(-1, 2)
+                free &= shapely.distance(shapely.MultiPoint(grown).convex_hull, cells) >= config.footprint
         return cls(free, origin, config.cell, tuple(furniture))
 
     @classmethod
@@ -78,8 +81,9 @@ class FloorGrid:
         """
         free = np.ones(occupied.shape, dtype=np.bool_)
         if occupied.any():
-            distance = scipy.ndimage.distance_transform_edt(~np.pad(occupied, 1))[1:-1, 1:-1]
-            free = distance * cell >= config.footprint
+            # Between squares: from the centre of one to those of the other and its neighbours.
+            grown = scipy.ndimage.binary_dilation(np.pad(occupied, 1), np.ones((3, 3)))
+            free = scipy.ndimage.distance_transform_edt(~grown)[1:-1, 1:-1] * cell >= config.footprint
         return cls(free, np.asarray(origin_world, dtype=np.float64), cell)
 
     def cells(self, points_world: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -93,25 +97,26 @@ class FloorGrid:
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
         return np.where(inside, row * width + column, 0), inside
 
-    def path_lengths(self, start_world: ArrayLike) -> Array:
-        """Length [m] of the shortest path over the floor from a point (x, y) to each cell, by one Dijkstra.
+    def centres(self, cells: NDArray[np.intp]) -> Array:
+        """Centres (..., 2) [m] of cells by their flat indices (...)."""
+        row, column = np.divmod(cells, self.free.shape[1])
+        return self.origin_world + self.cell * (np.stack([column, row], axis=-1) + 0.5)
+
+    def paths_from(self, start_world: ArrayLike) -> FloorPaths:
+        """Find the shortest paths over the floor from a point (2,), x and y [m], by one Dijkstra.
 
         A platform that stands beside the free cells (because the grid is coarse) starts at the nearest one.
-
-        Returns:
-            (H, W), inf where no path leads.
         """
-        if not self.free.any():
-            return np.full(self.free.shape, np.inf)
-        start = np.asarray(start_world, dtype=np.float64)[None, :2]
-        (cell,), (inside,) = self.cells(start)
-        if not (inside and self.free.ravel()[cell]):
-            rows, columns = np.nonzero(self.free)
-            centres = self.origin_world + self.cell * (np.stack([columns, rows], axis=-1) + 0.5)
-            nearest = np.argmin(np.linalg.norm(centres - start, axis=-1))
-            cell = rows[nearest] * self.free.shape[1] + columns[nearest]
-        lengths = scipy.sparse.csgraph.dijkstra(self._graph, directed=False, indices=int(cell))
-        return np.asarray(lengths).reshape(self.free.shape)
+        start = np.asarray(start_world, dtype=np.float64)[:2]
+        (cell,), (inside,) = self.cells(start[None])
+        free = np.flatnonzero(self.free)
+        if len(free) == 0:
+            return FloorPaths(self, start, -1, np.full(self.free.size, np.inf))
+        if not (inside and self.free.flat[cell]):
+            cell = free[np.argmin(np.linalg.norm(self.centres(free) - start, axis=-1))]
+        first_leg = np.linalg.norm(start - self.centres(cell))
+        between = scipy.sparse.csgraph.dijkstra(self.graph, indices=int(cell))
+        return FloorPaths(self, start, int(cell), first_leg + between)
 
     def hidden(self, eyes_world: Array, target_world: Array) -> NDArray[np.bool_]:
         """Test which eyes (N, 3) [m] have furniture between themselves and a target (3,) [m]."""
@@ -130,7 +135,7 @@ class FloorGrid:
         return blocked
 
     @cached_property
-    def _graph(self) -> scipy.sparse.csr_array:
+    def graph(self) -> scipy.sparse.csr_array:
         """Free cells and the steps between them [m]; a diagonal step needs both cells beside it."""
         height, width = self.free.shape
         index = np.arange(height * width).reshape(height, width)
@@ -145,4 +150,52 @@ class FloorGrid:
             length = np.full(passable.sum(), self.cell * np.hypot(down, right))
             edges.append((length, index[here][passable], index[there][passable]))
         lengths, sources, sinks = (np.concatenate(parts) for parts in zip(*edges, strict=True))
-        return scipy.sparse.csr_array((lengths, (sources, sinks)), shape=(height * width, height * width))
+        half = scipy.sparse.csr_array((lengths, (sources, sinks)), shape=(height * width, height * width))
+        return half + half.T
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class FloorPaths:
+    """The shortest paths over a floor from one place.
+
+    They lead over the centre of its cell from centre to centre, and stay in free cells: a diagonal step has
+    free cells on both sides.
+
+    Attributes:
+        grid: The floor.
+        start_world: Where they begin (2,), x and y [m].
+        cell: Flat index of the cell they begin in.
+        to_centres: Length [m] to the centre of each cell (H·W,), inf where no path leads.
+    """
+
+    grid: FloorGrid
+    start_world: Array
+    cell: int
+    to_centres: Array
+
+    def lengths(self, points_world: Array) -> Array:
+        """Length (N,) [m] of the path to each of some points (N, 2+): straight within the first cell."""
+        points = points_world[:, :2]
+        cells, _ = self.grid.cells(points)
+        last_leg = np.linalg.norm(points - self.grid.centres(cells), axis=-1)
+        straight = np.linalg.norm(points - self.start_world, axis=-1)
+        return np.where(cells == self.cell, straight, self.to_centres[cells] + last_leg)
+
+    def corners(self, point_world: Array) -> Array:
+        """Corners (C, 2) [m] of the path to a point (2+,), with both ends; of equal paths one of few."""
+        end_world = point_world[None, :2]
+        (cell,), _ = self.grid.cells(end_world)
+        if cell == self.cell:
+            return np.concatenate([self.start_world[None], end_world])
+        graph, corners, heading = self.grid.graph, [int(cell)], 0
+        while corners[-1] != self.cell:
+            here = corners[-1]
+            beside = slice(graph.indptr[here], graph.indptr[here + 1])
+            before, steps = graph.indices[beside], graph.data[beside]
+            before = before[np.abs(self.to_centres[before] + steps - self.to_centres[here]) < 1e-9]
+            if here + heading not in before:
+                heading = int(before[0]) - here
+                corners.append(here)
+            corners[-1] = here + heading
+        centres = self.grid.centres(np.array(corners[::-1]))
+        return np.concatenate([self.start_world[None], centres, end_world])

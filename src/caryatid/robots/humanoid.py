@@ -9,8 +9,9 @@ from caryatid.config import RobotConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.planning.candidates import Candidates
-from caryatid.robots.floor import FloorGrid
-from caryatid.robots.protocol import Posture, SimulatedRobot, Unreachable, count_reasons
+from caryatid.planning.posture import Posture
+from caryatid.robots.floor import FloorGrid, FloorPaths
+from caryatid.robots.protocol import OwnViews, SimulatedRobot, Unreachable, count_reasons
 from caryatid.sensing.view_sphere import ViewSphere
 
 REASONS = (
@@ -29,7 +30,7 @@ Indices = NDArray[np.intp]
 """Whole numbers (N,)."""
 
 
-class HumanoidRobot(SimulatedRobot):
+class HumanoidRobot(SimulatedRobot, OwnViews):
     """A humanoid of ARMAR-6's kind in simulation: holonomic platform, torso lift, head with yaw and pitch.
 
     It is nowhere at first, and goes to its first place by a path of length 0.
@@ -42,13 +43,14 @@ class HumanoidRobot(SimulatedRobot):
     def __init__(self, floor: FloorGrid, config: RobotConfig) -> None:
         self._floor = floor
         self._config = config
-        self._path_lengths = np.where(floor.free, 0.0, np.inf).ravel()
-        self._offer: tuple[ViewSphere, NDArray[np.bool_], Candidates, Indices] | None = None
+        self._paths: FloorPaths | None = None
+        self._reached = floor.free.ravel()
+        self._offer: tuple[ViewSphere, NDArray[np.bool_], Candidates, Array] | None = None
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
         """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot."""
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
-        (code,), (platform,), (head_yaw,), (pitch,), _ = self._reach(T[None])
+        (code,), (platform,), (head_yaw,), (pitch,) = self._reach(T[None])
         if code >= 0:
             x, y, z = T[:3, 3]
             where = f"camera at ({x:.2f}, {y:.2f}, {z:.2f}) m, pitch {np.rad2deg(pitch):.0f}°"
@@ -60,40 +62,63 @@ class HumanoidRobot(SimulatedRobot):
 
         Another sphere, or other cells in reach, need new ones; otherwise only their paths change.
         """
-        reached = np.isfinite(self._path_lengths)
         offer = self._offer
-        if offer is None or offer[0] is not sphere or not np.array_equal(offer[1], reached):
-            offer = self._offer = (sphere, reached, *self._offered(sphere))
-        return offer[2].from_elsewhere(self._path_lengths[offer[3]])
+        if offer is None or offer[0] is not sphere or not np.array_equal(offer[1], self._reached):
+            offer = self._offer = (sphere, self._reached, *self._offered(sphere))
+        return offer[2] if self._paths is None else offer[2].from_elsewhere(self._paths.lengths(offer[3]))
 
-    def _offered(self, sphere: ViewSphere) -> tuple[Candidates, Indices]:
-        """The views of a sphere that can be reached, and the cell of each."""
+    def waypoints(self, T_world_camera: Array) -> tuple[Posture, ...]:
+        """Return how it drives to a pose (4, 4): corners of the shortest path, turning and lifting evenly.
+
+        The platform's straight lines between them are as long as the path.
+
+        Raises:
+            PlanningError: The pose cannot be reached.
+        """
+        there, here = self._posture_at(T_world_camera), self._posture
+        if here is None or self._paths is None:
+            return (there,)
+        corners = self._paths.corners(there.platform_world)
+        legs = np.linalg.norm(np.diff(corners, axis=0), axis=-1)
+        start, end = (
+            np.array([p.platform_world[2], p.camera_height, p.head_yaw, p.head_pitch]) for p in (here, there)
+        )
+        change = end - start
+        change[0] = _wrapped(change[0])
+        between = (start + change * share for share in np.cumsum(legs)[:-1] / max(float(legs.sum()), 1e-9))
+        passed = (
+            Posture(np.array([*corner, _wrapped(yaw)]), float(height), float(head_yaw), float(pitch))
+            for corner, (yaw, height, head_yaw, pitch) in zip(corners[1:-1], between, strict=True)
+        )
+        return (here, *passed, there)
+
+    def _offered(self, sphere: ViewSphere) -> tuple[Candidates, Array]:
+        """The views of a sphere that can be reached, and where the platform stands for each (N, 3)."""
         height = sphere.positions_world[:, 2]
         low, high = self._config.camera_height
         indices = np.flatnonzero((height >= low) & (height <= high))
         poses = sphere.poses(sphere.directions[indices])
         code = np.where(height < low, 0, 1)
-        reach, _, _, _, cell = self._reach(poses)
+        reach, platform_world, _, _ = self._reach(poses)
         hidden = self._floor.hidden(poses[:, :3, 3], sphere.centre_world)
         code[indices] = np.where((reach < 0) & hidden, len(REASONS) - 1, reach)
         good = code[indices] < 0
-        indices, cell = indices[good], cell[good]
-        lengths, rejected = self._path_lengths[cell], count_reasons(code, REASONS)
-        return Candidates(poses[good], sphere.directions[indices], lengths, rejected, indices), cell
+        indices, rejected = indices[good], count_reasons(code, REASONS)
+        directions, lengths = sphere.directions[indices], np.zeros(len(indices))
+        return Candidates(poses[good], directions, lengths, rejected, indices), platform_world[good]
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
-        """Path length over the floor [m]; from there on path lengths begin there."""
-        (cell,), _ = self._floor.cells(posture.platform_world[None])
-        length = float(self._path_lengths[cell])
-        self._path_lengths = self._floor.path_lengths(posture.platform_world).ravel()
-        return length
+        """Drive along the waypoints; return how far [m]. From there on paths begin there."""
+        driven = np.array([p.platform_world[:2] for p in self.waypoints(T_world_camera)])
+        self._paths = self._floor.paths_from(driven[-1])
+        self._reached = np.isfinite(self._paths.to_centres)
+        return float(np.linalg.norm(np.diff(driven, axis=0), axis=-1).sum())
 
-    def _reach(self, T_world_camera: Array) -> tuple[Indices, Array, Array, Array, Indices]:
+    def _reach(self, T_world_camera: Array) -> tuple[Indices, Array, Array, Array]:
         """Find how to stand for poses (N, 4, 4), trying head yaws from straight ahead outwards.
 
         Returns:
-            Index of the reason or −1 (N,), platform (N, 3), head yaw (N,), head pitch (N,), and the cell
-            the platform stands in (N,).
+            Index of the reason or −1 (N,), platform (N, 3), head yaw (N,) and head pitch (N,).
         """
         config = self._config
         eyes = T_world_camera[:, :3, 3]
@@ -105,13 +130,12 @@ class HumanoidRobot(SimulatedRobot):
         yaws = np.deg2rad(np.linspace(*config.yaw, config.head_yaws))
         yaws = yaws[np.argsort(np.abs(yaws), kind="stable")]
         quality, best = np.full(len(eyes), -1), np.zeros(len(eyes), dtype=np.intp)
-        cell = np.zeros(len(eyes), dtype=np.intp)
         left = np.arange(len(eyes))
         for n, head_yaw in enumerate(yaws):
-            found, here = self._standing(eyes[left], heading[left] - head_yaw)
+            found = self._standing(eyes[left], heading[left] - head_yaw)
             better = found > quality[left]
             rows = left[better]
-            quality[rows], best[rows], cell[rows] = found[better], n, here[better]
+            quality[rows], best[rows] = found[better], n
             left = left[quality[left] < 3]
 
         tolerance = 1e-9
@@ -127,16 +151,20 @@ class HumanoidRobot(SimulatedRobot):
         refused = np.stack(tests)
         code = np.where(refused.any(axis=0), refused.argmax(axis=0), -1)
         yaw = heading - yaws[best]
-        wrapped = (yaw + np.pi) % (2.0 * np.pi) - np.pi
-        platform_world = np.column_stack([eyes[:, :2] - self._forward(yaw), wrapped])
-        return code, platform_world, yaws[best], pitch, cell
+        platform_world = np.column_stack([eyes[:, :2] - self._forward(yaw), _wrapped(yaw)])
+        return code, platform_world, yaws[best], pitch
 
-    def _standing(self, eyes_world: Array, yaw: Array) -> tuple[Indices, Indices]:
-        """How well the platform stands with a yaw (N,), from 0 outside the floor to 3, and in which cell."""
+    def _standing(self, eyes_world: Array, yaw: Array) -> Indices:
+        """How well (N,) the platform stands with a yaw (N,), from 0 outside the floor to 3."""
         cell, inside = self._floor.cells(eyes_world[:, :2] - self._forward(yaw))
         free = self._floor.free.ravel()[cell] & inside
-        return inside.astype(np.intp) + free + (free & np.isfinite(self._path_lengths[cell])), cell
+        return inside.astype(np.intp) + free + (free & self._reached[cell])
 
     def _forward(self, yaw: Array) -> Array:
         """How far (N, 2) [m] the camera stands before the platform's centre with a yaw (N,)."""
         return self._config.camera_forward * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
+
+
+def _wrapped(angle: Array) -> Array:
+    """Angles (...) [rad] as from −π to π."""
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from caryatid.errors import PlanningError
+from caryatid.planning.posture import Posture
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,23 +18,6 @@ if TYPE_CHECKING:
     from caryatid.geometry.transforms import Array
     from caryatid.planning.candidates import Candidates
     from caryatid.sensing.view_sphere import ViewSphere
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Posture:
-    """How the robot holds its camera at a pose.
-
-    Attributes:
-        platform_world: Platform (3,): x, y, yaw [m, m, rad].
-        camera_height: Height of the camera centre over the floor [m], set by the torso lift.
-        head_yaw: Against the platform, to the left [rad].
-        head_pitch: Upwards [rad].
-    """
-
-    platform_world: Array
-    camera_height: float
-    head_yaw: float
-    head_pitch: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +76,19 @@ class OwnViews:
         """
         return None
 
+    def waypoints(self, T_world_camera: Array) -> Sequence[Posture]:
+        """Say in which postures this robot goes to a pose (4, 4), from the one it is in to the one there.
+
+        Between two of them it moves straight. None said = only the posture there is known, from `solve`.
+        """
+        return ()
+
 
 class SimulatedRobot(Robot):
     """What robots in simulation share: where the camera is, and going on from there."""
 
     _T_world_camera: Array | None = None
+    _posture: Posture | None = None
 
     @property
     def T_world_camera(self) -> Array:
@@ -109,6 +101,17 @@ class SimulatedRobot(Robot):
             raise PlanningError("the robot is nowhere yet; move it to a first view")
         return self._T_world_camera
 
+    def _posture_at(self, T_world_camera: Array) -> Posture:
+        """The posture at a pose (4, 4).
+
+        Raises:
+            PlanningError: The pose cannot be reached.
+        """
+        posture = self.solve(T_world_camera)
+        if isinstance(posture, Unreachable):
+            raise PlanningError(f"the robot cannot go to this view: {posture.reason}")
+        return posture
+
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
         """Take a posture that `solve` gave; return the path length [m] from where the robot was."""
         return float(straight_lengths(self._T_world_camera, T_world_camera))
@@ -119,11 +122,9 @@ class SimulatedRobot(Robot):
         Raises:
             PlanningError: The pose cannot be reached.
         """
-        posture = self.solve(T_world_camera)
-        if isinstance(posture, Unreachable):
-            raise PlanningError(f"the robot cannot go to this view: {posture.reason}")
+        posture = self._posture_at(T_world_camera)
         length = self._go(posture, T_world_camera)
-        self._T_world_camera = T_world_camera.copy()
+        self._T_world_camera, self._posture = T_world_camera.copy(), posture
         return length
 
 
@@ -157,3 +158,13 @@ def view_sphere_of(robot: Robot | None, proposed: ViewSphere) -> ViewSphere:
 def refusal_of(robot: Robot | None, T_world_camera: Array) -> Unreachable | None:
     """Why a robot that inherits `OwnViews` does not take a candidate (4, 4) on a closer look, or None."""
     return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
+
+
+def waypoints_of(robot: Robot | None, T_world_camera: Array) -> tuple[Posture, ...]:
+    """In which postures a robot goes to a pose (4, 4); of one that does not say, only the posture there."""
+    if robot is None:
+        return ()
+    if isinstance(robot, OwnViews) and (told := robot.waypoints(T_world_camera)):
+        return tuple(told)
+    posture = robot.solve(T_world_camera)
+    return (posture,) if isinstance(posture, Posture) else ()

@@ -28,26 +28,26 @@ class NextView:
 
     Attributes:
         number: Which view it would be, 0 the first.
-        decision: Pose, expected gain, cost, and why.
-        posture: How the session's robot would stand there; None where candidates were given.
+        decision: Pose, the way there, expected gain, cost, and why. Where candidates were given there are no
+            waypoints.
         stop: Why another view may not pay, or None.
     """
 
     number: int
     decision: Decision
-    posture: Posture | None
     stop: str | None
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of `caryatid session next` and of the service."""
-        d, p = self.decision, self.posture
+        d = self.decision
+        waypoints = [posture.to_json() for posture in d.waypoints]
+        there = waypoints[-1] if waypoints else dict.fromkeys(("platform", "camera_height", "gaze", "joints"))
         return {
             "view": self.number,
             "T_world_camera": d.T_world_camera.tolist(),
             "candidate": d.index,
-            "platform": None if p is None else [float(x) for x in p.platform_world],
-            "camera_height": None if p is None else p.camera_height,
-            "gaze": None if p is None else {"yaw": p.head_yaw, "pitch": p.head_pitch},
+            **there,
+            "waypoints": waypoints,
             "expected_gain": d.saliency,
             "cost": d.cost,
             "score": d.score,

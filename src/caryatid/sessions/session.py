@@ -36,7 +36,7 @@ from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
-from caryatid.robots import HUMANOID, Posture, Surroundings, find_robot, view_sphere_of
+from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
 from caryatid.runtime.fingerprint import fingerprint
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
@@ -281,7 +281,7 @@ class Session:
             PlanningError: There is no view yet, or none can be reached.
             InputError: Candidates are no poses.
         """
-        sphere, robot, posture = self.scene.sphere, None, None
+        sphere, robot = self.scene.sphere, None
         if sphere is None:
             raise PlanningError("nothing has been seen yet; add a first view")
         T_world_cameras = np.stack([record.T_world_camera for record in self._records])
@@ -295,14 +295,12 @@ class Session:
         visited = sphere.direction_of(T_world_cameras)
         planner = make_planner(self.beginning.planner)
         decision = next_best_view(self.scene, robot, visited, candidates=reachable, planner=planner)
-        if robot is not None:
-            posture = robot.solve(decision.T_world_camera)
         assert self.scene.voxels is not None
         state = PlanningState(
             self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
         )
         stop = reason_to_stop(state, self.scene.changed, planner, decision)
-        return NextView(self.views, decision, posture if isinstance(posture, Posture) else None, stop)
+        return NextView(self.views, decision, stop)
 
     def undo(self) -> int:
         """Remove the last view.

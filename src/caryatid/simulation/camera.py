@@ -14,6 +14,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import View
+from caryatid.simulation.body import HumanoidBody
 from caryatid.simulation.world import SimulatedScene
 
 
@@ -107,6 +108,7 @@ class SimulatedCamera:
         noise_config: Figures of the noise.
         rng: Where the seed of all captures is drawn from.
         sensor: Image size, focal length and light.
+        body: Of the robot that carries it, seen where it is in the image; None = it floats.
 
     Raises:
         InputError: The noise model is not one of the two.
@@ -119,6 +121,7 @@ class SimulatedCamera:
         noise_config: NoiseConfig | None = None,
         rng: np.random.Generator | None = None,
         sensor: SensorConfig | None = None,
+        body: HumanoidBody | None = None,
     ) -> None:
         if noise not in ("none", "carmine"):
             raise InputError("noise", f"'{noise}' is no noise model", "choose none or carmine")
@@ -129,6 +132,7 @@ class SimulatedCamera:
         self.K = intrinsics(self.sensor)
         self._seed = int((rng or np.random.default_rng(0)).integers(2**63))
         self._captures = 0
+        self._body = body
 
     def fork(self) -> SimulatedCamera:
         """Return a camera whose next captures have the noise this one's would have; this one stays put."""
@@ -148,7 +152,8 @@ class SimulatedCamera:
             InputError: The pose is no rigid transform.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
-        image = render(self.scene, T, self.K, self.sensor)
+        around = None if self._body is None else self._body.around(T)
+        image = render(around or self.scene, T, self.K, self.sensor)
         number = self._captures
         rng = np.random.default_rng([self._seed, number])
         name = f"{self.scene.name} view {number}"

@@ -9,7 +9,9 @@ import numpy as np
 from caryatid.config import Config, NoiseModel
 from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, home_view
 from caryatid.robots.floor import FloorGrid
+from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.sensing.view_sphere import ViewSphere
+from caryatid.simulation.body import HumanoidBody
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.world import SimulatedScene, static_boxes, table_centre
 
@@ -53,5 +55,6 @@ def make_simulation(
     make = find_robot(robot) if isinstance(robot, str) else robot
     made = make(Surroundings(centre, floor, config))
     made.move_to(home_view(made, ViewSphere.around(centre, config.active), config.robot))
-    camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor)
+    body = HumanoidBody(scene, made, config.robot) if isinstance(made, HumanoidRobot) else None
+    camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor, body)
     return Simulation(camera, made)

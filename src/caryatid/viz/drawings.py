@@ -269,7 +269,67 @@ def _splat(
     return painted.round().astype(np.uint8)[rank], replace(frame, depth=depth)
 
 
-# The view sphere
+# From above: the view sphere, and where the robot stood
+
+
+def _from_above(centre_world: Array, scale: float, width: float, height: float) -> Projection:
+    """See the world from above by a scale [px/m], a centre (3,) in the middle, x to the right and y up."""
+    T_world_eye = transforms.rigid(np.diag([1.0, -1.0, -1.0]), centre_world + (0.0, 0.0, 10.0))
+    K = np.array([[scale, 0.0, width / 2.0], [0.0, scale, height / 2.0], [0.0, 0.0, 1.0]])
+    return Projection(T_world_eye, K, np.zeros((1, 1), dtype=np.float32), parallel=True)
+
+
+def draw_stands(steps: Sequence[Step]) -> Picture:
+    """Draw from above where the robot stood for each view, where it looked, and the way it took.
+
+    Args:
+        steps: Steps of which one at least knows its robot.
+    """
+    held = [(step.index, step.robot) for step in steps if step.robot is not None]
+    decisions = [step.decision for step in steps[:-1] if step.decision is not None]
+    ways = [np.array([p.platform_world for p in decision.waypoints]) for decision in decisions]
+    objects, reach = steps[-1].graph.objects, 0.2 + held[0][1].footprint
+    places = [np.stack([r.posture.platform_world, r.T_world_camera[:3, 3]])[:, :2] for _, r in held]
+    ground = [item.shape.outline()[:, :2] for item in objects]
+    there = np.concatenate([*(way[:, :2] for way in ways if len(way)), *places])
+    extent = np.concatenate([there - reach, there + reach, *ground])
+    low, high = extent.min(axis=0), extent.max(axis=0)
+    width, height = 480.0, 480.0 * float(np.clip((high - low)[1] / (high - low)[0], 0.6, 1.2))
+    scale = float(((width, height) / (high - low)).min())
+    above = _from_above(np.append((low + high) / 2.0, 0.0), scale, width, height)
+    strokes = _strokes(objects, above)
+
+    def pixels(points: Array) -> Array:
+        return above.project(np.column_stack([points[:, :2], np.zeros(len(points))]))[0]
+
+    def draw(axes: Axes) -> None:
+        from matplotlib.patches import Circle, Wedge
+
+        for lines, stroke in strokes:
+            axes.plot(*lines.T, **stroke)
+        for way in ways:
+            if len(way) > 1:
+                axes.plot(*pixels(way).T, color=VISITED, linewidth=1.6, zorder=6.0)
+        tags = []
+        for (number, robot), place in zip(held, places, strict=True):
+            platform, eye = pixels(place)
+            forward = robot.T_world_camera[:2, 2]
+            gaze = float(np.rad2deg(np.arctan2(-forward[1], forward[0])))
+            radius = scale * (0.08 if robot.arm else robot.footprint)
+            axes.add_patch(
+                Circle(platform, radius, facecolor=VISITED, edgecolor="none", alpha=0.1, zorder=5.8)
+            )
+            axes.add_patch(Circle(platform, radius, fill=False, color=VISITED, linewidth=1.0, zorder=5.9))
+            cone = Wedge(eye, 0.3 * scale, gaze - 30.0, gaze + 30.0, color=VISITED, alpha=0.35, zorder=6.0)
+            axes.add_patch(cone)
+            axes.plot(*platform, "o", markersize=6.0, color=VISITED, zorder=6.5)
+            x, y = (eye if robot.arm else platform).tolist()
+            tags.append(Tag(x, y - 15.0, str(number), VISITED))
+        put_tags(axes, tags, 13.0)
+        axes.plot([12.0, 12.0 + 0.5 * scale], [height - 12.0] * 2, color=SOFT, linewidth=2.0)
+        axes.text(12.0, height - 18.0, "0.5 m", fontsize=11.0, color=SOFT)
+
+    return Picture("where the robot stood", width, height, draw)
 
 
 def draw_sphere(step: Step) -> Picture:
@@ -279,10 +339,8 @@ def draw_sphere(step: Step) -> Picture:
     is the world's y, and the rim is the horizon.
     """
     sphere, decision, centre = step.sphere, step.decision, step.sphere.centre_world
-    side, radius, scale = 400.0, 165.0, 165.0 / step.sphere.radius
-    T_world_eye = transforms.rigid(np.diag([1.0, -1.0, -1.0]), centre + (0.0, 0.0, 10.0 * sphere.radius))
-    K = np.array([[scale, 0.0, side / 2.0], [0.0, scale, side / 2.0], [0.0, 0.0, 1.0]])
-    above = Projection(T_world_eye, K, np.zeros((1, 1), dtype=np.float32), parallel=True)
+    side, radius = 400.0, 165.0
+    above = _from_above(centre, radius / sphere.radius, side, side)
 
     def places(directions: Array) -> Array:
         return above.project(centre + sphere.radius * np.reshape(directions, (-1, 3)))[0]

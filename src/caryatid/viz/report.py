@@ -19,7 +19,7 @@ from caryatid.sensing.views import Cloud, View
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.world import SimulatedScene
-from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_layers, draw_sphere
+from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_layers, draw_sphere, draw_stands
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, picture_png, picture_svg
 from caryatid.viz.tables import (
@@ -179,7 +179,7 @@ def _cards(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list
 
 
 def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[Figure]:
-    """Scores and what was found, over views."""
+    """Scores and what was found, over views; and where the robot stood."""
     charts = []
     if scores:
         lines = {name: [s[name.lower()] for s in scores] for name in ("F1", "precision", "recall")}
@@ -192,7 +192,14 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
             "uncertain supports": [uncertain_supports(graph) for graph in graphs],
         }
         charts.append(draw_chart("Found so far", "number", found))
-    return [Figure("", chart) for chart in charts]
+    figures = [Figure("", chart) for chart in charts]
+    if any(step.robot is not None for step in steps):
+        caption = (
+            "From above, y up: where the platform, or an arm's base, stood for each view, where the camera "
+            "looked, and the platform's way in between."
+        )
+        figures.append(Figure("Where the robot stood", draw_stands(steps), caption))
+    return figures
 
 
 def _view(step: Step, before: Step | None, f1: str, width: int) -> Section:

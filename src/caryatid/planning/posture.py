@@ -1,0 +1,37 @@
+"""How a robot holds its camera; a decision says in which postures it gets there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from caryatid.geometry.transforms import Array
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Posture:
+    """How the robot holds its camera at a pose.
+
+    Attributes:
+        platform_world: Platform (3,): x, y, yaw [m, m, rad].
+        camera_height: Height of the camera centre over the floor [m], set by the torso lift.
+        head_yaw: Against the platform, to the left [rad].
+        head_pitch: Upwards [rad].
+        joints: Joint positions (J,) of an arm [rad, or m], or None where they are not known.
+    """
+
+    platform_world: Array
+    camera_height: float
+    head_yaw: float
+    head_pitch: float
+    joints: Array | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `session next`, the service and view.json say of it."""
+        return {
+            "platform": self.platform_world.tolist(),
+            "camera_height": self.camera_height,
+            "gaze": {"yaw": self.head_yaw, "pitch": self.head_pitch},
+            "joints": None if self.joints is None else self.joints.tolist(),
+        }
