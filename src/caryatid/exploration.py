@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +105,7 @@ class Explorer:
         config: Settings of all stages.
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
+        masks: Gives views their masks, or None to take them as they come.
 
     Attributes:
         scene: What is known so far.
@@ -123,8 +125,10 @@ class Explorer:
         config: Config | None = None,
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
+        masks: Callable[[View], View] | None = None,
     ) -> None:
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
+        self._masks = masks
         self.robot = robot
         self.step: Step | None = None
         self._camera = camera
@@ -153,6 +157,8 @@ class Explorer:
         scene, robot, before = self.scene, self.robot, self.step
         watch = Stopwatch()
         source = self._captured() if given is None else given
+        if self._masks is not None and isinstance(source, View):
+            source = self._masks(source)
         watch.lap("capture")
         graph = scene.update(source)
         assert scene.sphere is not None
@@ -290,6 +296,7 @@ def explore(
     config: Config | None = None,
     segmentation: SegmentationMethod | None = None,
     seed: int = 0,
+    masks: Callable[[View], View] | None = None,
     early_stop: bool = True,
 ) -> Iterator[Step]:
     """Look around until no view is expected to show more than its path costs, or the views are used up.
@@ -301,6 +308,7 @@ def explore(
         config: Settings of all stages; `config.active.max_views` limits the views.
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
+        masks: Gives views their masks, or None to take them as they come.
         early_stop: Stop before the views are used up, as `config.active.stop` says.
 
     Yields:
@@ -309,7 +317,8 @@ def explore(
     Raises:
         CaryatidError: A view cannot be used, or the planner does not exist.
     """
-    explorer = Explorer(camera, robot, planner=planner, config=config, segmentation=segmentation, seed=seed)
+    known: dict[str, Any] = {"config": config, "segmentation": segmentation, "seed": seed, "masks": masks}
+    explorer = Explorer(camera, robot, planner=planner, **known)
     while True:
         step = explorer.look()
         if step.index + 1 < explorer.scene.config.active.max_views:

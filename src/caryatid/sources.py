@@ -16,6 +16,7 @@ from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
 from caryatid.io.datasets import Dataset, format_of, open_dataset
 from caryatid.io.importing import choose_frames
+from caryatid.io.mask_sources import MaskSource
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
@@ -58,6 +59,7 @@ def open_source(
     segmentation: SegmentationMethod | None,
     seed: int,
     robot: str = HUMANOID,
+    masks: MaskSource | None = None,
 ) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
@@ -68,6 +70,7 @@ def open_source(
         segmentation: Which segmentation to use.
         seed: Seed of the noise.
         robot: Name of the simulated robot.
+        masks: Gives views their masks, or None to take them as they come.
 
     Raises:
         InputError: It is none of them, or broken, or lacks the labels that are demanded; or there is no such
@@ -80,7 +83,7 @@ def open_source(
         if robot != HUMANOID:
             reason = "is a recording, its camera can only be where a recorded view is"
             raise InputError(source, reason, "leave --robot out")
-        recording = open_recording(source, config, segmentation)
+        recording = open_recording(source, config, segmentation, masks)
         poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
     make = find_robot(robot)
@@ -90,10 +93,13 @@ def open_source(
     return Source(scene.name, stage.camera, stage.robot, truth)
 
 
-def open_recording(folder: str, config: Config, segmentation: SegmentationMethod | None) -> Dataset:
+def open_recording(
+    folder: str, config: Config, segmentation: SegmentationMethod | None, masks: MaskSource | None = None
+) -> Dataset:
     """Open a dataset and decode every frame once, so that a broken one is reported before any work is done.
 
-    Of a video a few sharp frames are chosen.
+    Of a video a few sharp frames are chosen. Where a source gives the masks, those of the dataset do not
+    count.
 
     Raises:
         InputError: It is broken, has no labels where they are demanded, or a segment too small for a shape.
@@ -101,12 +107,12 @@ def open_recording(folder: str, config: Config, segmentation: SegmentationMethod
     recording = open_dataset(folder, config.recording)
     if recording.is_video:
         recording = choose_frames(recording, config.recording)
-    if segmentation == "labels" and not recording.has_labels:
+    if segmentation == "labels" and masks is None and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()
     for frame in recording.frames:
         view = frame.load()
-        if view.labels is not None:
+        if view.labels is not None and masks is None:
             points.update(view.labels[view.valid].tolist())
     if segmentation != "auto":
         _check_segments(folder, points, config)
@@ -114,7 +120,13 @@ def open_recording(folder: str, config: Config, segmentation: SegmentationMethod
 
 
 def extract(
-    source: str, config: Config, *, segmentation: SegmentationMethod | None, seed: int, label_divisor: int = 1
+    source: str,
+    config: Config,
+    *,
+    segmentation: SegmentationMethod | None,
+    seed: int,
+    label_divisor: int = 1,
+    masks: MaskSource | None = None,
 ) -> Iterator[Step]:
     """Open a recording or a cloud; returns the steps of looking at all it holds.
 
@@ -124,13 +136,14 @@ def extract(
         segmentation: Which segmentation to use.
         seed: Seed of every random choice.
         label_divisor: For a cloud whose labels number parts of objects: object = label // this.
+        masks: Gives views their masks, or None to take them as they come.
 
     Raises:
         InputError: It is neither, or broken, or has no labels where they are demanded.
     """
-    explorer = Explorer(config=config, segmentation=segmentation, seed=seed)
+    explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if Path(source).suffix.lower() not in CLOUD_SUFFIXES:
-        recording = open_recording(source, config, segmentation)
+        recording = open_recording(source, config, segmentation, masks)
         return (explorer.look(frame.load()) for frame in recording.frames)
     stored, use_labels = read_stored_cloud(source, label_divisor), segmentation != "auto"
     if segmentation == "labels" and stored.labels is None:

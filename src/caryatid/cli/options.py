@@ -13,10 +13,12 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from caryatid.config.choices import FusionMethod, MaskIdentity, NoiseModel, Preset, SegmentationMethod
+from caryatid.errors import InputError
 
 if TYPE_CHECKING:
     from caryatid.cli.output import Output
     from caryatid.config import Config
+    from caryatid.io.mask_sources import MaskSource
 
 
 def shown(metavar: str | None = None, default: object = "") -> object:
@@ -134,19 +136,56 @@ class Modelling(Settings):
     """Settings to start from: caryatid's own, or those of the paper."""
     fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
     """What to fuse over views: points, graphs, or both."""
-    masks: Annotated[MaskIdentity | None, one_of(MaskIdentity), default_of("fusion.masks")] = None
-    """What the number of a mask means: an object in all views, or a segment of one view."""
+    masks: Annotated[
+        str | None, tyro.conf.arg(metavar="{scene,per-view,onnx:FILE,FOLDER}"), default_of("fusion.masks")
+    ] = None
+    """What a mask's number means: an object in all views (scene) or a segment of one (per-view); or where the
+    masks of each view come from: a model, or a folder of NAME.png or NAME.npy."""
     seed: Annotated[int, whole_number(0)] = 0
     """Seed of every random choice; the same seed gives the same graph, byte for byte."""
 
-    def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
-        """The configuration, as `Settings.read` returns it, with the options here."""
+    def read(
+        self,
+        options: Mapping[str, object] | None = None,
+        base: Config | None = None,
+        *,
+        takes_views: bool = False,
+    ) -> Config:
+        """The configuration, as `Settings.read` returns it, with the options here.
+
+        Args:
+            options: As there.
+            base: As there.
+            takes_views: Whether the command takes views, to which a model or folder may give masks.
+
+        Raises:
+            InputError: As there; or masks are to be given and the command takes no views.
+        """
         from caryatid.config.settings import preset
 
+        if self.masks_from is not None and not takes_views:
+            reason = "is neither scene nor per-view, and this command takes no views to give masks to"
+            raise InputError(
+                f"--masks {self.masks}", reason, "use it with explore, extract, dismantle or view"
+            )
         base = base or preset(self.preset)
-        return super().read(
-            {"fusion.method": self.fusion, "fusion.masks": self.masks, **(options or {})}, base
-        )
+        identity = None if self.masks_from else self.masks
+        return super().read({"fusion.method": self.fusion, "fusion.masks": identity, **(options or {})}, base)
+
+    @property
+    def masks_from(self) -> str | None:
+        """The model or folder that gives the masks, or None."""
+        return None if self.masks in (None, *get_args(MaskIdentity)) else self.masks
+
+    def mask_source(self, config: Config) -> MaskSource | None:
+        """What gives views their masks, or None.
+
+        Raises:
+            InputError: The model or folder is missing or broken.
+        """
+        from caryatid.io.mask_sources import mask_source
+
+        return None if self.masks_from is None else mask_source(self.masks_from, config, self.seed)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,4 +239,4 @@ class ExploringCommand(PlanningCommand):
 
     def config(self) -> Config:
         """All settings."""
-        return self.settings.read({"active.max_views": self.views})
+        return self.settings.read({"active.max_views": self.views}, takes_views=True)

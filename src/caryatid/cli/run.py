@@ -79,9 +79,12 @@ class Exploring(options.ExploringCommand):
 
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         with self.output.working("opening"):
-            source = open_source(self.source, config, noise=self.noise, robot=self.robot, **known)
+            masks = self.settings.mask_source(config)
+            options: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
+            source = open_source(self.source, config, **options, **known)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
-        known |= {"planner": planner, "config": config, "early_stop": not self.no_early_stop}
+        known |= {"planner": planner, "config": config, "masks": masks}
+        known["early_stop"] = not self.no_early_stop
         return source, explore(camera, source.robot, **known)
 
 
@@ -139,7 +142,7 @@ class Demo(RunCommand):
         from caryatid.config.settings import changed_settings, preset
 
         fewer = changed_settings(preset(self.settings.preset), {"active": {"max_views": 5}}, "demo")
-        config = self.settings.read({"active.max_views": self.views}, fewer)
+        config = self.settings.read({"active.max_views": self.views}, fewer, takes_views=True)
         shared = {field.name: getattr(self, field.name) for field in fields(self)}
         Explore(**shared | {"noise": "carmine"})(config)
 
@@ -168,11 +171,12 @@ class Extract(RunCommand, options.LookingCommand):
                 segmentation=self.segmentation,
                 seed=self.settings.seed,
                 label_divisor=self.label_divisor,
+                masks=self.settings.mask_source(config),
             )
         return Path(self.source).name, None, steps
 
     def __call__(self) -> None:
-        self.run(self.settings.read())
+        self.run(self.settings.read(takes_views=True))
 
 
 @dataclass(frozen=True, kw_only=True)

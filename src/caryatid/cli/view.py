@@ -84,7 +84,7 @@ class View(options.ExploringCommand):
         opening = partial(open_source, self.source, noise=self.noise, robot=self.robot, **shared)
         shared |= {"planner": self.chosen_planner, "host": self.host, "port": self.port}
         with self.output.working("opening"):
-            page = LoopPage(opening, config, **shared)
+            page = LoopPage(opening, config, masks=self.settings.mask_source(config), **shared)
         page.start()
         return page
 

@@ -65,7 +65,7 @@ class Polytope:
         return middle
 
     def cut(self, normal: Array, offset: float) -> tuple[Polytope | None, Polytope | None]:
-        """The parts on which normal · x is at most, and at least, an offset [m]; None where there is none."""
+        """The parts where n · x, n a normal (3,), is at most and at least an offset [m]; None for no part."""
         height = self.vertices @ normal - offset
         if height.max() <= 0.0 or height.min() >= 0.0:
             return (self, None) if height.max() <= 0.0 else (None, self)

@@ -31,6 +31,7 @@ from caryatid.simulation.world import SimulatedScene
 from caryatid.viewer.page import Page
 
 if TYPE_CHECKING:
+    from caryatid.io.mask_sources import MaskSource
     from caryatid.planning.candidates import Candidates
     from caryatid.sensing.view_sphere import ViewSphere
     from caryatid.sources import Source
@@ -47,6 +48,7 @@ class LoopPage(Page):
         planner: Name of the planner.
         segmentation: Where segments come from.
         seed: Seed of every random choice.
+        masks: Gives views their masks, or None to take them as they come.
         host: Address to listen at.
         port: Port to listen at, or the next free one; 0 = any that is free.
 
@@ -67,12 +69,13 @@ class LoopPage(Page):
         planner: str = "support",
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
+        masks: MaskSource | None = None,
         host: str = "127.0.0.1",
         port: int = 0,
     ) -> None:
         self._open_source, self._config, self._began_with = open_source, config, planner
         self._options: dict[str, Any] = {"segmentation": segmentation, "seed": seed}
-        self.planner = planner
+        self.planner, self._masks = planner, masks
         self._begin()
         super().__init__(f"caryatid: {self.source.name}", config.support, host=host, port=port)
         self._worker = ThreadPoolExecutor(1, "loop")
@@ -83,7 +86,8 @@ class LoopPage(Page):
         self.source = source = self._open_source(self._config)
         options = self._options | {"config": self._config}
         self._first, camera = planner_for(self._began_with, source.camera, source.truth, **options)
-        self._explorer = Explorer(camera, source.robot, planner=self._named(self.planner), **options)
+        options |= {"planner": self._named(self.planner), "masks": self._masks}
+        self._explorer = Explorer(camera, source.robot, **options)
         self._planned: Decision | None = None
         self.ended: str | None = None
 

@@ -1,0 +1,193 @@
+"""Masks that another program wrote, or that a learned segmenter gives for each view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from caryatid.config import Config
+from caryatid.errors import InputError
+from caryatid.geometry.transforms import Array
+from caryatid.io.images import MASK_MODES, decode_image
+from caryatid.segmentation.observation import label_image, observe
+from caryatid.sensing.masks import labels_from_masks
+from caryatid.sensing.views import SUPPORT_LABEL, View
+
+MaskSource = Callable[[View], View]
+"""Gives a view the masks of its objects, as segments of that view alone."""
+
+ONNX: Final = "onnx:"
+"""What a mask source begins with that goes on with the file of a model."""
+
+
+def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
+    """Return what gives views their masks.
+
+    Args:
+        name: `onnx:FILE`, a model; or a folder of masks.
+        config: All stages' settings.
+        seed: Seed of the segments a model may take as prompts.
+
+    Raises:
+        InputError: There is no such file or folder, the model is not one of instance masks, or onnxruntime is
+            not installed.
+    """
+    if name.startswith(ONNX):
+        return OnnxMasks(Path(name.removeprefix(ONNX)), config, seed)
+    folder = Path(name)
+    if not folder.is_dir():
+        raise InputError(name, "is not a directory of masks", "give one, or onnx:FILE")
+    return FolderMasks(folder)
+
+
+class FolderMasks:
+    """Masks in files named as the views: a label image `NAME.png`, or `NAME.npy`.
+
+    NAME is that of the view after its last slash. A `.npy` holds labels (H, W) or a stack of masks (N, H, W),
+    boolean or scores.
+
+    Args:
+        folder: The folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __call__(self, view: View) -> View:
+        """Return the view with its masks.
+
+        Raises:
+            InputError: It has none, or they are broken or of another size.
+        """
+        stem = self._folder / view.name.rpartition("/")[2]
+        image, array = stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.npy")
+        if image.exists():
+            labels = decode_image(image, modes=MASK_MODES, what="a grey PNG")
+        elif array.exists():
+            try:
+                labels = np.load(array, allow_pickle=False)
+            except (OSError, ValueError, EOFError) as error:
+                raise InputError(array, f"cannot be read ({error})", "save it with numpy.save") from None
+        else:
+            raise InputError(
+                self._folder, f"has no masks of '{stem.name}'", f"add {image.name} or {array.name}"
+            )
+        return replace(view, labels=labels, labels_are="segments")
+
+
+class OnnxMasks:
+    """A class-agnostic instance segmenter as an ONNX model, run on the CPU.
+
+    Inputs are float32 and told apart by name. Where H and W are fixed, images are resized.
+
+    * `image` (1, 3, H, W): RGB in [0, 1].
+    * `xyz` (1, 3, H, W), optional: points in the camera frame [m], 0 where there is no reading.
+    * `boxes` (N, 4), optional: x, y of two corners [px] around our own automatic segments, as prompts.
+
+    Outputs are `masks` and, optionally, `scores` (N,). Masks are (N, H, W), with any axes of length 1 beside:
+    boolean, scores in [0, 1], or logits, which are above 0 in the mask.
+
+    Args:
+        path: The model.
+        config: Settings of the automatic segments.
+        seed: Their seed.
+
+    Raises:
+        InputError: There is no such file, its inputs or outputs are others, or onnxruntime is not installed.
+    """
+
+    def __init__(self, path: Path, config: Config, seed: int = 0) -> None:
+        try:
+            import onnxruntime
+        except ImportError:
+            reason = "needs onnxruntime, which is not installed"
+            raise InputError(path, reason, 'pip install "caryatid[onnx]"') from None
+        if not path.is_file():
+            raise InputError(path, "the file is missing", "give an ONNX model")
+        try:
+            self._session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's own exceptions have no common base
+            reason = f"is not a model that onnxruntime reads ({' '.join(str(error).split())})"
+            raise InputError(path, reason, "export it again") from None
+        self._path, self._config, self._seed = path, config, seed
+        inputs = {i.name: i for i in self._session.get_inputs()}
+        outputs = [o.name for o in self._session.get_outputs()]
+        unknown = sorted(inputs.keys() - {"image", "xyz", "boxes"})
+        if "image" not in inputs or "masks" not in outputs or unknown:
+            reason = f"has inputs {', '.join(inputs)} and outputs {', '.join(outputs)}"
+            remedy = "export it with inputs image (and xyz, boxes) and outputs masks (and scores)"
+            raise InputError(path, reason, remedy)
+        self._inputs, self._outputs = set(inputs), [o for o in ("masks", "scores") if o in outputs]
+        height, width = inputs["image"].shape[2:]
+        fixed = isinstance(height, int) and isinstance(width, int)
+        self._size: tuple[int, int] | None = (height, width) if fixed else None
+
+    def __call__(self, view: View) -> View:
+        """Return the view with the masks the model gives it.
+
+        Raises:
+            InputError: It has no colour, or the model fails or gives something else than masks.
+        """
+        if view.rgb is None:
+            raise InputError(view.name, "has no colour image, which the model needs", "record colour")
+        height, width = self._size or view.depth.shape
+        given = {"image": _resized(view.rgb, height, width).transpose(2, 0, 1)[None] / np.float32(255.0)}
+        if "xyz" in self._inputs:
+            rows, columns = (
+                np.arange(n) * m // n for n, m in zip((height, width), view.depth.shape, strict=True)
+            )
+            given["xyz"] = _points(view)[rows][:, columns].transpose(2, 0, 1)[None]
+        if "boxes" in self._inputs:
+            scale = np.array([width, height] * 2) / np.array([*view.depth.shape[::-1]] * 2)
+            given["boxes"] = (self._prompts(view) * scale).astype(np.float32)
+        try:
+            results = self._session.run(self._outputs, given)
+        except Exception as error:  # onnxruntime's own exceptions have no common base
+            reason = f"fails on {view.name} ({' '.join(str(error).split())})"
+            raise InputError(self._path, reason, "check its input sizes") from None
+        masks = np.asarray(results[0])
+        masks = masks.reshape(-1, *masks.shape[-2:]) if masks.ndim > 3 else masks
+        if masks.dtype != np.bool_ and masks.size and masks.min() < 0.0:
+            masks = masks > 0.0
+        if masks.ndim == 3 and len(masks) == 0:
+            return replace(view, labels=np.zeros(view.depth.shape, dtype=np.int32), labels_are="segments")
+        if masks.ndim == 3 and masks.shape[1:] != view.depth.shape:
+            rows, columns = (
+                np.arange(n) * m // n for n, m in zip(view.depth.shape, masks.shape[1:], strict=True)
+            )
+            masks = masks[:, rows][:, :, columns]
+        scores = np.asarray(results[1]).ravel() if len(results) > 1 else None
+        return replace(view, labels=labels_from_masks(masks, scores), labels_are="segments")
+
+    def _prompts(self, view: View) -> Array:
+        """Boxes (N, 4) around the automatic segments of a view [px]."""
+        rng = np.random.default_rng(self._seed)
+        observation = observe(view, self._config, segmentation="auto", known=None, rng=rng)
+        labels = label_image(observation, view)
+        boxes = []
+        for label in sorted(set(observation.shown) - {0, SUPPORT_LABEL}):
+            rows, columns = np.nonzero(labels == label)
+            boxes.append((columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
+        return np.array(boxes, dtype=np.float64).reshape(-1, 4)
+
+
+def _resized(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.float32]:
+    image = Image.fromarray(rgb)
+    if rgb.shape[:2] != (height, width):
+        image = image.resize((width, height), Image.Resampling.BILINEAR)
+    return np.asarray(image, dtype=np.float32)
+
+
+def _points(view: View) -> NDArray[np.float32]:
+    """Points (H, W, 3) of a view in the camera frame [m]; 0 where there is no reading."""
+    rows, columns = np.indices(view.depth.shape)
+    x = (columns - view.K[0, 2]) / view.K[0, 0] * view.depth
+    y = (rows - view.K[1, 2]) / view.K[1, 1] * view.depth
+    points: NDArray[Any] = np.stack([x, y, view.depth], axis=-1)
+    return points.astype(np.float32)
