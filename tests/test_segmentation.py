@@ -6,12 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from raycast import TABLE, K, from_the_side, table_scene
+from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
-from caryatid.config import CloudConfig, FitConfig, SegmentationConfig, SurfaceConfig
+from caryatid.config import CloudConfig, Config, FitConfig, SegmentationConfig, SurfaceConfig
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
 from caryatid.segmentation.lccp import convex_parts
+from caryatid.segmentation.observation import observe
 from caryatid.segmentation.segments import cut_by_colour, segment, segment_cloud
 from caryatid.segmentation.support_plane import find_support_surface
 from caryatid.sensing.clouds import oriented_points, thin
@@ -275,3 +277,50 @@ def test_what_is_over_the_table_goes_by_height_and_outline():
     points = np.array([[0, 0, 0.8], [0, 0, 0.751], [0, 0, 0.5], [0, 0, 1.6], [0.6, 0, 0.8], [0.32, 0, 0.8]])
     kept = surface.over(points, 0.008, 0.6, 0.05)
     assert kept.tolist() == [True, False, False, False, False, True]
+
+
+def open_box(width=0.2, height=0.1, wall=0.01):
+    """Four walls on the table."""
+    aside, z = (width - wall) / 2.0, TABLE + height / 2.0
+    across, along = np.array([wall, width, height]), np.array([width, wall, height])
+    return [
+        *((np.array([x, 0.0, z]), across) for x in (-aside, aside)),
+        *((np.array([0.0, y, z]), along) for y in (-aside, aside)),
+    ]
+
+
+def test_an_open_box_is_one_object_with_its_bottom_and_its_content_is_another():
+    """The ball's top is 4 cm under the rim, and the bottom lies as low as the table."""
+    ball = (np.array([0.03, 0.0, TABLE + 0.03]), 0.03)
+    view = table_scene(from_the_side(elevation=55.0, distance=1.0), open_box(), [ball], sigma=0.0005)
+    truth = np.where(view.labels == 5, 2, np.minimum(view.labels, 1))
+    labels = parts(view)
+    assert found(labels, truth) == (2, 2, 2)
+    points = view.points_camera @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
+    bottom = (np.abs(points[..., :2]).max(axis=-1) < 0.08) & (np.abs(points[..., 2] - TABLE) < 0.002)
+    assert (labels[bottom] > 0).mean() > 0.9
+
+
+def test_what_stands_beside_the_table_is_no_object_on_it():
+    beside = (np.array([0.38, 0.0, 0.45]), np.array([0.12, 0.3, 0.9]))
+    view = table_scene(from_the_side(azimuth=180.0), [*STACK, beside], sigma=0.001)
+    assert found(parts(view), np.where(view.labels == 3, 0, view.labels)) == (2, 2, 2)
+
+
+def test_a_camera_upside_down_finds_the_table():
+    T = from_the_side(distance=1.0)
+    view = table_scene(T, STACK, sigma=0.001)
+    turned = replace(view, depth=view.depth[::-1, ::-1].copy(), labels=None, T_world_camera=None)
+    normal = surface_of(turned, up=None).normal_world * (-1.0, -1.0, 1.0)
+    assert np.degrees(transforms.angle_between(transforms.rotate(T, normal), UP)) < 0.5
+
+
+def test_masks_that_are_too_wide_label_nothing_far_behind_their_objects():
+    """Three pixels around the tower the masks show the floor, 75 cm below the small table."""
+    view = table_scene(from_the_side(elevation=20.0), STACK, half_table=(0.12, 0.25))
+    wide = replace(view, labels=ndimage.grey_dilation(view.labels, size=7))
+    assert (wide.labels > 0).sum() > 1.05 * (view.labels > 0).sum()
+    seen = observe(wide, Config(), segmentation=None, known=None, rng=np.random.default_rng(0))
+    shown = seen.cloud.points_world[(seen.labels == 1) | (seen.labels == 2)]
+    assert len(shown) > 0.95 * (view.labels > 0).sum()
+    assert shown[:, 2].min() > TABLE - 0.05

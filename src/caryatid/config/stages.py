@@ -45,8 +45,8 @@ class CloudConfig:
 
     max_depth: Positive = 3.0
     """Readings beyond this are dropped [m]; the paper's working range."""
-    min_depth: NotNegative = 0.35
-    """Readings nearer than the sensor's near limit are dropped [m]."""
+    min_depth: NotNegative = 0.1
+    """Readings nearer than this are the robot's own hand [m]; what a sensor cannot measure it leaves out."""
     normal_window: Count = 7
     """Largest side of the square window of the local planes [px]; 7 × 7 reduce the noise to a quarter."""
     normal_size: Positive = 0.02
@@ -79,8 +79,8 @@ class SurfaceConfig:
     """Parts of one plane further apart than this are two surfaces [m]; shadows of objects are narrower."""
     min_area: NotNegative = 0.05
     """Seen area a table has at least [m²]; more than most objects' tops."""
-    storey: NotNegative = 0.3
-    """A plane that has a table this far above it is the floor [m]."""
+    storey: NotNegative = 0.6
+    """A plane that has a table this far above it is the floor [m]; lower ones are tops of objects."""
     min_points: Count = 200
     """Minimum number of inliers of a table [points]; a tenth of `min_area` at 5 mm."""
     search: Positive = 0.05

@@ -44,13 +44,11 @@ class TwoObjects:
         second: Which points (N,) are the second's.
         explanations: Of both.
         cost: Of both and of the border between them [nats].
-        smooth: Share of that border without a concave crease [1].
     """
 
     second: Mask
     explanations: tuple[Explanation, Explanation]
     cost: float
-    smooth: float
 
 
 def split(
@@ -80,18 +78,40 @@ def split(
     Returns:
         Group of each point (N,), from 0, or None where one object is the better explanation.
     """
-    all_hints = cache(hints)
+    parts = _parts(evidence, whole, np.arange(len(evidence)), cache(hints), up, config, rng)
+    if parts is None:
+        return None
     groups = np.zeros(len(evidence), dtype=np.intp)
-    waiting = [(np.arange(len(groups)), whole)]
-    while waiting:
-        index, single = waiting.pop()
-        found = _best_two(evidence.select(index), single, index, all_hints, up, config, rng)
-        if found is None:
-            continue
-        groups[index[found.second]] = groups.max() + 1
-        sides = (index[~found.second], index[found.second])
-        waiting += zip(sides, found.explanations, strict=True)
-    return groups if groups.any() else None
+    for number, index in enumerate(parts):
+        groups[index] = number
+    return groups
+
+
+def _parts(
+    evidence: Evidence,
+    whole: Explanation,
+    index: Groups,
+    hints: Hints,
+    up: Array,
+    config: Config,
+    rng: np.random.Generator,
+) -> list[Groups] | None:
+    """Points of each object among those with this index; None where they are one.
+
+    A shape must explain each: pieces of a thing that has no shape are no objects.
+    """
+    own = evidence.select(index)
+    found = _best_two(own, whole, index, hints, up, config, rng)
+    if found is None:
+        return None
+    parts: list[Groups] = []
+    for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
+        costs = point_costs(explanation.shape, own.select(side), config.explanation)
+        further = _parts(evidence, explanation, index[side], hints, up, config, rng)
+        if further is None and costs.mean() > config.explanation.usual:
+            return None
+        parts += further or [index[side]]
+    return parts
 
 
 def _best_two(
@@ -118,8 +138,9 @@ def _best_two(
     starts = [h for h in starts if h.any() and not h.all()]
     starts += _hypotheses(evidence, bad, up, config)
     looks = _settled(evidence, starts, near, 0, config, rng, first_look=True)
-    # The best two are settled with full fits.
-    tried = sorted((look.cost, k) for k, look in enumerate(looks) if look is not None)[:2]
+    # The best two of those with a shape for one side at least are settled with full fits.
+    shaped = [k for k, look in enumerate(looks) if look and any(e.shape for e in look.explanations)]
+    tried = sorted((look.cost, k) for k, look in enumerate(looks) if look and k in shaped)[:2]
     settled = _settled(evidence, [starts[k] for _, k in tried], near, config.split.rounds, config, rng)
     better = [two for two in settled if two and two.cost < whole.cost and not _is_layer(evidence, two)]
     return min(better, key=lambda two: two.cost, default=None)
@@ -276,8 +297,8 @@ def _gain(
 ) -> float:
     """How much less [nats] one object costs than two, by the shapes of both and by fits to all the points.
 
-    Nothing where one shape leaves one of the two unexplained; without a shape two are one only where the
-    surface goes on from one to the other.
+    Nothing where one shape leaves one of the two unexplained, or none explains both: later views may undo
+    what is two, but not what is one.
     """
     costs, rng = config.explanation, np.random.default_rng([seed, *labels])
     (first, alone), (second, other) = (known[label] for label in labels)
@@ -289,10 +310,9 @@ def _gain(
         if one.cost > two.cost + price(None, costs):
             break
     if one.shape is None:
-        is_one = two.smooth > 0.8
-    else:
-        cost = point_costs(one.shape, both, costs)
-        is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= costs.irregular
+        return 0.0
+    cost = point_costs(one.shape, both, costs)
+    is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= costs.irregular
     return two.cost - one.cost if is_one else 0.0
 
 
@@ -314,4 +334,4 @@ def _two(
     bend = np.einsum("ij,ij->i", turn, between) / np.maximum(np.linalg.norm(between, axis=1), 1e-9)
     smooth = np.count_nonzero(bend > -np.sin(np.radians(config.segmentation.concavity)))
     border = config.explanation.border * smooth * evidence.weight / near.shape[1]
-    return TwoObjects(second, pair, pair[0].cost + pair[1].cost + border, smooth / max(len(row), 1))
+    return TwoObjects(second, pair, pair[0].cost + pair[1].cost + border)

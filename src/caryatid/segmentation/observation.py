@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PerceptionError
@@ -18,6 +19,8 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 UP = np.array([0.0, 0.0, 1.0])
 """The world's vertical (3,)."""
+WHOLE = 0.1
+"""What is smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -97,6 +100,8 @@ def observe(
         if known is not None:
             raise InputError(source.name, "has no camera pose", "only a single view may come without one")
         source = source.with_pose(level_transform(source, config, rng, use_labels=use_labels))
+    if use_labels and isinstance(source, View):
+        source = _with_whole_masks(source, 2.0 * config.segmentation.edge_jump)
     cloud, pixels = _points(source, config, known)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     surface = _surface(cloud, given, known, UP, config, rng)
@@ -111,6 +116,33 @@ def observe(
     labels = np.where(on_surface, np.int32(SUPPORT_LABEL), labels)
     view = source if isinstance(source, View) else None
     return Observation(view, replace(cloud, labels=labels), pixels, surface)
+
+
+def _with_whole_masks(view: View, jump: float) -> View:
+    """Take from the masks of a view the crumbs they show of other things, beyond a jump of 1/z [1/m].
+
+    Masks drawn or learned are a few pixels too wide, and pixels at depth edges mix both sides.
+    """
+    if view.labels is None:
+        return view
+    labels = np.where(view.valid, view.labels, np.int32(0))
+    inverse_depth = np.divide(1.0, view.depth, out=np.zeros(view.depth.shape), where=view.valid)
+    # Between each two pixels is a place that is set where they are one surface.
+    height, width = labels.shape
+    joined = np.zeros((2 * height - 1, 2 * width - 1), dtype=np.bool_)
+    joined[::2, ::2] = labels > 0
+    for here, there, between in (
+        (np.s_[1:], np.s_[:-1], np.s_[1::2, ::2]),
+        (np.s_[:, 1:], np.s_[:, :-1], np.s_[::2, 1::2]),
+    ):
+        near = np.abs(inverse_depth[here] - inverse_depth[there]) <= jump
+        joined[between] = near & (labels[here] == labels[there]) & (labels[here] > 0)
+    body = ndimage.label(joined)[0][::2, ::2]
+    sizes, owner = np.bincount(body.ravel()), np.zeros(int(body.max()) + 1, dtype=np.int32)
+    owner[body] = labels
+    largest = np.zeros(int(labels.max()) + 1)
+    np.maximum.at(largest, owner, sizes)
+    return replace(view, labels=np.where((sizes >= WHOLE * largest[owner])[body], labels, 0))
 
 
 def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.int32]:

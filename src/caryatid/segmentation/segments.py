@@ -17,16 +17,14 @@ from caryatid.fitting.primitives import Fit, candidates
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import on_threads
-from caryatid.segmentation.lccp import convex_parts, grid_edges, hollowness, number_by_appearance, wide_parts
+from caryatid.segmentation.insides import MEETING, merge_insides
+from caryatid.segmentation.lccp import convex_parts, grid_edges, number_by_appearance, wide_parts
 from caryatid.segmentation.samples import Samples, take_samples
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View, depth_behind
 
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]
-
-MEETING = 5
-"""Rows and columns of samples on which two parts must meet to be taken for one [1]; 3 cm at 1.5 m."""
 
 
 def segment(
@@ -60,16 +58,34 @@ def segment(
     edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
     part = convex_parts(points, normals, edges, config, steps)
     wide = wide_parts(samples.image(part))
-    part = number_by_appearance(np.where(wide[part], part, 0) - 1)
+    # What stands beside the surface, as at its edge or in the room behind, is no object on it.
+    over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
+    part = number_by_appearance(_with_share(np.where(wide[part], part, 0), over, 0.5) - 1)
     if samples.rgb is not None:
         part = cut_by_colour(samples.image(part), samples.rgb, config.min_size)[samples.places]
-    part = number_by_appearance(merge_occluded(samples, part, config, fit_config, rng) - 1)
+    part, enclosed = merge_insides(samples, part)
+    part = merge_occluded(samples, part, config, fit_config, rng)
+    # Readings of the surface that err together get over the clearance, but not twice as high.
+    part = number_by_appearance(_with_share(part, samples.height > 2.0 * config.clearance, 0.05) - 1)
     labels[samples.grid] = samples.image(part)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
     jump, rounds = np.float32(2.0 * config.edge_jump), 2 * config.stride
-    waiting = np.flatnonzero(foreground[around] & (labels[around] == 0))
-    _spread_labels(labels[around], waiting, view.depth[around], jump, rounds)
+    waiting = foreground[around] & (labels[around] == 0)
+    _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
+    if enclosed.any():
+        # The bottom of a bowl is as near to the surface as the surface's own readings.
+        low = surface.pixels_over(view, -config.clearance, config.clearance, config.margin)[around]
+        low &= enclosed.repeat(config.stride, 0).repeat(config.stride, 1)[: low.shape[0], : low.shape[1]]
+        waiting = low & (labels[around] == 0)
+        rounds = int(np.sqrt(np.count_nonzero(waiting)))
+        _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
     return labels
+
+
+def _with_share(part: Labels, own: Mask, least: float) -> Labels:
+    """Leave out the parts (N,) of samples of which less than a share is among some samples (N,)."""
+    share = np.bincount(part, own) / np.maximum(np.bincount(part), 1)
+    return np.where((share >= least)[part], part, np.int32(0))
 
 
 def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationConfig) -> Labels:
@@ -193,14 +209,13 @@ def merge_occluded(
     fit_config: FitConfig,
     rng: np.random.Generator,
 ) -> Labels:
-    """Merge parts of one object that something nearer cuts apart, and insides with what they are inside of.
+    """Merge parts of one object that something nearer cuts apart.
 
-    The inside of a bowl belongs to the outside whose rim it ends at. Two parts are one object when a nearer
-    surface hides what would lie between them, neither rises above the other's tangent planes, a single shape
-    explains as many samples of both as the shape of each does, and that shape fills no space seen empty. The
-    parts (N,) of samples get the number of the larger where two are merged.
+    Two parts are one object when a nearer surface hides what would lie between them, neither rises above the
+    other's tangent planes, a single shape explains as many samples of both as the shape of each does, and
+    that shape fills no space seen empty. The parts (N,) of samples get the number of the larger where two
+    are merged.
     """
-    part = _insides_merged(samples, part)
     inverse_depth = _inverse_depth(samples, part > 0)
     # Samples are evened out and hold few outliers.
     quick = replace(fit_config, hypotheses=40, polish=1, max_points=300)
@@ -233,27 +248,6 @@ def _candidates(
     """Shapes for the samples under one of the masks."""
     points, normals = samples.points_camera[masks[number]], samples.normals_camera[masks[number]]
     return candidates(points, normals, config=config, rng=rngs[number])
-
-
-def _insides_merged(samples: Samples, part: Labels) -> Labels:
-    """Give each hollow part to the neighbour with the longest common border whose top is as high."""
-    merged, count = part.copy(), int(part.max(initial=0)) + 1
-    # The inside of a bowl has 0.6, flat faces and their noise 0.05.
-    hollow = hollowness(samples.points_camera, samples.normals_camera, part) > 0.2
-    hollow[0] = False
-    if not hollow.any():
-        return merged
-    top = np.array([np.quantile(samples.height[part == k], 0.95) if k else 0.0 for k in range(count)])
-    for number in np.flatnonzero(hollow).tolist():
-        image = samples.image(merged)
-        around = ndimage.binary_dilation(samples.image(part) == number, np.ones((3, 3)), iterations=2)
-        border = np.bincount(image[around], minlength=count)
-        # Tops differ by no more than a rim's width and noise.
-        border[hollow | (np.abs(top - top[number]) >= 0.025)] = 0
-        border[0] = 0
-        if border.max() >= MEETING:
-            merged[part == number] = np.argmax(border)
-    return merged
 
 
 def _inverse_depth(samples: Samples, own: Mask) -> Array:

@@ -203,8 +203,12 @@ def find_support_surface(
     points, normals = np.asarray(cloud_points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     scene = _Scene(points, normals, up, config)
     if up is None:
-        largest = scene.largest_plane(np.ones(len(points), dtype=bool), rng)
-        up = None if largest is None else largest.normal
+        everywhere, turned = np.ones(len(points), dtype=bool), np.array([-1.0, -1.0, 1.0])
+        if (plane := scene.largest_plane(everywhere, rng)) is not None:
+            up = plane.normal
+        # The camera may be upside down.
+        elif plane := _Scene(points * turned, normals * turned, None, config).largest_plane(everywhere, rng):
+            up = plane.normal * turned
     planes: list[_Plane] = []
     if up is not None:
         up = transforms.unit(up)
@@ -213,9 +217,10 @@ def find_support_surface(
             planes.append(plane)
             left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
     if up is None or not planes:
+        tried = "in any direction the camera may be held" if up is None else "across the world's z, upwards"
         raise PerceptionError(
-            f"no support surface: no level plane holds {config.min_points} of the {len(points)} points; "
-            "the table top must be in view"
+            f"no support surface: of {len(points)} points no {config.min_points} lie on one plane {tried}; "
+            "the table top must be in view" + ("" if up is None else ", and the z of the poses point up")
         )
     return _surface(points, _choose_table(planes, up, config))
 

@@ -1,0 +1,114 @@
+"""Insides of hollow things: convexity cuts them to pieces, and from the outside they belong to."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from caryatid.geometry.polygons import hull
+from caryatid.geometry.transforms import Array
+from caryatid.segmentation.lccp import hollowness
+from caryatid.segmentation.samples import Labels, Samples
+
+Mask = NDArray[np.bool_]
+
+MEETING = 5
+"""Rows and columns of samples on which two parts must meet to be taken for one [1]; 3 cm at 1.5 m."""
+HOLLOW = 0.2
+"""Hollowness of an inside [1]; that of a bowl is 0.6, of flat faces and their noise 0.05."""
+RIM = 0.015
+"""Heights within which two parts end at one rim [m]: its width, and noise at depth edges."""
+RIM_WIDTH = 0.01
+"""Width of a rim, on which samples fail or are mixed with what is behind it [m]."""
+ALONG = 0.35
+"""Share of the hull of an inside along which its outside is seen [1]; from the side, that of half of it."""
+
+
+def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
+    """Make one part of each hollow thing.
+
+    Pieces beside each other that end at one rim and together look inwards, more than each by itself, are one
+    inside. What lies within its hull in the image is of it too, unless it looks outwards as contents do. The
+    outside lies along the hull and does not rise over the rim.
+
+    Returns:
+        Part (N,) of each sample, and the places (H, W) within the hulls of insides.
+    """
+    merged, within = part.copy(), np.zeros(samples.places.shape, dtype=np.bool_)
+    if not merged.any():
+        return merged, within
+    reach = max(2, round(RIM_WIDTH * samples.K[0, 0] / float(np.median(samples.points_camera[:, 2]))))
+    look, top = hollowness(samples.points_camera, samples.normals_camera, merged), _tops(samples, merged)
+    look[0] = 0.0
+    for first, second in combinations(range(1, len(look)), 2):
+        a, b = int(merged[np.argmax(part == first)]), int(merged[np.argmax(part == second)])
+        if a == b or not abs(top[a] - top[b]) < RIM:
+            continue
+        both = np.flatnonzero((merged == a) | (merged == b))
+        points, normals = samples.points_camera[both], samples.normals_camera[both]
+        joint = float(hollowness(points, normals, np.zeros(len(both), dtype=np.intp))[0])
+        if joint > max(HOLLOW, look[a], look[b]) and _meet(samples.image(merged), a, b, reach):
+            merged[both], look[a] = a, joint
+    for number in np.flatnonzero(look > HOLLOW).tolist():
+        own = merged == number
+        if not own.any() or np.ptp(np.quantile(samples.height[own], (0.05, 0.95))) < RIM:
+            continue
+        image = samples.image(merged)
+        inner = _hull_of(image == number)
+        sizes = np.bincount(merged, minlength=len(look))
+        held = (
+            (np.bincount(image[inner], minlength=len(look)) >= 0.8 * sizes) & (look > -HOLLOW) & (sizes > 0)
+        )
+        possible = ~held & (top < top[number] + RIM) & (look <= HOLLOW)
+        held[_outside(inner, image, possible, reach)] = True
+        held[0] = False
+        merged[held[merged]] = number
+        within |= inner | ndimage.binary_fill_holes(samples.image(merged) == number)
+    return merged, within
+
+
+def _tops(samples: Samples, part: Labels) -> Array:
+    """Height (P,) [m] up to which parts 0 … P − 1 reach; there is no part 0."""
+    tops = np.full(int(part.max()) + 1, np.nan)
+    for number in np.unique(part[part > 0]).tolist():
+        tops[number] = np.quantile(samples.height[part == number], 0.95)
+    return tops
+
+
+def _meet(image: Labels, first: int, second: int, reach: int) -> bool:
+    """Whether two parts of an image (H, W) lie within a reach of each other."""
+    rows, columns = (slice(max(0, own.start - reach), own.stop + reach) for own in _box(image == first))
+    image = image[rows, columns]
+    around = ndimage.binary_dilation(image == first, np.ones((3, 3)), iterations=reach)
+    return int(np.count_nonzero(image[around] == second)) >= MEETING * reach
+
+
+def _box(own: Mask) -> tuple[slice, ...]:
+    """Rows and columns of what is set in an image (H, W)."""
+    return tuple(ndimage.find_objects(own.astype(np.intp))[0])
+
+
+def _outside(inner: Mask, image: Labels, possible: Mask, reach: int) -> int:
+    """The possible part that lies along most of the contour of an inside, if along enough; 0 = none does."""
+    rows, columns = (slice(max(0, own.start - 2 * reach), own.stop + 2 * reach) for own in _box(inner))
+    inner, image = inner[rows, columns], image[rows, columns]
+    contour = inner & ~ndimage.binary_erosion(inner)
+    best, most = 0, float(ALONG * np.count_nonzero(contour))
+    for number in np.unique(image[possible[image]]):
+        near = ndimage.binary_dilation(image == number, np.ones((3, 3)), iterations=2 * reach)
+        if (along := np.count_nonzero(near & contour)) >= most:
+            best, most = int(number), float(along)
+    return best
+
+
+def _hull_of(own: Mask) -> Mask:
+    """The convex hull of places in an image (H, W)."""
+    corners = hull(np.argwhere(own).astype(np.float64))
+    row, column = np.ogrid[: own.shape[0], : own.shape[1]]
+    inside = np.ones(own.shape, dtype=np.bool_)
+    for (y, x), (down, right) in zip(corners, np.roll(corners, -1, axis=0) - corners, strict=True):
+        inside &= down * (column - x) - right * (row - y) >= 0.0
+    return inside
