@@ -19,6 +19,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 HERE = Path(__file__).parent
 SHARED = HERE.parents[1] / "shared"
 GOLDEN = HERE / "golden" / "runs.json"
@@ -99,6 +101,8 @@ def summary(graph: bytes) -> dict[str, Any]:
 
 
 def _sizes(size: Any) -> list[float]:
+    if isinstance(size, dict) and "parts" in size:
+        return np.ptp(np.concatenate(size["parts"]), axis=0).tolist()
     return list(size.values()) if isinstance(size, dict) else list(size)
 
 

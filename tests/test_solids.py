@@ -1,5 +1,7 @@
 """Solids: unions of convex parts, hollow ones among them, and what stands in them."""
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import as_scene, score
+from caryatid.exploration import explore
 from caryatid.exports import export_graph
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Sphere
@@ -14,8 +17,9 @@ from caryatid.geometry.solids import Polytope, Solid, hollowed
 from caryatid.graph import SceneObject, SupportGraph
 from caryatid.io.graph_json import graph_from_json, graph_to_json
 from caryatid.simulation.generation import generate
+from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import ground_truth
-from caryatid.simulation.world import true_shapes
+from caryatid.simulation.world import Body, build_spec, scene_from_spec, true_shapes
 from caryatid.support.contacts import find_contacts, find_gap
 from caryatid.support.relations import infer
 
@@ -125,3 +129,19 @@ def test_household_scenes_are_settled_and_hold_things_in_each_other():
     assert len(shapes) == 8
     assert sum(len(shape.parts) > 1 for shape in shapes.values()) >= 3
     assert sum(edge.supporter != "table" for edge in ground_truth(scene).edges) >= 4
+
+
+def test_a_tray_is_seen_to_be_hollow_and_carries_what_is_in_it():
+    """By a box that is higher than its walls; the floor is at 10 mm over the table."""
+    shapes = tray((0.0, 0.0, 0.75)), Box(transforms.rigid(AXES, (0.02, 0.03, 0.80)), np.full(3, 0.08))
+    scene = scene_from_spec(build_spec([Body(shape) for shape in shapes], "test"), "test", "test")
+    config = replace(Config(), active=replace(Config().active, max_views=3))
+    simulation = make_simulation(scene, config, noise="carmine", seed=0)
+    step = list(explore(simulation.camera, simulation.robot, config=config, early_stop=False))[-1]
+    found, box = step.graph["o1"].shape, step.graph["o2"].shape
+    assert (found.kind, box.kind) == ("solid", "box")
+    assert {s.pair for s in step.graph.supports} == {("o0", "o1"), ("o1", "o2")}
+    in_the_tray = np.array([[-0.05, -0.05, 0.77], [0.07, -0.06, 0.78]])
+    in_walls_and_floor = np.array([[0.095, 0.0, 0.775], [0.0, -0.095, 0.775], [-0.05, -0.05, 0.754]])
+    assert (found.signed_distance(in_the_tray) > 0.005).all()
+    assert (found.signed_distance(in_walls_and_floor) < 0.0).all()

@@ -249,11 +249,13 @@ class Scene(Pictured):
             return observation
         self._models.fit_all(shown, voxels)
         if named:
+            self._models.form(shown, voxels)
             return observation
         changed = set() if given else self._models.divide(shown, voxels)
         if changed:
             observation = self._models.nearest(observation, changed)
         given_up = self._models.unite(shown | changed, voxels)
+        self._models.form(shown | changed | set(given_up.values()), voxels)
         if given_up and self.config.fusion.matching == "points":
             names = {object_id(old): object_id(new) for old, new in given_up.items()}
             self._graphs = tuple(renamed(graph, names) for graph in self._graphs)

@@ -160,6 +160,28 @@ class Solid(Shape):
             return replace(self, T_world_object=T_world_object)
         return Solid.from_size(T_world_object, {"parts": [p.vertices * scale for p in self.polytopes]})
 
+    def lowest(self, direction: Array, depth: float) -> NDArray[np.bool_]:
+        """Which corners of its outline (N,) lie within a depth [m] of the last one along a direction (3,)."""
+        reach = np.concatenate([p.vertices for p in self.polytopes]) @ direction
+        return np.asarray(reach >= reach.max() - depth)
+
+    def lengthened(self, direction: Array, depth: float, length: float) -> Solid:
+        """The solid with the corners within a depth [m] of the last one along a direction moved on, or back.
+
+        Args:
+            direction: Unit vector (3,) in the solid's frame.
+            depth: Of the corners that move [m].
+            length: How far they go [m]; a negative one takes them back.
+        """
+        moving = np.split(self.lowest(direction, depth), np.cumsum([len(p.vertices) for p in self.polytopes]))
+        moved = []
+        for part, own in zip(self.polytopes, moving, strict=False):
+            # What moves on leaves a prism behind.
+            stays = part.vertices[~own] if length < 0.0 else part.vertices
+            longer = Polytope.around(np.concatenate([stays, part.vertices[own] + length * direction]))
+            moved.append(part if longer is None or not own.any() else longer)
+        return Solid.of(moved).moved(self.T_world_object)
+
     def signed_distance(self, points_world: Array) -> Array:
         """Distance (N,) [m] of points (N, 3) to the surface, negative inside.
 
@@ -226,6 +248,9 @@ def hollowed(part: Polytope, cavity: Sequence[tuple[Array, float]]) -> list[Poly
     Args:
         part: The part.
         cavity: Its planes, unit normal (3,) into the cavity and offset [m]: in it is what lies before all.
+
+    Returns:
+        The pieces; the part itself where the cavity does not reach it.
     """
     pieces, rest = [], part
     for normal, offset in cavity:
@@ -233,7 +258,7 @@ def hollowed(part: Polytope, cavity: Sequence[tuple[Array, float]]) -> list[Poly
         if behind is not None:
             pieces.append(behind)
         if before is None:
-            break
+            return [part]
         rest = before
     return pieces
 

@@ -58,7 +58,7 @@ def _extended(
 ) -> SceneObject:
     """Extend an object among the shapes of the others."""
     shape = candidate.shape
-    if isinstance(shape, (Sphere, Solid)):
+    if isinstance(shape, Sphere):
         return candidate
     axis, sign = _downward_side(shape)
     down_world = sign * shape.T_world_object[:3, axis]
@@ -116,7 +116,7 @@ def _depth_side(candidate: SceneObject) -> tuple[int, float] | None:
     if len(seen) != 1:
         return None
     axis, side = divmod(int(seen[0]), 2)
-    if isinstance(candidate.shape, Cylinder) and axis != 2:
+    if isinstance(candidate.shape, Solid) or (isinstance(candidate.shape, Cylinder) and axis != 2):
         return None
     # Their noise makes a single side's points up to 2 cm deep.
     return (axis, -1.0 if side else 1.0) if candidate.shape.extents[axis] <= 0.02 else None
@@ -164,6 +164,11 @@ def _downward_side(shape: Shape) -> tuple[int, float]:
 
 
 def _face(shape: Shape, axis: int, sign: float) -> Face:
+    if isinstance(shape, Solid):
+        lowest = shape.outline()[shape.lowest(sign * np.eye(3)[axis], SPACING / 2.0)]
+        middle = lowest.mean(axis=0)
+        rings = [middle + share * (lowest - middle) for share in (0.0, 0.3, 0.6, 0.8, 1.0)]
+        return np.concatenate(rings), rings[-2]
     across = [(axis + 1) % 3, (axis + 2) % 3]
     half = shape.extents / 2.0
     u, v = (_ticks(half[k], SPACING) for k in across)
@@ -189,6 +194,8 @@ def _ticks(half: float, spacing: float) -> Array:
 
 
 def _lengthened(shape: Shape, axis: int, sign: float, length: float) -> Shape:
+    if isinstance(shape, Solid):
+        return shape.lengthened(sign * np.eye(3)[axis], SPACING / 2.0, length)
     extents = shape.extents
     length = max(length, -0.8 * float(extents[axis]))
     shift = np.zeros(3)

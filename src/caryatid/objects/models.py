@@ -22,6 +22,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.objects.description_length import Evidence, Explanation, best_explanation
 from caryatid.objects.model_selection import GROWTH, best_merge, split
+from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.observation import UP, Observation
 from caryatid.sensing.clouds import thin
@@ -168,6 +169,7 @@ class ObjectModels:
         self.fits: dict[int, SceneObject] = {}
         self._config = config
         self._seed = seed
+        self._solids: dict[int, SceneObject] = {}
         self._undivided: dict[int, int] = {}
         self._segments: list[tuple[cKDTree, NDArray[np.int32]]] = []
         self._apart: dict[tuple[int, int], int] = {}
@@ -178,6 +180,7 @@ class ObjectModels:
         other = copy.copy(self)
         other.points = self.points.copy()
         other.fits = self.fits.copy()
+        other._solids = self._solids.copy()
         other._undivided = self._undivided.copy()
         other._segments = self._segments.copy()
         other._apart = self._apart.copy()
@@ -201,7 +204,7 @@ class ObjectModels:
             points,
             segments,
             {k: self.points.of(k).points_world for k in self.points.objects},
-            {k: o.shape for k, o in self.fits.items()},
+            {o.label: o.shape for o in self.objects()},
             self._config.segmentation,
             self.points.labels_used,
             masks=masks,
@@ -218,11 +221,11 @@ class ObjectModels:
         points = observation.cloud.points_world[rows]
         shown, index, count = np.unique(observation.labels[rows], return_inverse=True, return_counts=True)
         own, on_another = np.zeros(len(shown)), np.zeros(len(shown), dtype=bool)
-        for label, o in self.fits.items():
+        for o in self.objects():
             near = np.abs(o.shape.signed_distance(points)) < config.overlap_reach
             share = np.bincount(index[near], minlength=len(shown)) / count
-            own += np.where(shown == label, share, 0.0)
-            on_another |= (shown != label) & (share >= 0.5)
+            own += np.where(shown == o.label, share, 0.0)
+            on_another |= (shown != o.label) & (share >= 0.5)
         return int(np.count_nonzero(on_another & (own < config.overlap))), len(shown)
 
     def add(self, observation: Observation, view: int) -> set[int]:
@@ -324,9 +327,33 @@ class ObjectModels:
         changed[among] = owners[tree.query(observation.cloud.points_world[among])[1]]
         return observation.with_labels(changed)
 
+    def form(self, labels: set[int], voxels: VoxelMap | None) -> None:
+        """Take solids for objects whose points cost less without any primitive.
+
+        Args:
+            labels: Objects whose points have changed.
+            voxels: Space seen free.
+        """
+        noise = self._noise()
+        changed = sorted(labels & self.fits.keys())
+
+        def formed(number: int) -> SceneObject | None:
+            label = changed[number]
+            evidence, explanation = self._explained(label, noise, voxels)
+            if explanation.shape is not None:
+                return None
+            cloud = self.points.of(label, self._config.cloud.voxel)
+            others = [o.shape for k, o in self.fits.items() if k != label]
+            return as_solid(self.fits[label], cloud, evidence, others, self._config.fit)
+
+        for label, o in zip(changed, on_threads(formed, len(changed)), strict=True):
+            self._solids.pop(label, None)
+            if o is not None:
+                self._solids[label] = o
+
     def objects(self) -> list[SceneObject]:
-        """The fitted objects in the order of their labels."""
-        return [self.fits[k] for k in sorted(self.fits)]
+        """The objects in the order of their labels: as solids, or with the primitives fitted to them."""
+        return [self._solids.get(k, self.fits[k]) for k in sorted(self.fits)]
 
     def _explained(self, label: int, noise: float, voxels: VoxelMap | None) -> tuple[Evidence, Explanation]:
         """What explanations of an object go by, and its explanation by the shape fitted to it."""
@@ -358,7 +385,7 @@ class ObjectModels:
         """Standard deviation of points from their surfaces [m]: that of the object in the middle."""
         # 1.25 mean absolute values of a normal distribution are one standard deviation; registration leaves
         # 2 mm at the least.
-        residuals = [o.residual for o in self.fits.values()]
+        residuals = [o.residual for o in self.objects()]
         return max(1.25 * float(np.median(residuals)), 0.002) if residuals else 0.002
 
     def _fit(

@@ -10,6 +10,7 @@ from caryatid.config import Config, SegmentationMethod, SensorConfig
 from caryatid.exploration import Step, explore, next_best_view
 from caryatid.fitting.primitives import fit
 from caryatid.geometry.shapes import Box
+from caryatid.geometry.solids import Solid
 from caryatid.planning.planners import BUILT_IN
 from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
@@ -31,6 +32,7 @@ def warm_up(number: int) -> None:
 def _fit() -> None:
     points, normals = Box(np.eye(4), np.array([0.1, 0.2, 0.1])).surface(0.01)
     fit(points, normals, config=Config().fit, rng=np.random.default_rng(0))
+    Solid.from_extents(np.eye(4), np.ones(3)).signed_distance(points)
 
 
 def _explore_by_colour_and_depth() -> None:

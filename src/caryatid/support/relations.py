@@ -224,7 +224,7 @@ def _find_touches(
 ) -> dict[str, list[Touch]]:
     """What touches each object, or is nearer than a reach [m], by the object's id."""
     shapes = [o.shape for o in objects]
-    contacts = find_contacts(shapes, reach)
+    contacts = [c for c in find_contacts(shapes, reach) if not _parted(c, shapes)]
     normals_world = np.array([_plane_normal(objects[c.a], objects[c.b], c) for c in contacts]).reshape(-1, 3)
     tilts = np.degrees(transforms.angle_between(normals_world, (0.0, 0.0, 1.0)))
     # Shapes touch up to gaps that their fits' uncertainty across the contact explains.
@@ -247,6 +247,14 @@ def _find_touches(
         touches[b.id].append(Touch(a, c.parts[::-1], normal_world, c.distance, tilt, *place))
         touches[a.id].append(Touch(b, c.parts, -normal_world, c.distance, 180.0 - tilt, *place))
     return touches
+
+
+def _parted(contact: Contact, shapes: Sequence[Shape]) -> bool:
+    """Whether a third shape fills the gap: the floor of a tray parts what is in it from the table."""
+    if contact.distance <= 0.0:
+        return False
+    others = [shape for k, shape in enumerate(shapes) if k not in (contact.a, contact.b)]
+    return any((shape.signed_distance(contact.points_world) < 0.0).all() for shape in others)
 
 
 def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:
