@@ -371,7 +371,7 @@ def test_what_no_number_of_points_averages_out_is_the_least_deviation():
 def test_deviations_are_numbers_where_rounding_makes_a_variance_negative():
     information = np.diag(np.full(9, 1e12))
     information[0, 6] = information[6, 0] = 1e12 * (1.0 + 1e-10)
-    found = deviations(BOX_CODE, np.ones(6, dtype=np.bool_), np.zeros(6), information, 1.0, INDEPENDENT)
+    found = deviations(BOX_CODE, np.zeros((3, 2)), information, INDEPENDENT)
     for each in (found.position, found.rotation, found.sizes, found.sides):
         assert np.isfinite(each).all()
 

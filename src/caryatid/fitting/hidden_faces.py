@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_marquardt, normal_equations
@@ -46,124 +45,123 @@ def close_hidden_faces(
     points = points[np.linspace(0, len(points) - 1, min(len(points), 3500)).astype(np.intp)]
     origin = points.mean(axis=0)
     kind, R, centre, half = Primitives.of([shape]).row(0)
-    sides, centre, points = np.array(seen), centre - origin, points - origin
     # Where no step of least squares was better yet, a shape may still be thinner than it may be.
-    half = np.maximum(half, config.min_extent / 2.0)
-    # Unseen sides are moved out of the way, beyond all noise; a round side is seen as a whole, and a sphere
-    # stays.
-    opening = 0.05
-    unseen_mantle = kind == CYLINDER and not sides[:4].any()
-    flat = np.array([kind == BOX, kind == BOX, kind != SPHERE])
-    low, high = np.where(flat, opening * ~sides.reshape(3, 2).T, 0.0)
-    middle = centre + np.einsum("ab,b->a", R, (high - low) / 2.0)
-    refined = np.concatenate([R, [middle, half + (low + high) / 2.0]])
-    turned, middle, opened = refined[:3], refined[3], refined[4]
-    if unseen_mantle:
-        opened[:2] += opening
+    points, kept = points - origin, np.stack([centre - origin, np.maximum(half, config.min_extent / 2.0)])
+    hidden = ~np.array(seen).reshape(3, 2) & (kind != SPHERE)
+    if kind == CYLINDER:
+        # Any part of the mantle tells where all of it is.
+        hidden[:2] = hidden[:2].all()
+    # Unseen sides are moved out of the way, beyond all noise.
+    low, high = 0.05 * hidden.T
+    refined = np.concatenate([R, [kept[0] + R @ ((high - low) / 2.0), kept[1] + (low + high) / 2.0]])
     levenberg_marquardt(kind, refined, points, config.steps, config.min_extent, 0.0, CONVERGED)
-    distance = np.abs(signed_distances(kind, turned, middle, opened, points))
-    near = distance[distance < config.threshold]
-    sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) else config.threshold
-    information = np.empty((9, 9))
+    closed, unsure, information = np.concatenate([R, kept]), np.zeros((3, 2)), np.empty((9, 9))
+    sigma, residual, inliers = _close(
+        kind, refined, hidden, points, config.threshold, config.min_points, config.min_extent,
+        config.max_extent, config.correlated, config.rim**2, closed, unsure,
+    )  # fmt: skip
     normal_equations(kind, refined, points, 2.5 * sigma, information, np.empty(9))
-    # Each unseen side is put where points end, or back where it was.
-    hidden, closed = np.full(6, config.max_extent / np.sqrt(12.0)), opened.copy()
-    own = np.ascontiguousarray(in_frame(turned, middle, points).T)
-    before = in_frame(turned, middle, centre[None])[0]
-    if unseen_mantle:
-        end, hidden[:4] = _end(kind, opened, own, 0, 1.0, sigma, config) or (half[0], hidden[0])
-        closed[:2] = end
-    for axis in np.flatnonzero(flat & ~sides.reshape(3, 2).all(axis=1)).tolist():
-        ends = [-opened[axis], opened[axis]]
-        for side, sign in ((0, -1.0), (1, 1.0)):
-            if not sides[2 * axis + side]:
-                found = _end(kind, opened, own, axis, sign, sigma, config)
-                ends[side] = sign * found[0] if found else before[axis] + sign * half[axis]
-                hidden[2 * axis + side] = found[1] if found else hidden[2 * axis + side]
-        short = max(config.min_extent - (ends[1] - ends[0]), 0.0)
-        if sides[2 * axis + 1]:
-            ends[0] -= short
-        else:
-            ends[1] += short
-        closed[axis] = (ends[1] - ends[0]) / 2.0
-        middle += turned[:, axis] * (ends[1] + ends[0]) / 2.0
-    if 2.0 * closed.max() <= config.max_extent and len(near):
-        R, centre, half = turned, middle, closed
-    distance = np.abs(signed_distances(kind, R, centre, half, points))
-    residual = float(np.minimum(distance, config.threshold).mean())
-    inliers = float((distance < config.threshold).mean())
-    uncertainty = deviations(kind, sides, hidden, information * len(points), sigma, config)
-    return shape.from_extents(rigid(R, centre + origin), 2.0 * half), residual, inliers, uncertainty
+    information *= len(points) / (config.correlated * sigma**2)
+    uncertainty = deviations(kind, unsure, information, config)
+    found = shape.from_extents(rigid(closed[:3], closed[3] + origin), 2.0 * closed[4])
+    return found, residual, inliers, uncertainty
 
 
-def deviations(
-    kind: int, seen: NDArray[np.bool_], unseen: Array, information: Array, sigma: float, config: FitConfig
-) -> Uncertainty:
+@njit(cache=True, error_model="numpy", nogil=True)
+def _close(  # type: ignore[no-untyped-def]
+    kind, refined, hidden, points, threshold, min_points, min_extent, max_extent, correlated, rim, shape,
+    unsure,
+):  # fmt: skip
+    """Put each hidden side (3, 2) of a refined shape (5, 3) where points (N, 3) end, or back where it was.
+
+    The shape (5, 3) as it was is replaced by the closed one, unless that is too long; the variances (3, 2)
+    [m²] of the hidden sides are written to.
+
+    Returns:
+        Standard deviation of the points [m], their mean distance [m], and the share of inliers.
+    """
+    R, middle, half = refined[:3], refined[3].copy(), refined[4]
+    distance = np.abs(signed_distances(kind, R, middle, half, points))
+    near = distance[distance < threshold]
+    sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) > 0 else threshold
+    own, before, closed = in_frame(R, middle, points), in_frame(R, middle, shape[3:4])[0], half.copy()
+    for axis in range(3):
+        ends = [-half[axis], half[axis]]
+        for side, sign in enumerate((-1.0, 1.0)):
+            if hidden[axis, side]:
+                end, variance = _end(kind, half, own, axis, sign, sigma, min_points, correlated, rim)
+                if variance == np.inf:
+                    end, variance = shape[4, axis], max_extent**2 / 12.0
+                    if kind == BOX or axis == 2:
+                        end += sign * before[axis]
+                ends[side], unsure[axis, side] = sign * end, variance
+        short = max(min_extent - (ends[1] - ends[0]), 0.0)
+        low, high = (ends[0], ends[1] + short) if hidden[axis, 1] else (ends[0] - short, ends[1])
+        closed[axis] = (high - low) / 2.0
+        for a in range(3):
+            middle[a] += R[a, axis] * (high + low) / 2.0
+    if 2.0 * closed.max() <= max_extent and len(near) > 0:
+        shape[:3], shape[3], shape[4] = R, middle, closed
+    distance = np.abs(signed_distances(kind, shape[:3], shape[3], shape[4], points))
+    return sigma, np.minimum(distance, threshold).mean(), (distance < threshold).sum() / len(points)
+
+
+def deviations(kind: int, unsure: Array, information: Array, config: FitConfig) -> Uncertainty:
     """Standard deviations of a shape from the normal equations of its last fit.
 
     Args:
         kind: Code of the shape.
-        seen: Which sides (6,) points bear out.
-        unseen: Standard deviation (6,) [m] of the sides that no point bears out.
-        information: Sum over the points of the products of their derivatives (9, 9), unseen sides out of the
-            way; rows and columns as of `least_squares.normal_equations`.
-        sigma: Robust standard deviation [m] of the points' distances to the shape.
-        config: How many points share an error, and the error of registration.
+        unsure: Variance (3, 2) [m²] of the lower and upper sides that no point bears out, 0 of the others.
+        information: Inverse covariance (9, 9), unseen sides out of the way; rows and columns as of
+            `least_squares.normal_equations`.
+        config: The longest extent, and the error of registration.
     """
     # A radian for a rotation that nothing determines.
-    prior = np.array([config.max_extent] * 3 + [1.0] * 3 + [config.max_extent] * 3)
-    information = information / (config.correlated * sigma**2)
+    prior = np.repeat([config.max_extent, 1.0, config.max_extent], 3)
     covariance = np.linalg.inv(information + np.diag(prior**-2.0))
     # Rounding may leave a variance a little below zero.
     variance = np.maximum(np.diagonal(covariance), 0.0)
     # The half extents along x, y, z have these columns: round ones share one.
-    columns = {BOX: (6, 7, 8), SPHERE: (6, 6, 6)}.get(kind, (6, 6, 8))
-    centre, half, both = variance[:3], variance[list(columns)], covariance[range(3), columns]
-    borne_out = seen.copy()
-    if kind != BOX:
-        # Any part of a round surface tells where all of it is.
-        borne_out[:4] |= seen[:4].any()
-    borne_out |= kind == SPHERE
-    low = np.where(borne_out[0::2], np.maximum(centre + half - 2.0 * both, 0.0), unseen[0::2] ** 2)
-    high = np.where(borne_out[1::2], np.maximum(centre + half + 2.0 * both, 0.0), unseen[1::2] ** 2)
-    determined = borne_out[0::2] & borne_out[1::2]
-    floor = config.registration**2
+    columns = {BOX: [6, 7, 8], SPHERE: [6, 6, 6]}.get(kind, [6, 6, 8])
+    centre, half, both = variance[:3, None], variance[columns, None], covariance[range(3), columns][:, None]
+    sides = np.where(unsure > 0.0, unsure, np.maximum(centre + half + both * (-2.0, 2.0), 0.0))
+    floor, hidden = config.registration**2, unsure.any(axis=1, keepdims=True)
+    across = sides.sum(axis=1, keepdims=True)
     return Uncertainty(
-        position=np.sqrt(np.where(determined, centre, (low + high) / 4.0) + floor),
+        position=np.sqrt(np.where(hidden, across / 4.0, centre) + floor)[:, 0],
         rotation=np.sqrt(variance[3:6]),
-        sizes=np.sqrt(np.where(determined, 4.0 * half, low + high) + floor),
-        sides=np.sqrt(np.stack([low, high], axis=1).ravel() + floor),
+        sizes=np.sqrt(np.where(hidden, across, 4.0 * half) + floor)[:, 0],
+        sides=np.sqrt(sides.ravel() + floor),
     )
 
 
-def _end(
-    kind: int, half: Array, own: Array, axis: int, sign: float, sigma: float, config: FitConfig
-) -> tuple[float, float] | None:
-    """Where points (3, N) beside one side end along its direction, and its deviation [m]; None if few tell.
+@njit(cache=True, error_model="numpy", nogil=True)
+def _end(kind, half, own, axis, sign, sigma, min_points, correlated, rim):  # type: ignore[no-untyped-def]
+    """Where points (N, 3) beside one side end along its direction [m], and its variance; infinite if few do.
 
     Points of a cylinder's ends tell where its mantle is, those of a box's other faces where a face is.
     """
-    round_ = kind == CYLINDER and axis != 2
-    along = sign * own[axis]
-    if kind == CYLINDER:
-        reach = np.sqrt(own[0] ** 2 + own[1] ** 2)
-        off = np.abs(own[2]) - half[2] if round_ else reach - half[0]
-        along = reach if round_ else along
-    else:
+    growing = kind == CYLINDER and axis < 2
+    along = sign * own[:, axis]
+    if kind == BOX:
         u, v = (axis + 1) % 3, (axis + 2) % 3
-        off = np.maximum(np.abs(own[u]) - half[u], np.abs(own[v]) - half[v])
+        off = np.maximum(np.abs(own[:, u]) - half[u], np.abs(own[:, v]) - half[v])
+    else:
+        reach = np.sqrt(own[:, 0] ** 2 + own[:, 1] ** 2)
+        off = np.abs(own[:, 2]) - half[2] if growing else reach - half[0]
+        along = reach if growing else along
     found = along[np.abs(off) < 3.0 * sigma]
-    if len(found) < config.min_points:
-        return None
+    if len(found) < min_points:
+        return 0.0, np.inf
     start = quantile(found, 1.0 - TRIM)
-    span = start if round_ else start - quantile(found, TRIM)
+    span = start if growing else start - quantile(found, TRIM)
     window = max(4.0 * sigma, 0.1 * span)
     close = found[found > start - window - 12.0 * sigma]
-    end, deviation = likeliest_end(close, start, sigma, window, round_)
-    return end, math.sqrt(deviation * deviation * config.correlated + config.rim * config.rim)
+    end, deviation = likeliest_end(close, start, sigma, window, growing)
+    return end, deviation * deviation * correlated + rim
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def likeliest_end(coordinates, start, sigma, window, growing):  # type: ignore[no-untyped-def]
     """Upper end [m] of points (N,) whose density is even up to it, and its standard deviation [m].
 
