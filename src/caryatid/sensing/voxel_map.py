@@ -105,7 +105,7 @@ class VoxelMap:
         depth, K = np.ascontiguousarray(view.depth), np.ascontiguousarray(view.K)
         camera = (depth, K, T_world_camera, config.stride, config.margin, float(max_depth))
         for_each(_mark_rays, SHARES, (*camera, self.origin_world, config.size, hits, passes))
-        for_each(_count_marks, len(hits), (self.hits, self.passes, hits, passes))
+        for_each(_count_marks, SHARES, (self.hits, self.passes, hits, passes))
         return VoxelMap(self.origin_world, hits, passes, config)
 
     def solid(self, shapes: Sequence[Shape] = ()) -> Solid:
@@ -290,11 +290,12 @@ def _ray(depth_image, K, R, u, v):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _count_marks(layer, data):  # type: ignore[no-untyped-def]
-    """Turn the marks in one layer of the map into counts, at most 255; no ray passes where one ends."""
-    hits, passes = data[0][layer].reshape(-1), data[1][layer].reshape(-1)
-    new_hits, new_passes = data[2][layer].reshape(-1), data[3][layer].reshape(-1)
-    for n in range(len(hits)):
+def _count_marks(share, data):  # type: ignore[no-untyped-def]
+    """Turn the marks in a share of the map into counts, at most 255; no ray passes where one ends."""
+    hits, passes, new_hits, new_passes = data
+    hits, passes = hits.reshape(-1), passes.reshape(-1)
+    new_hits, new_passes = new_hits.reshape(-1), new_passes.reshape(-1)
+    for n in range(share * len(hits) // SHARES, (share + 1) * len(hits) // SHARES):
         hit, passed = new_hits[n], new_passes[n]
         new_hits[n] = hits[n] + np.uint8((hit > 0) & (hits[n] < 255))
         new_passes[n] = passes[n] + np.uint8((passed > hit) & (passes[n] < 255))
