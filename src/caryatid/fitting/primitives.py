@@ -15,7 +15,7 @@ from caryatid.fitting.search import TRIM, search
 from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
 from caryatid.geometry.points import quantile
 from caryatid.geometry.shapes import KINDS, Primitives, Shape, Uncertainty
-from caryatid.geometry.signed_distance import gradient, in_frame
+from caryatid.geometry.signed_distance import gradient, in_frame, sample_surface
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
@@ -355,55 +355,20 @@ def _bare_share(kind, R, centre, half, seen, points):  # type: ignore[no-untyped
     The shape has axes R (3, 3), a centre (3,) and half extents (3,) [m]; points are (N, 3).
     """
     own = in_frame(R, centre, points)
+    places, outward = sample_surface(kind, np.eye(3), np.zeros(3), half, BARE_SPACING)
     samples = bare = last = 0
-    for side in range(6):
-        if not seen[side]:
+    for k in range(len(places)):
+        # A round side is the part of the surface whose outward normal is nearest to the side's direction.
+        axis = np.argmax(np.abs(outward[k]))
+        if not seen[2 * axis + (outward[k, axis] > 0.0)]:
             continue
-        places = _samples(kind, half, side // 2, 2 * (side % 2) - 1)
-        samples += len(places)
-        for k in range(len(places)):
-            u, v, w = places[k, 0], places[k, 1], places[k, 2]
-            found = False
-            for n in range(-1, len(own)):
-                i = last if n < 0 else n
-                x, y, z = own[i, 0] - u, own[i, 1] - v, own[i, 2] - w
-                if x * x + y * y + z * z <= 4.0 * BARE_SPACING * BARE_SPACING:
-                    found, last = True, i
-                    break
-            bare += not found
+        samples += 1
+        found = False
+        for n in range(-1, len(own)):
+            i = last if n < 0 else n
+            x, y, z = own[i, 0] - places[k, 0], own[i, 1] - places[k, 1], own[i, 2] - places[k, 2]
+            if x * x + y * y + z * z <= 4.0 * BARE_SPACING * BARE_SPACING:
+                found, last = True, i
+                break
+        bare += not found
     return bare / samples if samples > 0 else 1.0
-
-
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
-def _samples(kind, half, axis, sign):  # type: ignore[no-untyped-def]
-    """Points (M, 3) [m] about `BARE_SPACING` apart on one side, in the object's frame.
-
-    A round side is the part of the surface whose outward normal is nearest to the side's direction.
-    """
-    u, v = (axis + 1) % 3, (axis + 2) % 3
-    flat = kind == BOX or (kind == CYLINDER and axis == 2)
-    if kind == CYLINDER and not flat:
-        u, v = 1 - axis, 2
-    quarter = half[0] * np.pi / 4.0
-    rows = max(2, int(np.ceil(2.0 * (half[u] if flat else quarter) / BARE_SPACING)))
-    columns = max(2, int(np.ceil(2.0 * (quarter if kind == SPHERE else half[v]) / BARE_SPACING)))
-    found = np.empty((rows * columns, 3))
-    count = 0
-    for i in range(rows):
-        for j in range(columns):
-            a, b = 2.0 * (i + 0.5) / rows - 1.0, 2.0 * (j + 0.5) / columns - 1.0
-            if flat:
-                x, y, z = half[axis], half[u] * a, half[v] * b
-                if kind == CYLINDER and y * y + z * z > half[0] * half[0]:
-                    continue
-            elif kind == CYLINDER:
-                angle = np.pi / 4.0 * a
-                x, y, z = half[0] * np.cos(angle), half[0] * np.sin(angle), half[2] * b
-            else:
-                # Equal angles both ways: the cube's side blown up to the sphere.
-                a, b = np.tan(np.pi / 4.0 * a), np.tan(np.pi / 4.0 * b)
-                x = half[0] / np.sqrt(1.0 + a * a + b * b)
-                y, z = a * x, b * x
-            found[count, axis], found[count, u], found[count, v] = sign * x, y, z
-            count += 1
-    return found[:count]

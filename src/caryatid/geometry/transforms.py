@@ -119,13 +119,13 @@ def random_rotation(rng: np.random.Generator) -> Array:
 
 
 def look_at(eye_world: ArrayLike, target_world: ArrayLike, up_world: ArrayLike = (0.0, 0.0, 1.0)) -> Array:
-    """`T_world_camera` (4, 4) of an OpenCV camera (x right, y down, z forward) that looks from eye to target.
+    """`T_world_camera` (..., 4, 4) of OpenCV cameras (x right, y down, z forward) that look at a target.
 
     Straight up or down, where `up` gives no roll, the image's top points along world +x (or +y).
 
     Args:
-        eye_world: Camera centre (3,) [m].
-        target_world: Point on the optical axis (3,) [m].
+        eye_world: Camera centres (..., 3) [m].
+        target_world: Points on the optical axes (..., 3) [m].
         up_world: Direction (3,) that is up in the image.
 
     Raises:
@@ -133,14 +133,16 @@ def look_at(eye_world: ArrayLike, target_world: ArrayLike, up_world: ArrayLike =
     """
     eye = np.asarray(eye_world, dtype=np.float64)
     forward = np.asarray(target_world, dtype=np.float64) - eye
-    if np.linalg.norm(forward) < 1e-9:
+    if (np.linalg.norm(forward, axis=-1) < 1e-9).any():
         raise InputError("look_at", "eye and target are the same point", "give two different points")
     z = unit(forward)
     x = np.cross(z, np.asarray(up_world, dtype=np.float64))
-    if np.linalg.norm(x) < 1e-6:
-        x = np.cross(z, perpendicular(z) if abs(z[0]) > 0.9 else (1.0, 0.0, 0.0))
-    x = unit(x)
-    return rigid(np.stack([x, np.cross(z, x), z], axis=1), eye)
+    aside = np.where(np.abs(z[..., :1]) > 0.9, (0.0, 1.0, 0.0), (1.0, 0.0, 0.0))
+    x = unit(np.where(np.linalg.norm(x, axis=-1, keepdims=True) < 1e-6, np.cross(z, aside), x))
+    T = np.zeros((*z.shape[:-1], 4, 4))
+    T[..., :3, :] = np.stack([x, np.cross(z, x), z, np.broadcast_to(eye, z.shape)], axis=-1)
+    T[..., 3, 3] = 1.0
+    return T
 
 
 def level_world(normal: ArrayLike, point: ArrayLike) -> Array:

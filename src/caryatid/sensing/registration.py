@@ -208,12 +208,13 @@ class ViewRegistration:
         self, pairs: Sequence[tuple[int, int]], twists: Array, reach: float, stride: int = 1
     ) -> list[Array]:
         """Rows (S, 8) of `_find_correspondences` of each pair (still, moving), for every stride-th patch."""
+        T = twist_transform(twists, self._pivot)
 
         def work(number: int) -> Array:
             still, moving = pairs[number]
             other, sample = self._views[still], np.ascontiguousarray(self._views[moving].sample[::stride])
             return _find_correspondences(
-                *(sample, twists[moving], other.patches, other.starts, twists[still]),
+                *(sample, other.patches, other.starts, T[moving], T[still], transforms.invert(T[still])),
                 *(self._pivot, self._edge, reach, self._config.noise),
             )
 
@@ -371,47 +372,42 @@ def _bucket(label, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _find_correspondences(samples, twist, patches, starts, other_twist, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
+def _find_correspondences(samples, patches, starts, T, T_other, T_back, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
     """Look for the patch of another view that is nearest in place and direction, and linearise the distance.
 
     Distance is along the mean of both normals, and its derivative by a move of either view that about the
-    middle between the two patches: a move of both views together changes nothing. Both views' patches (S, 8)
-    and (P, 8) were moved by their twists (6,). Rows (S, 8) are the derivative by the samples' twist; the
-    distance [m]; its inverse variance [1/m²]; zero where there is no partner within reach [m].
+    middle between the two patches: a move of both views together changes nothing. The samples (S, 8) are
+    where T puts them, the other view's patches (P, 8) where T_other does, whose inverse is T_back, all
+    (4, 4). Rows (S, 8) are the derivative by the samples' twist about the pivot (3,) [m]; the distance [m];
+    its inverse variance [1/m²]; zero where there is no partner within reach [m].
     """
     rows = np.zeros((len(samples), 8))
-    R = _rotation(twist[3], twist[4], twist[5])
-    S = _rotation(other_twist[3], other_twist[4], other_twist[5])
-    tx, ty, tz = twist[0], twist[1], twist[2]
-    sx, sy, sz = other_twist[0], other_twist[1], other_twist[2]
     for i in range(len(samples)):
         row, sample = rows[i], samples[i]
-        px, py, pz = _turned(R, sample[0] - pivot[0], sample[1] - pivot[1], sample[2] - pivot[2])
-        px, py, pz = px + tx, py + ty, pz + tz
-        nx, ny, nz = _turned(R, sample[3], sample[4], sample[5])
-        point, normal = _turned_back(S, px - sx, py - sy, pz - sz), _turned_back(S, nx, ny, nz)
-        found = _partner(patches, starts, pivot, edge, reach, point, normal, sample[7])
+        px, py, pz = _moved(T, sample[0], sample[1], sample[2], 1.0)
+        nx, ny, nz = _moved(T, sample[3], sample[4], sample[5], 0.0)
+        point, normal = _moved(T_back, px, py, pz, 1.0), _moved(T_back, nx, ny, nz, 0.0)
+        found = _partner(patches, starts, edge, reach, point, normal, sample[7])
         if found < 0:
             continue
         other = patches[found]
-        qx, qy, qz = _turned(S, other[0] - pivot[0], other[1] - pivot[1], other[2] - pivot[2])
-        qx, qy, qz = qx + sx, qy + sy, qz + sz
-        mx, my, mz = _turned(S, other[3], other[4], other[5])
+        qx, qy, qz = _moved(T_other, other[0], other[1], other[2], 1.0)
+        mx, my, mz = _moved(T_other, other[3], other[4], other[5], 0.0)
         mx, my, mz = mx + nx, my + ny, mz + nz
         length = np.sqrt(mx * mx + my * my + mz * mz)
         mx, my, mz = mx / length, my / length, mz / length
         row[0], row[1], row[2] = mx, my, mz
         row[6] = (px - qx) * mx + (py - qy) * my + (pz - qz) * mz
-        qx, qy, qz = 0.5 * (px + qx), 0.5 * (py + qy), 0.5 * (pz + qz)
+        qx, qy, qz = 0.5 * (px + qx) - pivot[0], 0.5 * (py + qy) - pivot[1], 0.5 * (pz + qz) - pivot[2]
         row[3], row[4], row[5] = qy * mz - qz * my, qz * mx - qx * mz, qx * my - qy * mx
         row[7] = 1.0 / (sample[6] + other[6] + noise * noise)
     return rows
 
 
 @njit(cache=True, error_model="numpy")
-def _partner(patches, starts, pivot, edge, reach, point, normal, label):  # type: ignore[no-untyped-def]
-    """Number of the patch nearest in place and direction, or −1; point [m] from the pivot."""
-    x, y, z = point[0] + pivot[0], point[1] + pivot[1], point[2] + pivot[2]
+def _partner(patches, starts, edge, reach, point, normal, label):  # type: ignore[no-untyped-def]
+    """Number of the patch nearest in place and direction, or −1."""
+    x, y, z = point
     cx, cy, cz = np.floor(x / edge), np.floor(y / edge), np.floor(z / edge)
     fx, fy, fz = x - cx * edge, y - cy * edge, z - cz * edge
     inside = min(min(fx, edge - fx), min(fy, edge - fy), min(fz, edge - fz))
@@ -451,30 +447,14 @@ def _partner(patches, starts, pivot, edge, reach, point, normal, label):  # type
     return found
 
 
-@njit(cache=True, error_model="numpy")
-def _rotation(x, y, z):  # type: ignore[no-untyped-def]
-    """Rotation of a rotation vector [rad], row by row (9)."""
-    angle = np.sqrt(x * x + y * y + z * z)
-    a, b = 1.0, 0.5
-    if angle > 1e-6:
-        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / (angle * angle)
+@njit(cache=True, error_model="numpy", inline="always")
+def _moved(T, x, y, z, last):  # type: ignore[no-untyped-def]
+    """A point (last 1) or a direction (last 0) moved by a rigid transform (4, 4)."""
     return (
-        1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y,
-        b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x,
-        b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y),
-    )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def _turned(R, x, y, z):  # type: ignore[no-untyped-def]
-    """A vector (3) turned by a rotation (9)."""
-    return R[0] * x + R[1] * y + R[2] * z, R[3] * x + R[4] * y + R[5] * z, R[6] * x + R[7] * y + R[8] * z
-
-
-@njit(cache=True, error_model="numpy")
-def _turned_back(R, x, y, z):  # type: ignore[no-untyped-def]
-    """A vector (3) turned by the inverse of a rotation (9)."""
-    return R[0] * x + R[3] * y + R[6] * z, R[1] * x + R[4] * y + R[7] * z, R[2] * x + R[5] * y + R[8] * z
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3] * last,
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3] * last,
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3] * last,
+    )
 
 
 @njit(cache=True, error_model="numpy")

@@ -157,7 +157,7 @@ def _flattened(
     """
     sizes = np.bincount(side)
     tolerance = 1.5 * config.noise
-    planes, widths, heights = _fit_planes(np.ascontiguousarray(patches[:, :3]), side, len(sizes), tolerance)
+    planes, widths, heights = _fit_planes(patches[:, :3], side, tolerance)
     plane = planes[side]
     agreement = np.sum(plane * patches[:, 3:6], axis=1)
     lies_in = (np.abs(heights) < 2.0 * tolerance) & (np.abs(agreement) > MIN_COSINE)
@@ -170,75 +170,24 @@ def _flattened(
     return patches[keep], side[keep]
 
 
-@njit(cache=True, error_model="numpy")
-def _fit_planes(points, side, sides, flat):  # type: ignore[no-untyped-def]
+def _fit_planes(
+    points: Array, side: NDArray[np.intp], flat: float
+) -> tuple[Array, NDArray[np.float64], NDArray[np.float64]]:
     """Fit a plane to the points (N, 3) [m] of each side, robustly: those off it lose their weight.
 
     At the distance `flat` [m] from the plane a point counts a quarter. It gives each plane's normal (S, 3),
     the variance along the shorter direction in the plane (S,) [m²], and each point's height (N,) [m].
     """
-    weights, heights = np.ones(len(points)), np.empty(len(points))
+    weights = np.ones(len(points))
     for _ in range(4):
-        total, centres, spreads = np.zeros(sides), np.zeros((sides, 3)), np.zeros((sides, 6))
-        for i in range(len(points)):
-            total[side[i]] += weights[i]
-            for a in range(3):
-                centres[side[i], a] += weights[i] * points[i, a]
-        for s in range(sides):
-            total[s] = max(total[s], 1e-9)
-            for a in range(3):
-                centres[s, a] /= total[s]
-        for i in range(len(points)):
-            weight, centre, spread = weights[i], centres[side[i]], spreads[side[i]]
-            x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-            for n, (a, b) in enumerate(((x, x), (y, y), (z, z), (x, y), (x, z), (y, z))):
-                spread[n] += weight * a * b
-        normals, widths = _least_spreads(spreads)
-        for i in range(len(points)):
-            centre, normal = centres[side[i]], normals[side[i]]
-            x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
-            heights[i] = x * normal[0] + y * normal[1] + z * normal[2]
-            weights[i] = 1.0 / (1.0 + (heights[i] / flat) ** 2) ** 2
-    return normals, widths / total, heights
-
-
-@njit(cache=True, error_model="numpy")
-def _least_spreads(spreads):  # type: ignore[no-untyped-def]
-    """Direction (S, 3) of least spread, and the middle of the principal spreads (S,), by Jacobi rotations.
-
-    A spread is a row xx, yy, zz, xy, xz, yz; all are overwritten.
-    """
-    directions, middles = np.zeros((len(spreads), 3)), np.zeros(len(spreads))
-    for s in range(len(spreads)):
-        spread, axes = spreads[s], np.zeros((3, 3))
-        axes[0, 0] = axes[1, 1] = axes[2, 2] = 1.0
-        for turn in range(18):  # Six sweeps of three rotations: they converge quadratically.
-            # Of the axes p and q the rotation takes the product away; r is the third one.
-            r = 2 - turn % 3
-            p, q = (1 if r == 0 else 0), (1 if r == 2 else 2)
-            product = spread[2 + p + q]
-            if product == 0.0:
-                continue
-            cotangent = (spread[q] - spread[p]) / (2.0 * product)
-            tangent = 1.0 / (abs(cotangent) + np.sqrt(cotangent * cotangent + 1.0))
-            if cotangent < 0.0:
-                tangent = -tangent
-            cosine = 1.0 / np.sqrt(tangent * tangent + 1.0)
-            sine = tangent * cosine
-            spread[p] -= tangent * product
-            spread[q] += tangent * product
-            spread[2 + p + q] = 0.0
-            u, v = spread[2 + r + p], spread[2 + r + q]
-            spread[2 + r + p], spread[2 + r + q] = cosine * u - sine * v, sine * u + cosine * v
-            for a in range(3):
-                u, v = axes[a, p], axes[a, q]
-                axes[a, p], axes[a, q] = cosine * u - sine * v, sine * u + cosine * v
-        x, y, z = spread[0], spread[1], spread[2]
-        least = 0 if x <= y and x <= z else (1 if y <= z else 2)
-        middles[s] = max(min(x, y), min(max(x, y), z))
-        for a in range(3):
-            directions[s, a] = axes[a, least]
-    return directions, middles
+        total = np.bincount(side, weights)
+        centres = np.stack([np.bincount(side, weights * x) for x in points.T], axis=-1) / total[:, None]
+        off = points - centres[side]
+        products = [np.bincount(side, weights * off[:, a] * off[:, b]) for a in range(3) for b in range(3)]
+        spreads, axes = np.linalg.eigh(np.stack(products, axis=-1).reshape(-1, 3, 3))
+        heights = np.einsum("ni,ni->n", off, axes[side, :, 0])
+        weights = 1.0 / (1.0 + (heights / flat) ** 2) ** 2
+    return axes[:, :, 0], spreads[:, 1] / total, heights
 
 
 def even_sample(side: NDArray[np.intp], count: int) -> NDArray[np.intp]:

@@ -49,19 +49,7 @@ class ViewSphere:
         Returns:
             `T_world_camera` (M, 4, 4).
         """
-        forward = -directions
-        right = np.stack([forward[:, 1], -forward[:, 0], np.zeros(len(forward))], axis=-1)
-        vertical = np.linalg.norm(right, axis=-1) < 1e-6
-        if vertical.any():
-            right[vertical] = np.cross(forward[vertical], (1.0, 0.0, 0.0))
-        right = transforms.unit(right)
-        T_world_camera = np.zeros((len(directions), 4, 4))
-        T_world_camera[:, :3, 0] = right
-        T_world_camera[:, :3, 1] = np.cross(forward, right)
-        T_world_camera[:, :3, 2] = forward
-        T_world_camera[:, :3, 3] = self.centre_world + self.radius * directions
-        T_world_camera[:, 3, 3] = 1.0
-        return T_world_camera
+        return transforms.look_at(self.centre_world + self.radius * directions, self.centre_world)
 
     def direction_of(self, T_world_camera: Array) -> Array:
         """Unit vectors (..., 3) from the centre to cameras (..., 4, 4), wherever they are."""
