@@ -13,6 +13,7 @@ import pytest
 
 import caryatid as ct
 from caryatid.geometry.shapes import KINDS
+from caryatid.geometry.solids import Polytope, Solid
 from caryatid.geometry.transforms import look_at
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.manipulation.order import Order, TakeStep
@@ -59,6 +60,7 @@ def shown(scene, steps, views):
         "box": ct.Box(pose, np.array([0.1, 0.2, 0.0004])),
         "cylinder": ct.Cylinder(pose, 0.04, 0.2),
         "sphere": ct.Sphere(pose, 0.05),
+        "solid": Solid.of([Polytope.around(ct.Box(pose, np.array([0.1, 0.2, 0.05])).outline())]),
         "view": views[0],
         "view of depth": View(np.zeros((4, 6)), views[0].K),
         "cloud": scene.cloud,

@@ -323,7 +323,7 @@ def explore(
         step = explorer.look()
         if step.index + 1 < explorer.scene.config.active.max_views:
             step = explorer.plan()
-            reason = explorer.reason_to_stop() if early_stop else step.stop
+            reason = explorer.reason_to_stop() if early_stop and step.stop is None else None
         else:
             reason = _used_up(step.index + 1)
         if reason is not None:
