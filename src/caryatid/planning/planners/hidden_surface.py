@@ -75,18 +75,18 @@ def _expected_gain(
 ) -> tuple[Samples, Array]:
     """Samples, and what cameras (C, 4, 4) show of them anew (K, C)."""
     config = state.config
-    solid = state.voxels.solid([o.shape for o in state.graph.objects])
-    surfaces, points = surface_samples(state.graph, solid), relation_samples(relations)
+    opaque = state.voxels.opaque([o.shape for o in state.graph.objects])
+    surfaces, points = surface_samples(state.graph, opaque), relation_samples(relations)
     T_world_visited = state.sphere.poses(state.visited)
-    seen = visibility(join([surfaces, points]), T_world_visited, solid, config).max(axis=1, initial=0.0)
+    seen = visibility(join([surfaces, points]), T_world_visited, opaque, config).max(axis=1, initial=0.0)
     shares = unseen_shares(surfaces, seen[: len(surfaces.weights)])
     surfaces = replace(surfaces, weights=surfaces.weights * shares)
     # All relations' points of interest are worth a tenth of all the objects' surfaces.
     points = replace(points, weights=0.1 * points.weights)
-    space = space_samples(state.graph, solid)
+    space = space_samples(state.graph, opaque)
     samples = join([surfaces, points, space])
     before = np.concatenate([seen, np.zeros(len(space.weights))])
-    return samples, shown_anew(samples, before, T_world_camera, solid, config)
+    return samples, shown_anew(samples, before, T_world_camera, opaque, config)
 
 
 def _on_sphere(
