@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PerceptionError
@@ -127,22 +127,44 @@ def _with_whole_masks(view: View, jump: float) -> View:
         return view
     labels = np.where(view.valid, view.labels, np.int32(0))
     inverse_depth = np.divide(1.0, view.depth, out=np.zeros(view.depth.shape), where=view.valid)
-    # Between each two pixels is a place that is set where they are one surface.
-    height, width = labels.shape
-    joined = np.zeros((2 * height - 1, 2 * width - 1), dtype=np.bool_)
-    joined[::2, ::2] = labels > 0
-    for here, there, between in (
-        (np.s_[1:], np.s_[:-1], np.s_[1::2, ::2]),
-        (np.s_[:, 1:], np.s_[:, :-1], np.s_[::2, 1::2]),
-    ):
-        near = np.abs(inverse_depth[here] - inverse_depth[there]) <= jump
-        joined[between] = near & (labels[here] == labels[there]) & (labels[here] > 0)
-    body = ndimage.label(joined)[0][::2, ::2]
-    sizes, owner = np.bincount(body.ravel()), np.zeros(int(body.max()) + 1, dtype=np.int32)
-    owner[body] = labels
+    shown = np.flatnonzero(labels > 0)
+    owner = labels.ravel()[shown]
+    body = _bodies(labels, inverse_depth, jump).ravel()[shown]
+    sizes = np.bincount(body, minlength=1)
     largest = np.zeros(int(labels.max()) + 1)
-    np.maximum.at(largest, owner, sizes)
-    return replace(view, labels=np.where((sizes >= WHOLE * largest[owner])[body], labels, 0))
+    first = np.flatnonzero(sizes)
+    np.maximum.at(largest, labels.ravel()[first], sizes[first])
+    whole = np.zeros(labels.size, dtype=labels.dtype)
+    whole[shown] = np.where(sizes[body] >= WHOLE * largest[owner], owner, 0)
+    return replace(view, labels=whole.reshape(labels.shape))
+
+
+@njit(cache=True)
+def _bodies(labels, inverse_depth, jump):  # type: ignore[no-untyped-def]
+    """The first pixel (H, W), counted by rows, of the surface of one label (H, W) that each pixel is on.
+
+    Neighbours of one label are on one surface where 1/z (H, W) differs by no more than a jump [1/m].
+    """
+    height, width = labels.shape
+    first = np.arange(height * width)
+    for row, column in np.ndindex(height, width):
+        if labels[row, column] <= 0:
+            continue
+        for r, c in ((row - 1, column), (row, column - 1)):
+            if r < 0 or c < 0 or labels[r, c] != labels[row, column]:
+                continue
+            if abs(inverse_depth[r, c] - inverse_depth[row, column]) <= jump:
+                one, other = r * width + c, row * width + column
+                while first[one] != one:
+                    first[one] = first[first[one]]
+                    one = first[one]
+                while first[other] != other:
+                    first[other] = first[first[other]]
+                    other = first[other]
+                first[max(one, other)] = min(one, other)
+    for here in range(height * width):
+        first[here] = first[first[here]]
+    return first.reshape(height, width)
 
 
 def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.int32]:
