@@ -47,7 +47,7 @@ def test_what_was_taken_for_one_is_divided_and_the_view_relabelled(models):
 
 def test_later_parts_over_both_are_divided_among_the_known(models):
     models.fit_all(models.add(observation_of((1, 2)), 0))
-    again = models.associate(observation_of((7, 7), seed=1))
+    again = models.associate(observation_of((7, 7), seed=1), models.objects())
     assert set(np.unique(again.labels)) == {1, 2}
     assert (again.labels == observation_of((1, 2), seed=1).labels).mean() > 0.9
 

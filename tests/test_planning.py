@@ -82,10 +82,10 @@ OPEN = ROBOT.candidates(SPHERE)
 def known(*objects):
     """A map that has seen every voxel: the objects occupied, the rest free."""
     voxels = VoxelMap.around(SPHERE.centre_world, VoxelConfig())
-    opaque = voxels.opaque([o.shape for o in objects])
-    low = np.rint((opaque.origin_world - voxels.origin_world) / voxels.config.size).astype(int)
+    occluders = voxels.occluders([o.shape for o in objects])
+    low = np.rint((occluders.origin_world - voxels.origin_world) / voxels.config.size).astype(int)
     hits = np.zeros_like(voxels.hits)
-    hits[tuple(slice(a, a + n) for a, n in zip(low, opaque.grid.shape, strict=True))] = opaque.grid
+    hits[tuple(slice(a, a + n) for a, n in zip(low, occluders.grid.shape, strict=True))] = occluders.grid
     return VoxelMap(voxels.origin_world, hits, 1 - hits, voxels.config)
 
 
@@ -245,8 +245,8 @@ class TestCandidates:
 
 class TestExpectedVisibility:
     GRAPH = SupportGraph((TABLE, CUBE))
-    OPAQUE = known(TABLE, CUBE).opaque()
-    SAMPLES = surface_samples(GRAPH, OPAQUE)
+    OCCLUDERS = known(TABLE, CUBE).occluders()
+    SAMPLES = surface_samples(GRAPH, OCCLUDERS)
 
     def test_surfaces_in_contact_are_not_asked_for(self):
         samples = self.SAMPLES
@@ -255,17 +255,17 @@ class TestExpectedVisibility:
         assert samples.normals_world[:, 2].min() > -0.5, "the face on the table"
         assert samples.weights.sum() == pytest.approx(5.0 / 6.0, abs=0.01)
         flat = box(2, (0.0, 0.3, 0.76), (0.3, 0.2, 0.02))
-        both = surface_samples(SupportGraph((TABLE, CUBE, flat)), known(TABLE, CUBE, flat).opaque())
+        both = surface_samples(SupportGraph((TABLE, CUBE, flat)), known(TABLE, CUBE, flat).occluders())
         for subject, open_ in ((0, 5.0 / 6.0), (1, (0.06 + 0.02) / (0.12 + 0.02))):
             assert both.weights[both.subjects == subject].sum() == pytest.approx(open_ / 2.0, abs=0.05)
-        assert len(surface_samples(SupportGraph((TABLE,)), known(TABLE).opaque()).weights) == 0
+        assert len(surface_samples(SupportGraph((TABLE,)), known(TABLE).occluders()).weights) == 0
 
     def test_a_surface_is_seen_from_before_and_less_from_aside_and_not_from_behind(self):
-        samples, opaque = self.SAMPLES, self.OPAQUE
-        seen = visibility(samples, SPHERE.poses(HOME[None]), opaque, CONFIG)[:, 0]
+        samples, occluders = self.SAMPLES, self.OCCLUDERS
+        seen = visibility(samples, SPHERE.poses(HOME[None]), occluders, CONFIG)[:, 0]
         assert seen[samples.normals_world[:, 0] < -0.9].min() == 1.0
         assert seen[samples.normals_world[:, 0] > 0.9].max() == 0.0
-        low = visibility(samples, SPHERE.poses(direction(np.pi, np.deg2rad(10.0))[None]), opaque, CONFIG)[
+        low = visibility(samples, SPHERE.poses(direction(np.pi, np.deg2rad(10.0))[None]), occluders, CONFIG)[
             :, 0
         ]
         top = samples.normals_world[:, 2] > 0.9
@@ -275,15 +275,15 @@ class TestExpectedVisibility:
         assert (low[top] > 0.0).mean() > 0.5
         away = SPHERE.poses(HOME[None])
         away[0, :3, :3] = away[0, :3, :3] @ transforms.rotation_from_vector((0.0, np.deg2rad(45.0), 0.0))
-        assert visibility(samples, away, opaque, CONFIG).max() == 0.0, "outside the image"
+        assert visibility(samples, away, occluders, CONFIG).max() == 0.0, "outside the image"
 
     def test_walls_hide_but_where_occlusion_is_ignored(self):
         wall = box(2, (0.0, 0.10, 0.95), (0.5, 0.02, 0.4))
-        opaque = known(TABLE, CUBE, wall).opaque()
-        samples = surface_samples(self.GRAPH, opaque)
+        occluders = known(TABLE, CUBE, wall).occluders()
+        samples = surface_samples(self.GRAPH, occluders)
         beyond = SPHERE.poses(direction(np.pi / 2.0, np.deg2rad(35.0))[None])
         seen, through = (
-            visibility(samples, beyond, opaque, replace(CONFIG, occlusion=how))[:, 0]
+            visibility(samples, beyond, occluders, replace(CONFIG, occlusion=how))[:, 0]
             for how in ("invert", "ignore")
         )
         towards = samples.normals_world[:, 1] > 0.9
@@ -314,9 +314,9 @@ class TestExpectedVisibility:
         objects = [box(1, (0.1, 0.15, 0.8), (0.1, 0.06, 0.1), 40.0), box(2, (-0.1, 0.0, 0.85), (0.06,) * 3)]
         objects.append(box(3, (0.1, -0.15, 0.79), (0.08, 0.08, 0.08)))
         graph = SupportGraph((table, *objects))
-        opaque = half_known(seen_in_a_corner, table, *objects).opaque([o.shape for o in objects])
-        samples = space_samples(graph, opaque)
-        low, high = space_above(graph, opaque.voxels)
+        occluders = half_known(seen_in_a_corner, table, *objects).occluders([o.shape for o in objects])
+        samples = space_samples(graph, occluders)
+        low, high = space_above(graph, occluders.voxels)
         heap = Delaunay(np.concatenate([o.shape.outline()[:, :2] for o in objects]))
         wanted, total, total_in_heap = {}, 0.0, 0.0
         for point in np.stack(
@@ -327,7 +327,7 @@ class TestExpectedVisibility:
                 worth = 1.0 - (point[2] - low[2]) / (high[2] - low[2])
                 inside = heap.find_simplex(point[:2]) >= 0
                 total, total_in_heap = total + worth, total_in_heap + worth * inside
-                if opaque.voxels.state_at(point[None]) == UNKNOWN and not opaque.holds(point[None]):
+                if occluders.voxels.state_at(point[None]) == UNKNOWN and not occluders.holds(point[None]):
                     wanted[tuple(point.round(6))] = (worth, worth * inside)
         found = {tuple(p.round(6)): w for p, w in zip(samples.points_world, samples.weights, strict=True)}
         assert found.keys() == wanted.keys()
@@ -336,8 +336,8 @@ class TestExpectedVisibility:
         assert 0.1 < sum(b > 0.0 for _, b in wanted.values()) / len(wanted) < 0.9
         assert samples.names == (SPACE,)
         assert not samples.normals_world.any()
-        assert len(space_samples(self.GRAPH, self.OPAQUE).weights) == 0, "all has been seen"
-        assert space_samples(SupportGraph((TABLE,)), self.OPAQUE).names == ()
+        assert len(space_samples(self.GRAPH, self.OCCLUDERS).weights) == 0, "all has been seen"
+        assert space_samples(SupportGraph((TABLE,)), self.OCCLUDERS).names == ()
 
 
 def seen_in_a_corner(x, y, z):
@@ -481,19 +481,19 @@ def worked_out():
     )
     now = state(objects, (Support("o0", "o1", occurrences=3),), visited=VISITED, inhibition=0.5)
     now = replace(now, voxels=half_known(seen_in_a_corner, TABLE, *objects))
-    opaque = now.voxels.opaque([o.shape for o in now.graph.objects])
+    occluders = now.voxels.occluders([o.shape for o in now.graph.objects])
     relations = points_of_interest(now.graph, SPHERE, VISITED, now.config)
     relations += points_of_doubt(now.graph, SPHERE, VISITED)
-    surfaces, space = surface_samples(now.graph, opaque), space_samples(now.graph, opaque)
+    surfaces, space = surface_samples(now.graph, occluders), space_samples(now.graph, occluders)
     judged = OPEN.T_world_camera[OPEN.looks(COUNT).chosen]
     gains = []
     for samples in (surfaces, relation_samples(relations), space):
-        seen = visibility(samples, SPHERE.poses(VISITED), opaque, now.config).max(axis=1)
+        seen = visibility(samples, SPHERE.poses(VISITED), occluders, now.config).max(axis=1)
         left = [1.0 - seen[samples.subjects == k].mean() for k in range(len(samples.names))]
         weights = samples.weights * (np.array(left)[samples.subjects] if samples is surfaces else 0.1)
         if samples is space:
             seen, weights = np.zeros_like(seen), samples.weights
-        new = np.maximum(visibility(samples, judged, opaque, now.config) - seen[:, None], 0.0)
+        new = np.maximum(visibility(samples, judged, occluders, now.config) - seen[:, None], 0.0)
         gains.append((samples, new * weights[:, None]))
     return decide("support", now), now.config, gains, len(relations)
 

@@ -193,8 +193,8 @@ def test_a_scene_is_the_same_bytes_on_any_number_of_threads(segmentation):
             scene = model_of(
                 [replace(view, normals_camera=None) for view in views], segmentation=segmentation
             )
-            opaque = scene.voxels.opaque([o.shape for o in scene.graph.objects])
-            arrays = (scene.labels, scene.cloud.points_world, scene.T_world_camera, opaque.grid)
+            occluders = scene.voxels.occluders([o.shape for o in scene.graph.objects])
+            arrays = (scene.labels, scene.cloud.points_world, scene.T_world_camera, occluders.grid)
             texts.append([graph_text(scene.graph), *(array.tobytes() for array in arrays)])
     finally:
         numba.set_num_threads(before)

@@ -24,8 +24,8 @@ def test_a_new_map_knows_nothing():
     assert voxels.states.shape == (40, 40, 30)
     assert (voxels.states == UNKNOWN).all()
     np.testing.assert_allclose(voxels.origin_world, (-0.3, -0.2, 0.1))
-    assert not voxels.opaque().blocked(np.zeros((2, 3)), np.ones((3, 3)), 0.0).any()
-    assert not voxels.opaque().holds(np.zeros((2, 3))).any()
+    assert not voxels.occluders().blocked(np.zeros((2, 3)), np.ones((3, 3)), 0.0).any()
+    assert not voxels.occluders().holds(np.zeros((2, 3))).any()
 
 
 def test_a_view_clears_its_rays_and_fills_their_ends():
@@ -54,7 +54,7 @@ def test_a_surface_survives_depth_noise_and_a_registration_error():
     y, z = np.meshgrid(np.linspace(-0.3, 0.3, 31), np.linspace(-0.15, 0.3, 21))
     points = np.column_stack([np.full(y.size, -0.25), y.ravel(), z.ravel()])
     targets = np.array([[0.4, 0.0, 0.0]])
-    assert voxels.opaque().blocked(points, targets, 0.0).all(), "there is a hole in the wall"
+    assert voxels.occluders().blocked(points, targets, 0.0).all(), "there is a hole in the wall"
     assert (voxels.state_at(points) == FREE).all()
 
 
@@ -79,23 +79,23 @@ def test_evidence_does_not_overflow():
 
 def test_lines_of_sight_stop_at_what_is_solid_and_leave_the_clearance_out():
     box = Box(transforms.rigid(np.eye(3), (0.0, 0.0, 0.0)), np.array([0.1, 0.1, 0.1]))
-    opaque = VoxelMap.around((0.0, 0.0, 0.0), CONFIG).opaque([box])
+    occluders = VoxelMap.around((0.0, 0.0, 0.0), CONFIG).occluders([box])
     points = np.array([[-0.2, 0.0, 0.0], [0.0, 0.0, 0.0]])
     targets = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [-0.2, 0.0, 1.0]])
-    assert opaque.blocked(points, targets, 0.0).tolist() == [[True, False, False], [True, True, True]]
-    assert opaque.blocked(points, targets, 0.12).tolist() == [[True, False, False], [False, False, False]]
+    assert occluders.blocked(points, targets, 0.0).tolist() == [[True, False, False], [True, True, True]]
+    assert occluders.blocked(points, targets, 0.12).tolist() == [[True, False, False], [False, False, False]]
 
 
 def test_shapes_are_solid_inside_and_only_there():
     ball = Sphere(transforms.rigid(np.eye(3), (0.38, 0.0, 0.1)), 0.1)
     voxels = VoxelMap.around((0.0, 0.0, 0.0), CONFIG)
-    opaque = voxels.opaque([ball])
+    occluders = voxels.occluders([ball])
     centres = voxels.centres_world(np.argwhere(voxels.states == UNKNOWN))
-    inside = opaque.holds(centres)
+    inside = occluders.holds(centres)
     assert inside.sum() > 100
     np.testing.assert_array_equal(inside, ball.signed_distance(centres) < 0.0)
     outside = Sphere(transforms.rigid(np.eye(3), (3.0, 0.0, 0.1)), 0.1)
-    assert not VoxelMap.around((0.0, 0.0, 0.0), CONFIG).opaque([outside]).grid.any()
+    assert not VoxelMap.around((0.0, 0.0, 0.0), CONFIG).occluders([outside]).grid.any()
 
 
 def test_what_was_never_hit_is_not_occupied_however_misses_count():
@@ -103,4 +103,4 @@ def test_what_was_never_hit_is_not_occupied_however_misses_count():
     hits[2], passes[1:] = 1, 9
     voxels = VoxelMap(np.zeros(3), hits, passes, VoxelConfig(miss=0.5))
     assert voxels.states.ravel().tolist() == [UNKNOWN, FREE, OCCUPIED]
-    assert voxels.opaque().grid.shape == (1, 1, 1)
+    assert voxels.occluders().grid.shape == (1, 1, 1)

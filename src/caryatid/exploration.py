@@ -239,7 +239,7 @@ class Explorer:
         refused = refusal_of(robot, T_world_camera)
         if refused is not None:
             raise PlanningError(refused.reason)
-        decision = decision.by_way_of(waypoints_of(robot, T_world_camera))
+        decision = decision.with_waypoints(waypoints_of(robot, T_world_camera))
         self.step = replace(self._newest(), decision=decision, stop=None)
         return self.step
 
@@ -407,7 +407,7 @@ def _decide(
         refused = refusal_of(robot, decision.T_world_camera)
         if refused is None:
             waypoints = waypoints_of(robot, decision.T_world_camera)
-            return decision.by_way_of(waypoints), state.candidates
+            return decision.with_waypoints(waypoints), state.candidates
         why = refused.reason
         state = replace(state, candidates=state.candidates.without(decision.index, why))
     raise PlanningError(f"the robot could take none of {ATTEMPTS} views: {why}")

@@ -159,10 +159,10 @@ class Scene(Pictured):
         observation, moved = self._registered(observation, named)
         watch.lap("register")
         if not named and (given or self.config.fusion.method != "sg"):
-            # Single views are fitted alone; what is known of the objects is fused then.
-            alone = self.config.fusion.method == "sg"
-            fused = [o for o in self.graph.objects if o.role == "object"] if alone else None
-            observation = self._models.associate(observation, fused, masks=given)
+            known = self._models.objects()
+            if self.config.fusion.method == "sg":  # its models have the newest view's objects alone
+                known = [o for o in self.graph.objects if o.role == "object"]
+            observation = self._models.associate(observation, known, masks=given)
         if named and self.views:
             self._check_identity(observation, source.name)
         shown = self._models.add(observation, self.views) | moved

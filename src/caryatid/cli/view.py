@@ -81,10 +81,12 @@ class View(options.ExploringCommand):
         from caryatid.viewer.loop import LoopPage
 
         shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
-        opening = partial(open_source, self.source, noise=self.noise, robot=self.robot, **shared)
+        masks = self.settings.mask_source(config)
+        given: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
+        opening = partial(open_source, self.source, **given, **shared)
         shared |= {"planner": self.chosen_planner, "host": self.host, "port": self.port}
         with self.output.working("opening"):
-            page = LoopPage(opening, config, masks=self.settings.mask_source(config), **shared)
+            page = LoopPage(opening, config, masks=masks, **shared)
         page.start()
         return page
 

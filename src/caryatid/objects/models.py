@@ -188,13 +188,13 @@ class ObjectModels:
         return other
 
     def associate(
-        self, observation: Observation, known: Sequence[SceneObject] | None = None, *, masks: bool = False
+        self, observation: Observation, known: Sequence[SceneObject], *, masks: bool = False
     ) -> Observation:
         """Give a view's segments the labels of the objects they belong to, or new ones.
 
         Args:
             observation: The view.
-            known: The objects as far as they are known; None = as they are fitted here.
+            known: The objects so far.
             masks: Its segments are given; two of one view are two objects for good.
         """
         points, labels = observation.cloud.points_world, observation.labels
@@ -207,7 +207,7 @@ class ObjectModels:
             points,
             segments,
             {k: self.points.of(k).points_world for k in self.points.objects},
-            {o.label: o.shape for o in (self.objects() if known is None else known)},
+            {o.label: o.shape for o in known},
             self._config.segmentation,
             self.points.labels_used,
             masks=masks,

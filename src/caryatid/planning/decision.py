@@ -95,7 +95,7 @@ class Decision(Pictured):
     sphere_saliency: PaintedLate = PaintedLate()
     waypoints: tuple[Posture, ...] = ()
 
-    def by_way_of(self, waypoints: tuple[Posture, ...]) -> Decision:
+    def with_waypoints(self, waypoints: tuple[Posture, ...]) -> Decision:
         """Return the same decision with the way there; its picture stays unpainted."""
         decision = copy.copy(self)
         object.__setattr__(decision, "waypoints", waypoints)

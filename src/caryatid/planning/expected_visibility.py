@@ -14,7 +14,7 @@ from caryatid.geometry.polygons import hull
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.points_of_interest import PointOfInterest
-from caryatid.sensing.voxel_map import UNKNOWN, Opaque, VoxelMap
+from caryatid.sensing.voxel_map import UNKNOWN, Occluders, VoxelMap
 from caryatid.support.stability import ground_outline
 
 SPACE = "unseen space"
@@ -56,14 +56,14 @@ def join(parts: Sequence[Samples]) -> Samples:
     )
 
 
-def surface_samples(graph: SupportGraph, opaque: Opaque) -> Samples:
+def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
     """Spread points over the objects' surfaces; together they weigh 1.
 
     Every object weighs the same, small or large: each is one vertex of the graph. What touches another
     shape or the table can never be seen and is left out.
     """
     objects = [o for o in graph.objects if o.role == "object"]
-    size = opaque.voxels.config.size
+    size = occluders.voxels.config.size
     x, y, z = np.array([o.shape.extents for o in objects]).reshape(-1, 3).T
     areas = 2.0 * (x * y + y * z + z * x)
     spacings = np.maximum(np.sqrt(areas * len(objects) / SURFACE_SAMPLES), size)
@@ -72,7 +72,7 @@ def surface_samples(graph: SupportGraph, opaque: Opaque) -> Samples:
     points, normals = map(np.concatenate, zip((nothing, nothing), *surfaces, strict=True))
     counts = np.array([len(found) for found, _ in surfaces], dtype=np.intp)
     subjects = np.repeat(np.arange(len(objects)), counts)
-    open_ = np.flatnonzero(~opaque.holds(points + 1.5 * size * normals))
+    open_ = np.flatnonzero(~occluders.holds(points + 1.5 * size * normals))
     subjects = subjects[open_]
     weights = (1.0 / (len(objects) * counts))[subjects]
     return Samples(points[open_], normals[open_], weights, subjects, tuple(o.id for o in objects))
@@ -101,7 +101,7 @@ def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | 
     return None if (high <= low).any() else (low, high)
 
 
-def space_samples(graph: SupportGraph, opaque: Opaque) -> Samples:
+def space_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
     """Spread points, four voxels apart, over the unseen space on the table, where something may stand.
 
     Space counts up to the height of the highest object, fully at the table and less the higher it is: what
@@ -109,11 +109,11 @@ def space_samples(graph: SupportGraph, opaque: Opaque) -> Samples:
     space among the objects, over the convex hull of their outlines, weighs 1 beside, as much as all their
     surfaces: what holds up a heap, or leans on it, is in there.
     """
-    table, corners = graph.support_surface, space_above(graph, opaque.voxels)
+    table, corners = graph.support_surface, space_above(graph, occluders.voxels)
     if table is None or corners is None:
         return relation_samples(())
     low, high = corners
-    spacing = 4.0 * opaque.voxels.config.size
+    spacing = 4.0 * occluders.voxels.config.size
     lattice = np.meshgrid(*(np.arange(a, b, spacing) for a, b in zip(low, high, strict=True)))
     points = np.stack(lattice, axis=-1).reshape(-1, 3)
     T, half = table.shape.T_world_object, table.shape.extents / 2.0
@@ -124,7 +124,7 @@ def space_samples(graph: SupportGraph, opaque: Opaque) -> Samples:
     shapely.prepare(heap)
     worth = 1.0 - (points[:, 2] - low[2]) / (high[2] - low[2])
     worth_in_heap = np.where(shapely.contains_xy(heap, points[:, :2]), worth, 0.0)
-    unseen = (opaque.voxels.state_at(points) == UNKNOWN) & ~opaque.holds(points)
+    unseen = (occluders.voxels.state_at(points) == UNKNOWN) & ~occluders.holds(points)
     on_table, in_heap = (w[unseen] / max(float(w.sum()), 1e-9) for w in (worth, worth_in_heap))
     anywhere, one_subject = np.zeros((len(on_table), 3)), np.zeros(len(on_table), dtype=np.intp)
     return Samples(points[unseen], anywhere, SPACE_WEIGHT * on_table + in_heap, one_subject, (SPACE,))
@@ -139,14 +139,16 @@ def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
     return Samples(positions, np.zeros_like(positions), weights, np.arange(len(points)), names)
 
 
-def visibility(samples: Samples, T_world_camera: Array, opaque: Opaque, config: ActiveVisionConfig) -> Array:
+def visibility(
+    samples: Samples, T_world_camera: Array, occluders: Occluders, config: ActiveVisionConfig
+) -> Array:
     """How well each camera (T, 4, 4) sees each sample: (K, T) from 0 hidden to 1."""
     alike = replace(samples, weights=np.ones_like(samples.weights))
-    return shown_anew(alike, np.zeros_like(samples.weights), T_world_camera, opaque, config)
+    return shown_anew(alike, np.zeros_like(samples.weights), T_world_camera, occluders, config)
 
 
 def shown_anew(
-    samples: Samples, before: Array, T_world_camera: Array, opaque: Opaque, config: ActiveVisionConfig
+    samples: Samples, before: Array, T_world_camera: Array, occluders: Occluders, config: ActiveVisionConfig
 ) -> Array:
     """Worth (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).
 
@@ -156,10 +158,12 @@ def shown_anew(
     followed where they could show nothing new; `before` is from 0 to 1.
     """
     if config.occlusion == "ignore":
-        opaque = replace(opaque, grid=np.zeros((0, 0, 0), dtype=np.uint8))
+        occluders = replace(occluders, grid=np.zeros((0, 0, 0), dtype=np.uint8))
     points, eyes, axes = samples.points_world, T_world_camera[:, :3, 3], T_world_camera[:, :3, 2]
-    clearance, cone = 2.5 * opaque.voxels.config.size, float(np.cos(np.deg2rad(config.view_cone)))
-    return opaque.shown(points, samples.normals_world, before, samples.weights, eyes, axes, clearance, cone)
+    clearance, cone = 2.5 * occluders.voxels.config.size, float(np.cos(np.deg2rad(config.view_cone)))
+    return occluders.shown(
+        points, samples.normals_world, before, samples.weights, eyes, axes, clearance, cone
+    )
 
 
 def unseen_shares(samples: Samples, seen: Array) -> Array:

@@ -108,7 +108,7 @@ class VoxelMap:
         for_each(_count_marks, SHARES, (self.hits, self.passes, hits, passes))
         return VoxelMap(self.origin_world, hits, passes, config)
 
-    def opaque(self, shapes: Sequence[Shape] = ()) -> Opaque:
+    def occluders(self, shapes: Sequence[Shape] = ()) -> Occluders:
         """What blocks lines of sight: the voxels seen occupied, and everything inside the shapes.
 
         Args:
@@ -134,7 +134,7 @@ class VoxelMap:
                 grid[tuple(index[inside].T)] = 1
                 high[number] = low[number]
         for_each(_fill_layer, len(grid), (*arrays, low, high, grid, origin_world, size))
-        return Opaque(origin_world, grid, self)
+        return Occluders(origin_world, grid, self)
 
     def cut(self, low_world: Array, high_world: Array) -> VoxelMap:
         """Return the part of the map whose voxels lie, all or in part, between two corners (3,) [m]."""
@@ -155,12 +155,12 @@ class VoxelMap:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class Opaque:
+class Occluders:
     """What stands in the way of looks.
 
     Attributes:
         origin_world: Corner (3,) [m] of voxel [0, 0, 0] of the grid.
-        grid: 1 where a voxel is opaque (X, Y, Z), 0 elsewhere; outside nothing is.
+        grid: 1 where a voxel hides what is behind it (X, Y, Z), 0 elsewhere; outside nothing is.
         voxels: The map it is of.
     """
 
@@ -169,9 +169,9 @@ class Opaque:
     voxels: VoxelMap
 
     def holds(self, points_world: Array) -> NDArray[np.bool_]:
-        """Whether points (N, 3) [m] lie in opaque voxels (N,)."""
-        opaque = self.grid.view(np.int8)
-        return _values_at(opaque, points_world, self.origin_world, self.voxels.config.size) > 0
+        """Whether points (N, 3) [m] lie in such voxels (N,)."""
+        occluders = self.grid.view(np.int8)
+        return _values_at(occluders, points_world, self.origin_world, self.voxels.config.size) > 0
 
     def blocked(self, points_world: Array, targets_world: Array, clearance: float) -> NDArray[np.bool_]:
         """Test lines of sight.
@@ -179,7 +179,7 @@ class Opaque:
         Args:
             points_world: Points of interest (P, 3) [m].
             targets_world: Camera positions (T, 3) [m].
-            clearance: Opaque voxels this near to the point do not count [m]: its own surface.
+            clearance: Occluding voxels this near to the point do not count [m]: its own surface.
 
         Returns:
             (P, T), True where something stands between.
@@ -218,11 +218,11 @@ class Opaque:
         Returns:
             (P, C): weight · (how well it is shown − how well before), 0 where that is less.
         """
-        opaque = (self.grid, self.origin_world, 1.0 / self.voxels.config.size)
+        occluders = (self.grid, self.origin_world, 1.0 / self.voxels.config.size)
         samples = (np.ascontiguousarray(points_world), normals_world, before, weights)
         cameras = (np.ascontiguousarray(eyes_world.T), np.ascontiguousarray(axes_world.T))
         worth = np.empty((len(points_world), len(eyes_world)))
-        for_each(_show, SHARES, (*opaque, *samples, *cameras, float(clearance), cone, worth))
+        for_each(_show, SHARES, (*occluders, *samples, *cameras, float(clearance), cone, worth))
         return worth
 
 
@@ -322,8 +322,8 @@ def _fill_layer(i, data):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy")
 def _show(share, data):  # type: ignore[no-untyped-def]
     """Write the worth of a share of the work: each piece is one point and 128 of the cameras."""
-    opaque, worth = data[0], data[-1]
-    found, count = room(opaque.shape), worth.shape[1]
+    occluders, worth = data[0], data[-1]
+    found, count = room(occluders.shape), worth.shape[1]
     across = (count + 127) // 128
     for piece in range(share, len(worth) * across, SHARES):
         p, first = piece // across, piece % across * 128
@@ -352,8 +352,8 @@ def _face(data, p, first, end):  # type: ignore[no-untyped-def]
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _hide(data, found, p, first, end):  # type: ignore[no-untyped-def]
     """Set to nought what cameras would show of one point but for what is in between."""
-    opaque, origin, per_metre, points, _, _, _, eyes, _, clearance, _, worths = data
-    shape, flat, worth = opaque.shape, opaque.reshape(-1), worths[p]
+    occluders, origin, per_metre, points, _, _, _, eyes, _, clearance, _, worths = data
+    shape, flat, worth = occluders.shape, occluders.reshape(-1), worths[p]
     x, y, z = points[p, 0], points[p, 1], points[p, 2]
     start = ((x - origin[0]) * per_metre, (y - origin[1]) * per_metre, (z - origin[2]) * per_metre)
     for n in range(first, end):

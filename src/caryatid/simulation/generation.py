@@ -89,15 +89,7 @@ def generate(
 
 def _pile(rng: np.random.Generator, size: int) -> _Plan:
     """Seven in ten objects are set down on another one, the others anywhere on the table."""
-
-    def draw(scene: SimulatedScene | None) -> _Drop:
-        shape = _upright(rng)
-        if scene is None or rng.random() >= 0.7:
-            half = np.array(TABLE_SIZE) / 2.0 - 0.06
-            return _let_go(shape, rng.uniform(-half, half), scene), False
-        return _on_another(rng, shape, scene), True
-
-    return _Plan(draw)
+    return _stacked(rng, _upright, 0.06)
 
 
 def _dense(rng: np.random.Generator, size: int) -> _Plan:
@@ -141,11 +133,16 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
 
 def _house(rng: np.random.Generator, size: int) -> _Plan:
     """Seven in ten things are set down on another one, or in it, the others anywhere on the table."""
+    return _stacked(rng, thing, 0.12)
+
+
+def _stacked(rng: np.random.Generator, make: Callable[[np.random.Generator], Shape], margin: float) -> _Plan:
+    """Seven in ten shapes are set down on another one, the others on the table, a margin [m] off its edge."""
 
     def draw(scene: SimulatedScene | None) -> _Drop:
-        shape = thing(rng)
+        shape = make(rng)
         if scene is None or rng.random() >= 0.7:
-            half = np.array(TABLE_SIZE) / 2.0 - 0.12
+            half = np.array(TABLE_SIZE) / 2.0 - margin
             return _let_go(shape, rng.uniform(-half, half), scene), False
         return _on_another(rng, shape, scene), True
 

@@ -75,18 +75,18 @@ def _expected_gain(
 ) -> tuple[Samples, Array]:
     """Samples, and what cameras (C, 4, 4) show of them anew (K, C)."""
     config = state.config
-    opaque = state.voxels.opaque([o.shape for o in state.graph.objects])
-    surfaces, points = surface_samples(state.graph, opaque), relation_samples(relations)
+    occluders = state.voxels.occluders([o.shape for o in state.graph.objects])
+    surfaces, points = surface_samples(state.graph, occluders), relation_samples(relations)
     T_world_visited = state.sphere.poses(state.visited)
-    seen = visibility(join([surfaces, points]), T_world_visited, opaque, config).max(axis=1, initial=0.0)
+    seen = visibility(join([surfaces, points]), T_world_visited, occluders, config).max(axis=1, initial=0.0)
     shares = unseen_shares(surfaces, seen[: len(surfaces.weights)])
     surfaces = replace(surfaces, weights=surfaces.weights * shares)
     # All relations' points of interest are worth a tenth of all the objects' surfaces.
     points = replace(points, weights=0.1 * points.weights)
-    space = space_samples(state.graph, opaque)
+    space = space_samples(state.graph, occluders)
     samples = join([surfaces, points, space])
     before = np.concatenate([seen, np.zeros(len(space.weights))])
-    return samples, shown_anew(samples, before, T_world_camera, opaque, config)
+    return samples, shown_anew(samples, before, T_world_camera, occluders, config)
 
 
 def _on_sphere(

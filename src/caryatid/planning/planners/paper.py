@@ -83,7 +83,7 @@ def _hidden(points: list[PointOfInterest], state: PlanningState) -> NDArray[np.b
     directions = np.array([p.direction for p in points]).reshape(-1, 3)
     eyes_world = state.sphere.centre_world + state.sphere.radius * directions
     # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
-    return np.diag(state.voxels.opaque().blocked(positions, eyes_world, 0.05))
+    return np.diag(state.voxels.occluders().blocked(positions, eyes_world, 0.05))
 
 
 def _on_sphere(

@@ -94,4 +94,4 @@ def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[
     positions = np.stack([p.position_world for p in points])
     # The line of sight leaves the neighbourhood of its point first: 5 cm, half a common object.
     eyes_world = state.candidates.T_world_camera[:, :3, 3]
-    return state.voxels.opaque().blocked(positions, eyes_world, 0.05).T
+    return state.voxels.occluders().blocked(positions, eyes_world, 0.05).T
