@@ -293,9 +293,11 @@ def _ray(depth_image, K, R, u, v):  # type: ignore[no-untyped-def]
 def _count_marks(share, data):  # type: ignore[no-untyped-def]
     """Turn the marks in a share of the map into counts, at most 255; no ray passes where one ends."""
     hits, passes, new_hits, new_passes = data
-    hits, passes = hits.reshape(-1), passes.reshape(-1)
-    new_hits, new_passes = new_hits.reshape(-1), new_passes.reshape(-1)
-    for n in range(share * len(hits) // SHARES, (share + 1) * len(hits) // SHARES):
+    low, high = share * hits.size // SHARES, (share + 1) * hits.size // SHARES
+    # Slices of their own let the compiler count many voxels at once.
+    hits, passes = hits.reshape(-1)[low:high], passes.reshape(-1)[low:high]
+    new_hits, new_passes = new_hits.reshape(-1)[low:high], new_passes.reshape(-1)[low:high]
+    for n in range(len(hits)):
         hit, passed = new_hits[n], new_passes[n]
         new_hits[n] = hits[n] + np.uint8((hit > 0) & (hits[n] < 255))
         new_passes[n] = passes[n] + np.uint8((passed > hit) & (passes[n] < 255))
