@@ -130,3 +130,16 @@ def test_what_gives_no_masks_is_refused(tmp_path, channels, capsys):
         mask_source(other, Config())
     assert run_command("config", "--masks", "onnx:model.onnx") == 1
     assert "takes no views" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "said"),
+    [
+        ("recording", ("--segmentation", "auto"), "--segmentation auto uses none"),
+        ("table.pcd", (), "is a cloud, which has no image for masks"),
+    ],
+)
+def test_masks_that_would_not_be_used_are_refused(tmp_path, capsys, source, options, said):
+    given = ("--masks", tmp_path, *options, "--out", tmp_path / "run")
+    assert run_command("extract", tmp_path / source, *given) == 1
+    assert said in capsys.readouterr().err

@@ -139,12 +139,16 @@ def extract(
         masks: Gives views their masks, or None to take them as they come.
 
     Raises:
-        InputError: It is neither, or broken, or has no labels where they are demanded.
+        InputError: It is neither, or broken, or has no labels where they are demanded; or masks are to be
+            given to a cloud.
     """
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if Path(source).suffix.lower() not in CLOUD_SUFFIXES:
         recording = open_recording(source, config, segmentation, masks)
         return (explorer.look(frame.load()) for frame in recording.frames)
+    if masks is not None:
+        remedy = "leave --masks out; labels of a cloud are its field label"
+        raise InputError(source, "is a cloud, which has no image for masks", remedy)
     stored, use_labels = read_stored_cloud(source, label_divisor), segmentation != "auto"
     if segmentation == "labels" and stored.labels is None:
         raise InputError(source, "has no field label", "use --segmentation auto")

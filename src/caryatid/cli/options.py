@@ -177,16 +177,6 @@ class Modelling(Settings):
         """The model or folder that gives the masks, or None."""
         return None if self.masks in (None, *get_args(MaskIdentity)) else self.masks
 
-    def mask_source(self, config: Config) -> MaskSource | None:
-        """What gives views their masks, or None.
-
-        Raises:
-            InputError: The model or folder is missing or broken.
-        """
-        from caryatid.io.mask_sources import mask_source
-
-        return None if self.masks_from is None else mask_source(self.masks_from, config, self.seed)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
@@ -211,6 +201,22 @@ class LookingCommand(Command):
         SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels where there are any")
     ] = None
     """Use the masks or labels of the views, or segment automatically."""
+
+    def mask_source(self, config: Config) -> MaskSource | None:
+        """What gives views their masks, or None.
+
+        Raises:
+            InputError: The model or folder is missing or broken, or its masks would not be used.
+        """
+        from caryatid.io.mask_sources import mask_source
+
+        settings = self.settings
+        if settings.masks_from is None:
+            return None
+        if self.segmentation == "auto":
+            reason = "gives masks, and --segmentation auto uses none"
+            raise InputError(f"--masks {settings.masks}", reason, "leave one of the two out")
+        return mask_source(settings.masks_from, config, settings.seed)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -79,7 +79,7 @@ class Exploring(options.ExploringCommand):
 
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         with self.output.working("opening"):
-            masks = self.settings.mask_source(config)
+            masks = self.mask_source(config)
             options: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
             source = open_source(self.source, config, **options, **known)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
@@ -171,7 +171,7 @@ class Extract(RunCommand, options.LookingCommand):
                 segmentation=self.segmentation,
                 seed=self.settings.seed,
                 label_divisor=self.label_divisor,
-                masks=self.settings.mask_source(config),
+                masks=self.mask_source(config),
             )
         return Path(self.source).name, None, steps
 

@@ -81,7 +81,7 @@ class View(options.ExploringCommand):
         from caryatid.viewer.loop import LoopPage
 
         shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
-        masks = self.settings.mask_source(config)
+        masks = self.mask_source(config)
         given: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
         opening = partial(open_source, self.source, **given, **shared)
         shared |= {"planner": self.chosen_planner, "host": self.host, "port": self.port}
