@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -9,13 +10,18 @@ import onnx
 import pytest
 from conftest import run_command
 from onnx import TensorProto, helper
-from synthetic import simulated_views
+from synthetic import AROUND, SENSOR, look_from, simulated_scene, simulated_views
 
 from caryatid.config import Config
 from caryatid.errors import InputError
+from caryatid.io.bop import read_recording, write_recording
+from caryatid.io.graph_json import graph_text
 from caryatid.io.images import png
 from caryatid.io.mask_sources import mask_source
+from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
+from caryatid.sessions import Session
+from caryatid.simulation.camera import SimulatedCamera
 from caryatid.steps import read_run
 
 HEIGHT, WIDTH = 90, 120
@@ -143,3 +149,61 @@ def test_masks_that_would_not_be_used_are_refused(tmp_path, capsys, source, opti
     given = ("--masks", tmp_path, *options, "--out", tmp_path / "run")
     assert run_command("extract", tmp_path / source, *given) == 1
     assert said in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def with_arm(tmp_path_factory):
+    """A folder with a recording near a tower, the same with an arm in front of the camera, and its mask."""
+    folder = tmp_path_factory.mktemp("arm")
+    camera = SimulatedCamera(simulated_scene("tower"), sensor=SENSOR)
+    views = [camera.capture(look_from(azimuth, 45.0, 0.9)) for azimuth in AROUND]
+    views = [replace(view, labels=None, normals_camera=None) for view in views]
+    arm = np.zeros(views[0].depth.shape, dtype=np.uint8)
+    arm[126:, 96:156] = 255
+    write_recording(folder / "clean", views)
+    write_recording(folder / "arm", [replace(v, depth=np.where(arm, 0.6, v.depth)) for v in views])
+    (folder / "masks").mkdir()
+    for name in ("mask", "masks/000000", "masks/000001", "masks/000002"):
+        (folder / f"{name}.png").write_bytes(png(arm))
+    (folder / "small.png").write_bytes(png(arm[:90]))
+    return folder
+
+
+def test_the_robots_own_arm_is_no_object(with_arm, tmp_path, capsys):
+    def objects(recording, *options):
+        out = ("--no-report", "--quiet", "--out", tmp_path / "run")
+        assert run_command("extract", with_arm / recording, *options, *out) == 0
+        return len(read_run(tmp_path / "run").graph.objects)
+
+    without = objects("clean")
+    assert objects("arm") > without
+    assert objects("arm", "--ignore", with_arm / "mask.png") == without
+    assert objects("arm", "--ignore", with_arm / "masks") == without
+    for source, mask, said in (
+        (with_arm / "arm", "small.png", "has shape (90, 240), depth (180, 240)"),
+        (with_arm / "arm", "none.png", "the file is missing"),
+        ("tower", "mask.png", "is simulated"),
+    ):
+        given = ("--ignore", with_arm / mask, "--out", tmp_path / "none")
+        assert run_command("explore", source, *given) == 1
+        assert said in capsys.readouterr().err
+
+
+def test_a_session_ignores_the_arm_in_every_view(with_arm, tmp_path):
+    """Also in views from its folder: what it knows is made again from those."""
+    options = ("--ignore", with_arm / "mask.png", "--quiet")
+    assert run_command("session", "new", tmp_path / "s", *options) == 0
+    graphs = []
+    for remake in (False, True):
+        if remake:
+            shutil.rmtree(tmp_path / "s/state")
+        with Session.open(tmp_path / "s") as session:
+            for view in [] if remake else read_recording(with_arm / "arm"):
+                session.add(view)
+            graphs.append(graph_text(session.graph))
+    scene = Scene()
+    for view in read_recording(with_arm / "arm"):
+        ignored = np.zeros(view.depth.shape, dtype=bool)
+        ignored[126:, 96:156] = True
+        scene.update(view.without(ignored))
+    assert graphs == [graph_text(scene.graph)] * 2

@@ -155,6 +155,17 @@ NOT_BEGUN = (
 )
 
 
+def test_a_session_over_http_ignores_what_its_mask_says(client, views):
+    mask = np.zeros(views[0].depth.shape, dtype=np.uint8)
+    mask[60:] = 255
+    options = {"name": "b", "segmentation": "labels", "ignore": text(png(mask))}
+    assert client.post("/sessions", json=options).status_code == 201
+    answer = client.post("/sessions/b/views", json=body(views[0]))
+    assert answer.json()["graph"] == graph_of([views[0].without(mask > 0)]) != graph_of(views[:1])
+    broken = client.post("/sessions", json=options | {"name": "c", "ignore": text(b"no image")})
+    assert (broken.status_code, broken.json()["detail"].split(":")[0]) == (422, "ignore")
+
+
 def test_a_session_that_cannot_be_begun_is_not(client):
     for given, status, said in NOT_BEGUN:
         refused = client.post("/sessions", json=given)

@@ -33,6 +33,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import changed_settings
 from caryatid.errors import CaryatidError, InputError, PlanningError
 from caryatid.io.graph_json import graph_to_json
+from caryatid.io.images import read_mask
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import Reachable
@@ -87,6 +88,9 @@ class NewSession(SessionOptions):
 
     settings: dict[str, dict[str, Any]] = Field(
         {}, description="As `caryatid config --json` lists them: stage → name → value"
+    )
+    ignore: Base64Bytes | None = Field(
+        None, description="Grey PNG whose pixels other than 0 are ignored in every view: the robot's own arm"
     )
 
 
@@ -314,6 +318,8 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         """Begin a session."""
         config = changed_settings(pool.config, given.settings, "settings")
         options = given.model_dump(include={"segmentation", "seed", "planner"})
+        if given.ignore is not None:
+            options["ignore"] = read_mask(given.ignore, "ignore", config.session.max_pixels)
         return described(given.name, pool.begin(given.name, config, **options))
 
     @app.get("/sessions/{name}", response_model=SessionAnswer)

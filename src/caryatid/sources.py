@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,14 @@ from caryatid.errors import InputError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
-from caryatid.io.datasets import Dataset, format_of, open_dataset
+from caryatid.io.datasets import Dataset, Frame, format_of, open_dataset
 from caryatid.io.importing import choose_frames
-from caryatid.io.mask_sources import MaskSource
+from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
 from caryatid.segmentation.observation import level_transform
-from caryatid.sensing.views import Camera
+from caryatid.sensing.views import Camera, View
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
 
@@ -60,6 +61,7 @@ def open_source(
     seed: int,
     robot: str = HUMANOID,
     masks: MaskSource | None = None,
+    ignore: Path | None = None,
 ) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
@@ -71,10 +73,11 @@ def open_source(
         seed: Seed of the noise.
         robot: Name of the simulated robot.
         masks: Gives views their masks, or None to take them as they come.
+        ignore: Mask of what to ignore in a recording, as `without_ignored` takes it, or None.
 
     Raises:
         InputError: It is none of them, or broken, or lacks the labels that are demanded; or there is no such
-            robot, or a robot is given for a recording.
+            robot, a robot is given for a recording, or a mask of what to ignore for a simulation.
         PlanningError: The robot reaches no view of the table.
     """
     if Path(source).suffix.lower() in CLOUD_SUFFIXES:
@@ -83,9 +86,11 @@ def open_source(
         if robot != HUMANOID:
             reason = "is a recording, its camera can only be where a recorded view is"
             raise InputError(source, reason, "leave --robot out")
-        recording = open_recording(source, config, segmentation, masks)
+        recording = open_recording(source, config, segmentation, masks, ignore)
         poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
+    if ignore is not None:
+        raise InputError(source, "is simulated, with nothing of the robot in the image", "leave --ignore out")
     make = find_robot(robot)
     scene = load_scene(source)
     truth = true_scene_from_simulation(scene)
@@ -94,19 +99,27 @@ def open_source(
 
 
 def open_recording(
-    folder: str, config: Config, segmentation: SegmentationMethod | None, masks: MaskSource | None = None
+    folder: str,
+    config: Config,
+    segmentation: SegmentationMethod | None,
+    masks: MaskSource | None = None,
+    ignore: Path | None = None,
 ) -> Dataset:
     """Open a dataset and decode every frame once, so that a broken one is reported before any work is done.
 
     Of a video a few sharp frames are chosen. Where a source gives the masks, those of the dataset do not
-    count.
+    count. What a mask says to ignore is not in the views.
 
     Raises:
-        InputError: It is broken, has no labels where they are demanded, or a segment too small for a shape.
+        InputError: It or the mask is broken, it has no labels where they are demanded, or a segment too small
+            for a shape.
     """
     recording = open_dataset(folder, config.recording)
     if recording.is_video:
         recording = choose_frames(recording, config.recording)
+    if ignore is not None:
+        frames = [replace(f, load=partial(_seen, f, ignore)) for f in recording.frames]
+        recording = replace(recording, frames=frames)
     if segmentation == "labels" and masks is None and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()
@@ -127,6 +140,7 @@ def extract(
     seed: int,
     label_divisor: int = 1,
     masks: MaskSource | None = None,
+    ignore: Path | None = None,
 ) -> Iterator[Step]:
     """Open a recording or a cloud; returns the steps of looking at all it holds.
 
@@ -137,6 +151,7 @@ def extract(
         seed: Seed of every random choice.
         label_divisor: For a cloud whose labels number parts of objects: object = label // this.
         masks: Gives views their masks, or None to take them as they come.
+        ignore: Mask of what to ignore in a recording, as `without_ignored` takes it, or None.
 
     Raises:
         InputError: It is neither, or broken, or has no labels where they are demanded; or masks are to be
@@ -144,10 +159,10 @@ def extract(
     """
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if Path(source).suffix.lower() not in CLOUD_SUFFIXES:
-        recording = open_recording(source, config, segmentation, masks)
+        recording = open_recording(source, config, segmentation, masks, ignore)
         return (explorer.look(frame.load()) for frame in recording.frames)
-    if masks is not None:
-        remedy = "leave --masks out; labels of a cloud are its field label"
+    if masks is not None or ignore is not None:
+        remedy = "leave --masks and --ignore out; labels of a cloud are its field label"
         raise InputError(source, "is a cloud, which has no image for masks", remedy)
     stored, use_labels = read_stored_cloud(source, label_divisor), segmentation != "auto"
     if segmentation == "labels" and stored.labels is None:
@@ -159,6 +174,11 @@ def extract(
     cloud = cloud.moved(level_transform(cloud, config, rng, use_labels=use_labels))
     steps = map(explorer.look, [cloud])
     return (replace(step, labels=stored.spread(step.labels)) for step in steps)
+
+
+def _seen(frame: Frame, ignore: Path) -> View:
+    """The view of a frame, without what a mask says to ignore."""
+    return without_ignored(frame.load(), ignore)
 
 
 def _check_segments(source: str, points: Mapping[int, int], config: Config) -> None:

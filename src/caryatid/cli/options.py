@@ -201,6 +201,9 @@ class LookingCommand(Command):
         SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels where there are any")
     ] = None
     """Use the masks or labels of the views, or segment automatically."""
+    ignore: Annotated[Path | None, shown("MASK.png")] = None
+    """Mask of the robot's own arm, or of anything else fixed to the camera: a grey PNG, whose pixels other
+    than 0 are ignored in every view; for a recording also a folder of one NAME.png a view."""
 
     def mask_source(self, config: Config) -> MaskSource | None:
         """What gives views their masks, or None.

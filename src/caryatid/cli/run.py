@@ -81,7 +81,7 @@ class Exploring(options.ExploringCommand):
         with self.output.working("opening"):
             masks = self.mask_source(config)
             options: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
-            source = open_source(self.source, config, **options, **known)
+            source = open_source(self.source, config, ignore=self.ignore, **options, **known)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "masks": masks}
         known["early_stop"] = not self.no_early_stop
@@ -172,6 +172,7 @@ class Extract(RunCommand, options.LookingCommand):
                 seed=self.settings.seed,
                 label_divisor=self.label_divisor,
                 masks=self.mask_source(config),
+                ignore=self.ignore,
             )
         return Path(self.source).name, None, steps
 

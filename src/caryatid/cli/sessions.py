@@ -44,6 +44,7 @@ class New(SessionStep, options.PlanningCommand):
     """Folder of the session; must be new or empty."""
 
     def __call__(self) -> None:
+        from caryatid.io.images import read_mask
         from caryatid.robots import located
         from caryatid.sessions import Session
 
@@ -54,6 +55,7 @@ class New(SessionStep, options.PlanningCommand):
             seed=self.settings.seed,
             planner=self.chosen_planner,
             robot=located(self.robot),
+            ignore=None if self.ignore is None else read_mask(self.ignore),
         )
         with session:
             self.show({"session": self.folder, "views": 0}, f"session: {self.folder}")

@@ -172,7 +172,7 @@ def _read_labels(masks: Masks, depth: NDArray[np.float32]) -> NDArray[np.int32]:
     """Object number of each pixel (H, W), 0 = nothing."""
     labels = np.zeros(depth.shape, dtype=np.int32)
     for path, label in masks:
-        mask = images.decode_image(path, "", images.MASK_MODES, "a grey PNG") > 0
+        mask = images.read_mask(path)
         if mask.shape != depth.shape:
             (height, width), (rows, columns) = mask.shape, depth.shape
             reason = f"is {width}×{height} pixels, the depth image is {columns}×{rows}"

@@ -99,6 +99,15 @@ def decode_image(
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
 
 
+def read_mask(image: Path | bytes, name: str = "", most: float = inf) -> NDArray[np.bool_]:
+    """Read where a grey PNG (H, W), a file or its content, is not 0.
+
+    Raises:
+        InputError: As `decode_image`.
+    """
+    return decode_image(image, name, MASK_MODES, "a grey PNG", most) > 0
+
+
 def _open(content: bytes) -> Image.Image:
     return Image.open(io.BytesIO(content), formats=("PNG", "JPEG"))
 

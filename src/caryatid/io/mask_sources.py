@@ -1,4 +1,4 @@
-"""Masks that another program wrote, or that a learned segmenter gives for each view."""
+"""Masks that another program wrote, or that a learned segmenter gives; and masks of what to ignore."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from PIL import Image
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
-from caryatid.io.images import MASK_MODES, decode_image
+from caryatid.io.images import MASK_MODES, decode_image, read_mask
 from caryatid.segmentation.observation import label_image, observe
 from caryatid.sensing.masks import labels_from_masks
 from caryatid.sensing.views import SUPPORT_LABEL, View
@@ -79,6 +79,20 @@ class FolderMasks:
                 self._folder, f"has no masks of '{stem.name}'", f"add {image.name} or {array.name}"
             )
         return replace(view, labels=labels, labels_are="segments")
+
+
+def without_ignored(view: View, ignore: Path) -> View:
+    """Return a view without the pixels where a mask is not 0, such as those of the robot's own arm.
+
+    Args:
+        view: The view.
+        ignore: A grey PNG for every view of a camera, or a folder of one for each, named as by `FolderMasks`.
+
+    Raises:
+        InputError: The mask is missing, broken, or of another size.
+    """
+    mask = ignore / f"{view.name.rpartition('/')[2]}.png" if ignore.is_dir() else ignore
+    return view.without(read_mask(mask))
 
 
 class OnnxMasks:

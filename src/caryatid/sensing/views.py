@@ -122,6 +122,21 @@ class View(Pictured):
         object.__setattr__(other, "T_world_camera", T)
         return other
 
+    def without(self, ignored: NDArray[np.bool_]) -> View:
+        """Return the view with no reading and no label in some pixels, such as those of the robot's own arm.
+
+        Args:
+            ignored: The pixels (H, W).
+
+        Raises:
+            InputError: Their mask is of another size.
+        """
+        if np.shape(ignored) != self.depth.shape:
+            reason = f"the mask of what to ignore has shape {np.shape(ignored)}, depth {self.depth.shape}"
+            raise InputError(self.name, reason, "draw it on an image of this camera")
+        labels = None if self.labels is None else np.where(ignored, np.int32(0), self.labels)
+        return replace(self, depth=np.where(ignored, np.float32(0.0), self.depth), labels=labels)
+
     def __repr__(self) -> str:
         given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
         given += [] if self.T_world_camera is None else ["pose"]

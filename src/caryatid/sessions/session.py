@@ -14,6 +14,7 @@ import hashlib
 import io
 import json
 import pickle
+from base64 import b64encode
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -25,13 +26,15 @@ from typing import Annotated, Any, Final, Self
 import numpy as np
 from annotated_types import Ge
 from filelock import FileLock, Timeout
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from pydantic import Base64Bytes
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import next_best_view, reason_to_stop
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
+from caryatid.io.images import png, read_mask
 from caryatid.io.json_files import parse_json, read_json
 from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
 from caryatid.planning.decision import PlanningState
@@ -76,6 +79,7 @@ class Beginning:
         planner: Name of the planner that chooses the next view.
         robot: Name of the robot that takes it.
         settings: All settings.
+        ignore: PNG whose pixels other than 0 are ignored in every view, or None.
     """
 
     segmentation: SegmentationMethod | None
@@ -83,6 +87,12 @@ class Beginning:
     planner: str
     robot: str
     settings: Config
+    ignore: Base64Bytes | None = None
+
+    def to_json(self) -> str:
+        """Return the text of session.json."""
+        document = FORMAT | {"caryatid": version("caryatid")} | asdict(self)
+        return json.dumps(document, indent=1, default=lambda image: b64encode(image).decode()) + "\n"
 
     @classmethod
     def read(cls, path: Path) -> Beginning:
@@ -140,6 +150,8 @@ class Session:
         self.path = path
         self.beginning = beginning
         self._lock = lock
+        mask = beginning.ignore
+        self._ignored = None if mask is None else read_mask(mask, f"{path / 'session.json'}: ignore")
         if lock is not None:
             for folder in (path, path / "views", path / "state"):
                 clear_partials(folder)
@@ -157,6 +169,7 @@ class Session:
         seed: int = 0,
         planner: str = "support",
         robot: str = HUMANOID,
+        ignore: NDArray[np.bool_] | None = None,
     ) -> Session:
         """Begin a session in a new or empty folder, to write to it.
 
@@ -169,6 +182,7 @@ class Session:
             planner: Name of the planner that chooses the next view.
             robot: Name of the robot that takes it, as `find_robot` knows it; it stands by the table, with
                 nothing else on its floor.
+            ignore: Pixels (H, W) that are ignored in every view, such as the robot's own arm, or None.
 
         Raises:
             InputError: The folder holds something, there is no such planner or robot, or nothing can be
@@ -183,9 +197,9 @@ class Session:
                 reason = "already holds a session or other files"
                 raise SessionConflictError(folder, reason, "use that session, or give a new folder")
             (folder / "views").mkdir(exist_ok=True)
-        beginning = Beginning(segmentation, seed, planner, robot, config or Config())
-        document = FORMAT | {"caryatid": version("caryatid")} | asdict(beginning)
-        write_file(folder / "session.json", f"{json.dumps(document, indent=1)}\n".encode(), durable=True)
+        mask = None if ignore is None else png(np.asarray(ignore, dtype=np.uint8))
+        beginning = Beginning(segmentation, seed, planner, robot, config or Config(), mask)
+        write_file(folder / "session.json", beginning.to_json().encode(), durable=True)
         sync(folder.resolve().parent)
         return cls.open(folder)
 
@@ -255,7 +269,7 @@ class Session:
                     record.name, f"is to be view {number}, the next one is view {self.views}"
                 )
             return Added(number, self.graph, self.scene.changed)
-        decoded = capture.decode(self.beginning.settings.session)
+        decoded = self._decode(capture)
         check_view(decoded, self.scene, self._first)
         scene = self.scene.copy()
         graph_text(scene.update(decoded))  # a view whose graph cannot be written is refused, and not kept
@@ -337,7 +351,11 @@ class Session:
         return [CameraRecord.read(folder / "camera.json") for folder in folders]
 
     def _decoded(self, number: int) -> View:
-        return Capture.read(self._folder(number)).decode(self.beginning.settings.session)
+        return self._decode(Capture.read(self._folder(number)))
+
+    def _decode(self, capture: Capture) -> View:
+        view = capture.decode(self.beginning.settings.session)
+        return view if self._ignored is None else view.without(self._ignored)
 
     def _after(self, records: Sequence[CameraRecord]) -> Scene:
         """The scene after some views, from the newest usable snapshot and the views after it."""
@@ -377,7 +395,7 @@ class Session:
     def _seal(self, records: Sequence[CameraRecord], payload: bytes) -> bytes:
         """Digest of the code and the views that made a snapshot, and of the snapshot itself."""
         views = (record.digest for record in records)
-        made_of = " ".join((fingerprint(), json.dumps(asdict(self.beginning)), *views))
+        made_of = " ".join((fingerprint(), self.beginning.to_json(), *views))
         return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
 
 
