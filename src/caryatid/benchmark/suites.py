@@ -24,6 +24,8 @@ HEAPED = tuple(f"pile-{6 + i % 7}-{401 + i}" for i in range(60))
 """Piles of 6 to 12 to be taken apart; nothing is tuned on these seeds."""
 DENSE = tuple(f"dense-{10 + i % 16}-{301 + i}" for i in range(32))
 """Heaps of 10 to 25 between screens and walls; nothing is tuned on these seeds."""
+HOUSEHOLD = tuple(f"house-{4 + i % 9}-{501 + i}" for i in range(30))
+"""Four to twelve things of a household on and in each other; nothing is tuned on these seeds."""
 MIXED = (*DESIGNED, *PILES[2::2], *DENSE[:8])
 """Some of each."""
 LABELS = "labels, Carmine noise"
@@ -298,6 +300,14 @@ _ALL = (
         _planners("support", "random"),
         MIXED,
         {**_NOISE, **_AUTO},
+        seeds=1,
+    ),
+    Suite(
+        "house",
+        "What is found of trays, bowls, mugs, bottles and the like, with labels and without.",
+        _planners("support"),
+        HOUSEHOLD,
+        {LABELS: {}, **_AUTO},
         seeds=1,
     ),
     Suite(
