@@ -93,6 +93,13 @@ def write_view_files(folder: Path, view, **camera) -> None:
     (folder / "camera.json").write_text(json.dumps(known | camera))
 
 
+def wall_of(view):
+    """A view of nothing but a wall 1 m ahead, by the camera of another view."""
+    depth, nothing = np.ones_like(view.depth), np.zeros_like(view.labels)
+    away = transforms.look_at((-1.2, 0.0, 1.2), (-2.0, 0.0, 1.2))
+    return replace(view, depth=depth, labels=nothing, normals_camera=None, T_world_camera=away)
+
+
 def without_poses(views):
     return [replace(view, T_world_camera=None) for view in views]
 

@@ -9,11 +9,12 @@ from dataclasses import asdict
 
 import numpy as np
 import pytest
-from conftest import SMALL, SMALL_SENSOR, run_command
+from conftest import SMALL, SMALL_SENSOR, run_command, wall_of
 from PIL import Image
+from synthetic import hausdorff, simulated_views
 
 from caryatid.config import Config
-from caryatid.io.bop import read_recording
+from caryatid.io.bop import read_recording, write_recording
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.truth import ground_truth
@@ -103,6 +104,29 @@ def test_all_views_of_a_recording_are_extracted(tmp_path, recording):
     assert run.record.keys() >= {"settings", "seed", "versions", "angle_travelled", "path_travelled"}
     assert run.record["steps"][2]["angle_travelled"] > run.record["steps"][1]["angle_travelled"] > 0.0
     assert (tmp_path / "run/report.html").is_file()
+
+
+@pytest.mark.parametrize("segmentation", ["labels", "auto"])
+def test_views_before_the_first_that_shows_the_table_are_kept_for_it(tmp_path, capsys, segmentation):
+    views, graphs = simulated_views("tower")[:2], []
+    wall, options = wall_of(views[0]), ("--segmentation", segmentation, "--no-report")
+    for name, seen in (("without", views), ("before", [wall, wall, *views])):
+        write_recording(tmp_path / name, seen)
+        capsys.readouterr()
+        assert run_command("extract", tmp_path / name, *options, "--out", tmp_path / f"{name}-run") == 0
+        graphs.append(read_run(tmp_path / f"{name}-run").graph)
+    kept = [line for line in capsys.readouterr().err.splitlines() if "is kept until" in line]
+    for number, line in enumerate(kept):
+        tried = "fewer than 200 of 21600 points lie on one level plane; the largest plane, 100% of them, leans"
+        assert line.startswith(f"before/{number:06d}: no support surface: {tried} by 90°")
+    run, (without, graph) = read_run(tmp_path / "before-run"), graphs
+    assert [v.name for v in run.views] == [f"before/{k:06d}" for k in range(4)]
+    assert [v.graph.objects == (v.graph.objects[0],) for v in run.views] == [True, True, False, False]
+    assert len(kept) == 2
+    assert [s.pair for s in graph.supports] == [s.pair for s in without.supports]
+    for one, other in zip(graph.objects, without.objects, strict=True):
+        assert one.id == other.id
+        assert hausdorff(one.shape, other.shape) < 0.005
 
 
 @pytest.mark.parametrize("command", ["extract", "explore"])

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import npy
+from conftest import npy, wall_of
 
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, InputError, PlanningError
@@ -127,6 +127,24 @@ def test_a_robot_may_say_itself_what_it_reaches(begun):
         for wrong in ([1.0], [1.0, 2.0, -0.5]):
             with pytest.raises(InputError, match="path_length"):
                 session.next(poses, wrong)
+
+
+def test_a_view_without_a_table_is_kept_until_one_shows_it(folder, views, graph_after):
+    with Session.begin(folder, segmentation="labels", seed=7) as session:
+        added = session.add(wall_of(views[0]))
+        assert (added.number, added.changed, added.graph.objects) == (0, False, ())
+    shutil.rmtree(folder / "state")
+    with Session.open(folder) as session:
+        with pytest.raises(PlanningError, match="add a view that shows the table top"):
+            session.next()
+        session.add(views[0])
+        session.undo()
+        added = session.add(views[0])
+        assert (added.number, added.changed, session.views) == (1, True, 2)
+        assert graph_text(added.graph) != graph_after(0)  # of two views
+        assert [o.id for o in added.graph.objects] == ["o0", "o1", "o2"]
+    with Session.open(folder, read_only=True) as session:
+        assert graph_text(session.graph) == graph_text(added.graph)
 
 
 def test_looking_on_stops_when_a_view_changes_nothing(folder, views):

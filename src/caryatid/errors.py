@@ -33,6 +33,10 @@ class PerceptionError(CaryatidError):
     """A view in which nothing can be perceived: no readings, or no support surface."""
 
 
+class NoSurfaceError(PerceptionError):
+    """A view that shows no support surface; another one may."""
+
+
 class PlanningError(CaryatidError):
     """No next view exists: none is reachable, or all have been visited."""
 

@@ -152,18 +152,35 @@ class Explorer:
             The new step, without candidates and decision.
 
         Raises:
+            NoSurfaceError: No support surface is known, and none seen. `scene` keeps a view with a pose.
             CaryatidError: The view cannot be used, or there is neither a view nor a camera.
         """
-        scene, robot, before = self.scene, self.robot, self.step
+        *_, step = self.looks(given)
+        return step
+
+    def looks(self, given: View | Cloud | None = None) -> Iterator[Step]:
+        """Look, and yield the steps of the views that the scene kept until now before the new one's.
+
+        Args:
+            given: As of `look`.
+
+        Raises:
+            CaryatidError: As `look`.
+        """
         watch = Stopwatch()
         source = self._captured() if given is None else given
         if self._masks is not None and isinstance(source, View):
             source = self._masks(source)
         watch.lap("capture")
-        graph = scene.update(source)
+        for taken in self.scene.updates(source):
+            self.step = self._step(taken, watch.laps["capture"])
+            yield self.step
+
+    def _step(self, source: View | Cloud, captured: float) -> Step:
+        """The step of a view that has just become part of the scene; capturing it took some time [s]."""
+        scene, robot, before = self.scene, self.robot, self.step
         assert scene.sphere is not None
         assert scene.labels is not None
-
         view = source if isinstance(source, View) else None
         found = scene.T_world_camera
         if view is not None and found is not None and (robot is None or view.T_world_camera is None):
@@ -179,12 +196,11 @@ class Explorer:
             visited = np.concatenate([visited, sphere.direction_of(T_world_camera)[None]])
         if len(visited) > 1:
             angle += float(transforms.angle_between(visited[-2], visited[-1]))
-        self.step = Step(
-            scene.views - 1, source.name, view, scene.labels, graph, scene.cloud, sphere, visited,
-            None, None, {"capture": watch.laps["capture"]} | scene.timings, angle, path, None,
+        return Step(
+            scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
+            None, None, {"capture": captured} | scene.timings, angle, path, None,
             None if robot is None else _robot_pose(robot, scene.config),
         )  # fmt: skip
-        return self.step
 
     def plan(self) -> Step:
         """Choose the next view. Where the robot, looking closer, refuses one, plan again among the others.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
+from caryatid.errors import NoSurfaceError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed
@@ -36,6 +38,9 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+KEPT = "%s; this view is kept until a later one shows the table top"
+"""What is logged of a view without a support surface."""
+
 
 class Scene(Pictured):
     """The scene model of section III, updated view by view.
@@ -50,12 +55,13 @@ class Scene(Pictured):
     Attributes:
         graph: The fused support graph.
         labels: Label image (H, W) of the newest view, or labels (N,) of a cloud; 65535 = support surface.
-        surface: The support surface, or None before the first view.
-        voxels: Free, occupied and unknown space, or None before the first view.
-        sphere: The view sphere around the table top, or None before the first view.
+        surface: The support surface, or None before the first view that shows one.
+        voxels: Free, occupied and unknown space, or None before that view.
+        sphere: The view sphere around the table top, or None before that view.
         T_world_camera: Pose (4, 4) of the newest view after registration, or None for a cloud.
         T_world_cameras: Poses (4, 4) of all views so far, each as it was when the view was new.
         views: How many views the model is made of.
+        waiting: Views kept until a later one shows the support surface.
         changed: Whether the newest view changed the graph.
         timings: Seconds the stages of the newest update took.
     """
@@ -75,6 +81,7 @@ class Scene(Pictured):
         self.T_world_camera: Array | None = None
         self.T_world_cameras: tuple[Array, ...] = ()
         self.views = 0
+        self.waiting: tuple[View, ...] = ()
         self.changed = False
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
@@ -140,21 +147,55 @@ class Scene(Pictured):
         other._contradicted = self._contradicted.copy()
         return other
 
-    @one_blas_thread
     def update(self, source: View | Cloud) -> SupportGraph:
         """Take in one view, or one cloud with z up, and return the fused graph.
 
+        A view with a pose that shows no support surface, before any did, is kept with a warning. The first
+        one that shows it is preceded by those kept.
+
         Raises:
             InputError: Labels are demanded and missing, or a later view has no pose.
-            PerceptionError: There are no readings, or no support surface.
+            PerceptionError: There are no readings; or no support surface, and no pose.
         """
-        watch = Stopwatch()
+        kept = len(self.waiting)
+        try:
+            for _ in self.updates(source):
+                pass
+        except NoSurfaceError as error:
+            if len(self.waiting) == kept:
+                raise
+            log.warning(KEPT, error)
+        return self.graph
+
+    def updates(self, source: View | Cloud) -> Iterator[View | Cloud]:
+        """Take in one view or cloud, after the views kept; yields each once it is part of the model.
+
+        Raises:
+            NoSurfaceError: There is no support surface. A view with a pose is kept all the same.
+            CaryatidError: As `update`.
+        """
+        try:
+            if self.waiting:
+                self.surface = self._observed(source).surface
+            waiting, self.waiting = self.waiting, ()
+            for view in (*waiting, source):
+                self._take_in(view)
+                yield view
+        except NoSurfaceError:
+            if isinstance(source, View) and source.T_world_camera is not None:
+                self.waiting = (*self.waiting, source)
+            raise
+
+    def _observed(self, source: View | Cloud) -> Observation:
         rng = np.random.default_rng([self.seed, self.views])
+        return observe(source, self.config, segmentation=self.segmentation, known=self.surface, rng=rng)
+
+    @one_blas_thread
+    def _take_in(self, source: View | Cloud) -> None:
+        watch = Stopwatch()
         given = source.labels is not None and self.segmentation != "auto"
         named = given and self._named(source)
-        observation = observe(
-            source, self.config, segmentation=self.segmentation, known=self.surface, rng=rng
-        )
+        observation = self._observed(source)
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
         watch.lap("register")
@@ -186,7 +227,6 @@ class Scene(Pictured):
         self.views += 1
         watch.lap("fuse")
         self.timings = watch.laps
-        return self.graph
 
     def _named(self, source: View | Cloud) -> bool:
         """Whether a label means the same object in all views."""

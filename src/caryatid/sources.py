@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from caryatid.config import Config, NoiseModel, SegmentationMethod
-from caryatid.errors import InputError
+from caryatid.errors import InputError, NoSurfaceError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
@@ -21,10 +22,13 @@ from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
+from caryatid.scene import KEPT
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera, View
 from caryatid.simulation.scenes import load_scene
 from caryatid.simulation.setup import make_simulation
+
+log = logging.getLogger(__name__)
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
 """Endings of files that are clouds."""
@@ -156,11 +160,12 @@ def extract(
     Raises:
         InputError: It is neither, or broken, or has no labels where they are demanded; or masks are to be
             given to a cloud.
+        PerceptionError: A cloud shows no support surface.
     """
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if Path(source).suffix.lower() not in CLOUD_SUFFIXES:
         recording = open_recording(source, config, segmentation, masks, ignore)
-        return (explorer.look(frame.load()) for frame in recording.frames)
+        return _look_at_all(explorer, recording)
     if masks is not None or ignore is not None:
         remedy = "leave --masks and --ignore out; labels of a cloud are its field label"
         raise InputError(source, "is a cloud, which has no image for masks", remedy)
@@ -179,6 +184,17 @@ def extract(
 def _seen(frame: Frame, ignore: Path) -> View:
     """The view of a frame, without what a mask says to ignore."""
     return without_ignored(frame.load(), ignore)
+
+
+def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
+    """The steps of all views, or the error of the last where none shows a support surface."""
+    for left, frame in zip(range(len(recording))[::-1], recording.frames, strict=True):
+        try:
+            yield from explorer.looks(frame.load())
+        except NoSurfaceError as error:
+            if not left:
+                raise
+            log.warning(KEPT, error)
 
 
 def _check_segments(source: str, points: Mapping[int, int], config: Config) -> None:

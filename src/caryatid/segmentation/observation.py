@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import InputError, PerceptionError
+from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.segments import segment, segment_cloud
@@ -91,7 +91,8 @@ def observe(
 
     Raises:
         InputError: Labels are demanded and missing, or a later view has no pose.
-        PerceptionError: There are no readings, or no support surface.
+        NoSurfaceError: No support surface is known, and none seen.
+        PerceptionError: There are no readings.
     """
     if segmentation == "labels" and source.labels is None:
         raise InputError(source.name, "has no labels", "give masks, or segment with --segmentation auto")
@@ -212,7 +213,8 @@ def level_transform(
         use_labels: Leave out what belongs to a labelled object.
 
     Raises:
-        PerceptionError: There are no readings, or no support surface.
+        NoSurfaceError: There is no support surface.
+        PerceptionError: There are no readings.
     """
     cloud, pixels = _points(source, config)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
@@ -231,7 +233,7 @@ def _surface(
     """Find the support surface in points that belong to no given object: near the known one, or anywhere."""
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
     if known is None and not loose.any():
-        raise PerceptionError(
+        raise NoSurfaceError(
             f"{cloud.name}: every point has the label of an object, none is left for the table; give the "
             "table label 0 (of a cloud --label-divisor may do so), or use --segmentation auto"
         )
@@ -243,7 +245,7 @@ def _surface(
     some = cloud.select(index[:: max(1, len(index) // count)])
     try:
         return find_support_surface(some.points_world, some.normals_world, up, config.surface, rng, planes)
-    except PerceptionError as error:
+    except NoSurfaceError as error:
         if known is not None:
             return known
-        raise PerceptionError(f"{cloud.name}: {error}") from None
+        raise NoSurfaceError(f"{cloud.name}: {error}") from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from caryatid.config import SurfaceConfig
-from caryatid.errors import PerceptionError
+from caryatid.errors import NoSurfaceError
 from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Box
@@ -198,7 +198,7 @@ def find_support_surface(
         max_planes: Horizontal planes looked at, largest first, before the table is chosen.
 
     Raises:
-        PerceptionError: No plane has enough points.
+        NoSurfaceError: No plane has enough points.
     """
     points, normals = np.asarray(cloud_points, dtype=np.float64), np.asarray(normals, dtype=np.float64)
     scene = _Scene(points, normals, up, config)
@@ -217,12 +217,24 @@ def find_support_surface(
             planes.append(plane)
             left = left & (np.abs(points @ plane.normal - plane.offset) > 2.0 * config.tolerance)
     if up is None or not planes:
-        tried = "in any direction the camera may be held" if up is None else "across the world's z, upwards"
-        raise PerceptionError(
-            f"no support surface: of {len(points)} points no {config.min_points} lie on one plane {tried}; "
-            "the table top must be in view" + ("" if up is None else ", and the z of the poses point up")
-        )
+        raise NoSurfaceError(f"no support surface: {_tried(scene, rng)}")
     return _surface(points, _choose_table(planes, up, config))
+
+
+def _tried(scene: _Scene, rng: np.random.Generator) -> str:
+    """Say among what a support surface was sought in vain, and what may help."""
+    points, normals, up, config = scene
+    if len(points) < config.min_points:
+        return f"{len(points)} points were seen, {config.min_points} are needed; show more of the table top"
+    level = "plane" if up is None else "level plane"
+    tried = f"fewer than {config.min_points} of {len(points)} points lie on one {level}"
+    facing = scene._replace(up=transforms.unit(normals.mean(axis=0)), config=replace(config, max_tilt=180.0))
+    plane = facing.largest_plane(np.ones(len(points), dtype=bool), rng)
+    if up is None or plane is None:
+        return f"{tried}; show the table top"
+    share, tilt = plane.inliers.mean(), np.degrees(transforms.angle_between(plane.normal, up))
+    tried += f"; the largest plane, {share:.0%} of them, leans by {tilt:.0f}°"
+    return f"{tried}; show the table top or, if that plane is it, give poses whose z is up"
 
 
 def refitted(
@@ -260,7 +272,7 @@ def _surface(points: Array, plane: _Plane) -> SupportSurface:
     basis, thickness = _basis(plane.normal), 0.04
     corners = hull(np.ascontiguousarray((on_plane - centroid) @ basis.T))
     if len(corners) < 3:
-        raise PerceptionError("the points of the support surface lie on one line")
+        raise NoSurfaceError("no support surface: the points on its plane lie on one line")
     edges = transforms.unit(np.roll(corners, -1, axis=0) - corners)
     along, across = corners @ edges.T, corners @ np.stack([-edges[:, 1], edges[:, 0]])
     sizes = np.stack([np.ptp(along, axis=0), np.ptp(across, axis=0)])

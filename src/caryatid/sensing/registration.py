@@ -130,7 +130,7 @@ class ViewRegistration:
         config, reach = self._config, self._config.reaches[-1]
         outlier = OUTLIER * reach
         *others, new = self._views
-        if not others:
+        if not any(len(self._views[v].sample) for v in others):
             return "reference"
         exact = [v for v in others if self.outcomes[v] in EXACT]
         right = self._matched((v, new) for v in exact)
@@ -303,7 +303,7 @@ class ViewRegistration:
         for v, now, told in zip(numbers, T, T_told, strict=True):
             moved = views[v].sample[:, :3] @ (now - told)[:3, :3].T + (now - told)[:3, 3]
             settled = (0.3 * self._config.noise) ** 2
-            if v == numbers[-1] or np.einsum("ni,ni->n", moved, moved).max() > settled:
+            if v == numbers[-1] or np.einsum("ni,ni->n", moved, moved).max(initial=0.0) > settled:
                 moves[v] = now @ transforms.invert(told)
                 twists[v] = self._now[v]
         self.twists = twists

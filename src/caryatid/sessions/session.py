@@ -258,7 +258,7 @@ class Session:
         Raises:
             SessionConflictError: It would have another number.
             InputError: The view cannot be used; the session is as it was.
-            PerceptionError: Nothing can be perceived in it; the session is as it was.
+            PerceptionError: There are no readings in it; the session is as it was.
         """
         self._check_writable()
         capture = Capture.of(view) if isinstance(view, View) else view
@@ -297,7 +297,7 @@ class Session:
         """
         sphere, robot = self.scene.sphere, None
         if sphere is None:
-            raise PlanningError("nothing has been seen yet; add a first view")
+            raise PlanningError("nothing has been seen yet; add a view that shows the table top")
         T_world_cameras = np.stack([record.T_world_camera for record in self._records])
         if candidates is not None:
             reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
@@ -361,10 +361,10 @@ class Session:
         """The scene after some views, from the newest usable snapshot and the views after it."""
         b = self.beginning
         scene = self._read_snapshot(records) or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
-        while scene.views < len(records):
-            scene.update(self._decoded(scene.views))
+        for number in range(_given(scene), len(records)):
+            scene.update(self._decoded(number))
             if self._lock is not None:
-                self._write_snapshot(scene, records[: scene.views])
+                self._write_snapshot(scene, records[: number + 1])
         return scene
 
     def _read_snapshot(self, records: Sequence[CameraRecord]) -> Scene | None:
@@ -374,18 +374,18 @@ class Session:
                 content = self._snapshot(views).read_bytes()
                 if content[:32] == self._seal(records[:views], content[32:]):
                     scene = _Unpickler(io.BytesIO(content[32:])).load()
-                    if isinstance(scene, Scene) and scene.views == views:
+                    if isinstance(scene, Scene) and _given(scene) == views:
                         return scene
         return None
 
     def _write_snapshot(self, scene: Scene, records: Sequence[CameraRecord]) -> None:
         """Keep the scene of all views, and those of the seven views before; a failure costs only time."""
         with suppress(Exception):
-            path = self._snapshot(scene.views)
+            path = self._snapshot(len(records))
             path.parent.mkdir(exist_ok=True)
             payload = pickle.dumps(scene, protocol=5)
             write_file(path, self._seal(records, payload) + payload)
-            kept = {self._snapshot(scene.views - back) for back in range(8)}
+            kept = {self._snapshot(len(records) - back) for back in range(8)}
             for older in set(path.parent.iterdir()) - kept:
                 older.unlink()
 
@@ -397,6 +397,11 @@ class Session:
         views = (record.digest for record in records)
         made_of = " ".join((fingerprint(), self.beginning.to_json(), *views))
         return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
+
+
+def _given(scene: Scene) -> int:
+    """How many views a scene was updated with."""
+    return scene.views + len(scene.waiting)
 
 
 def _locked(path: Path) -> FileLock:
