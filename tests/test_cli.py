@@ -117,8 +117,8 @@ def test_views_before_the_first_that_shows_the_table_are_kept_for_it(tmp_path, c
         graphs.append(read_run(tmp_path / f"{name}-run").graph)
     kept = [line for line in capsys.readouterr().err.splitlines() if "is kept until" in line]
     for number, line in enumerate(kept):
-        tried = "fewer than 200 of 21600 points lie on one level plane; the largest plane, 100% of them, leans"
-        assert line.startswith(f"before/{number:06d}: no support surface: {tried} by 90°")
+        tried = "fewer than 200 of 21600 points lie on one level plane; the largest plane, 100%"
+        assert line.startswith(f"before/{number:06d}: no support surface: {tried} of them, leans by 90°")
     run, (without, graph) = read_run(tmp_path / "before-run"), graphs
     assert [v.name for v in run.views] == [f"before/{k:06d}" for k in range(4)]
     assert [v.graph.objects == (v.graph.objects[0],) for v in run.views] == [True, True, False, False]
