@@ -14,6 +14,7 @@ from PIL import Image
 from synthetic import hausdorff, simulated_views
 
 from caryatid.config import Config
+from caryatid.geometry import transforms
 from caryatid.io.bop import read_recording, write_recording
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.simulation.scenes import load_scene
@@ -21,6 +22,7 @@ from caryatid.simulation.truth import ground_truth
 from caryatid.steps import read_run
 
 ESCAPE = "\x1b"
+BOTH = pytest.mark.parametrize("command", ["extract", "explore"])
 
 
 def explored(source, out, *options):
@@ -129,7 +131,23 @@ def test_views_before_the_first_that_shows_the_table_are_kept_for_it(tmp_path, c
         assert hausdorff(one.shape, other.shape) < 0.005
 
 
-@pytest.mark.parametrize("command", ["extract", "explore"])
+@BOTH
+def test_a_world_that_is_the_first_cameras_frame_is_levelled(tmp_path, views, refused, command):
+    """Its z points forward: the table top leans by 130°, of which the camera's elevation is 40°."""
+    T_first_world = transforms.invert(views[0].pose)
+    tilted = [view.with_pose(T_first_world @ view.pose) for view in views]
+    write_recording(tmp_path / "one", tilted[:1])
+    write_recording(tmp_path / "tilted", tilted)
+    said = refused(command, tmp_path / "one", names="one/000000", says="of them, leans by 130°")
+    assert "(--level)" in said
+    options = ("--no-early-stop",) if command == "explore" else ()
+    assert run_command(command, tmp_path / "tilted", "--level", "--out", tmp_path / "run", *options) == 0
+    run = read_run(tmp_path / "run")
+    assert len(run.views) == 3
+    assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
+
+
+@BOTH
 def test_a_single_frame_without_a_pose_gets_its_world_from_the_table(tmp_path, single, command):
     assert run_command(command, single, "--out", tmp_path / "run") == 0
     run = read_run(tmp_path / "run")

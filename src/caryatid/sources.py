@@ -17,7 +17,7 @@ from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
 from caryatid.io.datasets import Dataset, Frame, format_of, open_dataset
-from caryatid.io.importing import choose_frames
+from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
@@ -66,6 +66,7 @@ def open_source(
     robot: str = HUMANOID,
     masks: MaskSource | None = None,
     ignore: Path | None = None,
+    level: bool = False,
 ) -> Source:
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
@@ -78,6 +79,7 @@ def open_source(
         robot: Name of the simulated robot.
         masks: Gives views their masks, or None to take them as they come.
         ignore: Mask of what to ignore in a recording, as `without_ignored` takes it, or None.
+        level: Turn the world of a recording so that the table is level, for poses whose z is not up.
 
     Raises:
         InputError: It is none of them, or broken, or lacks the labels that are demanded; or there is no such
@@ -90,7 +92,7 @@ def open_source(
         if robot != HUMANOID:
             reason = "is a recording, its camera can only be where a recorded view is"
             raise InputError(source, reason, "leave --robot out")
-        recording = open_recording(source, config, segmentation, masks, ignore)
+        recording = open_recording(source, config, segmentation, masks, ignore, level)
         poses = [np.eye(4) if f.T_world_camera is None else f.T_world_camera for f in recording.frames]
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
     if ignore is not None:
@@ -108,15 +110,17 @@ def open_recording(
     segmentation: SegmentationMethod | None,
     masks: MaskSource | None = None,
     ignore: Path | None = None,
+    level: bool = False,
 ) -> Dataset:
     """Open a dataset and decode every frame once, so that a broken one is reported before any work is done.
 
     Of a video a few sharp frames are chosen. Where a source gives the masks, those of the dataset do not
-    count. What a mask says to ignore is not in the views.
+    count. What a mask says to ignore is not in the views. With `level` the world is turned so that the table
+    is level.
 
     Raises:
-        InputError: It or the mask is broken, it has no labels where they are demanded, or a segment too small
-            for a shape.
+        InputError: It or the mask is broken, it has no labels where they are demanded, a segment too small
+            for a shape, or no table to level the world by.
     """
     recording = open_dataset(folder, config.recording)
     if recording.is_video:
@@ -124,6 +128,10 @@ def open_recording(
     if ignore is not None:
         frames = [replace(f, load=partial(_seen, f, ignore)) for f in recording.frames]
         recording = replace(recording, frames=frames)
+    if level:
+        recording = levelled(recording, config)
+        for note in recording.notes:
+            log.info(note)
     if segmentation == "labels" and masks is None and not recording.has_labels:
         raise InputError(folder, "has no masks", "add mask_visib/, or use --segmentation auto")
     points: Counter[int] = Counter()
@@ -145,6 +153,7 @@ def extract(
     label_divisor: int = 1,
     masks: MaskSource | None = None,
     ignore: Path | None = None,
+    level: bool = False,
 ) -> Iterator[Step]:
     """Open a recording or a cloud; returns the steps of looking at all it holds.
 
@@ -156,6 +165,7 @@ def extract(
         label_divisor: For a cloud whose labels number parts of objects: object = label // this.
         masks: Gives views their masks, or None to take them as they come.
         ignore: Mask of what to ignore in a recording, as `without_ignored` takes it, or None.
+        level: Turn the world of a recording so that the table is level, for poses whose z is not up.
 
     Raises:
         InputError: It is neither, or broken, or has no labels where they are demanded; or masks are to be
@@ -164,7 +174,7 @@ def extract(
     """
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
     if Path(source).suffix.lower() not in CLOUD_SUFFIXES:
-        recording = open_recording(source, config, segmentation, masks, ignore)
+        recording = open_recording(source, config, segmentation, masks, ignore, level)
         return _look_at_all(explorer, recording)
     if masks is not None or ignore is not None:
         remedy = "leave --masks and --ignore out; labels of a cloud are its field label"

@@ -243,6 +243,8 @@ class ExploringCommand(PlanningCommand):
 
     views: Annotated[OptionalCount, default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
+    level: Flag = False
+    """Turn the world of a recording so that the table is level, for poses whose z is not up."""
     noise: NoiseModel = "none"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 

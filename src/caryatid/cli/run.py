@@ -81,7 +81,8 @@ class Exploring(options.ExploringCommand):
         with self.output.working("opening"):
             masks = self.mask_source(config)
             options: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
-            source = open_source(self.source, config, ignore=self.ignore, **options, **known)
+            options |= {"ignore": self.ignore, "level": self.level}
+            source = open_source(self.source, config, **options, **known)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "masks": masks}
         known["early_stop"] = not self.no_early_stop
@@ -160,6 +161,8 @@ class Extract(RunCommand, options.LookingCommand):
     """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
     label_divisor: options.Count = 1
     """For clouds whose labels number parts of objects: object = label // N."""
+    level: options.Flag = False
+    """Turn the world of a recording so that the table is level, for poses whose z is not up."""
 
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
         from caryatid.sources import extract
@@ -173,6 +176,7 @@ class Extract(RunCommand, options.LookingCommand):
                 label_divisor=self.label_divisor,
                 masks=self.mask_source(config),
                 ignore=self.ignore,
+                level=self.level,
             )
         return Path(self.source).name, None, steps
 
@@ -252,7 +256,7 @@ class Dismantle(Exploring):
 
 def _about(command: RunCommand | Dismantle) -> dict[str, Any]:
     """What run.json says of the command."""
-    names = ("robot", "segmentation", "noise", "label_divisor")
+    names = ("robot", "segmentation", "noise", "label_divisor", "level")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options["preset"] = command.settings.preset
     if isinstance(command, Exploring):

@@ -83,7 +83,8 @@ class View(options.ExploringCommand):
         shared: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         masks = self.mask_source(config)
         given: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
-        opening = partial(open_source, self.source, ignore=self.ignore, **given, **shared)
+        given |= {"ignore": self.ignore, "level": self.level}
+        opening = partial(open_source, self.source, **given, **shared)
         shared |= {"planner": self.chosen_planner, "host": self.host, "port": self.port}
         with self.output.working("opening"):
             page = LoopPage(opening, config, masks=masks, **shared)

@@ -23,6 +23,7 @@ from caryatid.io.images import BrokenImageError
 from caryatid.io.staging import StagedFolder
 from caryatid.io.video import SECOND
 from caryatid.segmentation.observation import level_transform
+from caryatid.sensing.views import View
 
 BROKEN: Final = "broken"
 DARK: Final = "hardly any depth"
@@ -65,15 +66,29 @@ def import_recording(
     dataset = open_dataset(source, config.recording, options)
     with StagedFolder(out) as folder:
         chosen = choose_frames(dataset, config.recording)
-        views = iter(chosen)
-        if level and chosen.has_poses:
-            T_level_world = _level_rotation(chosen, config)
-            turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
-            note = f"world: turned by {turn:.1f}°, so that the table is level"
-            chosen = replace(chosen, notes=(*chosen.notes, note))
-            views = (view.with_pose(T_level_world @ view.pose) for view in views)
-        write_views(folder, views)
+        if level:
+            chosen = levelled(chosen, config)
+        write_views(folder, chosen)
     return chosen
+
+
+def levelled(dataset: Dataset, config: Config) -> Dataset:
+    """Turn the world of a dataset so that the table is level; without poses there is none to turn.
+
+    Args:
+        dataset: The frames.
+        config: How a table is found.
+
+    Raises:
+        InputError: There is no table to level the world by.
+    """
+    if not dataset.has_poses:
+        return dataset
+    T_level_world = _level_rotation(dataset, config)
+    turn = np.rad2deg(transforms.angle_between(T_level_world[2, :3], _UP))
+    note = f"world: turned by {turn:.1f}°, so that the table is level"
+    frames = [_turned(frame, T_level_world) for frame in dataset.frames]
+    return replace(dataset, frames=frames, notes=(*dataset.notes, note))
 
 
 def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
@@ -184,6 +199,17 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
         raise InputError(dataset.path, reason, "leave --level out, and give a world that is level")
     turn, _ = Rotation.align_vectors(_UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
+
+
+def _turned(frame: Frame, T: Array) -> Frame:
+    """The frame, moved by a rigid transform (4, 4) of the world."""
+
+    def load() -> View:
+        view = frame.load()
+        return view.with_pose(T @ view.pose)
+
+    assert frame.T_world_camera is not None
+    return replace(frame, load=load, T_world_camera=T @ frame.T_world_camera)
 
 
 def _most_around(times: Array, values: Array, window: float) -> Array:

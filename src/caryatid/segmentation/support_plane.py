@@ -234,7 +234,7 @@ def _tried(scene: _Scene, rng: np.random.Generator) -> str:
         return f"{tried}; show the table top"
     share, tilt = plane.inliers.mean(), np.degrees(transforms.angle_between(plane.normal, up))
     tried += f"; the largest plane, {share:.0%} of them, leans by {tilt:.0f}°"
-    return f"{tried}; show the table top or, if that plane is it, give poses whose z is up"
+    return f"{tried}; show the table top or, if that plane is it, level the world (--level)"
 
 
 def refitted(
