@@ -165,7 +165,7 @@ def with_arm(tmp_path_factory):
     (folder / "masks").mkdir()
     for name in ("mask", "masks/000000", "masks/000001", "masks/000002"):
         (folder / f"{name}.png").write_bytes(png(arm))
-    (folder / "small.png").write_bytes(png(arm[:90]))
+    (folder / "small.png").write_bytes(png(arm[126:]))
     return folder
 
 
@@ -180,7 +180,7 @@ def test_the_robots_own_arm_is_no_object(with_arm, tmp_path, capsys):
     assert objects("arm", "--ignore", with_arm / "mask.png") == without
     assert objects("arm", "--ignore", with_arm / "masks") == without
     for source, mask, said in (
-        (with_arm / "arm", "small.png", "has shape (90, 240), depth (180, 240)"),
+        (with_arm / "arm", "small.png", "ignored is 240×54, depth is 240×180"),
         (with_arm / "arm", "none.png", "the file is missing"),
         ("tower", "mask.png", "is simulated"),
     ):
@@ -205,5 +205,5 @@ def test_a_session_ignores_the_arm_in_every_view(with_arm, tmp_path):
     for view in read_recording(with_arm / "arm"):
         ignored = np.zeros(view.depth.shape, dtype=bool)
         ignored[126:, 96:156] = True
-        scene.update(view.without(ignored))
+        scene.update(replace(view, ignored=ignored))
     assert graphs == [graph_text(scene.graph)] * 2

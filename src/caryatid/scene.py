@@ -23,6 +23,7 @@ from caryatid.objects.models import ObjectModels
 from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.display import Pictured, call
 from caryatid.runtime.parallel import one_blas_thread
+from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import UP, Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
 from caryatid.sensing.registration import ViewRegistration
@@ -196,6 +197,8 @@ class Scene(Pictured):
         given = source.labels is not None and self.segmentation != "auto"
         named = given and self._named(source)
         observation = self._observed(source)
+        if observation.view is not None:
+            self._check_holes(observation.view, observation.surface)
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
         watch.lap("register")
@@ -242,6 +245,16 @@ class Scene(Pictured):
                 "%s: %d of %d masks lie on objects that had other numbers; if a number means nothing in "
                 'another view, use --masks per-view or View(labels_are="segments")',
                 name, wrong, shown,
+            )  # fmt: skip
+
+    def _check_holes(self, view: View, surface: SupportSurface) -> None:
+        """Warn where something as large as an object may be that has no depth."""
+        holes = count_holes(view, surface, self.config.segmentation)
+        if holes:
+            log.warning(
+                "%s: no depth in %s over the table (transparent, black or shiny things?); "
+                "what is there is left out",
+                view.name, "1 region" if holes == 1 else f"{holes} regions",
             )  # fmt: skip
 
     def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:

@@ -92,7 +92,7 @@ def without_ignored(view: View, ignore: Path) -> View:
         InputError: The mask is missing, broken, or of another size.
     """
     mask = ignore / f"{view.name.rpartition('/')[2]}.png" if ignore.is_dir() else ignore
-    return view.without(read_mask(mask))
+    return replace(view, ignored=read_mask(mask))
 
 
 class OnnxMasks:

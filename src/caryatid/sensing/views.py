@@ -37,6 +37,8 @@ class View(Pictured):
         name: What to call the view in messages.
         labels_are: Whether a label is an object's in all views (`objects`) or a segment's in this view alone
             (`segments`).
+        ignored: Pixels (H, W) that are left out, such as those of the robot's own arm: they have no reading
+            and no label. None = none.
 
     Raises:
         InputError: Sizes differ, depth is negative or infinite, K or the pose is not valid.
@@ -50,6 +52,7 @@ class View(Pictured):
     normals_camera: NDArray[np.float32] | None = None
     name: str = "view"
     labels_are: Literal["objects", "segments"] = "objects"
+    ignored: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         depth = np.asarray(self.depth, dtype=np.float32)
@@ -69,7 +72,8 @@ class View(Pictured):
         if self.labels is not None and np.ndim(self.labels) == 3:
             object.__setattr__(self, "labels", labels_from_masks(self.labels))
             object.__setattr__(self, "labels_are", "segments")
-        for field, dtype in (("rgb", np.uint8), ("labels", np.int32), ("normals_camera", np.float32)):
+        kinds = {"rgb": np.uint8, "labels": np.int32, "normals_camera": np.float32, "ignored": np.bool_}
+        for field, dtype in kinds.items():
             image = getattr(self, field)
             if image is None:
                 continue
@@ -85,6 +89,10 @@ class View(Pictured):
                     self.name, f"labels leave 0…{SUPPORT_LABEL - 1}", "number objects from 1, 0 = nothing"
                 )
             object.__setattr__(self, field, image.astype(dtype, copy=False))
+        if self.ignored is not None:
+            object.__setattr__(self, "depth", np.where(self.ignored, np.float32(0.0), depth))
+            if self.labels is not None:
+                object.__setattr__(self, "labels", np.where(self.ignored, np.int32(0), self.labels))
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
@@ -121,21 +129,6 @@ class View(Pictured):
         T = transforms.as_rigid(T_world_camera, f"{self.name}: T_world_camera")
         object.__setattr__(other, "T_world_camera", T)
         return other
-
-    def without(self, ignored: NDArray[np.bool_]) -> View:
-        """Return the view with no reading and no label in some pixels, such as those of the robot's own arm.
-
-        Args:
-            ignored: The pixels (H, W).
-
-        Raises:
-            InputError: Their mask is of another size.
-        """
-        if np.shape(ignored) != self.depth.shape:
-            reason = f"the mask of what to ignore has shape {np.shape(ignored)}, depth {self.depth.shape}"
-            raise InputError(self.name, reason, "draw it on an image of this camera")
-        labels = None if self.labels is None else np.where(ignored, np.int32(0), self.labels)
-        return replace(self, depth=np.where(ignored, np.float32(0.0), self.depth), labels=labels)
 
     def __repr__(self) -> str:
         given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]

@@ -17,7 +17,7 @@ import pickle
 from base64 import b64encode
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
@@ -355,7 +355,7 @@ class Session:
 
     def _decode(self, capture: Capture) -> View:
         view = capture.decode(self.beginning.settings.session)
-        return view if self._ignored is None else view.without(self._ignored)
+        return view if self._ignored is None else replace(view, ignored=self._ignored)
 
     def _after(self, records: Sequence[CameraRecord]) -> Scene:
         """The scene after some views, from the newest usable snapshot and the views after it."""
