@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from conftest import SMALL, TWO_ON_A_TABLE, run_command, without_labels, without_poses
 
+from caryatid.geometry import transforms
 from caryatid.io import write_recording
+from caryatid.sensing.views import View
 from caryatid.steps import read_run
 
 BOTH = pytest.mark.parametrize("command", ["extract", "explore"])
@@ -38,6 +40,51 @@ def test_a_segment_of_three_points(tmp_path, views, refused):
     write_recording(tmp_path / "more", [view, *views[1:]])
     assert run_command("extract", tmp_path / "more", *options) == 0
     assert [len(v.graph.objects) for v in read_run(tmp_path / "run").views] == [2, 3, 3]
+
+
+def a_plane(width, height, T_world_camera, top=0.7):
+    """Depth of nothing but a level plane."""
+    v, u = np.mgrid[0:height, 0:width]
+    x, y = (u - (width - 1) / 2) / (0.8 * width), (v - (height - 1) / 2) / (0.8 * width)
+    down = np.stack([x, y, np.ones_like(x)], axis=-1) @ T_world_camera[2, :3]
+    return (top - T_world_camera[2, 3]) / down
+
+
+DOWN = transforms.look_at((-0.9, 0.0, 1.6), (0.0, 0.0, 0.7))
+AHEAD = transforms.look_at((0.0, 0.0, 1.0), (1.0, 0.0, 1.0))
+NOISE = np.random.default_rng(0).uniform(0.5, 2.0, (120, 160))
+FEW = np.where((np.indices((120, 160)) // 4 == 10).all(axis=0), 1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("depth", "T_world_camera", "posed", "loose"),
+    [
+        (np.zeros((120, 160)), DOWN, "no pixel has a depth reading; leave", "no pixel has a depth reading"),
+        (np.ones((120, 160)), AHEAD, "100% of them, leans by 90°; show the table top or", 1),
+        (np.full((120, 160), 5.0), AHEAD, "within 0.1–3 m, but 5–5 m; check the unit", "but 5–5 m; check"),
+        (NOISE, DOWN, "points lie on one level plane; show", "points lie on one plane; show the table top"),
+        (FEW, DOWN, "only 16 points are on a surface, 200 are needed", "or give a larger image"),
+        (np.ones((200, 1)), DOWN, "side by side are too few", "give a larger image, or one with less noise"),
+        (a_plane(12, 12, DOWN), DOWN, "200 are needed; show more", "or give a larger image"),
+        (a_plane(80, 60, DOWN), DOWN, 1, 1),
+        (a_plane(160, 120, DOWN), DOWN, 1, 1),
+    ],
+    ids=["no depth", "wall", "far wall", "noise", "few", "line", "12×12", "80×60", "one plane"],
+)
+@pytest.mark.parametrize("masks", [False, True])
+def test_an_image_that_shows_no_objects(tmp_path, refused, depth, T_world_camera, posed, loose, masks):
+    """One clear line, or a graph of the support surface and what a mask says; a wall may be a table's top."""
+    (height, width), labels = depth.shape, np.zeros(depth.shape, dtype=np.int32)
+    labels[3 * height // 8 : 5 * height // 8 + 1, 3 * width // 8 : 5 * width // 8 + 1] = masks
+    K = np.array([[0.8 * width, 0, (width - 1) / 2], [0, 0.8 * width, (height - 1) / 2], [0, 0, 1]])
+    for T, expected in ((T_world_camera, posed), (None, loose)):
+        folder = tmp_path / f"{T is None}"
+        write_recording(folder, [View(depth, K, T, labels=labels if masks else None)])
+        if isinstance(expected, str):
+            refused("extract", folder, names=folder.name, says=expected)
+        else:
+            assert run_command("extract", folder, "--out", tmp_path / "run") == 0
+            assert len(read_run(tmp_path / "run").graph.objects) == expected + masks
 
 
 # MJCF

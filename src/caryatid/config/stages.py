@@ -55,7 +55,8 @@ class CloudConfig:
     edge_jump: NotNegative = 0.01
     """A larger depth step between neighbours separates two surfaces [m]; at 1 m, growing with z²."""
     max_slope: NotNegative = 0.004
-    """Change of inverse depth within one surface beyond edge_jump [1/m per px]; a tilt of 80° at 2.7 m."""
+    """Change of inverse depth within one surface beyond edge_jump [1/m per px]; a tilt of 80° at 2.7 m with
+    f = 525 px. In coarser images more by as much as the pixels are larger."""
     voxel: Positive = 0.005
     """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
     depth: Count = 5

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.config import Config, SegmentationMethod
+from caryatid.config import CloudConfig, Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
@@ -194,11 +194,23 @@ def _points(
         among = among if among.any() else None
     points, normals, pixels = oriented_points(source, config.cloud, among=among)
     if len(points) == 0:
-        limits = f"{config.cloud.min_depth:g}–{config.cloud.max_depth:g} m"
-        raise PerceptionError(f"{source.name}: holds no depth readings within {limits}")
+        raise PerceptionError(f"{source.name}: {_why_nothing(source, config.cloud)}")
     rgb = None if source.rgb is None else np.take(source.rgb.reshape(-1, 3), pixels, axis=0)
     eye = None if source.T_world_camera is None else source.T_world_camera[:3, 3]
     return Cloud(points, normals, None, rgb, eye, source.name), pixels
+
+
+def _why_nothing(view: View, config: CloudConfig) -> str:
+    """Say why a view holds no oriented points, and what may help."""
+    readings, near, far = view.depth[view.valid], config.min_depth, config.max_depth
+    if len(readings) == 0:
+        return "holds no depth readings; leave it out"
+    if ((readings >= near) & (readings <= far)).any():
+        why = "pixels side by side are too few, or differ too much in depth"
+        return f"shows no surface: {why}; give a larger image, or one with less noise"
+    found = f"within {near:g}–{far:g} m, but {readings.min():.3g}–{readings.max():.3g} m"
+    remedy = "check the unit of depth, or set cloud.min_depth and cloud.max_depth"
+    return f"holds no depth readings {found}; {remedy}"
 
 
 def level_transform(

@@ -13,6 +13,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import SHARES, on_threads
 from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.sensing.clouds import slope_limit
 from caryatid.sensing.views import View
 
 Grid = tuple[slice, slice]
@@ -87,7 +88,7 @@ def take_samples(
         image = np.zeros(view.depth.shape, dtype=np.float32)
         np.divide(np.float32(1.0), view.depth, out=image, where=counts)
         shares = np.array_split(np.column_stack([row, column]), SHARES)
-        windows = radius, clouds.edge_jump, clouds.max_slope
+        windows = radius, clouds.edge_jump, slope_limit(view.K[0, 0], clouds)
         planes = np.concatenate(on_threads(lambda k: _fit_planes(image, shares[k], *windows), SHARES))
         known = planes[:, 0] > 0.0
         slopes = planes[:, 1:] * view.K[[0, 1], [0, 1]]

@@ -225,7 +225,8 @@ def _tried(scene: _Scene, rng: np.random.Generator) -> str:
     """Say among what a support surface was sought in vain, and what may help."""
     points, normals, up, config = scene
     if len(points) < config.min_points:
-        return f"{len(points)} points were seen, {config.min_points} are needed; show more of the table top"
+        few = f"only {len(points)} points are on a surface, {config.min_points} are needed"
+        return f"{few}; show more of the table top, or give a larger image"
     level = "plane" if up is None else "level plane"
     tried = f"fewer than {config.min_points} of {len(points)} points lie on one {level}"
     facing = scene._replace(up=transforms.unit(normals.mean(axis=0)), config=replace(config, max_tilt=180.0))

@@ -51,11 +51,16 @@ def oriented_points(
         radius = min(radius, max(1, round((width - 1.0) / 2.0)))
     if among is not None:
         inverse_depth[~among] = 0.0
-    planes = local_planes(inverse_depth, radius, config.edge_jump, config.max_slope)
+    planes = local_planes(inverse_depth, radius, config.edge_jump, slope_limit(view.K[0, 0], config))
     pixels = np.flatnonzero(planes[2] > 0.0)
     points, normals = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
     for_each(_orient, SHARES, (pixels, planes, np.ascontiguousarray(view.K), T, points, normals))
     return points, normals, pixels
+
+
+def slope_limit(focal: float, config: CloudConfig) -> float:
+    """Largest change of 1/z within one surface [1/m per px] for a focal length [px]."""
+    return config.max_slope * max(1.0, 525.0 / focal)
 
 
 def local_planes(inverse_depth: Image, radius: int, edge_jump: float, max_slope: float) -> Image:
