@@ -19,7 +19,7 @@ from synthetic import (
     vertices,
 )
 
-from caryatid.config import Config, FusionConfig, RegistrationConfig
+from caryatid.config import Config, FusionConfig, RegistrationConfig, SensorConfig
 from caryatid.errors import InputError, PerceptionError
 from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
@@ -27,6 +27,7 @@ from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
 from caryatid.sensing.views import SUPPORT_LABEL
+from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.truth import ground_truth
 
 METHODS = ("pc", "sg", "pc+sg")
@@ -193,6 +194,22 @@ def test_a_first_view_without_a_pose_gets_one_and_a_view_that_is_refused_changes
     with pytest.raises(PerceptionError):
         scene.update(nothing)
     assert (scene.graph, scene.views, len(scene.cloud)) == kept
+
+
+def test_of_large_images_as_many_pixels_are_used_as_points_are_kept(caplog):
+    """The others have the labels of those beside them."""
+    camera = SimulatedCamera(simulated_scene("tower"), sensor=SensorConfig(1281, 959, 1210.0))
+    view = replace(camera.capture(look_from(180.0)), normals_camera=None)
+    scene = Scene(segmentation="labels")
+    with caplog.at_level("INFO"):
+        graph = scene.update(view)
+    assert "641×480 of 1281×959 pixels are used" in caplog.text
+    assert scene.labels.shape == view.depth.shape
+    objects = (scene.labels > 0) & (scene.labels != SUPPORT_LABEL)
+    assert (scene.labels == view.labels)[objects].mean() > 0.98
+    assert objects.sum() == pytest.approx((view.labels > 0).sum(), rel=0.03)
+    few = model_of([view.every(2)]).graph
+    assert graph_text(graph) == graph_text(few)
 
 
 @pytest.mark.parametrize("segmentation", ["labels", "auto"])

@@ -197,7 +197,8 @@ class Scene(Pictured):
         given = source.labels is not None and self.segmentation != "auto"
         named = given and self._named(source)
         observation = self._observed(source)
-        if observation.view is not None:
+        if observation.view is not None and isinstance(source, View):
+            self._say_thinned(source, observation.view)
             self._check_holes(observation.view, observation.surface)
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
@@ -245,6 +246,15 @@ class Scene(Pictured):
                 "%s: %d of %d masks lie on objects that had other numbers; if a number means nothing in "
                 'another view, use --masks per-view or View(labels_are="segments")',
                 name, wrong, shown,
+            )  # fmt: skip
+
+    def _say_thinned(self, source: View, used: View) -> None:
+        """Say once that some pixels of large images are enough."""
+        (height, width), (rows, columns) = source.depth.shape, used.depth.shape
+        if not self.views and rows < height:
+            log.info(
+                "%s: %d×%d of %d×%d pixels are used, as near to each other as cloud.voxel asks for",
+                source.name, columns, rows, width, height,
             )  # fmt: skip
 
     def _check_holes(self, view: View, surface: SupportSurface) -> None:

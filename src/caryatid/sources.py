@@ -138,7 +138,8 @@ def open_recording(
     for frame in recording.frames:
         view = frame.load()
         if view.labels is not None and masks is None:
-            points.update(view.labels[view.valid].tolist())
+            pixels = np.bincount(view.labels[view.valid])
+            points.update({label: int(pixels[label]) for label in np.flatnonzero(pixels).tolist()})
     if segmentation != "auto":
         _check_segments(folder, points, config)
     return recording

@@ -28,7 +28,7 @@ class Observation:
     """What one view shows.
 
     Attributes:
-        view: The view, posed; None where the source was a cloud.
+        view: The view, posed and thinned; None where the source was a cloud.
         cloud: Oriented points in the world frame with labels: 0 nothing, 65535 the support surface.
         pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
         surface: The support surface as this view shows it.
@@ -97,6 +97,7 @@ def observe(
     if segmentation == "labels" and source.labels is None:
         raise InputError(source.name, "has no labels", "give masks, or segment with --segmentation auto")
     use_labels = source.labels is not None and segmentation != "auto"
+    source = thinned(source, config.cloud)
     if isinstance(source, View) and source.T_world_camera is None:
         if known is not None:
             raise InputError(source.name, "has no camera pose", "only a single view may come without one")
@@ -170,9 +171,20 @@ def _bodies(labels, inverse_depth, jump):  # type: ignore[no-untyped-def]
 
 def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.int32]:
     """Labels of all pixels (H, W) of a view, or of all points (N,) of a cloud."""
-    image = np.zeros(source.depth.shape if isinstance(source, View) else len(source), dtype=np.int32)
+    used = observation.view or source
+    image = np.zeros(used.depth.shape if isinstance(used, View) else len(used), dtype=np.int32)
     image.ravel()[observation.pixels] = observation.labels
+    if isinstance(used, View) and isinstance(source, View) and image.shape != source.depth.shape:
+        step = round(source.K[0, 0] / used.K[0, 0])
+        row, column = (np.arange(n) // step for n in source.depth.shape)
+        image = image[row[:, None], column]
     return image
+
+
+def thinned(source: View | Cloud, config: CloudConfig) -> View | Cloud:
+    """Return every n-th pixel of a view whose pixels are nearer to each other than points need be."""
+    step = 1 if isinstance(source, Cloud) else int(config.voxel * source.K[0, 0] / config.max_depth)
+    return source.every(step) if isinstance(source, View) and step > 1 else source
 
 
 def _points(
@@ -228,6 +240,7 @@ def level_transform(
         NoSurfaceError: There is no support surface.
         PerceptionError: There are no readings.
     """
+    source = thinned(source, config.cloud)
     cloud, pixels = _points(source, config)
     given = np.take(source.labels, pixels) if use_labels and source.labels is not None else None
     surface = _surface(cloud, given, None, None, config, rng)

@@ -130,6 +130,14 @@ class View(Pictured):
         object.__setattr__(other, "T_world_camera", T)
         return other
 
+    def every(self, step: int) -> View:
+        """Return the view as every `step`-th pixel of every `step`-th row shows it."""
+        K, taken = self.K / np.array([[step], [step], [1.0]]), dict[str, Any]()
+        for name in ("depth", "rgb", "labels", "normals_camera", "ignored"):
+            image = getattr(self, name)
+            taken[name] = None if image is None else np.ascontiguousarray(image[::step, ::step])
+        return replace(self, K=K, **taken)
+
     def __repr__(self) -> str:
         given = [name for name in ("rgb", "labels") if getattr(self, name) is not None]
         given += [] if self.T_world_camera is None else ["pose"]
