@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import struct
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -85,6 +87,16 @@ def test_an_image_that_shows_no_objects(tmp_path, refused, depth, T_world_camera
         else:
             assert run_command("extract", folder, "--out", tmp_path / "run") == 0
             assert len(read_run(tmp_path / "run").graph.objects) == expected + masks
+
+
+def test_an_image_larger_than_any_cameras(recording, refused):
+    """Its header says so; nothing is decoded."""
+    path = recording / "depth/000001.png"
+    header = b"IHDR" + struct.pack(">II", 12000, 9000) + path.read_bytes()[24:29]
+    path.write_bytes(
+        path.read_bytes()[:12] + header + struct.pack(">I", zlib.crc32(header)) + path.read_bytes()[33:]
+    )
+    refused("extract", recording, names=path, says="has more than 89478485 pixels; give a smaller image")
 
 
 # MJCF

@@ -19,11 +19,10 @@ from caryatid.errors import InputError
 DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
-_BAD_BYTES: Final = (
-    *(SyntaxError, ValueError, EOFError, struct.error, zlib.error),
-    *(Image.DecompressionBombError, Image.DecompressionBombWarning),
-)
-"""What Pillow raises on a broken image, and on one that says it is larger than any camera's."""
+_BAD_BYTES: Final = (SyntaxError, ValueError, EOFError, struct.error, zlib.error)
+"""What Pillow raises on a broken image, …"""
+_TOO_LARGE: Final = (Image.DecompressionBombError, Image.DecompressionBombWarning)
+"""… and on one that says it is larger than any camera's."""
 
 
 class BrokenImageError(InputError):
@@ -93,6 +92,9 @@ def decode_image(
                 return np.array(opened.convert("RGB") if modes is None or "RGB" in modes else opened)
     except FileNotFoundError:
         raise BrokenImageError(source, "the file is missing", remedy) from None
+    except _TOO_LARGE:
+        reason = f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
+        raise BrokenImageError(source, reason, "give a smaller image") from None
     except UnidentifiedImageError as error:
         raise BrokenImageError(source, "is no image", remedy) from error
     except (*_BAD_BYTES, OSError) as error:
