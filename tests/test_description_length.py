@@ -12,10 +12,19 @@ from synthetic import box, cylinder, seen_free, sphere, surface_points
 
 from caryatid.config import Config, ExplanationConfig, FitConfig
 from caryatid.geometry import transforms
-from caryatid.objects.description_length import Evidence, best_explanation, explain, point_costs, price
+from caryatid.objects.compounds import OpenBox, Revolution
+from caryatid.objects.description_length import (
+    Evidence,
+    best_compound,
+    best_explanation,
+    explain,
+    point_costs,
+    price,
+)
 from caryatid.objects.model_selection import best_merge, split
 from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import Cloud
+from caryatid.simulation import household
 
 CONFIG, COSTS, FIT = Config(), ExplanationConfig(), FitConfig()
 EYE = (-1.2, -0.6, 1.0)
@@ -190,17 +199,22 @@ def test_what_something_in_front_cut_in_two_is_one_and_looked_at_again_when_it_h
 
 
 def bowl(azimuths, seed=0):
-    """Outside of a bowl that widens upwards, of the directions [rad] given: none of the shapes."""
+    """Outside of a lobed bowl that widens upwards, of the directions [rad] given: none of the shapes."""
     rng = np.random.default_rng(seed)
     azimuth, height = rng.uniform(*azimuths, 2500), rng.uniform(0.0, 0.06, 2500)
-    radius = 0.03 + height * (1.0 + 0.5 * np.sin(4.0 * azimuth))
-    across = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
-    normals = np.concatenate([across, np.full((2500, 1), -1.0)], axis=1) / np.sqrt(2.0)
-    return Cloud(np.column_stack([radius[:, None] * across, height]), normals)
+    opening, turning = 1.0 + 0.5 * np.sin(4.0 * azimuth), 2.0 * height * np.cos(4.0 * azimuth)
+    radius = 0.03 + height * opening
+    away = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(2500)], axis=1)
+    around = np.stack([-np.sin(azimuth), np.cos(azimuth), np.zeros(2500)], axis=1)
+    normals = away - (turning / radius)[:, None] * around - opening[:, None] * UP
+    return Cloud(radius[:, None] * away + height[:, None] * UP, transforms.unit(normals))
+
+
+def test_halves_of_what_goes_around_an_axis_are_one():
+    assert pair_of({1: bowl((-np.pi, 0.3)), 2: bowl((0.3, np.pi))}) is not None
 
 
 def test_irregular_neighbours_stay_two_also_where_the_surface_goes_on():
-    assert pair_of({1: bowl((-np.pi, 0.3)), 2: bowl((0.3, np.pi))}) is None
     rng = np.random.default_rng(1)
     xy = rng.uniform(-0.15, 0.15, (6000, 2))
     xy = xy[np.hypot(*xy.T) > 0.035]
@@ -210,3 +224,55 @@ def test_irregular_neighbours_stay_two_also_where_the_surface_goes_on():
     for cloud in (paper, standing):
         assert alone_in(gather(cloud)).shape is None
     assert pair_of({1: standing, 2: paper}) is None
+
+
+def visible(shape, spacing=0.005, eye=(0.9, 0.3, 0.9)):
+    """Noisy points of a shape that the eye sees past the shape itself, with normals."""
+    points, normals = shape.surface(spacing)
+    way = np.asarray(eye) - points
+    seen = np.einsum("ni,ni->n", way, normals) > 0.0
+    for far in np.linspace(0.006, 0.3, 40):
+        seen &= shape.signed_distance(points + far * transforms.unit(way)) > -1e-4
+    noise = np.random.default_rng(0).normal(0.0, 0.001, (int(seen.sum()), 3))
+    return gather(Cloud(points[seen] + noise, normals[seen]))
+
+
+@pytest.mark.parametrize(
+    ("make", "kind"),
+    [
+        (household._tray, OpenBox),
+        (household._open_box, OpenBox),
+        (household._bowl, Revolution),
+        (household._mug, Revolution),
+        (household._bottle, Revolution),
+    ],
+)
+def test_a_compound_explains_what_no_primitive_does(make, kind):
+    evidence = visible(make(np.random.default_rng(1)))
+    primitive = alone_in(evidence)
+    compound = best_compound(evidence, CONFIG, primitive.cost)
+    assert isinstance(compound.shape, kind)
+    assert compound.cost < primitive.cost
+
+
+def test_two_things_that_share_no_axis_are_no_compound():
+    for second in (box((0.03, 0.05, 0.025), (0.06, 0.08, 0.05)), sphere((0.0, 0.07, 0.03), 0.03)):
+        first = visible(cylinder((0.0, 0.0, 0.05), 0.04, 0.1))
+        other = visible(second)
+        apart = alone_in(first).cost + alone_in(other).cost
+        assert best_compound(first.joined(other), CONFIG, apart).shape is None
+
+
+def test_a_compound_costs_by_the_space_seen_free_in_it():
+    """A ring that would hold two plates side by side is not there between them."""
+    plates = [visible(cylinder((x, 0.0, 0.01), 0.06, 0.02)) for x in (-0.1, 0.1)]
+    both = plates[0].joined(plates[1])
+    apart = sum(alone_in(plate).cost for plate in plates)
+
+    def beside(places):
+        return np.min([np.hypot(places[:, 0] - x, places[:, 1]) for x in (-0.1, 0.1)], axis=0) > 0.07
+
+    unknown = best_compound(both, CONFIG, np.inf)
+    seen = replace(both, voxels=seen_free(beside))
+    assert best_compound(seen, CONFIG, np.inf).cost > unknown.cost + 30.0
+    assert best_compound(seen, CONFIG, apart).shape is None

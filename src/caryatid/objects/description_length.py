@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from caryatid.config import ExplanationConfig, FitConfig
+from caryatid.config import Config, ExplanationConfig, FitConfig
 from caryatid.fitting.primitives import candidates, free_inside
 from caryatid.geometry.shapes import Box, Shape
-from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import Array
+from caryatid.objects.compounds import Compound, compounds, shape_costs
 from caryatid.sensing.voxel_map import VoxelMap
 
 
@@ -53,57 +52,60 @@ class Explanation:
     """The best shape for some points.
 
     Attributes:
-        shape: The shape, or None where the points cost less as an irregular object.
+        shape: The shape or compound, or None where the points cost less as an irregular object.
         cost: Cost of all the points and of the object itself [nats].
     """
 
-    shape: Shape | None
+    shape: Shape | Compound | None
     cost: float
 
 
-def price(shape: Shape | None, config: ExplanationConfig) -> float:
+def price(shape: Shape | Compound | None, config: ExplanationConfig) -> float:
     """Price [nats] of an object: of the parameters of its shape; an irregular one has as many as a box."""
     return config.parameter_cost * (Box if shape is None else shape).parameters
 
 
-def point_costs(shape: Shape | None, evidence: Evidence, config: ExplanationConfig) -> Array:
+def point_costs(shape: Shape | Compound | None, evidence: Evidence, config: ExplanationConfig) -> Array:
     """Cost (N,) [nats] of each point on a shape, or on an irregular object, before its weight."""
     if shape is None:
         return np.full(len(evidence), config.irregular)
-    costs: Array = _point_costs(
-        shape.code, shape.T_world_object, shape.extents / 2.0, evidence.points, evidence.normals,
-        evidence.noise, config.normal_weight, config.outlier,
-    )  # fmt: skip
-    return costs
+    seen = evidence.points, evidence.normals, evidence.noise, config
+    return shape_costs(shape, *seen) if isinstance(shape, Shape) else shape.costs(*seen)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _point_costs(kind, T, half, points, normals, noise, normal_weight, outlier):  # type: ignore[no-untyped-def]
-    costs, hx, hy, hz = np.empty(len(points)), half[0], half[1], half[2]
-    centre, origin = T[:3, 3], np.zeros(3)
-    for i in range(len(points)):
-        x, y, z = local(T, centre, points, i)
-        distance, gx, gy, gz = gradient(kind, x, y, z, hx, hy, hz)
-        u, v, w = local(T, origin, normals, i)
-        turned = 1.0 - (gx * u + gy * v + gz * w)
-        costs[i] = min(distance**2 / (2.0 * noise**2) + normal_weight * turned, outlier)
-    return costs
-
-
-def best_explanation(shapes: Sequence[Shape], evidence: Evidence, config: ExplanationConfig) -> Explanation:
+def best_explanation(
+    shapes: Sequence[Shape | Compound], evidence: Evidence, config: ExplanationConfig
+) -> Explanation:
     """Explain points by one of some shapes, or as an irregular object, whichever costs least."""
     found = [Explanation(shape, _cost(shape, evidence, config)) for shape in (None, *shapes)]
     return min(found, key=lambda e: e.cost)
 
 
-def _cost(shape: Shape | None, evidence: Evidence, config: ExplanationConfig) -> float:
+def best_compound(evidence: Evidence, config: Config, below: float) -> Explanation:
+    """Explain points by the compound that costs least, if any costs less than `below` [nats], or by none."""
+    best, costs = Explanation(None, below), config.explanation
+    if len(evidence) < 2 * config.fit.min_points:
+        return best
+    known = evidence.noise, evidence.weight, config.fit.min_extent, costs
+    for compound in compounds(evidence.points, evidence.normals, *known):
+        cost = float(point_costs(compound, evidence, costs).sum()) * evidence.weight + price(compound, costs)
+        if cost < best.cost and evidence.voxels is not None:
+            cost += costs.free_cost * compound.free(evidence.voxels)
+        if cost < best.cost:
+            best = Explanation(compound, cost)
+    return best
+
+
+def _cost(shape: Shape | Compound | None, evidence: Evidence, config: ExplanationConfig) -> float:
     """Cost [nats] of points as one object: of the points, the space seen free inside it, and its price."""
-    cost = float(point_costs(shape, evidence, config).sum()) * evidence.weight
-    if shape is not None and evidence.voxels is not None:
-        # A surface voxel may be half free.
-        inset = max(1.2 * evidence.voxels.config.size, 3.0 * evidence.noise)
-        cost += config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
-    return cost + price(shape, config)
+    cost = float(point_costs(shape, evidence, config).sum()) * evidence.weight + price(shape, config)
+    if shape is None or evidence.voxels is None:
+        return cost
+    if not isinstance(shape, Shape):
+        return cost + config.free_cost * shape.free(evidence.voxels)
+    # A surface voxel may be half free.
+    inset = max(1.2 * evidence.voxels.config.size, 3.0 * evidence.noise)
+    return cost + config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
 
 
 def explain(

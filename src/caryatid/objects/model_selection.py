@@ -14,12 +14,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from caryatid.config import Config
-from caryatid.geometry import transforms
-from caryatid.geometry.shapes import KINDS
+from caryatid.geometry.shapes import KINDS, Shape
 from caryatid.geometry.transforms import Array
+from caryatid.objects.compounds import box_axes
 from caryatid.objects.description_length import (
     Evidence,
     Explanation,
+    best_compound,
     best_explanation,
     explain,
     point_costs,
@@ -143,7 +144,10 @@ def _best_two(
     tried = sorted((look.cost, k) for k, look in enumerate(looks) if look and k in shaped)[:2]
     settled = _settled(evidence, [starts[k] for _, k in tried], near, config.split.rounds, config, rng)
     better = [two for two in settled if two and two.cost < whole.cost and not _is_layer(evidence, two)]
-    return min(better, key=lambda two: two.cost, default=None)
+    best = min(better, key=lambda two: two.cost, default=None)
+    if best is not None and best_compound(evidence, config, best.cost).shape is not None:
+        return None
+    return best
 
 
 def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
@@ -151,7 +155,7 @@ def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
     sides = evidence.points[two.second], evidence.points[~two.second]
     # 9 mm: a view that is off by 3σ leaves points that far from a surface.
     return any(
-        other.shape is not None and float((other.shape.signed_distance(side) < 0.009).mean()) >= 0.8
+        isinstance(other.shape, Shape) and float((other.shape.signed_distance(side) < 0.009).mean()) >= 0.8
         for side, other in zip(sides, two.explanations, strict=True)
     )
 
@@ -208,23 +212,10 @@ def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> It
             start[np.flatnonzero(poor)[part == number]] = True
             yield start
     shares = np.linspace(0.0, 1.0, config.split.cuts + 2)[1:-1]
-    for direction in _directions(evidence.normals, up):
+    for direction in box_axes(evidence.normals, up):
         height = evidence.points @ direction
         for level in np.quantile(height, shares):
             yield height > level
-
-
-def _directions(normals: Array, up: Array) -> list[Array]:
-    """Up, and the two horizontal directions most faces look along."""
-    level = normals - np.outer(normals @ up, up)
-    length = np.linalg.norm(level, axis=1)
-    upright = level[length > 0.5] / length[length > 0.5, None]
-    if len(upright) == 0:
-        return [up]
-    x, y = transforms.perpendicular(up), np.cross(up, transforms.perpendicular(up))
-    angle = np.angle(np.mean(((upright @ x) + 1j * (upright @ y)) ** 4)) / 4.0
-    main = np.cos(angle) * x + np.sin(angle) * y
-    return [up, main, np.cross(up, main)]
 
 
 def _components(points: Array) -> Groups:
@@ -309,11 +300,21 @@ def _gain(
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
         if one.cost > two.cost + price(None, costs):
             break
+    gain = two.cost - one.cost
+    # A compound has creases of its own: to it a border without one means nothing. Where both shapes do, it
+    # must be the simpler one: with more parameters it fits what is left of the views' errors better.
+    apart, simpler = alone.cost + other.cost, price(alone.shape, costs) + price(other.shape, costs)
+    compound = best_compound(both, config, apart - max(gain, 0.0))
+    usual = all(
+        point_costs(e.shape, own, costs).mean() <= costs.usual for own, e in (known[k] for k in labels)
+    )
+    if compound.shape is not None and (price(compound.shape, costs) <= simpler or not usual):
+        one, gain = compound, apart - compound.cost
     if one.shape is None:
         return 0.0
     cost = point_costs(one.shape, both, costs)
     is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= costs.irregular
-    return two.cost - one.cost if is_one else 0.0
+    return gain if is_one else 0.0
 
 
 def _around(points: Array) -> Groups:

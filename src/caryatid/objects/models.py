@@ -20,7 +20,14 @@ from caryatid.geometry.points import last_in_voxels, most_central
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, object_id
-from caryatid.objects.description_length import Evidence, Explanation, best_explanation
+from caryatid.objects.compounds import Compound
+from caryatid.objects.description_length import (
+    Evidence,
+    Explanation,
+    best_compound,
+    best_explanation,
+    point_costs,
+)
 from caryatid.objects.model_selection import GROWTH, best_merge, split
 from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
@@ -170,6 +177,7 @@ class ObjectModels:
         self._config = config
         self._seed = seed
         self._solids: dict[int, SceneObject] = {}
+        self._compounds: dict[int, Shape | Compound | None] = {}
         self._undivided: dict[int, int] = {}
         self._segments: list[tuple[cKDTree, NDArray[np.int32]]] = []
         self._apart: dict[tuple[int, int], int] = {}
@@ -181,6 +189,7 @@ class ObjectModels:
         other.points = self.points.copy()
         other.fits = self.fits.copy()
         other._solids = self._solids.copy()
+        other._compounds = self._compounds.copy()
         other._undivided = self._undivided.copy()
         other._segments = self._segments.copy()
         other._apart = self._apart.copy()
@@ -255,7 +264,7 @@ class ObjectModels:
             labels: Objects this view shows.
             voxels: Space this view sees free, which no shape may fill.
         """
-        self.fits = {}
+        self.fits, self._compounds = {}, {}
         self._fit(labels, self.points.newest, voxels)
 
     def fit_all(self, labels: set[int], voxels: VoxelMap | None = None) -> None:
@@ -304,7 +313,7 @@ class ObjectModels:
             Label given up → label that takes its points.
         """
         noise, given_up = self._noise(), dict[int, int]()
-        known = {k: self._explained(k, noise, voxels) for k in sorted(self.fits)}
+        known = {k: self._explained(k, noise, voxels, compound=True) for k in sorted(self.fits)}
         while pair := best_merge(
             known, labels, self._apart, distinct=self._distinct, config=self._config, seed=self._seed
         ):
@@ -316,7 +325,7 @@ class ObjectModels:
             del self.fits[old], known[old], known[new]
             self.fit_all({new}, voxels)
             if new in self.fits:
-                known[new] = self._explained(new, noise, voxels)
+                known[new] = self._explained(new, noise, voxels, compound=True)
             labels = labels | {new}
         return given_up
 
@@ -358,13 +367,22 @@ class ObjectModels:
         """The objects in the order of their labels: as solids, or with the primitives fitted to them."""
         return [self._solids.get(k, self.fits[k]) for k in sorted(self.fits)]
 
-    def _explained(self, label: int, noise: float, voxels: VoxelMap | None) -> tuple[Evidence, Explanation]:
-        """What explanations of an object go by, and its explanation by the shape fitted to it."""
+    def _explained(
+        self, label: int, noise: float, voxels: VoxelMap | None, *, compound: bool = False
+    ) -> tuple[Evidence, Explanation]:
+        """What explanations of an object go by, and its explanation by its shape, or by a compound too."""
         config = self._config.explanation
         cloud = self.points.of(label, config.spacing)
         weight = config.spacing**2 / config.reading
         evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels)
-        return evidence, best_explanation([self.fits[label].shape], evidence, config)
+        shape = self.fits[label].shape
+        explanation = best_explanation([shape], evidence, config)
+        if not compound or point_costs(shape, evidence, config).mean() <= config.usual:
+            return evidence, explanation
+        if label not in self._compounds:
+            self._compounds[label] = best_compound(evidence, self._config, explanation.cost).shape
+        known = self._compounds[label]
+        return evidence, explanation if known is None else best_explanation([shape, known], evidence, config)
 
     def _hints(self, points: Array) -> Sequence[NDArray[np.bool_]]:
         """Points (N,) that segmentation took for a segment of its own in one of the views."""
@@ -405,6 +423,7 @@ class ObjectModels:
 
         for label, result in zip(names, on_threads(fitted, len(names)), strict=True):
             self.fits.pop(label, None)
+            self._compounds.pop(label, None)
             if isinstance(result, Fit):
                 self.fits[label] = SceneObject(
                     id=object_id(label),

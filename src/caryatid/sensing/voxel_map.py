@@ -153,6 +153,17 @@ class VoxelMap:
         """State (N,) of the voxels that hold points (N, 3) [m]; 0 outside the map."""
         return _values_at(self.states, points_world, self.origin_world, self.config.size)
 
+    def empty_at(self, points_world: Array) -> NDArray[np.bool_]:
+        """Whether the voxels (N,) that hold points (N, 3) [m] were looked through and never hit.
+
+        Views along a thin wall look through its voxels more often than they hit it.
+        """
+        passed, hit = (
+            _values_at(counts.view(np.int8), points_world, self.origin_world, self.config.size)
+            for counts in (self.passes, self.hits)
+        )
+        return (passed != 0) & (hit == 0)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Occluders:
