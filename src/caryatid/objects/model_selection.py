@@ -300,7 +300,7 @@ def _gain(
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
         if one.cost > two.cost + price(None, costs):
             break
-    gain = two.cost - one.cost
+    gain, most = two.cost - one.cost, costs.irregular
     # A compound has creases of its own: to it a border without one means nothing. Where both shapes do, it
     # must be the simpler one: with more parameters it fits what is left of the views' errors better.
     apart, simpler = alone.cost + other.cost, price(alone.shape, costs) + price(other.shape, costs)
@@ -309,11 +309,11 @@ def _gain(
         point_costs(e.shape, own, costs).mean() <= costs.usual for own, e in (known[k] for k in labels)
     )
     if compound.shape is not None and (price(compound.shape, costs) <= simpler or not usual):
-        one, gain = compound, apart - compound.cost
+        one, gain, most = compound, apart - compound.cost, costs.usual
     if one.shape is None:
         return 0.0
     cost = point_costs(one.shape, both, costs)
-    is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= costs.irregular
+    is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= most
     return gain if is_one else 0.0
 
 
