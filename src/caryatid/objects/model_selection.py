@@ -63,10 +63,11 @@ def split(
 ) -> Groups | None:
     """Split points that several shapes explain at a lower cost than one.
 
-    Tried are hints, the patches that the single shape does not explain, and cuts across the vertical, where
-    one object lies on another, and across the two horizontal directions of the points' faces, where they
-    stand side by side. From each such hypothesis the points go to the shape that explains them better, and
-    the shapes are fitted again.
+    Pieces are two where space was seen free between them and nothing connects them. Otherwise tried are
+    hints, the patches that the single shape does not explain, and cuts across the vertical, where one object
+    lies on another, and across the two horizontal directions of the points' faces, where they stand side by
+    side. From each such hypothesis the points go to the shape that explains them better, and the shapes are
+    fitted again.
 
     Args:
         evidence: The points of what is taken for one object.
@@ -79,6 +80,9 @@ def split(
     Returns:
         Group of each point (N,), from 0, or None where one object is the better explanation.
     """
+    pieces = _far_apart(evidence, config)
+    if pieces is not None:
+        return pieces
     parts = _parts(evidence, whole, np.arange(len(evidence)), cache(hints), up, config, rng)
     if parts is None:
         return None
@@ -218,9 +222,31 @@ def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> It
             yield height > level
 
 
-def _components(points: Array) -> Groups:
-    """Connected part (N,) of each point, from 0; twice their spacing and more parts two."""
-    pairs = cKDTree(points).query_pairs(0.02, output_type="ndarray")
+def _far_apart(evidence: Evidence, config: Config) -> Groups | None:
+    """Piece (N,) of each point where free space parts the largest from others, or None where none is."""
+    points, voxels = evidence.points, evidence.voxels
+    piece = _components(points, config.explanation.reach)
+    sizes = np.bincount(piece)
+    if voxels is None or np.count_nonzero(sizes >= config.split.min_points) < 2:
+        return None
+    largest = int(sizes.argmax())
+    body = points[piece == largest]
+    tree = cKDTree(body)
+    groups = np.zeros(len(points), dtype=np.intp)
+    for number in np.flatnonzero(sizes >= config.split.min_points):
+        own = points[piece == number]
+        gap, near = tree.query(own)
+        begin, end = own[gap.argmin()], body[near[gap.argmin()]]
+        steps = np.arange(1.0, max(gap.min() // voxels.config.size, 1.0))[:, None] * voxels.config.size
+        between = begin + steps / max(float(gap.min()), 1e-9) * (end - begin)
+        if voxels.empty_at(between).any():
+            groups[piece == number] = groups.max() + 1
+    return groups if groups.any() else None
+
+
+def _components(points: Array, gap: float = 0.02) -> Groups:
+    """Connected part (N,) of each point, from 0; a gap [m], of twice their spacing and more, parts two."""
+    pairs = cKDTree(points).query_pairs(gap, output_type="ndarray")
     graph = scipy.sparse.coo_array((np.ones(len(pairs)), pairs.T), shape=(len(points), len(points)))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.intp)
 
