@@ -103,7 +103,7 @@ def _parts(
 ) -> list[Groups] | None:
     """Points of each object among those with this index; None where they are one.
 
-    A shape must explain each: pieces of a thing that has no shape are no objects.
+    Shapes must explain most of them: pieces of a thing that has no shape are no objects.
     """
     own = evidence.select(index)
     found = _best_two(own, whole, index, hints, up, config, rng)
@@ -113,7 +113,8 @@ def _parts(
     for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
         costs = point_costs(explanation.shape, own.select(side), config.explanation)
         further = _parts(evidence, explanation, index[side], hints, up, config, rng)
-        if further is None and costs.mean() > config.explanation.usual:
+        shapeless = further is None and costs.mean() > config.explanation.usual
+        if shapeless and 2 * np.count_nonzero(side) > len(index):
             return None
         parts += further or [index[side]]
     return parts
