@@ -87,7 +87,7 @@ def split(
     if parts is None:
         return None
     groups = np.zeros(len(evidence), dtype=np.intp)
-    for number, index in enumerate(parts):
+    for number, (index, _) in enumerate(parts):
         groups[index] = number
     return groups
 
@@ -100,8 +100,8 @@ def _parts(
     up: Array,
     config: Config,
     rng: np.random.Generator,
-) -> list[Groups] | None:
-    """Points of each object among those with this index; None where they are one.
+) -> list[tuple[Groups, float]] | None:
+    """Points of each object among those with this index, and its cost [nats]; None where they are one.
 
     Shapes must explain most of them: pieces of a thing that has no shape are no objects.
     """
@@ -109,15 +109,16 @@ def _parts(
     found = _best_two(own, whole, index, hints, up, config, rng)
     if found is None:
         return None
-    parts: list[Groups] = []
+    parts: list[tuple[Groups, float]] = []
     for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
         costs = point_costs(explanation.shape, own.select(side), config.explanation)
         further = _parts(evidence, explanation, index[side], hints, up, config, rng)
         shapeless = further is None and costs.mean() > config.explanation.usual
         if shapeless and 2 * np.count_nonzero(side) > len(index):
             return None
-        parts += further or [index[side]]
-    return parts
+        parts += further or [(index[side], explanation.cost)]
+    compound = best_compound(own, config, sum(cost for _, cost in parts))
+    return parts if compound.shape is None else None
 
 
 def _best_two(
@@ -149,10 +150,7 @@ def _best_two(
     tried = sorted((look.cost, k) for k, look in enumerate(looks) if look and k in shaped)[:2]
     settled = _settled(evidence, [starts[k] for _, k in tried], near, config.split.rounds, config, rng)
     better = [two for two in settled if two and two.cost < whole.cost and not _is_layer(evidence, two)]
-    best = min(better, key=lambda two: two.cost, default=None)
-    if best is not None and best_compound(evidence, config, best.cost).shape is not None:
-        return None
-    return best
+    return min(better, key=lambda two: two.cost, default=None)
 
 
 def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
