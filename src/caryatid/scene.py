@@ -199,7 +199,8 @@ class Scene(Pictured):
         observation = self._observed(source)
         if observation.view is not None and isinstance(source, View):
             self._say_thinned(source, observation.view)
-            self._check_holes(observation.view, observation.surface)
+            if not given:  # masks show what has no depth
+                self._check_holes(observation.view, observation.surface)
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
         watch.lap("register")
