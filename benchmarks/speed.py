@@ -25,14 +25,13 @@ from caryatid import Config, Scene, SupportGraph, View, next_best_view
 from caryatid.config import SegmentationMethod, SensorConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.expected_visibility import SURFACE_SAMPLES
 from caryatid.planning.planners import make_planner
 from caryatid.planning.points_of_interest import points_of_interest
 from caryatid.robots import Robot
 from caryatid.runtime.parallel import one_blas_thread
-from caryatid.segmentation.observation import UP
 from caryatid.segmentation.segments import segment
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
 from caryatid.sensing.clouds import oriented_points

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import NoSurfaceError
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed
 from caryatid.objects.hidden_extents import complete
@@ -24,7 +24,7 @@ from caryatid.runtime.compiling import compile_kernels
 from caryatid.runtime.display import Pictured, call
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
-from caryatid.segmentation.observation import UP, Observation, label_image, observe
+from caryatid.segmentation.observation import Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere

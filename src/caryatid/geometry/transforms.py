@@ -11,6 +11,8 @@ Array = NDArray[np.float64]
 """An array of float64; its shape is told where it is used."""
 
 
+UP: Array = np.array([0.0, 0.0, 1.0])
+"""The world's vertical (3,)."""
 RIGID_TOLERANCE = 1e-4
 """How far RᵀR may be from the identity (per entry, no unit) before a matrix is refused as a rotation."""
 

@@ -19,11 +19,9 @@ from caryatid.config import ExplanationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.signed_distance import gradient, local
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.sensing.voxel_map import VoxelMap
 
-UP = np.array([0.0, 0.0, 1.0])
-"""The world's vertical (3,)."""
 Index = NDArray[np.intp]
 """Indices (M,) of points."""
 

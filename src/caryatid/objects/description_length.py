@@ -73,6 +73,12 @@ def point_costs(shape: Shape | Compound | None, evidence: Evidence, config: Expl
     return shape_costs(shape, *seen) if isinstance(shape, Shape) else shape.costs(*seen)
 
 
+def explained(explanation: Explanation, evidence: Evidence, config: ExplanationConfig) -> bool:
+    """Whether a shape explains points about as well as true shapes do, without space seen free inside it."""
+    own = explanation.cost - price(explanation.shape, config)
+    return explanation.shape is not None and own <= config.usual * evidence.weight * len(evidence)
+
+
 def best_explanation(
     shapes: Sequence[Shape | Compound], evidence: Evidence, config: ExplanationConfig
 ) -> Explanation:
@@ -88,18 +94,21 @@ def best_compound(evidence: Evidence, config: Config, below: float) -> Explanati
         return best
     known = evidence.noise, evidence.weight, config.fit.min_extent, costs
     for compound in compounds(evidence.points, evidence.normals, *known):
-        cost = float(point_costs(compound, evidence, costs).sum()) * evidence.weight + price(compound, costs)
-        if cost < best.cost and evidence.voxels is not None:
-            cost += costs.free_cost * compound.free(evidence.voxels)
+        cost = _cost(compound, evidence, costs, best.cost)
         if cost < best.cost:
             best = Explanation(compound, cost)
     return best
 
 
-def _cost(shape: Shape | Compound | None, evidence: Evidence, config: ExplanationConfig) -> float:
-    """Cost [nats] of points as one object: of the points, the space seen free inside it, and its price."""
+def _cost(
+    shape: Shape | Compound | None, evidence: Evidence, config: ExplanationConfig, below: float = np.inf
+) -> float:
+    """Cost [nats] of points as one object: of the points, the space seen free inside it, and its price.
+
+    Space is not looked at where the cost is not below a limit [nats] without it.
+    """
     cost = float(point_costs(shape, evidence, config).sum()) * evidence.weight + price(shape, config)
-    if shape is None or evidence.voxels is None:
+    if shape is None or evidence.voxels is None or cost >= below:
         return cost
     if not isinstance(shape, Shape):
         return cost + config.free_cost * shape.free(evidence.voxels)

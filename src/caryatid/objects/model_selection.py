@@ -23,6 +23,7 @@ from caryatid.objects.description_length import (
     best_compound,
     best_explanation,
     explain,
+    explained,
     point_costs,
     price,
 )
@@ -80,9 +81,10 @@ def split(
     Returns:
         Group of each point (N,), from 0, or None where one object is the better explanation.
     """
-    pieces = _far_apart(evidence, config)
-    if pieces is not None:
-        return pieces
+    if not explained(whole, evidence, config.explanation):
+        pieces = _far_apart(evidence, config)
+        if pieces is not None:
+            return pieces
     parts = _parts(evidence, whole, np.arange(len(evidence)), cache(hints), up, config, rng)
     if parts is None:
         return None
@@ -103,7 +105,7 @@ def _parts(
 ) -> list[tuple[Groups, float]] | None:
     """Points of each object among those with this index, and its cost [nats]; None where they are one.
 
-    Shapes must explain most of them: pieces of a thing that has no shape are no objects.
+    A shape must explain each: pieces of a thing that has no shape are no objects.
     """
     own = evidence.select(index)
     found = _best_two(own, whole, index, hints, up, config, rng)
@@ -111,10 +113,8 @@ def _parts(
         return None
     parts: list[tuple[Groups, float]] = []
     for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
-        costs = point_costs(explanation.shape, own.select(side), config.explanation)
         further = _parts(evidence, explanation, index[side], hints, up, config, rng)
-        shapeless = further is None and costs.mean() > config.explanation.usual
-        if shapeless and 2 * np.count_nonzero(side) > len(index):
+        if further is None and not explained(explanation, own.select(side), config.explanation):
             return None
         parts += further or [(index[side], explanation.cost)]
     compound = best_compound(own, config, sum(cost for _, cost in parts))
@@ -317,7 +317,8 @@ def _gain(
     what is two, but not what is one.
     """
     costs, rng = config.explanation, np.random.default_rng([seed, *labels])
-    (first, alone), (second, other) = (known[label] for label in labels)
+    pair = [known[label] for label in labels]
+    (first, alone), (second, other) = pair
     both = first.joined(second)
     two = _two(both, np.arange(len(both)) >= len(first), (alone, other), _around(both.points), config)
     one = best_explanation([e.shape for e in (alone, other) if e.shape is not None], both, costs)
@@ -326,15 +327,12 @@ def _gain(
         if one.cost > two.cost + price(None, costs):
             break
     gain, most = two.cost - one.cost, costs.irregular
-    # A compound has creases of its own: to it a border without one means nothing. Where both shapes do, it
-    # must be the simpler one: with more parameters it fits what is left of the views' errors better.
-    apart, simpler = alone.cost + other.cost, price(alone.shape, costs) + price(other.shape, costs)
-    compound = best_compound(both, config, apart - max(gain, 0.0))
-    usual = all(
-        point_costs(e.shape, own, costs).mean() <= costs.usual for own, e in (known[k] for k in labels)
-    )
-    if compound.shape is not None and (price(compound.shape, costs) <= simpler or not usual):
-        one, gain, most = compound, apart - compound.cost, costs.usual
+    if not all(isinstance(e.shape, Shape) and explained(e, own, costs) for own, e in pair):
+        # A compound has creases of its own: to it a border without one means nothing.
+        apart = alone.cost + other.cost
+        compound = best_compound(both, config, apart - max(gain, 0.0))
+        if compound.shape is not None:
+            one, gain, most = compound, apart - compound.cost, costs.usual
     if one.shape is None:
         return 0.0
     cost = point_costs(one.shape, both, costs)

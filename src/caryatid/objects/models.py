@@ -18,7 +18,7 @@ from caryatid.fitting.primitives import Fit, FitFailure, fit
 from caryatid.geometry import points as kernels
 from caryatid.geometry.points import last_in_voxels, most_central
 from caryatid.geometry.shapes import Shape
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SceneObject, object_id
 from caryatid.objects.compounds import Compound
 from caryatid.objects.description_length import (
@@ -26,12 +26,12 @@ from caryatid.objects.description_length import (
     Explanation,
     best_compound,
     best_explanation,
-    point_costs,
+    explained,
 )
 from caryatid.objects.model_selection import GROWTH, best_merge, split
 from caryatid.objects.solids import as_solid
 from caryatid.runtime.parallel import on_threads
-from caryatid.segmentation.observation import UP, Observation
+from caryatid.segmentation.observation import Observation
 from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 from caryatid.sensing.voxel_map import VoxelMap
@@ -377,7 +377,7 @@ class ObjectModels:
         evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels)
         shape = self.fits[label].shape
         explanation = best_explanation([shape], evidence, config)
-        if not compound or point_costs(shape, evidence, config).mean() <= config.usual:
+        if not compound or explained(explanation, evidence, config):
             return evidence, explanation
         if label not in self._compounds:
             self._compounds[label] = best_compound(evidence, self._config, explanation.cost).shape

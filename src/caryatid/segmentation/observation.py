@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from caryatid.config import CloudConfig, Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import UP, Array
 from caryatid.segmentation.segments import segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
 from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
-UP = np.array([0.0, 0.0, 1.0])
-"""The world's vertical (3,)."""
 WHOLE = 0.1
 """What is smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
 
