@@ -13,6 +13,8 @@ from caryatid.sensing.views import View
 
 BASELINE = 0.1
 """Distance of a depth camera's two eyes, or of eye and projector, at the most [m]; a Kinect's is 0.075."""
+COARSER = 2
+"""How much coarser holes are sampled than segments [1]; what is to be found is as large as an object."""
 
 
 def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig) -> int:
@@ -26,8 +28,9 @@ def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig)
         surface: The support surface.
         config: Sampling, and what the smallest segment is.
     """
-    every = np.s_[:: config.stride, :: config.stride]
-    K = view.K / np.array([[config.stride], [config.stride], [1.0]])
+    step = COARSER * config.stride
+    every = np.s_[::step, ::step]
+    K = view.K / np.array([[step], [step], [1.0]])
     depth = view.depth[every]
     ignored = np.zeros(depth.shape, dtype=bool) if view.ignored is None else view.ignored[every]
     surface = surface.moved(transforms.invert(view.pose))
@@ -51,6 +54,6 @@ def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig)
     numbers = np.arange(1, count + 1)
     # A region is as wide as the largest circle in it [m].
     width = (2.0 * ndimage.distance_transform_edt(hole) - 1.0) / (K[0, 0] * np.where(hole, level, 1.0))
-    large = ndimage.sum_labels(hole, parts, numbers) >= config.min_size
+    large = ndimage.sum_labels(hole, parts, numbers) >= config.min_size / COARSER**2
     wide = ndimage.maximum(width, parts, numbers) >= config.min_width if count else large
     return int(np.count_nonzero(large & wide))
