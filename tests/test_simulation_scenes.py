@@ -227,6 +227,18 @@ def test_packed_objects_touch_one_another():
         assert -0.002 < min(gaps) < 0.004
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_blocks_are_equal_boxes_close_to_one_another(seed: int):
+    scene = generate("blocks", 6, seed)
+    assert_settled(scene)
+    shapes = list(true_shapes(scene).values())
+    assert all(isinstance(s, Box) and (s.extents == shapes[0].extents).all() for s in shapes)
+    for shape in shapes:
+        surface = shape.surface(0.003)[0]
+        gaps = [float(other.signed_distance(surface).min()) for other in shapes if other is not shape]
+        assert -0.002 < min(gaps) < 0.016
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pile-6-2", "dense-11-4", "packed-5-1"])
 def test_generated_names_repeat_byte_for_byte(name: str):

@@ -1,4 +1,4 @@
-"""Random scenes by size and seed: piles, dense heaps between screens and walls, packed and household ones."""
+"""Random scenes by size and seed: piles, heaps between screens, packed things, households, blocks."""
 
 from __future__ import annotations
 
@@ -30,16 +30,19 @@ from caryatid.simulation.world import (
     true_shapes,
 )
 
-GeneratedKind = Literal["pile", "dense", "packed", "house"]
+GeneratedKind = Literal["pile", "dense", "packed", "house", "blocks"]
 SIZES: dict[GeneratedKind, tuple[int, int]] = {
     "pile": (1, 25),
     "dense": (10, 25),
     "packed": (2, 25),
     "house": (1, 14),
+    "blocks": (2, 10),
 }
 """Kind of a scene → fewest and most objects, the screens of a dense one among them."""
 GAP = 0.002
 """Height over what is below from which an object is let go [m]."""
+CLOSE = 0.0005
+"""Distance of things that touch before they settle [m]: far below what a camera can see."""
 TRIES = 10
 """Times an object is set down again while it falls off, rolls away or upsets others; then the one before it
 is taken up again as well."""
@@ -65,7 +68,8 @@ def generate(
 
     A `pile` has most of them on what is there already, `dense` heaps them between tall free screens with
     walls that close part of the circle for a robot, `packed` pushes them together until they touch. All these
-    are of primitives; `house` has trays, bowls, mugs, plates, books and the like on and in each other.
+    are of primitives; `house` has trays, bowls, mugs, plates, books and the like on and in each other;
+    `blocks` are equal boxes in a row, a wall or a pyramid with gaps of 0 to 15 mm.
 
     Args:
         kind: Kind of scene.
@@ -83,8 +87,8 @@ def generate(
     if seed < 0:
         raise InputError(name, f"seed {seed} is negative", "give 0 or more")
     rng = np.random.default_rng([list(SIZES).index(kind), size, seed])
-    plan = {"pile": _pile, "dense": _dense, "packed": _packed, "house": _house}[kind](rng, size)
-    return _set_down(name, size, plan, physics or PhysicsConfig())
+    plans = {"pile": _pile, "dense": _dense, "packed": _packed, "house": _house, "blocks": _blocks}
+    return _set_down(name, size, plans[kind](rng, size), physics or PhysicsConfig())
 
 
 def _pile(rng: np.random.Generator, size: int) -> _Plan:
@@ -134,6 +138,28 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
 def _house(rng: np.random.Generator, size: int) -> _Plan:
     """Seven in ten things are set down on another one, or in it, the others anywhere on the table."""
     return _stacked(rng, thing, 0.12)
+
+
+def _blocks(rng: np.random.Generator, size: int) -> _Plan:
+    """Equal boxes side by side and in layers, all turned alike."""
+    extents = rng.uniform((0.04, 0.04, 0.04), (0.07, 0.1, 0.08))
+    gap = rng.uniform(CLOSE, 0.015)
+    pyramid = int(np.ceil(np.sqrt(2.0 * size + 0.25) - 0.5))
+    # Boxes of the lowest layer, and how many fewer each layer has than the one below it.
+    base, fewer = [(size, 0), ((size + 1) // 2, 0), (pyramid, 1)][int(rng.integers(3))]
+    layers = [(layer, base - fewer * layer) for layer in range(base if fewer else 2)]
+    cells = [(k - (count - 1) / 2.0, layer) for layer, count in layers for k in range(count)][:size]
+    turn = transforms.rigid(
+        transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi))), np.zeros(3)
+    )
+
+    def draw(scene: SimulatedScene | None) -> _Drop:
+        along, layer = cells[0 if scene is None else len(scene.object_bodies)]
+        z = TABLE_HEIGHT + (layer + 0.5) * extents[2] + (layer + 1) * CLOSE
+        box = Box(transforms.rigid(np.eye(3), (along * (extents[0] + gap), 0.0, z)), extents)
+        return Body(box.moved(turn)), layer > 0
+
+    return _Plan(draw)
 
 
 def _stacked(rng: np.random.Generator, make: Callable[[np.random.Generator], Shape], margin: float) -> _Plan:
@@ -282,17 +308,16 @@ def _turned(shape: Shape, turn: Array) -> Shape:
 def _pushed(shape: Shape, outward_world: Array, others: Sequence[Shape]) -> Shape:
     """Push a shape over the table from outside towards the middle until it touches another.
 
-    Before they settle, half a millimetre stays between them: far below what a camera can see.
+    Before they settle, `CLOSE` stays between them.
     """
-    close = 0.0005
-    z = TABLE_HEIGHT + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + close
+    z = TABLE_HEIGHT + float(shape.support(np.array([[0.0, 0.0, -1.0]]))[0]) + CLOSE
     distance = float(np.hypot(*TABLE_SIZE))
     for _ in range(60):
         at = shape.moved(transforms.rigid(np.eye(3), distance * outward_world + (0.0, 0.0, z)))
         gap = min(_gap(at, other) for other in others)
-        if gap < close or distance <= 0.0:
+        if gap < CLOSE or distance <= 0.0:
             break
-        distance = max(distance - gap + close / 2.0, 0.0)
+        distance = max(distance - gap + CLOSE / 2.0, 0.0)
     return at
 
 

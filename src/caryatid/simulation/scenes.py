@@ -97,15 +97,14 @@ SCENE_FILE = "scene.xml"
 TRUTH_FILE = "gt.json"
 """Name of the ground truth beside it."""
 
-_GENERATED = re.compile(r"(pile|dense|packed|house)-(\d+)-(\d+)")
+_GENERATED = re.compile(r"(pile|dense|packed|house|blocks)-(\d+)-(\d+)")
 
 
 def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None) -> SimulatedScene:
     """Load a scene and let it come to rest.
 
-    Built-in names come before files: a designed scene (`tower`, `bridge`, …), or `pile-SIZE-SEED`,
-    `dense-SIZE-SEED`, `packed-SIZE-SEED` and `house-SIZE-SEED` for a generated one, say `pile-8-3`. A folder
-    of such a name is reached as `./tower`.
+    Built-in names come before files: a designed scene (`tower`, `bridge`, …), or KIND-SIZE-SEED for a
+    generated one, say `pile-8-3`, of the kinds of `generate`. A folder called so is reached as `./tower`.
 
     Args:
         source: A built-in name, an MJCF file, or a folder with a `scene.xml`.
