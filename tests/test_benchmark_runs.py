@@ -26,7 +26,7 @@ from caryatid.benchmark.running import connect, run_locally, run_on_cluster, run
 from caryatid.benchmark.store import RESULTS, ResultStore
 from caryatid.benchmark.suites import SUITES, change_suite
 from caryatid.errors import CaryatidError, InputError
-from caryatid.runtime.fingerprint import fingerprint
+from caryatid.runtime import fingerprint
 
 pytestmark = pytest.mark.slow
 

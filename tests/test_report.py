@@ -29,11 +29,12 @@ from caryatid.planning.points_of_interest import PointOfInterest
 from caryatid.planning.posture import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
-from caryatid.viz import Figure, Report, make_report, render_html, render_pdf
 from caryatid.viz.colours import object_colour, rgb
 from caryatid.viz.drawings import Projection, draw_chart, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import arrange, draw_graph, layers
+from caryatid.viz.pdf import render_pdf
 from caryatid.viz.pictures import keep_apart, picture_svg
+from caryatid.viz.report import Figure, Report, make_report, render_html
 from caryatid.viz.tables import object_table
 
 SMALL = ReportConfig(image_width=160)

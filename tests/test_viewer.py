@@ -232,7 +232,7 @@ def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(step, opening, se
 
 def _waiting(monkeypatch, meanwhile):
     """Have the command, where it would wait for Ctrl-C, do something else."""
-    monkeypatch.setattr("caryatid.cli.view.wait_for_interrupt", meanwhile)
+    monkeypatch.setattr("caryatid.cli.run.wait_for_interrupt", meanwhile)
 
 
 def test_view_serves_a_run_to_this_machine_until_it_is_stopped(scene_file, tmp_path, monkeypatch, capsys):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from os import PathLike
 
 
@@ -39,6 +41,27 @@ class NoSurfaceError(PerceptionError):
 
 class PlanningError(CaryatidError):
     """No next view exists: none is reachable, or all have been visited."""
+
+
+def missing_extra(extra: str, library: str, source: str | PathLike[str]) -> InputError:
+    """The error of a library that comes with an extra of the package and is not installed."""
+    return InputError(source, f"needs {library}", f'pip install "caryatid[{extra}]"')
+
+
+@contextmanager
+def needs_extra(extra: str, source: str | PathLike[str]) -> Iterator[None]:
+    """Say which extra to install where an import in the block does not find its library.
+
+    Raises:
+        InputError: In place of the ModuleNotFoundError.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = str(error.name).partition(".")[0]
+        if library == "caryatid":
+            raise
+        raise missing_extra(extra, library, source) from None
 
 
 def in_one_line(error: Exception) -> str:

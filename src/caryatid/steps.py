@@ -23,7 +23,7 @@ from caryatid.graph import SupportGraph
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
-from caryatid.io.staging import StagedFolder
+from caryatid.io.staging import StagedFolder, read_errors
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
@@ -156,10 +156,7 @@ class RunView:
         path = self.folder / "labels.npy"
         if not path.exists():
             return images.read_units(self.folder / "labels.png")
-        try:
-            labels = np.asarray(np.load(path, allow_pickle=False))
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(path, f"is not an array of labels ({error})", AGAIN) from error
+        labels = images.read_npy(path)
         if labels.ndim != 1 or labels.dtype.kind not in "iu":
             raise InputError(path, "is not an array of whole numbers (N,)", AGAIN)
         return labels.astype(np.int32)
@@ -310,13 +307,12 @@ def _encoded(step: Step) -> bytes:
 def _read_step(folder: Path) -> Step:
     """The step in a folder `views/NN`."""
     path, remedy = folder / "step.npz", "explore again"
+    with read_errors(path, remedy):
+        content = path.read_bytes()
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            stored: dict[str, Any] = dict(archive)
+        stored: dict[str, Any] = dict(np.load(io.BytesIO(content), allow_pickle=False))
         stored |= json.loads(stored.pop("document").tobytes())
         return _decoded(stored | {"graph": read_graph(folder / "graph.json")})
-    except FileNotFoundError:
-        raise InputError(path, "the file is missing", remedy) from None
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(path, f"is not a step of a run ({error})", remedy) from error
 

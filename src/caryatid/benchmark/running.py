@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 
 from caryatid.benchmark.episodes import Episode, Outcome, plugin_of, run_episode
 from caryatid.errors import CaryatidError, InputError
-from caryatid.runtime.fingerprint import fingerprint
+from caryatid.runtime import fingerprint
 from caryatid.runtime.parallel import one_blas_thread
 
 if TYPE_CHECKING:
@@ -58,18 +58,6 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def import_distributed() -> None:
-    """Import dask.distributed, or say that it is missing before anything is written.
-
-    Raises:
-        InputError: It is not installed.
-    """
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise InputError("--scheduler", "needs dask.distributed", 'pip install "caryatid[cluster]"') from None
 
 
 def run_on_cluster(

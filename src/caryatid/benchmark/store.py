@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Self
 from filelock import FileLock, Timeout
 
 from caryatid.benchmark.episodes import MEASURES, Episode, Outcome
-from caryatid.errors import InputError
-from caryatid.runtime.fingerprint import LIBRARIES
+from caryatid.errors import InputError, needs_extra
+from caryatid.runtime import LIBRARIES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -185,12 +185,8 @@ def import_pandas() -> Any:
     Raises:
         InputError: It is not installed.
     """
-    try:
+    with needs_extra("benchmark", "benchmark"):
         import pandas
-    except ImportError:
-        raise InputError(
-            "benchmark", "tables and figures need pandas", 'pip install "caryatid[benchmark]"'
-        ) from None
     return pandas
 
 

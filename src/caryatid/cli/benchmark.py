@@ -13,7 +13,7 @@ import tyro
 
 from caryatid.cli import options
 from caryatid.config.choices import FusionMethod, NoiseModel, Preset, SegmentationMethod
-from caryatid.errors import InputError
+from caryatid.errors import InputError, needs_extra
 
 if TYPE_CHECKING:
     from caryatid.benchmark.episodes import Episode
@@ -75,15 +75,15 @@ class Benchmark(options.Command):
 
     def __call__(self) -> None:
         from caryatid.benchmark.report import check_reference
-        from caryatid.benchmark.running import import_distributed
         from caryatid.benchmark.store import RESULTS, ResultStore, collect_provenance, import_pandas
         from caryatid.benchmark.suites import SUITES, change_suite
         from caryatid.cli.output import kept
-        from caryatid.runtime.fingerprint import fingerprint
+        from caryatid.runtime import fingerprint
 
         import_pandas()
         if self.scheduler is not None:
-            import_distributed()
+            with needs_extra("cluster", "--scheduler"):  # before anything is written
+                import distributed  # noqa: F401
             if self.jobs is not None:
                 raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
         suite = (

@@ -33,7 +33,7 @@ COMMANDS = {
     "demo": "run:Demo",
     "explore": "run:Explore",
     "extract": "run:Extract",
-    "view": "view:View",
+    "view": "run:View",
     "evaluate": "results:Evaluate",
     "order": "results:OrderCommand",
     "dismantle": "run:Dismantle",

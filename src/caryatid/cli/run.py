@@ -1,11 +1,15 @@
-"""`caryatid demo`, `explore`, `extract` and `dismantle`: commands that write a run folder."""
+"""`caryatid demo`, `explore`, `view`, `extract` and `dismantle`: from views to a graph, and their page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import nullcontext
+import sys
+import webbrowser
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -18,9 +22,13 @@ if TYPE_CHECKING:
     from caryatid.config import Config
     from caryatid.evaluation.scores import TrueScene
     from caryatid.exploration import Step
+    from caryatid.io.mask_sources import MaskSource
     from caryatid.sources import Source
     from caryatid.steps import RunWriter
-    from caryatid.viewer.page import PageProcess
+    from caryatid.viewer.page import Page, PageProcess
+
+PORT = 8770
+"""Port of the page, or else the next free one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,14 +83,11 @@ class Exploring(options.ExploringCommand):
         """Open the source; returns it and the steps of its exploration."""
         from caryatid.evaluation.oracle import planner_for
         from caryatid.exploration import explore
-        from caryatid.sources import open_source
 
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
         with self.output.working("opening"):
             masks = self.mask_source(config)
-            options: dict[str, Any] = {"noise": self.noise, "robot": self.robot, "masks": masks}
-            options |= {"ignore": self.ignore, "level": self.level}
-            source = open_source(self.source, config, **options, **known)
+            source = _opening(self, masks)(config)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "masks": masks}
         known["early_stop"] = not self.no_early_stop
@@ -115,10 +120,8 @@ class Explore(RunCommand, Exploring):
         return source.name, source.truth, steps
 
     def __call__(self, config: Config | None = None) -> None:
-        from caryatid.cli.view import watched
-
         config = config or self.config()
-        with watched(self.source, config, self.output) if self.view else nullcontext() as page:
+        with _watched(self.source, config, self.output) if self.view else nullcontext() as page:
             self.run(config, page)
 
 
@@ -146,6 +149,73 @@ class Demo(RunCommand):
         config = self.settings.read({"active.max_views": self.views}, fewer, takes_views=True)
         shared = {field.name: getattr(self, field.name) for field in fields(self)}
         Explore(**shared | {"noise": "carmine"})(config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class View(options.ExploringCommand):
+    """Show a finished run in the browser, or control there the exploration of a scene or a recording.
+
+    SOURCE is one of
+      a run folder, as explore, extract and dismantle write it; it is not changed
+      an MJCF scene, the name of a built-in one, or a recording, as for explore
+
+    The page is served to this machine only, loads nothing from elsewhere, and stays until Ctrl-C.
+
+    To try:
+      caryatid view run
+      caryatid view clutter --noise carmine
+      caryatid view recording/ --segmentation auto --port 8080 --no-browser
+    """
+
+    source: options.SourceName
+    """Run, scene or recording."""
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
+    """Address to listen at; at any but 127.0.0.1, other machines can connect without a password."""
+    port: options.Port = PORT
+    """Port to listen at, or else the next free one; 0 = any free one."""
+    no_browser: options.Flag = False
+    """Print the address of the page without opening it."""
+
+    def __call__(self) -> None:
+        from caryatid.steps import is_run
+
+        config, output = self.config(), self.output
+        # The page shares the interpreter with the loop: a tenth of Python's interval lets it answer at once.
+        sys.setswitchinterval(0.0005)
+        with closing(self._open_run() if is_run(Path(self.source)) else self._open_loop(config)) as page:
+            output.result({"address": page.url, "source": self.source}, "")
+            output.say(f"{self.source} at {page.url}; Ctrl-C ends")
+            if not self.no_browser:
+                webbrowser.open(page.url)
+            wait_for_interrupt()
+
+    def _open_run(self) -> Page:
+        from caryatid.steps import read_config, read_run, read_steps
+        from caryatid.viewer.page import Page
+
+        run = read_run(self.source)
+        steps = read_steps(run)
+        title = f"caryatid: {run.folder.name}"
+        page = Page(title, read_config(run).support, host=self.host, port=self.port)
+        scores = [score["f1"] for score in run.record.get("scores", ())]
+        for step in steps:
+            page.add(step, scores[step.index] if scores else None)
+        return page
+
+    def _open_loop(self, config: Config) -> Page:
+        from caryatid.viewer.loop import LoopPage
+
+        masks = self.mask_source(config)
+        known: dict[str, Any] = {
+            "segmentation": self.segmentation,
+            "seed": self.settings.seed,
+            "masks": masks,
+        }
+        known |= {"planner": self.chosen_planner, "host": self.host, "port": self.port}
+        with self.output.working("opening"):
+            page = LoopPage(_opening(self, masks), config, **known)
+        page.start()
+        return page
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -252,6 +322,39 @@ class Dismantle(Exploring):
         columns = ("", "take", "body", "hold", "disturbed", "why")
         shown = table(f"{source.name}: {outcome}", columns, rows)
         self.output.result(record, shown, f"{order.refusal}\n" if order.refusal else "")
+
+
+def _opening(command: Exploring | View, masks: MaskSource | None) -> Callable[[Config], Source]:
+    """What opens the source of a command."""
+    from caryatid.sources import open_source
+
+    options: dict[str, Any] = {"noise": command.noise, "robot": command.robot, "masks": masks}
+    options |= {"segmentation": command.segmentation, "seed": command.settings.seed}
+    return partial(open_source, command.source, ignore=command.ignore, level=command.level, **options)
+
+
+def wait_for_interrupt() -> None:
+    """Return at Ctrl-C."""
+    try:
+        Event().wait()
+    except KeyboardInterrupt:
+        return
+
+
+@contextmanager
+def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]:
+    """Open a page for an exploration; when that ends by itself, keep the page until Ctrl-C."""
+    from caryatid.viewer.page import PageProcess
+
+    page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
+    output.say(f"{name} at {page.url}")
+    webbrowser.open(page.url)
+    try:
+        yield page
+        output.say(f"the page stays at {page.url}; Ctrl-C ends")
+        wait_for_interrupt()
+    finally:
+        page.close()
 
 
 def _about(command: RunCommand | Dismantle) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import tyro
 
 from caryatid.cli import options
-from caryatid.errors import InputError
+from caryatid.errors import needs_extra
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[Path | None, options.shown("FILE")]
@@ -209,12 +209,8 @@ class Serve(SessionStep):
 
     def __call__(self) -> None:
         config = self.settings.read()
-        try:
+        with needs_extra("serve", "serve"):
             from caryatid.service import SessionPool, check_token, make_app, run_service
-        except ModuleNotFoundError as error:
-            if error.name not in ("fastapi", "starlette", "uvicorn"):
-                raise
-            raise InputError("serve", f"needs {error.name}", 'pip install "caryatid[serve]"') from None
         from caryatid.io.staging import write_errors
         from caryatid.runtime.compiling import compile_kernels
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import RecordingConfig
-from caryatid.errors import CaryatidError, InputError
+from caryatid.errors import CaryatidError, InputError, needs_extra
 from caryatid.io import images
 from caryatid.io.datasets import Dataset, OpenOptions
 from caryatid.io.images import BrokenImageError
@@ -90,11 +90,9 @@ class _Bag:
     """An open bag; closed once no frame of it is left."""
 
     def __init__(self, path: Path) -> None:
-        try:
+        with needs_extra("ros", path):
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
-        except ImportError:
-            raise InputError(path, "reading bags needs rosbags", 'pip install "caryatid[ros]"') from None
         self.path = path
         if path.is_file() and path.stat().st_size == 0:
             raise InputError(path, "the bag is empty", "record it again")

@@ -1,4 +1,4 @@
-"""Image files, decoded strictly."""
+"""Image files and stored arrays, decoded strictly."""
 
 from __future__ import annotations
 
@@ -108,6 +108,21 @@ def read_mask(image: Path | bytes, name: str = "", most: float = inf) -> NDArray
         InputError: As `decode_image`.
     """
     return decode_image(image, name, MASK_MODES, "a grey PNG", most) > 0
+
+
+def read_npy(array: Path | bytes, name: str = "") -> NDArray[Any]:
+    """Read an array (...) of a .npy, a file or its content.
+
+    Raises:
+        InputError: It is missing or broken.
+    """
+    source = array if isinstance(array, Path) else name
+    try:
+        content = array.read_bytes() if isinstance(array, Path) else array
+        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+    except Exception as error:  # NumPy reads the header as Python: a damaged one raises almost anything
+        reason = f"is not a valid .npy ({' '.join(str(error).split())})"
+        raise InputError(source, reason, "save it with numpy.save") from None
 
 
 def _open(content: bytes) -> Image.Image:

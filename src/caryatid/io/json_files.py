@@ -15,6 +15,7 @@ from pydantic_core import core_schema, from_json
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.io.staging import read_errors
 
 T = TypeVar("T")
 
@@ -104,12 +105,10 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
     Raises:
         InputError: The file is missing, unreadable, no JSON, holds NaN or infinity, or is no object.
     """
+    with read_errors(path, remedy):
+        content = path.read_bytes()
     try:
-        document = from_json(path.read_bytes(), allow_inf_nan=False)
-    except FileNotFoundError:
-        raise InputError(path, "the file is missing", remedy) from None
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
+        document = from_json(content, allow_inf_nan=False)
     except ValueError as error:
         raise InputError(path, f"broken JSON: {error}", remedy) from error
     if not isinstance(document, dict):

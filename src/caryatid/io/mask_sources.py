@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from caryatid.config import Config
-from caryatid.errors import InputError
+from caryatid.errors import InputError, needs_extra
 from caryatid.geometry.transforms import Array
-from caryatid.io.images import MASK_MODES, decode_image, read_mask
+from caryatid.io.images import MASK_MODES, decode_image, read_mask, read_npy
 from caryatid.segmentation.observation import label_image, observe
 from caryatid.sensing.masks import labels_from_masks
 from caryatid.sensing.views import SUPPORT_LABEL, View
@@ -43,42 +44,29 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
     folder = Path(name)
     if not folder.is_dir():
         raise InputError(name, "is not a directory of masks", "give one, or onnx:FILE")
-    return FolderMasks(folder)
+    return partial(with_stored_masks, folder)
 
 
-class FolderMasks:
-    """Masks in files named as the views: a label image `NAME.png`, or `NAME.npy`.
-
-    NAME is that of the view after its last slash. A `.npy` holds labels (H, W) or a stack of masks (N, H, W),
-    boolean or scores.
+def with_stored_masks(folder: Path, view: View) -> View:
+    """Return a view with the masks of a file named as it is: a label image `NAME.png`, or `NAME.npy`.
 
     Args:
-        folder: The folder.
+        folder: Holds the files.
+        view: The view; NAME is its name after the last slash. A `.npy` holds labels (H, W) or a stack of
+            masks (N, H, W), boolean or scores.
+
+    Raises:
+        InputError: There is no such file, or it is broken or of another size.
     """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-
-    def __call__(self, view: View) -> View:
-        """Return the view with its masks.
-
-        Raises:
-            InputError: It has none, or they are broken or of another size.
-        """
-        stem = self._folder / view.name.rpartition("/")[2]
-        image, array = stem.with_name(f"{stem.name}.png"), stem.with_name(f"{stem.name}.npy")
-        if image.exists():
-            labels = decode_image(image, modes=MASK_MODES, what="a grey PNG")
-        elif array.exists():
-            try:
-                labels = np.load(array, allow_pickle=False)
-            except (OSError, ValueError, EOFError) as error:
-                raise InputError(array, f"cannot be read ({error})", "save it with numpy.save") from None
-        else:
-            raise InputError(
-                self._folder, f"has no masks of '{stem.name}'", f"add {image.name} or {array.name}"
-            )
-        return replace(view, labels=labels, labels_are="segments")
+    name = view.name.rpartition("/")[2]
+    image, array = folder / f"{name}.png", folder / f"{name}.npy"
+    if image.exists():
+        labels = decode_image(image, modes=MASK_MODES, what="a grey PNG")
+    elif array.exists():
+        labels = read_npy(array)
+    else:
+        raise InputError(folder, f"has no masks of '{name}'", f"add {image.name} or {array.name}")
+    return replace(view, labels=labels, labels_are="segments")
 
 
 def without_ignored(view: View, ignore: Path) -> View:
@@ -86,7 +74,7 @@ def without_ignored(view: View, ignore: Path) -> View:
 
     Args:
         view: The view.
-        ignore: A grey PNG for every view of a camera, or a folder of one for each, named as by `FolderMasks`.
+        ignore: A grey PNG for every view of a camera, or a folder of one for each: NAME.png, as there.
 
     Raises:
         InputError: The mask is missing, broken, or of another size.
@@ -117,11 +105,8 @@ class OnnxMasks:
     """
 
     def __init__(self, path: Path, config: Config, seed: int = 0) -> None:
-        try:
+        with needs_extra("onnx", path):
             import onnxruntime
-        except ImportError:
-            reason = "needs onnxruntime, which is not installed"
-            raise InputError(path, reason, 'pip install "caryatid[onnx]"') from None
         if not path.is_file():
             raise InputError(path, "the file is missing", "give an ONNX model")
         try:
@@ -156,7 +141,8 @@ class OnnxMasks:
             rows, columns = (
                 np.arange(n) * m // n for n, m in zip((height, width), view.depth.shape, strict=True)
             )
-            given["xyz"] = _points(view)[rows][:, columns].transpose(2, 0, 1)[None]
+            xyz = view.points_camera.astype(np.float32)
+            given["xyz"] = xyz[rows][:, columns].transpose(2, 0, 1)[None]
         if "boxes" in self._inputs:
             scale = np.array([width, height] * 2) / np.array([*view.depth.shape[::-1]] * 2)
             given["boxes"] = (self._prompts(view) * scale).astype(np.float32)
@@ -196,12 +182,3 @@ def _resized(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.floa
     if rgb.shape[:2] != (height, width):
         image = image.resize((width, height), Image.Resampling.BILINEAR)
     return np.asarray(image, dtype=np.float32)
-
-
-def _points(view: View) -> NDArray[np.float32]:
-    """Points (H, W, 3) of a view in the camera frame [m]; 0 where there is no reading."""
-    rows, columns = np.indices(view.depth.shape)
-    x = (columns - view.K[0, 2]) / view.K[0, 0] * view.depth
-    y = (rows - view.K[1, 2]) / view.K[1, 1] * view.depth
-    points: NDArray[Any] = np.stack([x, y, view.depth], axis=-1)
-    return points.astype(np.float32)

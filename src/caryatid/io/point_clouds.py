@@ -16,6 +16,7 @@ from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.io.staging import read_errors
 from caryatid.sensing.clouds import estimate_normals
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
@@ -94,19 +95,17 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
         InputError: The file is missing, of another kind, broken, its header lies, it holds no readings, or
             its labels are no object numbers.
     """
-    path, remedy = Path(path), "give a .pcd or .ply file"
+    path = Path(path)
     parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
     if parse is None:
         raise InputError(path, "is no .pcd or .ply file", "convert it to one of these")
+    with read_errors(path, "give a .pcd or .ply file"):
+        content = path.read_bytes()
     try:
-        columns, viewpoint = parse(path.read_bytes())
+        columns, viewpoint = parse(content)
         points = _triple(columns, "x y z")
         if points is None or any(columns[axis].dtype.kind != "f" for axis in "xyz"):
             raise ValueError("there are no fields x y z of floating point numbers")
-    except FileNotFoundError:
-        raise InputError(path, "the file is missing", remedy) from None
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
     except Exception as error:
         reason = f"is broken, or the header lies: {_reason(error)}"
         raise InputError(path, reason, "export the cloud again") from error

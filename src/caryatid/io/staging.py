@@ -160,6 +160,25 @@ def clear_partials(folder: Path) -> None:
 
 
 @contextmanager
+def read_errors(path: Path, remedy: str) -> Iterator[None]:
+    """Turn an OSError while reading into one sentence with the path and the reason.
+
+    Args:
+        path: The file.
+        remedy: What the user can do about it.
+
+    Raises:
+        InputError: In place of the OSError.
+    """
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(path, "the file is missing", remedy) from None
+    except OSError as error:
+        raise InputError(path, f"cannot be read ({error.strerror})", remedy) from error
+
+
+@contextmanager
 def write_errors(path: Path) -> Iterator[None]:
     """Turn an OSError while writing into one sentence with the path, the reason and the remedy.
 

@@ -18,7 +18,7 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import fibonacci_sphere
 from caryatid.geometry.transforms import Array
-from caryatid.io.staging import write_file
+from caryatid.io.staging import read_errors, write_file
 
 Forward = Callable[[Array], Array]
 """Forward kinematics: joints (N, J) [rad, or m] → `T_base_camera` (N, 4, 4)."""
@@ -129,11 +129,10 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
         InputError: The file is missing, damaged, something else, or from another version.
     """
     file = Path(path)
+    with read_errors(file, REMEDY):
+        content = file.read_bytes()
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            held = dict(stored)
-    except FileNotFoundError:
-        raise InputError(file, "the file is missing", REMEDY) from None
+        held = dict(np.load(io.BytesIO(content), allow_pickle=False))
     except Exception as error:  # a damaged archive makes NumPy raise one of half a dozen kinds
         raise InputError(file, f"is not a readable .npz: {error}", REMEDY) from None
     if str(held.get("format")) != FORMAT:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
@@ -22,3 +24,32 @@ def imported_late(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[
         return getattr(import_module(f"{package}.{module_of[name]}"), name)
 
     return get
+
+
+LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
+"""Libraries whose release may change a figure."""
+
+BYSTANDERS = frozenset(
+    {"benchmark", "cli", "exports.py", "service.py", "sessions", "sources.py", "viewer", "viz"}
+)
+"""Parts of caryatid that only arrange, hand on, draw or tell what others found, but for `DECIDING`."""
+
+DECIDING = frozenset({"benchmark/episodes.py"})
+"""Modules in these parts that decide figures."""
+
+
+@cache
+def fingerprint() -> str:
+    """Digest of the code and library releases that decide what an episode gives."""
+    import hashlib
+    from importlib.metadata import version
+
+    root = Path(__file__).parents[1]
+    digest = hashlib.sha256()
+    for file in sorted(root.rglob("*.py")):
+        name = file.relative_to(root).as_posix()
+        if not BYSTANDERS & set(name.split("/")) or name in DECIDING:
+            digest.update(name.encode() + b"\0" + hashlib.sha256(file.read_bytes()).digest())
+    for library in LIBRARIES:
+        digest.update(f"{library} {version(library)}\0".encode())
+    return digest.hexdigest()[:16]

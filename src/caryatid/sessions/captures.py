@@ -20,8 +20,9 @@ from caryatid.config import SessionConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.images import DEPTH_MODES, MASK_MODES, decode_image
+from caryatid.io.images import DEPTH_MODES, MASK_MODES, decode_image, read_npy
 from caryatid.io.json_files import Numbers, parse_json, read_json
+from caryatid.io.staging import read_errors
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 
@@ -176,11 +177,7 @@ class Capture:
 def _decoded(key: str, content: bytes, name: str, max_pixels: int) -> NDArray[Any]:
     if key in _FILES and _suffix(content) != ".npy":
         return decode_image(content, name, *_FILES[key], max_pixels)
-    try:
-        array = np.load(io.BytesIO(content), allow_pickle=False)
-    except Exception as error:  # NumPy reads the header as Python: a damaged one raises almost anything
-        reason = f"is not a valid .npy ({' '.join(str(error).split())})"
-        raise InputError(name, reason, "save it with numpy.save") from None
+    array = read_npy(content, name)
     kind, channels, wanted = _ARRAYS[key]
     if not np.issubdtype(array.dtype, kind) or array.ndim < 2 or array.shape[2:] != channels:
         raise InputError(name, f"is {array.shape} of {array.dtype}", f"give {wanted}")
@@ -203,14 +200,10 @@ def _suffix(content: bytes) -> str:
 
 
 def _read(path: Path, max_bytes: float = np.inf) -> bytes:
-    try:
+    with read_errors(path, "give a file you may read"):
         if path.stat().st_size > max_bytes:
             raise InputError(path, f"is larger than {max_bytes} bytes", "give a smaller file")
         return path.read_bytes()
-    except FileNotFoundError:
-        raise InputError(path, "the file is missing", "give one that is there") from None
-    except OSError as error:
-        raise InputError(path, f"cannot be read ({error.strerror})", "give a file you may read") from None
 
 
 def check_view(view: View, scene: Scene, first: View | None) -> None:

@@ -40,7 +40,7 @@ from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, syn
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
-from caryatid.runtime.fingerprint import fingerprint
+from caryatid.runtime import fingerprint
 from caryatid.scene import Scene
 from caryatid.sensing.views import View
 from caryatid.sessions.captures import CameraRecord, Capture, check_view

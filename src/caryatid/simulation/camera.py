@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import mujoco
@@ -14,7 +15,6 @@ from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import View
-from caryatid.simulation.body import HumanoidBody
 from caryatid.simulation.world import SimulatedScene
 
 
@@ -108,7 +108,8 @@ class SimulatedCamera:
         noise_config: Figures of the noise.
         rng: Where the seed of all captures is drawn from.
         sensor: Image size, focal length and light.
-        body: Of the robot that carries it, seen where it is in the image; None = it floats.
+        around: Gives the scene with the body of the robot that holds the camera at a pose (4, 4), which is
+            seen where it is in the image, or None where none can stand there. None = it floats.
 
     Raises:
         InputError: The noise model is not one of the two.
@@ -121,7 +122,7 @@ class SimulatedCamera:
         noise_config: NoiseConfig | None = None,
         rng: np.random.Generator | None = None,
         sensor: SensorConfig | None = None,
-        body: HumanoidBody | None = None,
+        around: Callable[[Array], SimulatedScene | None] | None = None,
     ) -> None:
         if noise not in ("none", "carmine"):
             raise InputError("noise", f"'{noise}' is no noise model", "choose none or carmine")
@@ -132,7 +133,7 @@ class SimulatedCamera:
         self.K = intrinsics(self.sensor)
         self._seed = int((rng or np.random.default_rng(0)).integers(2**63))
         self._captures = 0
-        self._body = body
+        self._around = around
 
     def fork(self) -> SimulatedCamera:
         """Return a camera whose next captures have the noise this one's would have; this one stays put."""
@@ -152,8 +153,8 @@ class SimulatedCamera:
             InputError: The pose is no rigid transform.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
-        around = None if self._body is None else self._body.around(T)
-        image = render(around or self.scene, T, self.K, self.sensor)
+        scene = None if self._around is None else self._around(T)
+        image = render(scene or self.scene, T, self.K, self.sensor)
         number = self._captures
         rng = np.random.default_rng([self._seed, number])
         name = f"{self.scene.name} view {number}"

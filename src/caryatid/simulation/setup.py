@@ -1,19 +1,74 @@
-"""A simulated robot with its camera before a scene, ready to explore."""
+"""A simulated robot with its body and its camera before a scene, ready to explore."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 
-from caryatid.config import Config, NoiseModel
+from caryatid.config import Config, NoiseModel, RobotConfig
+from caryatid.geometry.transforms import Array
+from caryatid.planning.posture import Posture
 from caryatid.robots import HUMANOID, Robot, RobotMaker, Surroundings, find_robot, home_view
 from caryatid.robots.floor import FloorGrid
 from caryatid.robots.humanoid import HumanoidRobot
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.simulation.body import HumanoidBody
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.world import SimulatedScene, static_boxes, table_centre
+
+PLATFORM, MAST, NECK = 0.3, 0.04, 0.15
+"""Greatest height of the platform, radius of the mast on it, and how far under the camera that ends [m]."""
+
+
+class HumanoidBody:
+    """A platform and a mast that the torso lift makes longer, in a copy of a scene.
+
+    Nothing is pushed by it. The head is left out: it is behind the camera, which is at its front.
+
+    Args:
+        scene: Where it stands; stays as it is.
+        robot: Says how it stands for a camera pose.
+        config: Its footprint and heights.
+
+    Attributes:
+        scene: The copy, with the body where it was placed last.
+    """
+
+    def __init__(self, scene: SimulatedScene, robot: HumanoidRobot, config: RobotConfig) -> None:
+        self._robot = robot
+        low, high = config.camera_height
+        self._platform_height = min(PLATFORM, low / 2.0)
+        spec = scene.spec.copy()
+        body = spec.worldbody.add_body(name="robot", mocap=True)
+        # The mast is made as long as it can be, since MuJoCo bounds a geom only once.
+        for radius, height in ((config.footprint, self._platform_height), (MAST, high)):
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=[0.0, 0.0, height / 2.0],
+                size=[radius, height / 2.0, 0.0], contype=0, conaffinity=0, rgba=(0.47, 0.51, 0.56, 1.0),
+            )  # fmt: skip
+        model = spec.compile()
+        data = mujoco.MjData(model)
+        data.qpos[:] = scene.data.qpos
+        labels = np.append(scene.geom_labels, np.zeros(2, dtype=np.int32))
+        self.scene = replace(scene, model=model, data=data, spec=spec, geom_labels=labels)
+        self._geoms = np.flatnonzero(model.geom_bodyid == model.body("robot").id)
+
+    def place(self, posture: Posture) -> None:
+        """Put it where a posture has it."""
+        model, data, mast = self.scene.model, self.scene.data, self._geoms[1]
+        top = max(posture.camera_height - NECK, self._platform_height)
+        model.geom_pos[mast, 2] = model.geom_size[mast, 1] = top / 2.0
+        data.mocap_pos[-1] = (*posture.platform_world[:2], 0.0)
+        mujoco.mj_kinematics(model, data)
+
+    def around(self, T_world_camera: Array) -> SimulatedScene | None:
+        """The scene with the body that holds the camera at a pose (4, 4), or None where it cannot stand."""
+        posture = self._robot.solve(T_world_camera)
+        if not isinstance(posture, Posture):
+            return None
+        self.place(posture)
+        return self.scene
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -55,6 +110,6 @@ def make_simulation(
     make = find_robot(robot) if isinstance(robot, str) else robot
     made = make(Surroundings(centre, floor, config))
     made.move_to(home_view(made, ViewSphere.around(centre, config.active), config.robot))
-    body = HumanoidBody(scene, made, config.robot) if isinstance(made, HumanoidRobot) else None
-    camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor, body)
+    around = HumanoidBody(scene, made, config.robot).around if isinstance(made, HumanoidRobot) else None
+    camera = SimulatedCamera(scene, noise, config.noise, np.random.default_rng(seed), config.sensor, around)
     return Simulation(camera, made)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from caryatid.config import SupportConfig
-from caryatid.errors import InputError
+from caryatid.errors import InputError, missing_extra, needs_extra
 from caryatid.exploration import Step
 from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
@@ -308,7 +308,7 @@ class PageProcess:
 
     def __init__(self, title: str, support: SupportConfig, port: int) -> None:
         if find_spec("viser") is None:
-            raise _needs_viser()
+            raise missing_extra("view", "viser", "viewer")
         context = get_context("spawn")
         self._connection, theirs = context.Pipe()
         self._process = context.Process(target=_show_sent, args=(theirs, title, support, port), daemon=True)
@@ -352,17 +352,9 @@ def _log_failure(drawn: Future[None]) -> None:
         logging.getLogger(__name__).error("a view could not be drawn", exc_info=error)
 
 
-def _needs_viser() -> InputError:
-    return InputError("viewer", "needs viser", 'pip install "caryatid[view]"')
-
-
 def _serve(title: str, host: str, port: int) -> Any:
-    try:
+    with needs_extra("view", "viewer"):
         import viser
-    except ModuleNotFoundError as error:
-        if error.name != "viser":
-            raise
-        raise _needs_viser() from None
 
     class Server(viser.ViserServer):
         """A server whose page stays on this machine: nobody can ask for a public address."""
