@@ -140,6 +140,11 @@ def test_views_may_be_handed_in_without_camera_or_robot():
         explorer.plan()
 
 
+def test_masks_that_would_not_be_used_are_refused():
+    with pytest.raises(InputError, match="segmentation auto uses none"):
+        Explorer(masks=lambda view: view, segmentation="auto")
+
+
 def written(folder, steps):
     with RunWriter(folder, FEW_VIEWS, {}) as writer:
         for step in steps:

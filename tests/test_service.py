@@ -17,7 +17,7 @@ import httpx
 import numpy as np
 import pytest
 from anyio.from_thread import start_blocking_portal
-from conftest import npy, run_command
+from conftest import npy, run_command, wall_of
 
 from caryatid.config import Config
 from caryatid.io.graph_json import graph_to_json
@@ -76,7 +76,8 @@ def test_a_session_over_http_is_the_session(client, views):
     answers = [client.post("/sessions/a/views", json=body(view)) for view in views[:2]]
     for number, answer in enumerate(answers):
         assert answer.status_code == 201
-        assert answer.json() == {"view": number, "changed": True, "graph": graph_of(views[: number + 1])}
+        told = {"view": number, "changed": True, "note": None}
+        assert answer.json() == told | {"graph": graph_of(views[: number + 1])}
 
     again = client.post("/sessions/a/views", json=body(views[1], number=1))
     assert (again.status_code, again.json()) == (201, answers[1].json())
@@ -103,6 +104,14 @@ def test_a_session_over_http_is_the_session(client, views):
     assert client.delete("/sessions/a/views/last").json() == {"views": 1, "graph": graph_of(views[:1])}
     assert client.delete("/sessions/a/views/last").json()["views"] == 0
     assert client.delete("/sessions/a/views/last").status_code == 409
+
+
+def test_a_view_without_a_table_is_kept_and_the_client_told(client, views):
+    wall = body(wall_of(views[0]), number=0)
+    first, again = (client.post("/sessions/a/views", json=wall) for _ in range(2))
+    assert first.json()["note"].endswith("this view is kept until a later one shows the table top")
+    assert again.json() == first.json()
+    assert client.post("/sessions/a/views", json=body(views[0])).json()["note"] is None
 
 
 def camera_of(view, **changes):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import PlanningError
+from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
@@ -113,7 +113,7 @@ class Explorer:
         step: The newest step, or None before the first view.
 
     Raises:
-        InputError: There is no such planner.
+        InputError: There is no such planner, or masks are given and not to be used.
     """
 
     def __init__(
@@ -127,6 +127,8 @@ class Explorer:
         seed: int = 0,
         masks: Callable[[View], View] | None = None,
     ) -> None:
+        if masks is not None and segmentation == "auto":
+            raise InputError("masks", "are given, segmentation auto uses none", "leave one of the two out")
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
         self._masks = masks
         self.robot = robot

@@ -126,6 +126,7 @@ class ViewAnswer(Document):
 
     view: int = Field(description="Its number, 0 the first")
     changed: bool = Field(description="Whether it changed the graph")
+    note: str | None = Field(description="That the view waits for one that shows the table top, or null")
     graph: dict[str, Any] = Field(description="graph.json")
 
 

@@ -41,7 +41,7 @@ from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
 from caryatid.runtime import fingerprint
-from caryatid.scene import Scene
+from caryatid.scene import KEPT, Scene
 from caryatid.sensing.views import View
 from caryatid.sessions.captures import CameraRecord, Capture, check_view
 from caryatid.sessions.next_view import NextView, given_candidates, reached_candidates, table_floor
@@ -123,15 +123,18 @@ class Added:
         number: Number of the view, 0 the first.
         graph: The fused support graph with it.
         changed: Whether it changed the graph.
+        note: That the view waits for one that shows the table top, or None.
     """
 
     number: int
     graph: SupportGraph
     changed: bool
+    note: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of `caryatid session add` and of the service."""
-        return {"view": self.number, "changed": self.changed, "graph": graph_to_json(self.graph)}
+        graph = graph_to_json(self.graph)
+        return {"view": self.number, "changed": self.changed, "note": self.note, "graph": graph}
 
 
 class Session:
@@ -268,7 +271,7 @@ class Session:
                 raise SessionConflictError(
                     record.name, f"is to be view {number}, the next one is view {self.views}"
                 )
-            return Added(number, self.graph, self.scene.changed)
+            return self._added()
         decoded = self._decode(capture)
         check_view(decoded, self.scene, self._first)
         scene = self.scene.copy()
@@ -281,7 +284,7 @@ class Session:
         self._first = self._first or decoded
         self.scene = scene
         self._write_snapshot(scene, self._records)
-        return Added(self.views - 1, self.graph, scene.changed)
+        return self._added()
 
     def next(self, candidates: ArrayLike | None = None, path_length: ArrayLike | None = None) -> NextView:
         """Choose where to look next.
@@ -334,6 +337,10 @@ class Session:
         self._records, self.scene = left, scene
         self._first = self._first if left else None
         return len(left)
+
+    def _added(self) -> Added:
+        note = KEPT % "no support surface has been seen yet" if self.scene.waiting else None
+        return Added(self.views - 1, self.graph, self.scene.changed, note)
 
     def _check_writable(self) -> None:
         if self._lock is None:
