@@ -24,7 +24,7 @@ from caryatid.objects.description_length import (
 from caryatid.objects.model_selection import best_merge, split
 from caryatid.sensing.clouds import thin
 from caryatid.sensing.views import Cloud
-from caryatid.simulation import household
+from caryatid.simulation import generation
 
 CONFIG, COSTS, FIT = Config(), ExplanationConfig(), FitConfig()
 EYE = (-1.2, -0.6, 1.0)
@@ -240,11 +240,11 @@ def visible(shape, spacing=0.005, eye=(0.9, 0.3, 0.9)):
 @pytest.mark.parametrize(
     ("make", "kind"),
     [
-        (household._tray, OpenBox),
-        (household._open_box, OpenBox),
-        (household._bowl, Revolution),
-        (household._mug, Revolution),
-        (household._bottle, Revolution),
+        (generation._tray, OpenBox),
+        (generation._open_box, OpenBox),
+        (generation._bowl, Revolution),
+        (generation._mug, Revolution),
+        (generation._bottle, Revolution),
     ],
 )
 def test_a_compound_explains_what_no_primitive_does(make, kind):
