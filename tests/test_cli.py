@@ -17,8 +17,6 @@ from caryatid.config import Config
 from caryatid.geometry import transforms
 from caryatid.io.bop import read_recording, write_recording
 from caryatid.sensing.views import SUPPORT_LABEL
-from caryatid.simulation.scenes import load_scene
-from caryatid.simulation.truth import ground_truth
 from caryatid.steps import read_run
 
 ESCAPE = "\x1b"
@@ -78,15 +76,6 @@ def test_every_view_has_its_graph_labels_pose_and_choice(kept_run):
 # Sources
 
 
-def test_a_built_in_scene_is_explored_by_name(tmp_path):
-    """The tower without noise: every support of the settled scene, and nothing else."""
-    run = explored("tower", tmp_path / "run", "--views", 3, "--no-report")
-    scene = load_scene("tower")
-    labels = {"table": "o0"} | {body: f"o{k}" for k, body in scene.object_bodies.items()}
-    truth = {(labels[a], labels[b]) for a, b in ground_truth(scene).pairs}
-    assert {s.pair for s in run.graph.supports} == truth
-
-
 def test_a_recording_is_explored_where_it_was_recorded(tmp_path, recording):
     run = explored(recording, tmp_path / "run", "--no-early-stop", "--no-report")
     poses = [f.T_world_camera for f in read_recording(recording).frames]
@@ -102,8 +91,6 @@ def test_all_views_of_a_recording_are_extracted(tmp_path, recording):
     run = read_run(tmp_path / "run")
     assert [v.name for v in run.views] == [f"recording/{k:06d}" for k in range(3)]
     assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
-    assert run.record["source"] == str(recording)
-    assert run.record.keys() >= {"settings", "seed", "versions", "angle_travelled", "path_travelled"}
     assert run.record["steps"][2]["angle_travelled"] > run.record["steps"][1]["angle_travelled"] > 0.0
     assert (tmp_path / "run/report.html").is_file()
 

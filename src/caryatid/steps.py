@@ -92,9 +92,7 @@ class RunWriter(StagedFolder):
         if labels.ndim == 2:
             self.write(f"{folder}/labels.png", images.png(labels.astype(np.uint16)))
         else:
-            buffer = io.BytesIO()
-            np.save(buffer, labels.astype(np.int32))
-            self.write(f"{folder}/labels.npy", buffer.getvalue())
+            self.write(f"{folder}/labels.npy", images.npy(labels.astype(np.int32)))
         document = {"view": number, "name": step.name} | _summary(step)
         self.write(f"{folder}/view.json", json_text(document).encode())
         self.write(f"{folder}/step.npz", _encoded(step))

@@ -21,6 +21,7 @@ from caryatid.benchmark.statistics import CONFIDENCE, RESAMPLES, summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES
 from caryatid.errors import InputError
+from caryatid.viz.tables import count_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -282,12 +283,12 @@ def _suite(result: SuiteResult) -> Iterator[str | Figure]:
     yield f"## {_plain(result.name)}"
     failed = f"{len(result.failures)} failed" if result.failures else "none failed"
     yield _plain(
-        f"{known.what if known else ''} {_count(result.episodes, 'episode')} of "
-        f"{_count(summary['method'].nunique(), 'method')} in {_count(result.scenes, 'scene')} with "
-        f"{_count(result.seeds, 'seed')}; {failed}."
+        f"{known.what if known else ''} {count_of(result.episodes, 'episode')} of "
+        f"{count_of(summary['method'].nunique(), 'method')} in {count_of(result.scenes, 'scene')} with "
+        f"{count_of(result.seeds, 'seed')}; {failed}."
     )
     if result.planned > result.episodes:
-        missing = _count(result.planned - result.episodes, "episode")
+        missing = count_of(result.planned - result.episodes, "episode")
         yield f"Not finished: {missing} of {result.planned:,} to be run."
     if conditions > 1:
         yield draw_conditions(summary, main, heading)
@@ -362,10 +363,6 @@ def _text(quantity: str, value: float, low: float, high: float) -> str:
         return number(value)
     text = f"{number(value)} [{number(low)}, {number(high)}]"
     return f"**{text}**" if sign and (low > 0.0 or high < 0.0) else text
-
-
-def _count(number: int, one: str) -> str:
-    return f"{number:,} {one}" + ("" if number == 1 else "s")
 
 
 def _plain(text: str) -> str:

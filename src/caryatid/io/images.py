@@ -125,6 +125,13 @@ def read_npy(array: Path | bytes, name: str = "") -> NDArray[Any]:
         raise InputError(source, reason, "save it with numpy.save") from None
 
 
+def npy(array: NDArray[Any]) -> bytes:
+    """Encode an array (...) as .npy."""
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
 def _open(content: bytes) -> Image.Image:
     return Image.open(io.BytesIO(content), formats=("PNG", "JPEG"))
 

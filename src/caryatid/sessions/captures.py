@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -20,7 +19,7 @@ from caryatid.config import SessionConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.io.images import DEPTH_MODES, MASK_MODES, decode_image, read_npy
+from caryatid.io.images import DEPTH_MODES, MASK_MODES, decode_image, npy, read_npy
 from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import read_errors
 from caryatid.scene import Scene
@@ -95,7 +94,7 @@ class Capture:
         """
         arrays = (view.depth, view.rgb, view.labels, view.normals_camera)
         named = zip(("depth", "rgb", "labels", "normals"), arrays, strict=True)
-        images = {key: _npy(array) for key, array in named if array is not None}
+        images = {key: npy(array) for key, array in named if array is not None}
         return cls(images, CameraRecord(view.K, view.pose, name=view.name, labels_are=view.labels_are))
 
     @classmethod
@@ -185,12 +184,6 @@ def _decoded(key: str, content: bytes, name: str, max_pixels: int) -> NDArray[An
         reason = f"has shape {array.shape}, {max_pixels} pixels are allowed"
         raise InputError(name, reason, "give a smaller image")
     return np.ascontiguousarray(array)
-
-
-def _npy(array: NDArray[Any]) -> bytes:
-    file = io.BytesIO()
-    np.save(file, np.ascontiguousarray(array), allow_pickle=False)
-    return file.getvalue()
 
 
 def _suffix(content: bytes) -> str:

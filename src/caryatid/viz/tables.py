@@ -128,7 +128,7 @@ def size_of(shape: Shape) -> str:
 def count_of(number: int, name: str) -> str:
     """Say how many there are of something, in the singular or plural."""
     ending = "" if number == 1 else "es" if name.endswith("x") else "s"
-    return f"{number} {name}{ending}"
+    return f"{number:,} {name}{ending}"
 
 
 def census(graph: SupportGraph) -> str:
