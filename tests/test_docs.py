@@ -1,4 +1,4 @@
-"""What README and docs show works: their Python runs, their commands do, their links lead somewhere."""
+"""README and docs: their Python runs, their commands do, their links lead somewhere, their picture moves."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ import pytest
 from arms import SLIDES, gantry
 from bag_files import write_bag, write_tum
 from conftest import SMALL, pcd_text, run_command, without_labels
+from PIL import Image
 
 import caryatid as ct
 from caryatid.config.settings import write_settings
@@ -28,6 +29,7 @@ from caryatid.robots.reachability import sample_reachability, write_reachability
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SOURCE = ROOT / "src/caryatid"
+README = (ROOT / "README.md").read_text()
 GENERATED = {"benchmark.md", "benchmark-dismantle.md"}
 """Pages that are written when the documentation is built."""
 BUILT = ("_build", "gallery", "notebooks")
@@ -254,3 +256,37 @@ def test_a_message_of_ros_becomes_a_view_as_the_page_does_it(workplace, views):
     view = names["view_of"](depth, SimpleNamespace(k=views[0].K.ravel()), still)
     np.testing.assert_allclose(view.depth, views[0].depth, atol=6e-4)
     np.testing.assert_allclose(view.pose[:3, 3], (1.0, 2.0, 3.0))
+
+
+# The front door
+
+
+def test_it_begins_with_a_picture_that_moves_for_ever_at_800_pixels_within_3_megabytes():
+    first = re.search(r"!\[[^\]]{40,}\]\(([^)]+)\)", README)
+    assert README[: first.start()].count("\n") <= 3
+    assert (ROOT / first[1]).stat().st_size <= 3_000_000
+    with Image.open(ROOT / first[1]) as film:
+        assert (film.width, film.info["loop"]) == (800, 0)
+        assert film.n_frames > 30
+        seconds = 0.0
+        for number in range(film.n_frames):
+            film.seek(number)
+            seconds += film.info["duration"] / 1e3
+    assert 10.0 < seconds < 40.0
+
+
+def test_two_commands_and_five_lines_are_enough_to_begin():
+    block = re.search(r"## Two commands\n\n```sh\n(.*?)```", README, re.S)
+    assert block[1].splitlines() == ["make demo", ".venv/bin/caryatid view clutter"]
+    program = re.search(r"## Five lines of Python\n\n```python\n(.*?)```", README, re.S)[1]
+    assert len([line for line in program.splitlines() if line and not re.match("import|from", line)]) <= 5
+
+
+def test_the_citation_is_that_of_the_citation_file():
+    cited = (ROOT / "CITATION.cff").read_text()
+    bibtex = re.search(r"```text\n(.*?)```", README, re.S)[1]
+    fields = re.findall(r"^(?: {4}title|version): (.+)$", cited, re.M)
+    names = [f"{name}," for name in re.findall(r"family-names: (.+)$", cited, re.M)]
+    assert fields
+    assert names
+    assert all(text in bibtex for text in (*fields, *names))

@@ -1,4 +1,4 @@
-"""Shapes, polygons, rays and points: what they promise, tried against SciPy, shapely and plain sums."""
+"""Shapes, polygons, rays, points and views on a sphere, tried against SciPy, shapely and plain sums."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import shapely
 from scipy.spatial import ConvexHull, cKDTree
 from synthetic import random_motion
 
+from caryatid.config import ActiveVisionConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.points import last_in_voxels, most_central, quantile, select, solve_positive
@@ -26,6 +27,7 @@ from caryatid.geometry.shapes import (
     fibonacci_sphere,
     from_size,
 )
+from caryatid.sensing.view_sphere import ViewSphere
 
 T = random_motion(np.random.default_rng(1))
 SOLIDS = [Box(T, np.array([0.06, 0.1, 0.14])), Cylinder(T, 0.04, 0.11), Sphere(T, 0.05)]
@@ -369,3 +371,28 @@ def test_points_are_thinned_by_voxels(points):
     voxel = np.floor(points / 0.03).astype(int)
     later = [(voxel[i:] == voxel[i]).all(axis=1).sum() for i in range(len(points))]
     np.testing.assert_array_equal(last_in_voxels(points, 0.03, 4), np.flatnonzero(np.array(later) <= 4))
+
+
+VIEW_SPHERE = ViewSphere.around((0.1, -0.2, 0.75), ActiveVisionConfig(sphere_points=2000))
+
+
+def test_views_lie_on_the_sphere_and_are_spread_evenly():
+    distance = np.linalg.norm(VIEW_SPHERE.positions_world - VIEW_SPHERE.centre_world, axis=-1)
+    np.testing.assert_allclose(distance, 1.5)
+    np.testing.assert_allclose(VIEW_SPHERE.directions.mean(axis=0), 0.0, atol=1e-3)
+    np.testing.assert_allclose(
+        VIEW_SPHERE.directions.T @ VIEW_SPHERE.directions / 2000, np.eye(3) / 3, atol=1e-3
+    )
+
+
+def test_poses_look_at_the_centre_like_look_at_does():
+    directions = np.vstack([VIEW_SPHERE.directions[::50], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    for T, d in zip(VIEW_SPHERE.poses(directions), directions, strict=True):
+        expected = transforms.look_at(VIEW_SPHERE.centre_world + 1.5 * d, VIEW_SPHERE.centre_world)
+        np.testing.assert_allclose(T, expected, atol=1e-9)
+
+
+def test_direction_of_a_pose_is_where_it_came_from():
+    poses = VIEW_SPHERE.poses(VIEW_SPHERE.directions[:100])
+    np.testing.assert_allclose(VIEW_SPHERE.direction_of(poses), VIEW_SPHERE.directions[:100], atol=1e-12)
+    np.testing.assert_allclose(VIEW_SPHERE.direction_of(poses[7]), VIEW_SPHERE.directions[7], atol=1e-12)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import io
 import json
+import pickle
 import re
 import shlex
 import shutil
@@ -21,6 +22,7 @@ from caryatid.benchmark.store import RESULTS
 from caryatid.cli import sessions
 from caryatid.cli.commands import COMMANDS as TOP
 from caryatid.cli.commands import find_command, read_command
+from caryatid.errors import InputError, PerceptionError, in_one_line
 
 ESCAPE = "\x1b"
 QUICK = ["--set", "rehearsal.draws=2"]
@@ -238,3 +240,21 @@ def test_a_spinner_turns_on_a_terminal_only(kept_run, said_on):
     assert said_on(words, out=True, err=False, FORCE_COLOR="1")[1] == ""
     assert said_on(words, out=False, err=True, TERM="dumb")[1] == ""
     assert said_on([*words, "--quiet"], out=False, err=True)[1] == ""
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    "error", [InputError("scene.xml", "is broken", "give another"), PerceptionError("nothing is seen")]
+)
+def test_an_error_crosses_processes_as_it_is(error):
+    copy = pickle.loads(pickle.dumps(error))
+    assert type(copy) is type(error)
+    assert (vars(copy), str(copy)) == (vars(error), str(error))
+
+
+def test_what_failed_is_said_in_one_line():
+    assert in_one_line(InputError("a.xml", "is\nbroken")) == "a.xml: is broken"
+    assert in_one_line(FileNotFoundError(2, "No such file", "a.xml")) == "a.xml: no such file"
+    assert "ZeroDivisionError" in in_one_line(ZeroDivisionError("by zero"))

@@ -152,12 +152,16 @@ class Shape(Pictured):
 
     def _drawn(self, eye: Array) -> list[Array]:
         """What `lines` are in the object's frame."""
+        return [np.linspace(a, b, 33) for a, b in self._edges(eye, 20.0)]
+
+    def _edges(self, eye: Array, crease: float) -> Array:
+        """Ends (E, 2, 3) [m] of the mesh's edges sharper than an angle [deg], or on its outline."""
         mesh = self.mesh()
         faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
-        drawn = mesh.face_adjacency_angles > np.radians(20.0)
+        drawn = mesh.face_adjacency_angles > np.radians(crease)
         drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
-        edges = mesh.vertices[mesh.face_adjacency_edges[drawn]]
-        return [np.linspace(a, b, 33) for a, b in edges]
+        ends: Array = mesh.vertices[mesh.face_adjacency_edges[drawn]]
+        return ends
 
     def moved(self, T: Array) -> Self:
         """Return the shape moved by a rigid transform (4, 4) of the world: T @ T_world_object."""

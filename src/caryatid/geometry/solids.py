@@ -220,11 +220,7 @@ class Solid(Shape):
 
     def _drawn(self, eye: Array) -> list[Array]:
         """Edges and silhouette of the parts, where they do not lie within another one."""
-        mesh = self.mesh()
-        faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
-        drawn = mesh.face_adjacency_angles > np.radians(30.0)
-        drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
-        ends = mesh.vertices[mesh.face_adjacency_edges[drawn]]
+        ends = self._edges(eye, 30.0)
         local = Solid(np.eye(4), self.polytopes)
         lines = np.linspace(ends[:, 0], ends[:, 1], 9, axis=1)
         hidden = local.signed_distance(lines.mean(axis=1)) < -1e-3

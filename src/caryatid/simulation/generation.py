@@ -119,7 +119,7 @@ def _dense(rng: np.random.Generator, size: int) -> _Plan:
 
 def _packed(rng: np.random.Generator, size: int) -> _Plan:
     """Half of the objects are parallel, so that faces touch; three in ten are set down on another one."""
-    turn = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    turn = _yaw(rng)
 
     def draw(scene: SimulatedScene | None) -> _Drop:
         shape = _upright(rng)
@@ -150,9 +150,7 @@ def _blocks(rng: np.random.Generator, size: int) -> _Plan:
     base, fewer = [(size, 0), ((size + 1) // 2, 0), (pyramid, 1)][int(rng.integers(3))]
     layers = [(layer, base - fewer * layer) for layer in range(base if fewer else 2)]
     cells = [(k - (count - 1) / 2.0, layer) for layer, count in layers for k in range(count)][:size]
-    turn = transforms.rigid(
-        transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi))), np.zeros(3)
-    )
+    turn = transforms.rigid(_yaw(rng), np.zeros(3))
 
     def draw(scene: SimulatedScene | None) -> _Drop:
         along, layer = cells[0 if scene is None else len(scene.object_bodies)]
@@ -263,9 +261,14 @@ def _overlap(shape: Shape, other: Shape) -> bool:
     return bool((apart < (shape.support(np.eye(3)) + other.support(np.eye(3)))[:2]).all())
 
 
+def _yaw(rng: np.random.Generator) -> Array:
+    """Any turn (3, 3) about the vertical."""
+    return transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+
+
 def _upright(rng: np.random.Generator) -> Shape:
     """A shape at the origin with one axis vertical; three in ten lie on their side."""
-    yaw = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
+    yaw = _yaw(rng)
     on_its_side = transforms.rotation_from_vector((np.pi / 2.0, 0.0, 0.0))
     return _shape(rng, yaw @ on_its_side if rng.random() < 0.3 else yaw)
 
@@ -348,8 +351,7 @@ def thing(rng: np.random.Generator) -> Shape:
         _book: 0.14, _carton: 0.08, _can: 0.08, _bottle: 0.06, _fruit: 0.1,
     }  # fmt: skip
     shape = list(makers)[int(rng.choice(len(makers), p=list(makers.values())))](rng)
-    yaw = transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
-    return shape.moved(transforms.rigid(yaw, np.zeros(3)))
+    return shape.moved(transforms.rigid(_yaw(rng), np.zeros(3)))
 
 
 def _tray(rng: np.random.Generator) -> Shape:
