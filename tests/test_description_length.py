@@ -34,7 +34,7 @@ UP = np.array([0.0, 0.0, 1.0])
 def gather(cloud, voxels=None, costs=COSTS):
     kept = cloud.select(thin(cloud.points_world, costs.spacing))
     weight = costs.spacing**2 / costs.reading
-    return Evidence(kept.points_world, kept.normals_world, weight, 0.003, voxels)
+    return Evidence(kept.points_world, kept.normals_world, weight, 0.003, voxels, kept.rgb)
 
 
 def alone_in(evidence):
@@ -212,6 +212,23 @@ def bowl(azimuths, seed=0):
 
 def test_halves_of_what_goes_around_an_axis_are_one():
     assert pair_of({1: bowl((-np.pi, 0.3)), 2: bowl((0.3, np.pi))}) is not None
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "merged"),
+    [((200, 30, 30), (30, 60, 190), False), ((200, 30, 30), (120, 18, 18), True), (None, None, True)],
+    ids=["red beside blue", "shaded", "printed"],
+)
+def test_flush_boxes_are_two_where_each_has_a_colour_of_its_own(left, right, merged):
+    points, normals, _ = points_of([box((0.0, 0.0, 0.03), (0.06, 0.12, 0.06))])
+    rng, clouds = np.random.default_rng(2), {}
+    for label, (own, colour) in enumerate(
+        zip((points[:, 1] < 0.0, points[:, 1] >= 0.0), (left, right), strict=True), 1
+    ):
+        prints = rng.choice([(230, 200, 20), (200, 20, 20), (30, 30, 120)], own.sum())
+        rgb = np.clip((colour or prints) + rng.normal(0.0, 3.0, (own.sum(), 3)), 0, 255).astype(np.uint8)
+        clouds[label] = Cloud(points[own], normals[own], rgb=rgb)
+    assert (pair_of(clouds) is not None) == merged
 
 
 def test_irregular_neighbours_stay_two_also_where_the_surface_goes_on():

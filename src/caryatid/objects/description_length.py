@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from caryatid.config import Config, ExplanationConfig, FitConfig
 from caryatid.fitting.primitives import candidates, free_inside
@@ -14,6 +15,9 @@ from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.objects.compounds import Compound, compounds, shape_costs
 from caryatid.sensing.voxel_map import VoxelMap
+
+PLAIN = 0.02
+"""How much the shares of red and green differ on a thing of one colour [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -26,6 +30,7 @@ class Evidence:
         weight: Independent readings each point stands for [1].
         noise: Standard deviation of the points from the surfaces they are on [m].
         voxels: Space seen free, or None where nothing is known.
+        rgb: Colours (N, 3), or None.
     """
 
     points: Array
@@ -33,18 +38,23 @@ class Evidence:
     weight: float
     noise: float
     voxels: VoxelMap | None
+    rgb: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
     def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> Evidence:
         """Return the evidence of some of the points, by a mask (N,) or indices (M,)."""
-        return replace(self, points=self.points[kept], normals=self.normals[kept])
+        rgb = None if self.rgb is None else self.rgb[kept]
+        return replace(self, points=self.points[kept], normals=self.normals[kept], rgb=rgb)
 
     def joined(self, other: Evidence) -> Evidence:
         """Return the evidence of two objects together; noise and space are the same for both."""
         points = np.concatenate([self.points, other.points])
-        return replace(self, points=points, normals=np.concatenate([self.normals, other.normals]))
+        normals = np.concatenate([self.normals, other.normals])
+        known = self.rgb is not None and other.rgb is not None
+        rgb = np.concatenate([self.rgb, other.rgb]) if known else None
+        return replace(self, points=points, normals=normals, rgb=rgb)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -77,6 +87,28 @@ def explained(explanation: Explanation, evidence: Evidence, config: ExplanationC
     """Whether a shape explains points about as well as true shapes do, without space seen free inside it."""
     own = explanation.cost - price(explanation.shape, config)
     return explanation.shape is not None and own <= config.usual * evidence.weight * len(evidence)
+
+
+def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig) -> float:
+    """How much [nats] colours speak for two objects rather than one; of two printed ones they say nothing."""
+    if first.rgb is None or second.rgb is None:
+        return 0.0
+    sides = first.rgb, second.rgb, np.concatenate([first.rgb, second.rgb])
+    alone, other, both = (_colour_cost(rgb, config) for rgb in sides)
+    return max(both - alone - other, 0.0)
+
+
+def _colour_cost(rgb: NDArray[np.uint8], config: ExplanationConfig) -> float:
+    """Cost [nats] of colours (N, 3): of one plain colour and outliers, or of a print.
+
+    Shading leaves the shares of red, green and blue as they are.
+    """
+    shares = (rgb + 1.0) / (rgb + 1.0).sum(axis=1, keepdims=True)
+    # Enough of them to hold one of the most frequent colour.
+    tried = shares[:: max(1, len(shares) // 64)]
+    squares = cdist(shares[:, :2], tried[:, :2], "sqeuclidean") / (2.0 * PLAIN**2)
+    plain = float(np.minimum(squares, config.outlier).sum(axis=0).min())
+    return min(plain, config.irregular * len(rgb))
 
 
 def best_explanation(

@@ -22,6 +22,7 @@ from caryatid.objects.description_length import (
     Explanation,
     best_compound,
     best_explanation,
+    colour_evidence,
     explain,
     explained,
     point_costs,
@@ -311,7 +312,7 @@ def best_merge(
 def _gain(
     known: Mapping[int, tuple[Evidence, Explanation]], labels: Pair, config: Config, seed: int
 ) -> float:
-    """How much less [nats] one object costs than two, by the shapes of both and by fits to all the points.
+    """How much less [nats] one object costs than two, by their shapes, fits to all the points, and colours.
 
     Nothing where one shape leaves one of the two unexplained, or none explains both: later views may undo
     what is two, but not what is one.
@@ -326,10 +327,11 @@ def _gain(
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
         if one.cost > two.cost + price(None, costs):
             break
-    gain, most = two.cost - one.cost, costs.irregular
+    colours = colour_evidence(first, second, costs)
+    gain, most = two.cost - one.cost - colours, costs.irregular
     if not all(isinstance(e.shape, Shape) and explained(e, own, costs) for own, e in pair):
         # A compound has creases of its own: to it a border without one means nothing.
-        apart = alone.cost + other.cost
+        apart = alone.cost + other.cost - colours
         compound = best_compound(both, config, apart - max(gain, 0.0))
         if compound.shape is not None:
             one, gain, most = compound, apart - compound.cost, costs.usual

@@ -374,7 +374,7 @@ class ObjectModels:
         config = self._config.explanation
         cloud = self.points.of(label, config.spacing)
         weight = config.spacing**2 / config.reading
-        evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels)
+        evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels, cloud.rgb)
         shape = self.fits[label].shape
         explanation = best_explanation([shape], evidence, config)
         if not compound or explained(explanation, evidence, config):
