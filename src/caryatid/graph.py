@@ -35,6 +35,7 @@ class SceneObject(Pictured):
         why: How the shape came about, for a person to read.
         uncertainty: How far off the shape may be, where that is known.
         doubt: What is physically implausible about it, for a person to read; empty where nothing is.
+        probability: How likely it is about where and as large as `shape` says [1]; None: not known.
     """
 
     id: str
@@ -49,6 +50,7 @@ class SceneObject(Pictured):
     why: str = ""
     uncertainty: Uncertainty | None = None
     doubt: str = ""
+    probability: float | None = None
 
     @property
     def centre_world(self) -> Array:
@@ -73,6 +75,7 @@ class Support:
         contact_world: Centre (3,) [m] of the contact patch, or None.
         normal_world: Normal (3,) of the separating plane, from supporter to supported, or None.
         why: Which test put it there, with figures.
+        probability: How likely it is there [1]; None: not known.
     """
 
     supporter: str
@@ -84,6 +87,7 @@ class Support:
     contact_world: Array | None = None
     normal_world: Array | None = None
     why: str = ""
+    probability: float | None = None
 
     @property
     def pair(self) -> tuple[str, str]:
@@ -142,7 +146,8 @@ class SupportGraph(Pictured):
         for o in self.objects:
             graph.add_node(o.id, data=o, role=o.role, shape=o.shape.kind)
         for s in self.supports:
-            graph.add_edge(s.supporter, s.supported, data=s, kind=s.kind, certain=s.certain)
+            known = {} if s.probability is None else {"probability": s.probability}
+            graph.add_edge(s.supporter, s.supported, data=s, kind=s.kind, certain=s.certain, **known)
         return graph
 
     def __repr__(self) -> str:

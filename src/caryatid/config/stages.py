@@ -299,6 +299,20 @@ class SupportConfig:
     stability: Literal["area", "balance"] = "balance"
     """An object is unstable by r_s of eq. 1 over its contact points, and all that rests on it may hold it
     (`area`, the paper's); or also by its centre of mass, and only what weighs against its tipping does."""
+    draws: Count = 12
+    """Scenes drawn by the fits' uncertainty, for probabilities [1]: a share is right to 0.14 near a half."""
+    force_share: Share = 0.03
+    """Share of its weight [1] from which an object is held by another one in a draw, as in the truth."""
+    at_rest: Share = 0.05
+    """Acceleration below which an object is at rest in a draw [g]: it closes a gap of 2 mm at most."""
+    unexplained: Share = 0.1
+    """Weight of a draw for an object that does not rest in it [1]: how often what nobody saw holds one."""
+    friction: Lengths = (0.4, 1.0)
+    """Sliding friction of each object is drawn from this range [1]: wood on cardboard to rubber on glass."""
+    density: Lengths = (300.0, 1200.0)
+    """Density of each object is drawn from this range [kg/m³]: half-empty packets to full bottles."""
+    touch: Positive = 0.0005
+    """Standard deviation of the gap of two shapes in contact [m]; round edges, soft surfaces."""
     max_drop: NotNegative = 0.04
     """How far below an unsupported object its supporter may lie, hidden gap between them [m]; with 0
     it stays unsupported."""
@@ -595,10 +609,6 @@ class RehearsalConfig:
     draws: Count = 8
     """Scenes that a lift is rehearsed in [1]: the shapes as extracted, and others as likely by their
     uncertainty; a risk of a third shows in one of eight with 96 %."""
-    friction: Lengths = (0.4, 1.0)
-    """Sliding friction is drawn from this range [1]: wood on cardboard to rubber on glass."""
-    density: Lengths = (300.0, 1200.0)
-    """Density of each object is drawn from this range [kg/m³]: half-empty packets to full bottles."""
     settling: NotNegative = 0.5
     """Time the extracted shapes get to settle [s]; gaps of a millimetre close at once."""
 

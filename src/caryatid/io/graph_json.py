@@ -19,6 +19,7 @@ from caryatid.io.json_files import Numbers, json_text, parse_json, plain, read_j
 from caryatid.sensing.views import SUPPORT_LABEL
 
 Count = Annotated[int, Ge(0)]
+Probability = Annotated[float, Ge(0.0), Le(1.0)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class _Object:
     why: str = ""
     doubt: str = ""
     uncertainty: _Uncertainty | None = None
+    probability: Probability | None = None
 
     def decoded(self, source: str) -> SceneObject:
         source = f"{source} ('{self.id}')"
@@ -75,6 +77,7 @@ class _Support:
     contact: Annotated[Array, Numbers(3)] | None = None
     normal: Annotated[Array, Numbers(3)] | None = None
     why: str = ""
+    probability: Probability | None = None
 
 
 @dataclass(frozen=True)

@@ -261,7 +261,7 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
     if number > 0:
         objects = [drawn(o, rng, config.plausibility) for o in objects]
         objects = reconcile(objects, config.plausibility)
-    settings = config.rehearsal
+    settings = config.support
     frictions = rng.uniform(*settings.friction, len(objects))
     densities = rng.uniform(*settings.density, len(objects))
     if number == 0:

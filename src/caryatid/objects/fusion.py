@@ -103,7 +103,11 @@ def fused_graph(
         opportunities = occurrences + contradicted.get(i, 0)
         if occurrences >= config.keep_share * opportunities:
             vertex = _vertex(seen, config)
-            objects[i] = replace(vertex, occurrences=occurrences, opportunities=opportunities)
+            likely = vertex.probability
+            likely = None if likely is None else likely * occurrences / max(opportunities, 1)
+            objects[i] = replace(
+                vertex, occurrences=occurrences, opportunities=opportunities, probability=likely
+            )
     supports = []
     for pair, found in edges.items():
         if pair[0] not in objects or pair[1] not in objects:
@@ -114,6 +118,9 @@ def fused_graph(
         if (mostly and config.method != "pc") or (newest in found and config.method != "sg"):
             last = found[max(found)]
             certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
+            if last.probability is not None and newest not in found:
+                # Where it was not found it counts as nothing.
+                last = replace(last, probability=last.probability * occurrences / len(views))
             supports.append(replace(last, certain=certain, occurrences=occurrences, opportunities=len(views)))
     ordered = sorted(objects.values(), key=lambda o: (o.role != "support_surface", o.label))
     rank = {o.id: k for k, o in enumerate(ordered)}

@@ -33,7 +33,7 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
         The objects in the same order, `doubt` telling what could not be explained.
     """
     done = list(objects)
-    sigma = np.array([_sigma(o) for o in objects]).reshape(-1, 9)
+    sigma = np.array([deviations(o) for o in objects]).reshape(-1, 9)
     variance = sigma**2
     doubts: dict[int, str] = {}
     for number in range(config.rounds):
@@ -43,7 +43,7 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
             break
         pairs = np.array([(c.a, c.b) for c in wrong], dtype=np.intp)
         gaps = np.array([c.distance for c in wrong])
-        rows = _rows(done, wrong, pairs)
+        rows = gap_rows(done, wrong, pairs)
         scatter = np.einsum("kpv,kpv->k", rows**2, variance[pairs]) + config.touch**2
         explained = np.abs(gaps) <= config.sigmas * np.sqrt(scatter)
         if number == 0:
@@ -67,24 +67,28 @@ def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) 
         config: How many standard deviations uncertainty can explain.
     """
     draw = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas)
-    return replace(o, shape=_changed(o.shape, draw * _sigma(o)))
+    return replace(o, shape=_changed(o.shape, draw * deviations(o)))
 
 
 @cache
-def _effect(ties: tuple[int, int, int]) -> Array:
-    """What each independent variable (9,) does to translation, rotation and half extents (9, 9)."""
-    effect = np.zeros((9, 9))
-    effect[3:6, 3:6] = np.eye(3)
+def effect(ties: tuple[int, int, int]) -> Array:
+    """What each independent variable (9,) does to translation, rotation and half extents (9, 9).
+
+    Args:
+        ties: Which extents of the shape are one number.
+    """
+    matrix = np.zeros((9, 9))
+    matrix[3:6, 3:6] = np.eye(3)
     for axis, round_ in enumerate(_round(ties)):
         if round_:
             # What is round moves as a whole, and its radius is one number.
-            effect[axis, axis] = 1.0
+            matrix[axis, axis] = 1.0
         else:
-            effect[[axis, 6 + axis], axis] = -0.5, 0.5
-            effect[[axis, 6 + axis], 6 + axis] = 0.5, 0.5
+            matrix[[axis, 6 + axis], axis] = -0.5, 0.5
+            matrix[[axis, 6 + axis], 6 + axis] = 0.5, 0.5
     if _round(ties)[0]:
-        effect[6:9, 6] = _round(ties)
-    return effect
+        matrix[6:9, 6] = _round(ties)
+    return matrix
 
 
 def _round(ties: tuple[int, int, int]) -> list[bool]:
@@ -92,8 +96,12 @@ def _round(ties: tuple[int, int, int]) -> list[bool]:
     return [ties.count(tie) > 1 for tie in ties]
 
 
-def _sigma(o: SceneObject) -> Array:
-    """Standard deviation of each of an object's independent variables (9,); zero where it cannot change."""
+def deviations(o: SceneObject) -> Array:
+    """Standard deviation of each of an object's independent variables (9,); zero where it cannot change.
+
+    Args:
+        o: An object; the support surface, and what has no `uncertainty`, cannot change.
+    """
     sigma = np.zeros(9)
     if (known := o.uncertainty) is None or o.role == "support_surface":
         return sigma
@@ -119,16 +127,22 @@ def _floating(
     return [c for c in nearest.values() if c.distance > config.touch]
 
 
-def _rows(objects: Sequence[SceneObject], contacts: Sequence[Contact], pairs: NDArray[np.intp]) -> Array:
-    """How much (K, 2, 9) each variable of the two objects of a contact closes its gap."""
-    points_world = np.array([c.point_world for c in contacts])
-    normals_world = np.array([c.normal_world for c in contacts])
+def gap_rows(objects: Sequence[SceneObject], contacts: Sequence[Contact], pairs: NDArray[np.intp]) -> Array:
+    """How much (K, 2, 9) each variable of the two objects of a contact closes its gap.
+
+    Args:
+        objects: All of them.
+        contacts: K contacts.
+        pairs: Indices (K, 2) of the two objects of each.
+    """
+    points_world = np.array([c.point_world for c in contacts]).reshape(-1, 3)
+    normals_world = np.array([c.normal_world for c in contacts]).reshape(-1, 3)
     shapes = [o.shape for o in objects]
     p, u = local_frames(Primitives.of(shapes), pairs, points_world, normals_world)
-    round_ = np.array([_round(s.ties) for s in shapes])[pairs]
+    round_ = np.array([_round(s.ties) for s in shapes]).reshape(-1, 3)[pairs]
     sizes = np.where(round_, 0.0, np.abs(u))
     sizes[..., 0] += np.linalg.norm(np.where(round_, u, 0.0), axis=-1)
-    effects = np.array([_effect(s.ties) for s in shapes])[pairs]
+    effects = np.array([effect(s.ties) for s in shapes]).reshape(-1, 9, 9)[pairs]
     rows: Array = np.einsum("kpi,kpij->kpj", np.concatenate([u, np.cross(p, u), sizes], axis=-1), effects)
     return rows
 
@@ -155,7 +169,7 @@ def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, 
 
 def _changed(shape: Shape, change: Array) -> Shape:
     """Change a shape's independent variables (9,)."""
-    change = _effect(shape.ties) @ change
+    change = effect(shape.ties) @ change
     T = shape.T_world_object @ transforms.rigid(transforms.rotation_from_vector(change[3:6]), change[:3])
     extents = np.maximum(shape.extents + 2.0 * change[6:9], 0.008)  # As of the fits.
     return shape.resized(T, extents)

@@ -14,6 +14,7 @@ from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array, rigid
 from caryatid.graph import Kind, SceneObject, Stability, Support, SupportGraph
 from caryatid.support.contacts import Contact, find_contacts, find_gap, local_frames
+from caryatid.support.equilibrium import support_shares
 from caryatid.support.stability import (
     Tipping,
     assess,
@@ -68,8 +69,10 @@ class Effect:
     why: str
 
 
-def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph:
-    """Infer who supports whom among the objects of one scene model.
+def infer(
+    objects: Sequence[SceneObject], config: SupportConfig, rng: np.random.Generator | None = None
+) -> SupportGraph:
+    """Infer who supports whom among the objects of one scene model, and how likely.
 
     From each separating plane the lower object supports the upper one. An object whose centre of mass lies
     outside what then carries it looks for what keeps it from tipping: first contacts below it that a slightly
@@ -79,10 +82,26 @@ def infer(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph
     Args:
         objects: Shapes in the world frame; the one with role `support_surface` is supported by nothing.
         config: The stage's numbers.
+        rng: Source of the draws that probabilities come from; None draws the same ones every time.
+
+    Returns:
+        The graph. The probability of a support is the mean of two witnesses: the rules, which say 1, and the
+        share of draws in whose equilibrium of forces it holds. With `stability` = `area` there is none.
 
     Raises:
         InputError: Two objects have the same id.
     """
+    graph = _by_rules(objects, config)
+    if config.stability == "area":
+        return graph
+    shares, likeness = support_shares(graph, config, rng or np.random.default_rng(0))
+    supports = [replace(s, probability=(1.0 + p) / 2.0) for s, p in zip(graph.supports, shares, strict=True)]
+    named = [replace(o, probability=p) for o, p in zip(graph.objects, likeness, strict=True)]
+    return replace(graph, objects=tuple(named), supports=tuple(supports))
+
+
+def _by_rules(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph:
+    """What planes, support polygons and the ways objects tip say of supports."""
     if len({o.id for o in objects}) < len(objects):
         raise InputError("objects", "two of them have the same id", "give every object an id of its own")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
@@ -202,7 +221,7 @@ def _next_effect(
     staying = [o for o in graph.objects if o.id not in gone]
     losses = [(o, [s for s in graph.supporters(o.id) if s.supporter in gone]) for o in staying]
     losses = [(o, lost) for o, lost in losses if lost and o.id not in known]
-    left = infer(staying, config) if losses else graph
+    left = _by_rules(staying, config) if losses else graph
     for o, lost in losses:
         named = ", ".join(dict.fromkeys(s.supporter for s in lost))
         # Two standard deviations by which the fit may be off sideways.
@@ -224,7 +243,8 @@ def _find_touches(
 ) -> dict[str, list[Touch]]:
     """What touches each object, or is nearer than a reach [m], by the object's id."""
     shapes = [o.shape for o in objects]
-    contacts = [c for c in find_contacts(shapes, reach) if not _parted(c, shapes)]
+    low, high = Primitives.of(shapes).bounds()
+    contacts = [c for c in find_contacts(shapes, reach) if not _parted(c, shapes, low, high)]
     normals_world = np.array([_plane_normal(objects[c.a], objects[c.b], c) for c in contacts]).reshape(-1, 3)
     tilts = np.degrees(transforms.angle_between(normals_world, (0.0, 0.0, 1.0)))
     # Shapes touch up to gaps that their fits' uncertainty across the contact explains.
@@ -249,12 +269,17 @@ def _find_touches(
     return touches
 
 
-def _parted(contact: Contact, shapes: Sequence[Shape]) -> bool:
-    """Whether a third shape fills the gap: the floor of a tray parts what is in it from the table."""
+def _parted(contact: Contact, shapes: Sequence[Shape], low: Array, high: Array) -> bool:
+    """Whether a third shape fills the gap: the floor of a tray parts what is in it from the table.
+
+    Only one whose level box, from corners low to high (N, 3) [m], holds all the contact's points can.
+    """
     if contact.distance <= 0.0:
         return False
-    others = [shape for k, shape in enumerate(shapes) if k not in (contact.a, contact.b)]
-    return any((shape.signed_distance(contact.points_world) < 0.0).all() for shape in others)
+    points = contact.points_world
+    around = (low <= points.min(axis=0)) & (points.max(axis=0) <= high)
+    others = set(np.flatnonzero(around.all(axis=1)).tolist()) - {contact.a, contact.b}
+    return any((shapes[k].signed_distance(points) < 0.0).all() for k in others)
 
 
 def _plane_normal(other: SceneObject, o: SceneObject, contact: Contact) -> Array:

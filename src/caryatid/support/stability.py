@@ -15,12 +15,17 @@ from caryatid.geometry.shapes import Box, Primitives, Shape
 from caryatid.geometry.solids import Solid
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Stability
+from caryatid.support.contacts import Contact
 
 _UP = np.array([0.0, 0.0, 1.0])
 _NO_AREA = 1e-12
 """Contact areas below this are lines and points, blurred by rounding [m²]; a micrometre squared."""
 _HIT = 5e-4
 """A point this near to the other shape has met it [m]."""
+_STEEP = 0.1
+"""Cosine to the vertical of a normal below which a contact is nearly a line from above: 84°."""
+_CORNERS = 8
+"""Most corners of a contact area [1]; a disc keeps nine tenths of its area."""
 _EDGES = {
     "box": np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]),
     "cylinder": np.concatenate(
@@ -73,6 +78,22 @@ def contact_patch(
     lower = _cap(other, normal_world, min(depth, _touching_depth(other, config)))
     patch = polygons.intersection(_cap(shape, -normal_world, depth), lower)
     return patch if polygons.area(patch) > _NO_AREA else polygons.hull(points_world)
+
+
+def contact_area(contact: Contact, config: SupportConfig) -> Array:
+    """Corners (K, 3) [m] of the area over which the shapes of a contact touch, in its separating plane.
+
+    Args:
+        contact: Steep ones, whose area has no outline seen from above, give their own points.
+        config: `patch_depth`.
+    """
+    x, y, z = contact.normal_world
+    if abs(z) < _STEEP:
+        return contact.points_world
+    patch = contact_patch(*contact.parts[::-1], contact.normal_world, contact.points_world, config)
+    patch = patch[:: -(-len(patch) // _CORNERS)]
+    height = contact.point_world[2] - (patch - contact.point_world[:2]) @ (x, y) / z
+    return np.column_stack([patch, height])
 
 
 def drop_distance(shape: Shape, other: Shape, limit: float) -> float:
