@@ -35,7 +35,7 @@ class SceneObject(Pictured):
         why: How the shape came about, for a person to read.
         uncertainty: How far off the shape may be, where that is known.
         doubt: What is physically implausible about it, for a person to read; empty where nothing is.
-        probability: How likely it is about where and as large as `shape` says [1]; None: not known.
+        probability: Probability that its true shape agrees with `shape` by an IoU of 0.5 [1], or None.
     """
 
     id: str
@@ -75,7 +75,7 @@ class Support:
         contact_world: Centre (3,) [m] of the contact patch, or None.
         normal_world: Normal (3,) of the separating plane, from supporter to supported, or None.
         why: Which test put it there, with figures.
-        probability: How likely it is there [1]; None: not known.
+        probability: Probability that it exists [1], or None.
     """
 
     supporter: str

@@ -65,7 +65,7 @@ def split(
 ) -> Groups | None:
     """Split points that several shapes explain at a lower cost than one.
 
-    Pieces are two where space was seen free between them and nothing connects them. Otherwise tried are
+    Where one shape does not explain all, pieces with free space between them are two. Otherwise tried are
     hints, the patches that the single shape does not explain, and cuts across the vertical, where one object
     lies on another, and across the two horizontal directions of the points' faces, where they stand side by
     side. From each such hypothesis the points go to the shape that explains them better, and the shapes are
