@@ -14,18 +14,22 @@ from caryatid.config.settings import read_settings
 from caryatid.errors import InputError
 from caryatid.planning.planners import VOLUMETRIC
 
+
+def _generated(kind: str, smallest: int, largest: int, seed: int, count: int) -> tuple[str, ...]:
+    """Names of generated scenes from a seed on, their sizes going round from the smallest to the largest."""
+    return tuple(f"{kind}-{smallest + i % (largest - smallest + 1)}-{seed + i}" for i in range(count))
+
+
 DESIGNED = ("tower", "bridge", "counterweight", "leaning_plank", "hidden_stack", "shelf", "clutter")
 """Scenes with one difficulty each."""
 PILES = tuple(
     f"pile-{size}-{seed}" for seed, size in enumerate((4, 5, 6, 8, 10, 12, 14, 16, 18, 20), start=1)
 )
 """Primitives set down one by one, 4 to 20."""
-HEAPED = tuple(f"pile-{6 + i % 7}-{401 + i}" for i in range(60))
+HEAPED = _generated("pile", 6, 12, 401, 60)
 """Piles of 6 to 12 to be taken apart; nothing is tuned on these seeds."""
-DENSE = tuple(f"dense-{10 + i % 16}-{301 + i}" for i in range(32))
+DENSE = _generated("dense", 10, 25, 301, 32)
 """Heaps of 10 to 25 between screens and walls; nothing is tuned on these seeds."""
-HOUSEHOLD = tuple(f"house-{4 + i % 9}-{501 + i}" for i in range(30))
-"""Four to twelve things of a household on and in each other; nothing is tuned on these seeds."""
 MIXED = (*DESIGNED, *PILES[2::2], *DENSE[:8])
 """Some of each."""
 LABELS = "labels, Carmine noise"
@@ -306,9 +310,26 @@ _ALL = (
         "house",
         "What is found of trays, bowls, mugs, bottles and the like, with labels and without.",
         _planners("support"),
-        HOUSEHOLD,
+        _generated("house", 4, 12, 501, 30),
         {LABELS: {}, **_AUTO},
         seeds=1,
+    ),
+    Suite(
+        "easy",
+        "What automatic segments find of piles of 4 to 20 and of equal boxes in rows, walls and pyramids.",
+        _planners("support"),
+        _generated("pile", 4, 20, 800, 60) + _generated("blocks", 2, 10, 800, 40),
+        _AUTO,
+        seeds=1,
+    ),
+    Suite(
+        "heaps",
+        "What automatic segments find of dense heaps, over ten views.",
+        _planners("support"),
+        _generated("dense", 10, 25, 700, 32),
+        _AUTO,
+        seeds=1,
+        views=10,
     ),
     Suite(
         "dismantle",

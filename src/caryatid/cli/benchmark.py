@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 SUITES = (
     "smoke", "fig5", "fig5-paper", "presets", "planners", "path", "ablation", "ablation-attention", "poses",
-    "noise", "house", "dismantle", "full",
+    "noise", "house", "easy", "heaps", "dismantle", "full",
 )  # fmt: skip
 """Names of the suites; the benchmark is imported later."""
 
