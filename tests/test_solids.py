@@ -75,6 +75,21 @@ def test_a_body_in_a_tray_touches_its_floor_and_not_its_rim():
     assert find_gap(tray(), cube((0.0, 0.0, 0.1))) == pytest.approx(0.07, abs=1e-5)
 
 
+def test_gaps_of_solids_do_not_depend_on_the_solids_asked_for_before():
+    """MuJoCo's model is kept between calls: neither its first meshes nor those of the last call may show."""
+    rng = np.random.default_rng(1)
+    table = Box(transforms.rigid(AXES, (0.0, 0.0, -0.02)), np.array([6.0, 6.0, 0.04]))
+    for size in (0.1, 0.4, 0.1):
+        solids = []
+        for number in range(12):
+            points = size * rng.uniform(size=(12, 3)) * (1.0, 1.0, 0.5)
+            points += [number % 4 - 2, number // 4 - 1, 0.001 - points[:, 2].min()]
+            solids.append(Solid.of([Polytope.around(points)]))
+        contacts = find_contacts([table, *solids], 0.01)
+        assert [c.b for c in contacts] == list(range(1, 13))
+        np.testing.assert_allclose([c.distance for c in contacts], 0.001, atol=1e-5)
+
+
 def test_what_stands_in_a_tray_is_supported_by_it_all_over():
     objects = on_a_table(
         tray(), cube((0.05, 0.0, 0.03)), Sphere(transforms.rigid(AXES, (0.0, 0.0, 0.25)), 0.02)

@@ -188,4 +188,6 @@ def _engine(capacity: int, corners: int, thread: int) -> tuple[mujoco.MjModel, m
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=np.ones(3))
     model = spec.compile()
     model.geom_pos[:], model.geom_quat[:] = 0.0, (1.0, 0.0, 0.0, 0.0)
+    # Faces would be those of the ball: with none, a solid has one contact point with a convex part.
+    model.mesh_polymapnum[:] = 0
     return model, mujoco.MjData(model)
