@@ -237,12 +237,9 @@ class SuiteRun(Gated):
             rows[name] += part
         for name in names:
             show_rows(rows[name], console, name)
-
-        def kept(name: str) -> bool:
-            return (suite := name.split(".")[0]) in SUITES and suite not in names
-
         self.write(rows)
-        return self.finish(measures(rows), BASELINE, console, kept)
+        others = {*SUITES} - {*names}
+        return self.finish(measures(rows), BASELINE, console, lambda name: name.split(".")[0] in others)
 
 
 @dataclass(frozen=True)

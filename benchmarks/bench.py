@@ -13,7 +13,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,12 +21,12 @@ from typing import Annotated
 import numba
 import peers
 import psutil
+import speed
 import tyro
 from fit_speed import measure_fits
 from measures import gate, print_table, read_baseline, run_main, write_baseline
 from rich.console import Console
 from rows import FULL, NOTHING, QUICK, Effort, Row, machine, measures, table_of_rows
-from speed import AXES, measure_decision, measure_growth, measure_map, measure_start, measure_turns
 
 from caryatid.benchmark.store import collect_provenance, describe_provenance
 from caryatid.errors import InputError
@@ -38,12 +38,13 @@ THREADS = ["omp", "tbb", "workqueue"]
 CALM = 0.2
 """So many cores taken by others before a measurement are a system's own business [1]."""
 MEASUREMENTS: dict[str, Callable[[Effort], list[Row]]] = {
-    "turn": measure_turns,
+    "turn": speed.measure_turns,
     **{f"fit.{kind}": partial(measure_fits, kind) for kind in ("cylinder", "box", "sphere")},
-    "decision": measure_decision,
-    "map": measure_map,
-    "start": measure_start,
-    **{f"growth.{axis}": partial(measure_growth, axis) for axis in AXES},
+    "decision": speed.measure_decision,
+    "map": speed.measure_map,
+    "real": speed.measure_real,
+    "start": speed.measure_start,
+    **{f"growth.{axis}": partial(speed.measure_growth, axis) for axis in speed.AXES},
 }
 """Name → what is measured; `turn` gives the rows of perceiving and of the stages too."""
 
@@ -56,6 +57,8 @@ class Bench:
     """What to measure, say `turn`, `fit` or `growth.views`. [default: all]"""
     quick: bool = False
     """Few runs and small sizes, in a few minutes: to see that it works, not to compare."""
+    real: Path = FULL.real
+    """Folder of recordings of real frames, BOP folders."""
     out: Path | None = None
     """JSON file for the rows."""
     docs: Path | None = None
@@ -140,7 +143,7 @@ def main() -> int:
             console.print(f"other processes hold {busy:.1f} cores: figures of {name} are not right")
         console.print(f"measuring {name} …", end="")
         started = time.perf_counter()
-        rows_by_name[name] = MEASUREMENTS[name](QUICK if args.quick else FULL)
+        rows_by_name[name] = MEASUREMENTS[name](replace(QUICK if args.quick else FULL, real=args.real))
         console.print(f" {time.perf_counter() - started:.0f} s")
     rows = [row for part in rows_by_name.values() for row in part]
     show(rows, console)

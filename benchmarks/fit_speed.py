@@ -85,10 +85,8 @@ def _compare(kind: Kind, count: int, side: str, runs: int) -> Iterator[Row]:
                 continue
             for quantity, off in errors_of(estimate, shape).items():
                 errors[name][quantity].append(off)
-    where, words = (
-        f"{kind}.{count // 1000}k-{side.replace(' ', '-')}",
-        f"{kind}, {count // 1000}k points, {side}",
-    )
+    where = f"{kind}.{count // 1000}k-{side.replace(' ', '-')}"
+    words = f"{kind}, {count // 1000}k points, {side}"
     for variant, peer in product(variants, peers):
         if peer == CGAL_ALONE and variant != "fit":
             continue

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 from measures import Gated, Measure, run_main
+from peers import NEIGHBOURS
 from rich.console import Console
 from scipy.spatial import cKDTree
 
@@ -41,8 +42,6 @@ SETTINGS = (("", 0.001, 5000), ("noisy.", 0.003, 800))
 KINDS = ("box", "cylinder", "sphere")
 STEEPEST = np.radians(80.0)
 """Surfaces seen at a wider angle give no reading."""
-NEIGHBOURS = 20
-"""Points a normal is estimated from."""
 ONE_VIEW = FitConfig(correlated=1.0, registration=0.0, rim=0.0)
 """Every point here has an error of its own: no registration, no smoothing, no loss of pixels at rims."""
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import TypeVar
 
 import numba
@@ -28,7 +29,7 @@ Limit = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How many runs; sizes of fits [points], images [px], tables [objects], voxels [m] and many views."""
+    """How many runs; sizes of fits [points], images [px], tables [objects], voxels [m]; views; recordings."""
 
     runs: int = 7
     points: tuple[int, ...] = (1000, 5000, 20_000)
@@ -36,6 +37,7 @@ class Effort:
     objects: tuple[int, ...] = (5, 10, 20, 40, 70, 100)
     voxels: tuple[float, ...] = (0.04, 0.02, 0.01, 0.005)
     views: int = 200
+    real: Path = Path(__file__).parents[2] / "shared/data/real"
 
 
 FULL = Effort()

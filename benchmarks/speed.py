@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import copy
 import os
-import re
 import subprocess
 import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
 
+import numba
 import numpy as np
 from peers import hash_voxels, open3d_chain, told
-from rows import PAUSE, Effort, Limit, Row, in_turns, median, timed, timed_row
+from rows import PAUSE, Effort, Limit, Row, T, in_turns, median, timed, timed_row
 
 from caryatid import Config, Scene, SupportGraph, View, next_best_view
 from caryatid.config import SegmentationMethod, SensorConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere
 from caryatid.geometry.transforms import UP, Array
+from caryatid.io.bop import read_recording
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.expected_visibility import SURFACE_SAMPLES
 from caryatid.planning.planners import make_planner
@@ -59,8 +60,6 @@ SEGMENTS = {"auto": "automatic segments", "labels": "labels given"}
 TARGETS = {"turn.auto": 0.5, "turn.labels": 0.5, "perceive.labels": 0.25}
 OBJECTS, POINTS = 36, 30
 """Objects on the table; of so many are left that a decision is about no more points of interest [1]."""
-PATIENCE = 90.0
-"""How long the views of growth with views may take [s]; those that were done by then count."""
 AXES = {
     "points": "pixels of the image", "objects": "objects on the table", "views": "views seen",
     "voxels": "voxels of the map",
@@ -329,7 +328,7 @@ def measure_decision(effort: Effort) -> list[Row]:
 
 
 def measure_map(effort: Effort) -> list[Row]:
-    """Rows of the map's update with a VGA view against a pass that only unprojects and hashes its points."""
+    """Row of the map's update with a VGA view against a pass that only unprojects and hashes its points."""
     recording = record(load_scene(HEAP), 3)
     config, view = recording.config, recording.views[-1]
     centre_world = recording.poses[0][:3, 3] + config.active.sphere_radius * recording.poses[0][:3, 2]
@@ -337,42 +336,26 @@ def measure_map(effort: Effort) -> list[Row]:
     for earlier in recording.views[:-1]:
         known = known.integrate(earlier, config.cloud.max_depth)
     size = config.voxels.size
-
-    def hash_in_numpy() -> object:
-        bare = fresh(view)
-        points_world = transforms.transform(bare.pose, bare.points_camera[bare.valid])
-        return np.unique(np.floor(points_world / size).astype(np.int64) @ (1 << 40, 1 << 20, 1))
-
-    found = in_turns(
-        {
-            "map": lambda: known.integrate(view, config.cloud.max_depth),
-            "pass": lambda: hash_voxels(view, size),
-            "numpy": one_blas_thread(hash_in_numpy),
-        },
-        3 * effort.runs,
-    )
+    calls = {
+        "map": lambda: known.integrate(view, config.cloud.max_depth), "pass": lambda: hash_voxels(view, size),
+    }  # fmt: skip
+    found = in_turns(calls, 3 * effort.runs)
     what, peer = f"update of the voxel map, {size * 100.0:g} cm", "unprojecting and hashing alone"
-    count = len(hash_voxels(view, size))
-    note = (
-        f"{int(view.valid.sum()):,} points in {count:,} voxels; the map bounds its space, the pass does not"
-    )
+    points, count = int(view.valid.sum()), len(hash_voxels(view, size))
+    note = f"{points:,} points in {count:,} voxels; the map bounds its space, the pass does not"
     limit = (4.0 * view.depth.size + 4.0 * known.hits.size, 0.0)
+    theirs = found["pass"]
     return [
-        timed_row(
-            "map", what, found["map"], peer=peer, theirs=found["pass"], limit=limit, target=3.0, note=note,
-        ),
-        timed_row("map.numpy", what, found["map"], peer=f"{peer}, in NumPy", theirs=found["numpy"]),
-    ]  # fmt: skip
+        timed_row("map", what, found["map"], peer=peer, theirs=theirs, limit=limit, target=3.0, note=note)
+    ]
 
 
 def measure_start(effort: Effort) -> list[Row]:
     """Rows of start-up, each in a process of its own; the first run of each is the warm-up."""
 
     def run(*arguments: str, **environment: str) -> str:
-        return subprocess.run(
-            [sys.executable, *arguments], env=os.environ | environment, capture_output=True, text=True,
-            check=True,
-        ).stdout  # fmt: skip
+        command, known = [sys.executable, *arguments], os.environ | environment
+        return subprocess.check_output(command, env=known, stderr=subprocess.DEVNULL, text=True)
 
     importing = [float(run("-c", IMPORT)) for _ in range(effort.runs + 1)][1:]
     helping = [timed(lambda: run("-m", "caryatid", "--help"), warm=False)[0] for _ in range(effort.runs + 1)]
@@ -434,29 +417,62 @@ def _exponent(axis: str, segmentation: str, sizes: Sequence[float], turns: Seque
     return Row(name, what, float(whole), "1", runs=len(sizes), target=target, note=note)
 
 
-def _over_views(segmentation: SegmentationMethod, views: int) -> Iterator[Row]:
+def _over_views(segmentation: SegmentationMethod, views: int) -> list[Row]:
     """Rows of growth with the views seen, from the tenth on, and of peak memory, in a process of its own."""
-    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
-        turns, peak = pool.submit(_many_views, segmentation, views).result()
+    turns, peak = _alone(_many_views, segmentation, views)
     edges = np.unique(np.geomspace(min(10, len(turns) // 2), len(turns) + 1, 13).astype(int))
     bins = [range(a, b) for a, b in pairwise(edges)]
     sizes = [float(np.exp(np.mean(np.log(b)))) for b in bins]
     row = _exponent("views", segmentation, sizes, [median([turns[v - 1] for v in b])[0] for b in bins])
     what = f"peak memory of {views} views, {SEGMENTS[segmentation]}"
-    memory = Row(f"growth.memory.{segmentation}", what, peak, "MB", target=1024.0)
-    done = f"only {len(turns)} views were done in {PATIENCE:.0f} s: {row.value:.2f}, {peak:.0f} MB by then"
-    yield from (one if len(turns) == views else replace(one, value=None, note=done) for one in (row, memory))
+    return [row, Row(f"growth.memory.{segmentation}", what, peak, "MB", target=1024.0)]
 
 
-def _many_views(segmentation: SegmentationMethod, views: int) -> tuple[list[float], float]:
-    """Whole turn of each of many views [s], and the peak memory of the process [MB]."""
+def _alone(call: Callable[..., T], *arguments: object) -> tuple[T, float]:
+    """Result of a call in a process of its own, and the peak memory of that process [MB]."""
+    with ProcessPoolExecutor(1, get_context("spawn")) as pool:
+        result = pool.submit(call, *arguments).result()
+        # Unlike getrusage's, this peak is not that of the process that started this one.
+        status = pool.submit(Path("/proc/self/status").read_text, "ascii").result()
+    return result, int(status.split("VmHWM:")[1].split()[0]) / 1024.0
+
+
+def _many_views(segmentation: SegmentationMethod, views: int) -> list[float]:
+    """Whole turn of each of many views [s]."""
     scene = load_scene(HEAP)
-    episode, turns, started = Episode(record(scene, 1), segmentation), [], time.perf_counter()
+    episode, turns = Episode(record(scene, 1), segmentation), []
     simulation = make_simulation(scene, Config(), noise="carmine", seed=0)
     for T_world_camera in _ring(scene, simulation.robot, Config(), views):
         turns.append(episode.look(T_world_camera, simulation.camera.capture(T_world_camera))["turn"])
-        if time.perf_counter() - started > PATIENCE:
-            break
-    # Unlike getrusage's, this peak is not that of the process that started this one.
-    (peak,) = re.findall(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text(encoding="ascii"))
-    return turns, int(peak) / 1024.0
+    return turns
+
+
+def measure_real(effort: Effort) -> list[Row]:
+    """Rows of real frames, the first view of each on one thread, and of ten views of the slowest."""
+    folders = [f for f in sorted(effort.real.glob("*/")) if "-masks" not in f.name]
+    if not folders:
+        return [Row("perceive.real", "real frames", None, target=1000.0, note=f"{effort.real} is absent")]
+    took, _ = _alone(_real_views, folders[:1] + folders, 1)
+    seconds, slowest = max((seconds, folder) for folder, seconds in took.items())
+    _, peak = _alone(_real_views, [slowest], 10)
+    what = "real frame in → graph, automatic segments, CPU time on one thread"
+    return [
+        timed_row("perceive.real", what, [*took.values()], target=1000.0),
+        timed_row("perceive.real.slowest", f"the slowest, {slowest.name}", [seconds], target=2500.0),
+        Row("growth.memory.real", "peak memory of ten views of that frame", peak, "MB", target=1024.0),
+    ]
+
+
+def _real_views(folders: Sequence[Path], views: int) -> dict[Path, float]:
+    """CPU time [s] of the last of so many views, all the same, of each recording that shows its surface."""
+    numba.set_num_threads(1)
+    took = {}
+    for folder in folders:
+        scene = Scene(segmentation="auto")
+        for _ in range(views):
+            view, started = read_recording(folder)[0], time.process_time()
+            # A single image has no pose until a surface gives it one.
+            scene.update(view if scene.T_world_camera is None else view.with_pose(scene.T_world_camera))
+            if scene.views:  # it is not kept for later
+                took[folder] = time.process_time() - started
+    return took
