@@ -164,7 +164,7 @@ def test_a_run_is_scored_against_its_scene(kept_run, scene_file, capsys):
     assert run_command("evaluate", kept_run, scene_file.parent, "--json") == 0
     views = json.loads(capsys.readouterr().out)["views"]
     assert [v["view"] for v in views] == [0, 1]
-    keys = {"view", "precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou"}
+    keys = {"view", "precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou", "brier"}
     assert all(v.keys() >= keys for v in views)
     told = json.loads((kept_run / "run.json").read_text())["scores"]
     assert [v["f1"] for v in views] == [s["f1"] for s in told]
@@ -174,6 +174,7 @@ def test_a_run_is_scored_against_its_scene(kept_run, scene_file, capsys):
     table = capsys.readouterr().out
     assert "F1" in table
     assert f"{views[1]['mean_iou']:.3f}" in table
+    assert all(len(line) <= 80 for line in table.splitlines())
     assert ESCAPE not in table
 
 

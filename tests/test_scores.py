@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from synthetic import box, sphere, table_object, thing
 from caryatid.config import Config
 from caryatid.errors import InputError
 from caryatid.evaluation import as_scene, evaluate_run, score, score_masks
-from caryatid.evaluation.scores import mask_ious
+from caryatid.evaluation.scores import Forecast, average_precision, mask_ious
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.graph import SceneObject, Support, SupportGraph
@@ -86,6 +87,41 @@ def test_empty_graphs():
     against = score(empty, as_scene(some))
     assert (against.precision, against.recall, against.f1, against.mean_iou) == (0.0, 0.0, 0.0, 0.0)
     assert score(some, as_scene(empty)).f1 == 0.0
+
+
+def test_probabilities_by_hand():
+    """Of cubes on each other three supports are said, one is wrong, and one true one is missing."""
+    truth = as_scene(tower(4))
+    objects, supports = tower(4).objects, tower(4).supports
+    said = [0.9, 0.6, None]
+    sure = [replace(s, probability=p, certain=False) for s, p in zip(supports, said, strict=False)]
+    wrong = Support("o0", "o4", probability=0.7)
+    found = score(SupportGraph(objects, (*sure, wrong)), truth)
+    # By falling probability: true, wrong, true, true; the fourth true one is missing.
+    squares = [0.1**2, 0.7**2, 0.4**2, 0.5**2, 1.0]
+    assert found.brier == pytest.approx(sum(squares) / 5)
+    assert found.average_precision == pytest.approx((1 / 1 + 2 / 3 + 3 / 4) / 4)
+    assert sorted(found.forecasts) == [
+        (0.0, 0.0, True), (0.5, 0.5, True), (0.6, 0.5, True), (0.7, 1.0, False), (0.9, 0.5, True)
+    ]  # fmt: skip
+    # What says nothing of a probability: supports of objects that are not there.
+    strange = Support("o0", "o9", probability=0.9)
+    aside = SupportGraph((*objects, thing(9, sphere((0.4, 0.0, 0.8), 0.05))), (*supports, strange))
+    assert (score(aside, truth).brier, score(aside, truth).average_precision) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ([], 1.0),
+        ([(0.3, False)], 0.0),
+        ([(0.0, True)], 0.0),
+        ([(0.5, True), (0.5, False)], 0.5),
+        ([(0.5, False), (0.4, True), (0.0, True)], 0.25),
+    ],
+)
+def test_average_precision_of_few(said, expected):
+    assert average_precision([Forecast(p, p, true) for p, true in said]) == expected
 
 
 def turned(extents, *degrees):

@@ -94,6 +94,13 @@ class Support:
         """(supporter, supported)."""
         return self.supporter, self.supported
 
+    @property
+    def belief(self) -> float:
+        """Its probability [1]; where that is not known, 1 if it is certain and 0.5 if it is not."""
+        if self.probability is None:
+            return 1.0 if self.certain else 0.5
+        return self.probability
+
     def __repr__(self) -> str:
         doubt = "" if self.certain else ", uncertain"
         found = f"{self.occurrences} of {self.opportunities}"

@@ -39,9 +39,10 @@ Row = dict[str, float]
 """What was measured after one view: `view` (from 1), `MEASURES` and `counts`."""
 SCORES = (
     "precision", "recall", "f1", "vertex_precision", "vertex_recall", "vertex_f1", "edge_precision",
-    "edge_recall", "edge_f1", "mean_iou",
+    "edge_recall", "edge_f1", "mean_iou", "brier", "average_precision",
 )  # fmt: skip
-"""Eq. 4 and 5 for vertices and edges together and alone, and the mean IoU of the matched objects [1]."""
+"""Eq. 4 and 5 for vertices and edges together and alone, the mean IoU of the matched objects, and how good the
+supports' probabilities are [1]."""
 TIMES = ("planning_seconds", "perception_seconds")
 """Time to choose this view, and from the view to the fused graph [s]; they differ from run to run."""
 MEASURES = (*SCORES, "angle", "path", *TIMES, "unharmed", "lifts")

@@ -98,6 +98,8 @@ def table(
 ) -> Table:
     """A table of text, or of figures aligned to the right."""
     made = Table(title=Text(title), title_justify="left")
+    if figures:
+        made.box, made.padding, made.pad_edge = box.SIMPLE_HEAD, (0, 0, 0, 0), False
     for name in columns:
         made.add_column(name, justify="right" if figures else "left", no_wrap=figures)
     for row in rows:
@@ -119,9 +121,7 @@ def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], T
         [name, *(f"{1000.0 * view[stage]:.1f}" if stage in view else "" for stage in stages)]
         for name, view in times.items()
     ]
-    made = table("time by view [ms]", ["view", *stages], rows, figures=True)
-    made.box, made.padding, made.pad_edge = box.SIMPLE_HEAD, (0, 0, 0, 0), False
-    return views, made
+    return views, table("time by view [ms]", ["view", *stages], rows, figures=True)
 
 
 def turn(timings: Mapping[str, float]) -> float:

@@ -71,7 +71,10 @@ class Import(options.Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(options.Command):
-    """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU.
+    """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU, probabilities.
+
+    Brier score (0 is perfect) and average precision (1 is perfect) are of the supports' probabilities, among
+    objects that were found.
 
     To try:
       caryatid evaluate run scenes/tower
@@ -87,10 +90,13 @@ class Evaluate(options.Command):
         from caryatid.evaluation.truths import evaluate_run
 
         views = [{"view": n} | score.to_json() for n, score in enumerate(evaluate_run(self.run, self.truth))]
-        names = ("precision", "recall", "f1", "edge_precision", "edge_recall", "mean_iou")
-        rows = [[f"{view['view']:02d}", *(f"{view[name]:.3f}" for name in names)] for view in views]
-        columns = ("view", "precision", "recall", "F1", "edge precision", "edge recall", "mean IoU")
-        shown = table(f"{self.run} against {self.truth}", columns, rows, figures=True)
+        columns = {
+            "precision": "precision", "recall": "recall", "f1": "F1", "edge_precision": "edge\nprecision",
+            "edge_recall": "edge\nrecall", "mean_iou": "mean\nIoU", "brier": "Brier\nscore",
+            "average_precision": "average\nprecision",
+        }  # fmt: skip
+        rows = [[f"{view['view']:02d}", *(f"{view[name]:.3f}" for name in columns)] for view in views]
+        shown = table(f"{self.run} against {self.truth}", ["view", *columns.values()], rows, figures=True)
         self.output.result({"views": views}, shown)
 
 

@@ -1,11 +1,11 @@
-"""Precision, recall and F1 of a support graph against a truth: method notes 5, eqs. 4 and 5 of the paper."""
+"""Scores of a support graph and of its probabilities: method notes 5, eqs. 4 and 5 of the paper."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, fields
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,20 @@ class TrueScene:
     table_top: float | None = None
 
 
+class Forecast(NamedTuple):
+    """What a graph says of a support, and whether it is true.
+
+    Attributes:
+        probability: That of the support; 0 if the graph does not have it [1].
+        by_certain: The same said by `certain` alone: 1, and 0.5 if uncertain [1].
+        true: It is in the truth.
+    """
+
+    probability: float
+    by_certain: float
+    true: bool
+
+
 @dataclass(frozen=True, slots=True)
 class Score:
     """How a graph compares with the truth.
@@ -72,8 +86,14 @@ class Score:
         vertex_precision: Vertices alone, the table included [1].
         vertex_recall: Vertices alone [1].
         mean_iou: Mean IoU of the matched objects, the table left out; 0 where none is matched [1].
+        brier: Brier score of the forecasts: their mean squared error; 0 is perfect [1].
+        average_precision: Area under precision over recall of the forecasts as the least probability that
+            counts falls from 1; 1 is perfect [1].
         matches: Extracted vertex to the true vertex it is.
         ious: IoU of each matched object [1].
+        forecasts: Of each support in the graph with both ends matched, and of each true one between matched
+            vertices that the graph lacks, with probability 0. What is neither is not listed. Supports of
+            vertices that are not matched say nothing of probabilities; they count in precision and recall.
     """
 
     precision: float
@@ -84,8 +104,11 @@ class Score:
     vertex_precision: float
     vertex_recall: float
     mean_iou: float
+    brier: float
+    average_precision: float
     matches: Mapping[str, str] = field(default_factory=dict)
     ious: Mapping[str, float] = field(default_factory=dict)
+    forecasts: tuple[Forecast, ...] = ()
 
     @property
     def vertex_f1(self) -> float:
@@ -99,7 +122,7 @@ class Score:
 
     def to_json(self) -> dict[str, float]:
         """What `caryatid evaluate --json` writes of a view."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("matches", "ious")}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.type == "float"}
 
 
 def score(
@@ -120,6 +143,7 @@ def score(
         config: Least IoU, tolerance of the table's height, points a pair.
     """
     config = config or EvaluationConfig()
+    edges = _said(found)
     found = as_scene(found) if isinstance(found, SupportGraph) else found
     iou = _volume_ious(found.objects, truth.objects, config.samples, rng or np.random.default_rng(0))
     names, true_names = [o.name for o in found.objects], [o.name for o in truth.objects]
@@ -128,7 +152,7 @@ def score(
     same = len(tops) == 2 and abs(tops[0] - tops[1]) <= config.table_tolerance
     if same and found.table is not None and truth.table is not None:
         matches[found.table] = truth.table
-    return _score_matches(found.vertices, found.edges, truth.vertices, truth.edges, matches, ious)
+    return _score_matches(found.vertices, edges, truth.vertices, truth.edges, matches, ious)
 
 
 def score_masks(
@@ -165,7 +189,14 @@ def score_masks(
     if surface is not None and TABLE in vertices:
         matches[surface.id] = TABLE
     found = [o.id for o in graph.objects]
-    return _score_matches(found, {s.pair for s in graph.supports}, vertices, edges, matches, ious)
+    return _score_matches(found, _said(graph), vertices, edges, matches, ious)
+
+
+def _said(found: SupportGraph | TrueScene) -> dict[tuple[str, str], tuple[float, float]]:
+    """Probability of each edge, and what `certain` alone says of it; a scene of solids is sure of all."""
+    if isinstance(found, TrueScene):
+        return dict.fromkeys(found.edges, (1.0, 1.0))
+    return {s.pair: (s.belief, 1.0 if s.certain else 0.5) for s in found.supports}
 
 
 def _matched(
@@ -178,20 +209,48 @@ def _matched(
 
 def _score_matches(
     found_vertices: Sequence[str],
-    found_edges: Set[tuple[str, str]],
+    found_edges: Mapping[tuple[str, str], tuple[float, float]],
     vertices: Sequence[str],
     edges: Set[tuple[str, str]],
     matches: dict[str, str],
     ious: dict[str, float],
 ) -> Score:
-    """Eqs. 4 and 5 once it is known which extracted vertex is which true one, one-to-one."""
-    v, e = len(matches), sum((matches.get(a), matches.get(b)) in edges for a, b in found_edges)
+    """All scores once it is known which extracted vertex is which true one, one-to-one."""
+    named = {(matches.get(a, ""), matches.get(b, "")): said for (a, b), said in found_edges.items()}
+    judged = {pair: Forecast(*said, pair in edges) for pair, said in named.items() if all(pair)}
+    v, e = len(matches), sum(forecast.true for forecast in judged.values())
     precision, recall = _ratios(v + e, len(found_vertices) + len(found_edges), len(vertices) + len(edges))
     of_vertices = _ratios(v, len(found_vertices), len(vertices))
     of_edges = _ratios(e, len(found_edges), len(edges))
     mean_iou = float(np.mean(list(ious.values()))) if ious else 0.0
     f1 = _harmonic_mean(precision, recall)
-    return Score(precision, recall, f1, *of_edges, *of_vertices, mean_iou, matches, ious)
+    there = set(matches.values())
+    missed = [pair for pair in edges if there.issuperset(pair) and pair not in judged]
+    forecasts = (*judged.values(), *[Forecast(0.0, 0.0, True)] * len(missed))
+    brier = float(np.mean([(f.probability - f.true) ** 2 for f in forecasts])) if forecasts else 0.0
+    of_forecasts = brier, average_precision(forecasts)
+    shares = precision, recall, f1, *of_edges, *of_vertices, mean_iou, *of_forecasts
+    return Score(*shares, matches, ious, forecasts)
+
+
+def average_precision(forecasts: Sequence[Forecast]) -> float:
+    """Sum of precision times gain in recall, as the least probability that counts falls from 1 to above 0.
+
+    Equal probabilities are one step. A support that has probability 0 is never found.
+
+    Args:
+        forecasts: What is said of supports.
+
+    Returns:
+        In [0, 1]; 1 where there is nothing to find and nothing is said, 0 where only false ones are.
+    """
+    said, _, true = np.array(forecasts, dtype=np.float64).reshape(-1, 3).T
+    order = np.argsort(-said, kind="stable")[: np.count_nonzero(said)]
+    steps = np.flatnonzero(np.diff(said[order], append=-1.0))
+    hits = np.cumsum(true[order])[steps]
+    if not true.any():
+        return float(len(steps) == 0)
+    return float(np.diff(hits, prepend=0.0) @ (hits / (steps + 1)) / true.sum())
 
 
 def _volume_ious(
