@@ -38,7 +38,8 @@ def without_times(outcome: Outcome) -> Outcome:
 
 
 def row(view: int, f1: float, path: float = 0.0) -> dict[str, float]:
-    return {"view": view, **dict.fromkeys(MEASURES, f1), "path": path, "lifts": 0.0, "unharmed": 0.0}
+    figures = {**dict.fromkeys(MEASURES, f1), "path": path, "lifts": 0.0, "unharmed": 0.0}
+    return {"view": view, **figures, "forecasts": [[float(f1), 1.0, True], [0.4, 0.5, False]]}
 
 
 def member(scene: str = "tower", method: str = "support", seed: int = 0, kind: str = "designed") -> Member:
@@ -263,6 +264,28 @@ def test_figures_by_hand(method, quantity, at, expected):
     assert figure(to_one, "best", "path ratio", 0.9).value == pytest.approx(0.4 / 0.75)
 
 
+def test_how_good_probabilities_are_by_hand():
+    """Two scenes, the other one twice as large; a true support that is missing counts in the Brier score."""
+    one = [[0.95, 1.0, True], [0.92, 1.0, True], [0.42, 0.5, False], [0.0, 0.0, True]]
+    two = [[0.95, 1.0, False], [1.0, 1.0, True], [0.48, 0.5, False], [0.95, 1.0, True]] * 2
+    rows = table({"a": [("one", [0.5]), ("two", [0.5])]})
+    rows["forecasts"] = [one, two]
+    summary = summarise(rows, reference="a")
+    said, by_certain, true = np.array(one + two).T
+    errors = (said - true) ** 2
+    assert figure(summary, "a", "pooled brier", 1).value == pytest.approx(np.mean(errors))
+    assert figure(summary, "a", "listed brier", 1).value == pytest.approx(np.mean(errors[said > 0.0]))
+    gain = 1.0 - np.sum(errors[said > 0.0]) / np.sum((by_certain - true)[said > 0.0] ** 2)
+    assert figure(summary, "a", "brier gain", 1).value == pytest.approx(gain)
+    low, high = (0.42 + 2 * 0.48) / 3, (0.95 + 0.92 + 2 * (0.95 + 1.0 + 0.95)) / 8
+    for quantity, expected in (("reliability 1", [0.0, 6 / 8]), ("supports 1", [3, 8])):
+        bins = summary[summary["quantity"] == quantity]
+        assert bins["at"].tolist() == pytest.approx([low, high])
+        assert bins["value"].tolist() == expected
+    error = (3 * low + 8 * (high - 6 / 8)) / 11
+    assert figure(summary, "a", "calibration error", 1).value == pytest.approx(error)
+
+
 def test_seeds_of_a_scene_count_as_one_and_failures_not_at_all(tmp_path):
     path = tmp_path / RESULTS
     members = [member("a", seed=0), member("a", seed=1), member("b"), member("b", seed=1)]
@@ -304,7 +327,8 @@ def test_the_command_writes_tables_figures_and_pages_of_what_there_is(tmp_path, 
     shown = {line.split("(")[1].rstrip(")") for line in document.splitlines() if line.startswith("![")}
     assert shown == {f"page/{file.name}" for file in (tmp_path / "page").iterdir()}
     assert page.count('src="data:image/svg+xml;base64,') == len(shown)
-    assert (out / "planners" / "f1-over-views.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("f1-over-views", "reliability"):
+        assert (out / "planners" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     f1 = said["f1"]["labels, Carmine noise"]["random"]
     assert f"| random | {f1[0]:.3f} [" in document
     with ResultStore(out / RESULTS) as store:

@@ -35,14 +35,14 @@ ORDERS: tuple[OrderName, ...] = tuple(name for name in get_args(OrderName) if na
 REMOVAL_VIEWS = (1, 3, 5, 10)
 """Views after which a scene is taken apart, by what is known then."""
 
-Row = dict[str, float]
-"""What was measured after one view: `view` (from 1), `MEASURES` and `counts`."""
+Row = dict[str, Any]
+"""What was measured after one view: `view` (from 1), `MEASURES`, `counts`, and `forecasts` of its `Score`."""
 SCORES = (
     "precision", "recall", "f1", "vertex_precision", "vertex_recall", "vertex_f1", "edge_precision",
     "edge_recall", "edge_f1", "mean_iou", "brier", "average_precision",
 )  # fmt: skip
-"""Eq. 4 and 5 for vertices and edges together and alone, the mean IoU of the matched objects, and how good the
-supports' probabilities are [1]."""
+"""Eq. 4 and 5 for vertices and edges together and alone, mean IoU of the matched objects, and scores of
+probabilities [1]."""
 TIMES = ("planning_seconds", "perception_seconds")
 """Time to choose this view, and from the view to the fused graph [s]; they differ from run to run."""
 MEASURES = (*SCORES, "angle", "path", *TIMES, "unharmed", "lifts")
@@ -232,7 +232,8 @@ def _rows(episode: Episode) -> list[Row]:
         travelled = {"angle": step.angle_travelled, "path": step.path_travelled}
         times = dict(zip(TIMES, (planning, sum(perceiving)), strict=True))
         figures = figures_of(found, step.graph, len(truth.objects))
-        rows.append({"view": view} | figures | travelled | times | removal)
+        forecasts = {"forecasts": [list(forecast) for forecast in found.forecasts]}
+        rows.append({"view": view} | figures | travelled | times | removal | forecasts)
         planning = step.timings.get("plan", 0.0)
     missing = range(int(rows[-1]["view"]) + 1, episode.views + 1)
     return rows + [rows[-1] | dict.fromkeys(TIMES, 0.0) | {"view": view} for view in missing]

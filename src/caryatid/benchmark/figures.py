@@ -72,6 +72,15 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
         caption = f"{label} in {scenes}, paired: mean and interval. Pale: the interval holds 0."
         plot = partial(_rows, differences, label, zero=True)
         yield _figure(f"{measure} differences {family}", caption, len(differences), plot)
+    panels = {view: curves_of(group, f"reliability {view}").get(reference) for view in (1, 2, 3, 5)}
+    shown = {view: curve for view, curve in panels.items() if curve is not None}
+    if shown and not family:
+        numbers = {view: curves_of(group, f"supports {view}")[reference] for view in shown}
+        caption = (
+            f"Reliability of {reference}: the share of supports with about this probability that is true, "
+            "with intervals. The larger a mark, the more supports. On the line probabilities are right."
+        )
+        yield _figure("reliability", caption, 6, partial(_reliability, shown, numbers))
 
 
 def draw_conditions(summary: pd.DataFrame, measure: str, heading: str) -> Figure:
@@ -136,6 +145,21 @@ def _rows(curves: Curves, label: str, figure: Any, *, zero: bool = False) -> Non
     panels[0].set(ylim=(len(curves) - 0.5, -0.5))
     panels[0].set_yticks(range(len(curves)), list(curves))
     figure.supxlabel(label, fontsize=9.0)
+
+
+def _reliability(curves: dict[int, pd.DataFrame], numbers: dict[int, pd.DataFrame], figure: Any) -> None:
+    """Plot a panel for each view: share that is true over probability."""
+    panels = figure.subplots(1, len(curves), sharex=True, sharey=True, squeeze=False)[0]
+    for panel, (view, curve) in zip(panels, curves.items(), strict=True):
+        number = numbers[view]["value"]
+        panel.plot((0.0, 1.0), (0.0, 1.0), color="#5d666f", linewidth=0.9, zorder=1)
+        look = {"color": COLOURS[0], "clip_on": False}
+        panel.errorbar(curve.index, curve["value"], _interval(curve), fmt="none", elinewidth=0.9, **look)
+        panel.scatter(curve.index, curve["value"], 12.0 + 100.0 * number / number.sum(), zorder=3, **look)
+        panel.set_title(f"view {view}, {number.sum():,.0f} supports", fontsize=9.0)
+        panel.set_aspect("equal")
+    panels[0].set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), ylabel="share that is true")
+    figure.supxlabel("probability", fontsize=9.0)
 
 
 def _interval(curve: pd.DataFrame) -> Any:

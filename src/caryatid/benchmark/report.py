@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from caryatid.benchmark.figures import Figure, conditions_of, curves_of, draw_conditions, draw_group
-from caryatid.benchmark.statistics import CONFIDENCE, RESAMPLES, summarise
+from caryatid.benchmark.statistics import BINS, CONFIDENCE, RESAMPLES, summarise
 from caryatid.benchmark.store import ResultStore, describe_provenance, import_pandas
 from caryatid.benchmark.suites import SUITES
 from caryatid.errors import InputError
@@ -29,6 +29,13 @@ if TYPE_CHECKING:
 Column = tuple[str, float]
 """A quantity of the summary and where it is taken."""
 BY_VIEW = {"f1": "F1", "edge_f1": "F1 of edges", "mean_iou": "Mean IoU", "path": "Path [m]"}
+CALIBRATION = {
+    "listed brier": "Brier score of the supports in the graph, all scenes together",
+    "brier gain": "How much lower it is than with certain = 1, uncertain = 0.5",
+    "calibration error": "Expected calibration error of the supports in the graph",
+    "pooled brier": "Brier score with the true supports that the graph lacks",
+}
+"""How good probabilities are: quantities with a column for each view, and their headings."""
 REMOVAL = {"unharmed": "Scenes taken apart without harm", "lifts": "Lifts without harm"}
 """Measures with a column for each view, and their headings."""
 COUNTS = {("scenes", 0.0): "scenes", ("episodes", 0.0): "episodes", ("failed", 0.0): "failed"}
@@ -64,6 +71,10 @@ NOTES = (
     "F1 along the path: the area under F1 over the path travelled, divided by its length. F1 holds until "
     "the next view. The length is the median of the methods' mean paths; where an episode ends before, "
     "its last F1 holds.",
+    "Probabilities are of supports whose ends are both true objects, those of all scenes together. The Brier "
+    "score is the mean of (p − true)², 0 is perfect; a support that the graph lacks has p = 0. The expected "
+    "calibration error is the distance between mean probability and share that is true in each of {bins} "
+    "equal bins of probability, weighted by how many are in it.",
 )
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -196,7 +207,7 @@ def check_reference(reference: str | None, store: ResultStore) -> None:
 def _write_tables(store: ResultStore, folder: Path) -> None:
     """Write the rows of each suite as `SUITE.csv` and, where pyarrow is installed, `SUITE.parquet`."""
     for name in store.suites:
-        table = store.table(name)
+        table = store.table(name).drop(columns="forecasts")
         table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
         if find_spec("pyarrow") is not None:
             table.to_parquet(folder / f"{name}.parquet", index=False)
@@ -269,7 +280,7 @@ def _markdown(
                 block = f"![{caption}]({keep(result.name, block)})\n\n*{caption}*"
             blocks.append(block)
     blocks.append("## How to read it")
-    blocks += [n.format(confidence=100.0 * CONFIDENCE, resamples=RESAMPLES) for n in NOTES]
+    blocks += [n.format(confidence=100.0 * CONFIDENCE, resamples=RESAMPLES, bins=BINS) for n in NOTES]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -324,6 +335,8 @@ def _tables(group: pd.DataFrame, measures: Mapping[str, str], reference: str) ->
     title = f"{measures[main]} minus that of {reference}, paired"
     tables[title] = by_view(f"{main} difference") | PAIRED
     tables["Share of the gap that is closed"] = by_view("gap")
+    if not group["family"].iloc[0]:
+        tables |= {heading: by_view(quantity) for quantity, heading in CALIBRATION.items()}
     if main == "f1":
         for at in sorted(group["at"][group["quantity"] == "share"].unique(), reverse=True):
             tables[f"Until F1 reaches {at:.2f}"] = {(name, at): text for name, text in TO_THRESHOLD.items()}
@@ -349,6 +362,8 @@ def _text(quantity: str, value: float, low: float, high: float) -> str:
         return f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"
     if quantity == "share":
         return f"{100.0 * value:.0f} %"
+    if quantity == "brier gain":
+        return "–" if math.isnan(value) else f"{100.0 * value:.0f} % [{100.0 * low:.0f}, {100.0 * high:.0f}]"
     digits, sign = DIGITS.get(quantity, 3), "+" if quantity.endswith(" difference") else ""
 
     def number(value: float) -> str:

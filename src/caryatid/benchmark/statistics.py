@@ -25,6 +25,8 @@ CONFIDENCE = 0.95
 """Probability with which an interval covers the true mean [1]."""
 THRESHOLDS = (0.94, 0.90)
 """F1 for which views and path length are reported [1]; the paper's, and one nearly all methods reach."""
+BINS = 10
+"""Equal bins of probability, of the reliability diagram and the expected calibration error [1]."""
 COLUMNS = ("condition", "family", "method", "quantity", "at", "value", "low", "high")
 """Columns of a summary. `family` is empty for all scenes; `at` is the view, threshold or quantile."""
 CURVE = ["f1", "path"]
@@ -47,7 +49,10 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
         difference` from the reference over the scenes and seeds both have, `gap`; `share`, `median views`,
         `median path`, `mean path` and `path ratio` (`at`: threshold of F1); `area` under F1 over the path up
         to `budget` [m]; `planning` and `perception` [s] (`at`: quantile); `scenes`, `episodes`, `failed`, and
-        `paired scenes`, `paired episodes`.
+        `paired scenes`, `paired episodes`. Of the supports of all scenes together: `listed brier` of
+        those in the graph, `brier gain` of these over certain = 1, uncertain = 0.5, `calibration error`, and
+        `pooled brier` with those that are missing (`at`: view); and of each bin at each VIEW `reliability
+        VIEW`, the share that is true, and `supports VIEW`, how many (`at`: mean probability).
 
     Raises:
         ValueError: Two episodes of a method have the same scene and seed.
@@ -78,6 +83,7 @@ def _compare(
         figures = [*_counts(own), _plain("failed", 0.0, episodes["error"].notna().sum())]
         if len(own):
             figures += _alone(own, budget)
+            figures += _calibration(episodes.dropna(subset="forecasts"))
             if method != reference and reference in known:
                 figures += _against(own, known[reference])
             if gap is not None and method not in gap and set(gap) <= set(known):
@@ -186,6 +192,45 @@ def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Statistic]:
     found = bootstrap([frame[name] for frame in (own, other) for name in CURVE], ratios)
     # Where the other method is not there either its path is infinite, and the ratio 0.
     yield from (row for row in _by_threshold("path ratio", found) if 0.0 < row[2] < np.inf)
+
+
+def _calibration(episodes: pd.DataFrame) -> Iterator[Statistic]:
+    """How good the probabilities of a method's supports are."""
+    if episodes.empty:
+        return
+    rows = episodes.set_index(["scene", "seed", "view"])["forecasts"].map(_sums)
+    sums = import_pandas().DataFrame(rows.tolist(), index=rows.index).unstack("view")
+    views = list(sums[0].columns)
+
+    def figures(means: Array) -> Array:
+        """Of mean sums (..., C) the named figures (..., V), and the shares of the bins (..., BINS · V)."""
+        sums = means.reshape(*means.shape[:-1], -1, len(views))
+        missing, ours, theirs = np.moveaxis(sums[..., :3, :], -2, 0)
+        count, said, true = (sums[..., k : k + BINS, :] for k in (3, 3 + BINS, 3 + 2 * BINS))
+        listed, error = count.sum(axis=-2), np.abs(said - true).sum(axis=-2)
+        pooled = (ours + missing) / (listed + missing)
+        shares = (true / count).reshape(*means.shape[:-1], -1)
+        return np.concatenate([ours / listed, 1.0 - ours / theirs, error / listed, pooled, shares], axis=-1)
+
+    found = bootstrap([sums], figures)
+    names = ("listed brier", "brier gain", "calibration error", "pooled brier")
+    yield from _named([(name, view) for name in names for view in views], found)
+    count, said = (sums.sum().to_numpy().reshape(-1, len(views))[k : k + BINS] for k in (3, 3 + BINS))
+    shares = found[len(names) * len(views) :].reshape(BINS, len(views), 3)
+    for k, j in np.argwhere(count > 0.0):
+        at = float(said[k, j] / count[k, j])
+        yield f"reliability {views[j]}", at, *shares[k, j].tolist()
+        yield _plain(f"supports {views[j]}", at, count[k, j])
+
+
+def _sums(forecasts: Sequence[Sequence[float]]) -> Array:
+    """How many are missing; of the others both squared errors, and number, probability, truth by bin."""
+    table = np.array(forecasts, dtype=np.float64).reshape(-1, 3)
+    said, by_certain, true = table[table[:, 0] > 0.0].T
+    bins = np.minimum(BINS * said, BINS - 1).astype(int)
+    binned = [np.bincount(bins, of, BINS) for of in (np.ones(len(bins)), said, true)]
+    squares = ((said - true) ** 2).sum(), ((by_certain - true) ** 2).sum()
+    return np.concatenate([[len(table) - len(said), *squares], *binned])
 
 
 def _gap_closed(own: Array, low: Array, high: Array) -> Array:

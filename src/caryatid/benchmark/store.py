@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 RESULTS = "results.jsonl"
 """Name of the result file in the folder of a benchmark."""
-FORMAT = "3"
+FORMAT = "4"
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,8 @@ class ResultStore:
                 known |= known.pop("episode") | {"error": outcome.error}
                 known["settings"] = json.dumps(member.episode.settings, ensure_ascii=False)
                 rows += [known | row for row in outcome.rows or ({},)]
-        columns = ["method", "condition", "family", *Episode.__slots__, "view", *MEASURES, "error"]
+        about = ("method", "condition", "family", *Episode.__slots__)
+        columns = [*about, "view", *MEASURES, "forecasts", "error"]
         table = import_pandas().DataFrame(rows, columns=columns)
         return table.astype({"view": "Int64", "error": "string", **dict.fromkeys(MEASURES, "float64")})
 
