@@ -105,6 +105,15 @@ def test_what_floats_over_the_floor_of_a_tray_lands_on_it():
     assert "let down 20.0 mm" in graph.support("o1", "o2").why
 
 
+def test_a_solid_is_drawn_without_the_seams_between_its_parts():
+    corners = np.indices((2, 2, 2)).reshape(3, -1).T / 10.0
+    two = Solid.of([Polytope.around(corners + (x, 0.0, 0.0)) for x in (0.0, 0.1)])
+    seen = np.concatenate(two.lines(np.array([1.0, 2.0, 3.0]))).reshape(-1, 33, 3)
+    for lines in (two.creases(), seen):
+        assert len(lines) == 16
+        assert (np.abs(lines[..., 0] - 0.1).max(axis=1) > 0.01).all()
+
+
 def test_a_solid_scores_with_its_inside():
     """The block has the same hull as the tray: IoU 1, though the tray fills a third of it."""
     of_tray, of_block = (SupportGraph(tuple(on_a_table(shape))) for shape in (tray(), BLOCK))

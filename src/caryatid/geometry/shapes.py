@@ -152,14 +152,19 @@ class Shape(Pictured):
 
     def _drawn(self, eye: Array) -> list[Array]:
         """What `lines` are in the object's frame."""
-        return [np.linspace(a, b, 33) for a, b in self._edges(eye, 20.0)]
+        return [np.linspace(a, b, 33) for a, b in self._edges(eye)]
 
-    def _edges(self, eye: Array, crease: float) -> Array:
-        """Ends (E, 2, 3) [m] of the mesh's edges sharper than an angle [deg], or on its outline."""
+    def creases(self) -> Array:
+        """Ends (E, 2, 3) [m] of the edges sharper than 30°."""
+        return transforms.transform(self.T_world_object, self._edges(None))
+
+    def _edges(self, eye: Array | None) -> Array:
+        """Ends (E, 2, 3) [m] of the edges sharper than 30°, and of those on the outline an eye (3,) sees."""
         mesh = self.mesh()
-        faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
-        drawn = mesh.face_adjacency_angles > np.radians(crease)
-        drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
+        drawn = mesh.face_adjacency_angles > np.radians(30.0)
+        if eye is not None:
+            faces_eye = np.einsum("ij,ij->i", mesh.face_normals, eye - mesh.triangles_center) > 0.0
+            drawn |= faces_eye[mesh.face_adjacency].sum(axis=1) == 1
         ends: Array = mesh.vertices[mesh.face_adjacency_edges[drawn]]
         return ends
 

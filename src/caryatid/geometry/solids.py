@@ -218,13 +218,21 @@ class Solid(Shape):
             [trimesh.Trimesh(p.vertices, p.triangles, process=False) for p in self.polytopes]
         )
 
-    def _drawn(self, eye: Array) -> list[Array]:
-        """Edges and silhouette of the parts, where they do not lie within another one."""
-        ends = self._edges(eye, 30.0)
-        local = Solid(np.eye(4), self.polytopes)
-        lines = np.linspace(ends[:, 0], ends[:, 1], 9, axis=1)
-        hidden = local.signed_distance(lines.mean(axis=1)) < -1e-3
-        return list(lines[~hidden])
+    def _edges(self, eye: Array | None) -> Array:
+        """Those of the whole: none where parts touch or overlap."""
+        import trimesh
+
+        ends = Shape._edges(self, eye)
+        middle, around = ends.mean(axis=1), trimesh.creation.icosphere(subdivisions=2).vertices
+        nearby = (middle[:, None] + 2e-3 * around).reshape(-1, 3)
+        filled = Solid(np.eye(4), self.polytopes).signed_distance(nearby).reshape(len(ends), -1) < 0.0
+        # Half of what is around a point on a flat face is filled, a quarter around one on a box's edge.
+        share = filled.mean(axis=1)
+        kept = (np.abs(share - 0.5) > 0.1) & (share < 0.9)
+        if eye is not None:  # across the line of sight
+            inward, sight = transforms.unit(filled @ around), transforms.unit(eye - middle)
+            kept |= (np.abs(np.einsum("ij,ij->i", inward, sight)) < 0.3) & (share < 0.9)
+        return ends[kept]
 
     def __repr__(self) -> str:
         x, y, z = self.T_world_object[:3, 3]

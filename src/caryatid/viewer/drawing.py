@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.exploration import RobotPose, Step
-from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import Support, SupportGraph
 from caryatid.scene import Scene
@@ -139,11 +138,9 @@ class SceneDrawing:
             )  # fmt: skip
             body.on_click(lambda _, name=item.id: self._clicked(name))
             nodes.append(body)
-            sharp = mesh.face_adjacency_edges[mesh.face_adjacency_angles > np.radians(30.0)]
-            if item.shape.kind != "sphere":
-                outlines.append(transforms.transform(T_world_object, mesh.vertices[sharp]))
-                dark = (0.55 * np.array(colour)).astype(np.uint8)
-                colours.append(np.tile(dark, (len(sharp), 2, 1)))
+            outlines.append(item.shape.creases())
+            dark = (0.55 * np.array(colour)).astype(np.uint8)
+            colours.append(np.tile(dark, (len(outlines[-1]), 2, 1)))
         edges, paint = np.concatenate(outlines), np.concatenate(colours)
         return [*nodes, *self._lines("/shapes/outlines", edges, paint, **SCREEN)]
 

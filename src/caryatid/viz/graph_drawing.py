@@ -197,6 +197,10 @@ def _put_node(axes: Axes, item: SceneObject, at: Array, half: Array, graph: Supp
         axes.plot(*(at + lid - middle).T, color=INK, linewidth=1.2, zorder=3.5)
     elif item.shape.kind == "sphere":
         outline = half * np.stack([np.cos(2.0 * angle), np.sin(2.0 * angle)], axis=-1)
+    elif item.shape.kind == "solid":  # a box without its corners
+        outline = np.repeat(outline, 2, axis=0)
+        outline[[1, 2, 5, 6], 0] *= 0.75
+        outline[[0, 3, 4, 7], 1] *= 0.65
     kind, rim = f"node {item.id}", {"edgecolor": INK, "linewidth": 1.2}
     if not table and not graph.supporters(item.id):
         kind += " unsupported"
