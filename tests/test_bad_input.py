@@ -63,7 +63,7 @@ FEW = np.where((np.indices((120, 160)) // 4 == 10).all(axis=0), 1.0, 0.0)
     [
         (np.zeros((120, 160)), DOWN, "no pixel has a depth reading; leave", "no pixel has a depth reading"),
         (np.ones((120, 160)), AHEAD, "100% of them, leans by 90°; show the table top or", 1),
-        (np.full((120, 160), 5.0), AHEAD, "within 0.1–3 m, but 5–5 m; check the unit", "but 5–5 m; check"),
+        (np.full((120, 160), 5.0), AHEAD, "readings are at 5 m, none within 0.1–3 m; check", "at 5 m, none"),
         (NOISE, DOWN, "points lie on one level plane; show", "points lie on one plane; show the table top"),
         (FEW, DOWN, "only 16 points are on a surface, 200 are needed", "or give a larger image"),
         (np.ones((200, 1)), DOWN, "side by side are too few", "give a larger image, or one with less noise"),
@@ -87,6 +87,16 @@ def test_an_image_that_shows_no_objects(tmp_path, refused, depth, T_world_camera
         else:
             assert run_command("extract", folder, "--out", tmp_path / "run") == 0
             assert len(read_run(tmp_path / "run").graph.objects) == expected + masks
+
+
+def test_an_image_too_small_to_tell_objects_in(tmp_path, capsys):
+    depth, higher = a_plane(80, 60, DOWN), a_plane(80, 60, DOWN, top=0.8)
+    patches = np.add.outer(np.arange(60) // 5 % 2, np.arange(80) // 5 % 2) == 2
+    patches[:15] = patches[45:] = patches[:, :20] = patches[:, 60:] = False
+    depth[patches] = higher[patches]
+    write_recording(tmp_path / "small", [View(depth, [[64, 0, 39.5], [0, 64, 29.5], [0, 0, 1]], DOWN)])
+    assert run_command("extract", tmp_path / "small", "--out", tmp_path / "run") == 0
+    assert "no object among" in capsys.readouterr().err
 
 
 def test_an_image_larger_than_any_cameras(recording, refused):

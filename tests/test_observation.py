@@ -97,7 +97,7 @@ def test_labels_that_are_demanded_and_missing_are_an_error(source):
 
 @pytest.mark.parametrize("pose", [VIEW.T_world_camera, None], ids=["posed", "not posed"])
 def test_nothing_is_an_error_that_names_it(pose):
-    with pytest.raises(PerceptionError, match="frame 7: holds no depth readings"):
+    with pytest.raises(PerceptionError, match="frame 7: has no depth readings"):
         observation_of(View(np.zeros((60, 80)), VIEW.K, pose, name="frame 7"))
     nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3)), name="cloud 7")
     with pytest.raises(PerceptionError, match="cloud 7: holds no points"):

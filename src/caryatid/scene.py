@@ -201,6 +201,7 @@ class Scene(Pictured):
             self._say_thinned(source, observation.view)
             if not given:  # masks show what has no depth
                 self._check_holes(observation.view, observation.surface)
+        self._check_found(observation, source.name, masks=given)
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
         watch.lap("register")
@@ -267,6 +268,17 @@ class Scene(Pictured):
                 "what is there is left out",
                 view.name, "1 region" if holes == 1 else f"{holes} regions",
             )  # fmt: skip
+
+    def _check_found(self, observation: Observation, name: str, masks: bool) -> None:
+        """Warn where there are readings over the support surface, but no object."""
+        if set(observation.shown) <= {0, SUPPORT_LABEL}:
+            low, high = self.config.segmentation.clearance, self.config.surface.storey
+            over = observation.surface.over(observation.cloud.points_world, low, high, 0.0)
+            if over.sum() >= self.config.segmentation.min_size:
+                remedy = (
+                    "no mask shows what they are" if masks else "go nearer, or give a larger image or masks"
+                )
+                log.warning("%s: no object among %d points over the table; %s", name, over.sum(), remedy)
 
     def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:
         """Lay the view onto the earlier ones and move those by what it shows of them.

@@ -214,13 +214,13 @@ def _why_nothing(view: View, config: CloudConfig) -> str:
     """Say why a view holds no oriented points, and what may help."""
     readings, near, far = view.depth[view.valid], config.min_depth, config.max_depth
     if len(readings) == 0:
-        return "holds no depth readings; leave it out"
+        return "has no depth readings; leave it out"
     if ((readings >= near) & (readings <= far)).any():
         why = "pixels side by side are too few, or differ too much in depth"
         return f"shows no surface: {why}; give a larger image, or one with less noise"
-    found = f"within {near:g}–{far:g} m, but {readings.min():.3g}–{readings.max():.3g} m"
+    ends = dict.fromkeys(f"{end:.3g}" for end in (readings.min(), readings.max()))
     remedy = "check the unit of depth, or set cloud.min_depth and cloud.max_depth"
-    return f"holds no depth readings {found}; {remedy}"
+    return f"all depth readings are at {'–'.join(ends)} m, none within {near:g}–{far:g} m; {remedy}"
 
 
 def level_transform(
