@@ -26,6 +26,12 @@ from caryatid.support.relations import infer
 
 CONFIG = replace(Config(), rehearsal=RehearsalConfig(draws=2), lift=LiftConfig(watch=1.0))
 TOP = TABLE_HEIGHT
+
+
+def with_risk(risk):
+    return replace(CONFIG, rehearsal=replace(CONFIG.rehearsal, risk=risk))
+
+
 FIRM = Uncertainty(np.full(3, 0.001), np.full(3, 0.005), np.full(3, 0.001), np.full(6, 0.001))
 
 
@@ -78,6 +84,10 @@ class TestOrder:
         held = plan_order(counterweight(), CONFIG, hands=2)
         assert held.safe
         assert (held.steps[0].object_id, held.steps[0].hold) == ("o3", ("o2",))
+        risk = refused.steps[0].risk
+        for accepted, safe in ((risk, True), (risk - 0.01, False)):
+            bold = plan_order(counterweight(), with_risk(accepted), hands=1)
+            assert bold.steps[0].safe == safe
 
     def test_what_would_fall_by_itself_is_held_and_goes_by_the_graph(self):
         """o2 floats: what carries it has not been seen. The graph may say that o1 does."""
@@ -89,6 +99,11 @@ class TestOrder:
             order = plan_order(graph, CONFIG, goal="o1")
             assert order.safe
             assert [s.object_id for s in order.steps] == taken
+        (bold,) = plan_order(told, with_risk(0.5), goal="o1", hands=1).steps
+        assert (bold.object_id, bold.safe, bold.risk) == ("o1", True, 0.5)
+        assert "o2 with probability 0.50" in bold.why
+        doubtful = replace(told, supports=(*floating.supports, Support("o1", "o2", probability=0.25)))
+        assert plan_order(doubtful, with_risk(0.5), goal="o1", hands=1).steps[0].risk == 0.25
 
     def test_nothing_to_take_and_unknown_goals_are_refused(self):
         with pytest.raises(InputError, match="no objects"):
@@ -165,12 +180,15 @@ class TestCommands:
         assert (out.err, document["safe"], document["refusal"]) == ("", True, None)
         assert [step["object"] for step in document["steps"]] == ["o2", "o1"]
         for step in document["steps"]:
-            assert step.keys() == {"object", "hold", "safe", "risk", "why"}
+            assert step.keys() == {"object", "hold", "safe", "risk", "probability", "why"}
             assert (step["safe"], step["hold"]) == (True, [])
+            assert step["probability"] == 1.0 - step["risk"]
         assert run_command("order", kept_run, "--goal", "o2", *QUICK) == 0
         table = capsys.readouterr().out
         assert "a safe order" in table
-        assert re.search(r"│ 1 │ o2 ", table)
+        assert re.search(r"│ 1 │ o2 +│ – +│ 1.00 ", table)
+        assert run_command("order", kept_run, "--risk", "1.5", *QUICK) == 1
+        assert "rehearsal.risk" in capsys.readouterr().err
 
     def test_orders_that_cannot_be_are_errors(self, kept_run, tmp_path, capsys):
         assert run_command("order", kept_run, "--goal", "o9", *QUICK) == 1

@@ -142,7 +142,7 @@ def test_facts_are_told(shown, scene, steps):
     }
     for name, fact in said.items():
         assert fact in words(shown[name]._repr_html_()), name
-    assert "risk 25%" in words(shown["order"]._repr_html_())
+    assert "0.75, too low" in words(shown["order"]._repr_html_())
     html = scene._repr_html_()
     assert html.count("<svg") == 2
     assert all(object_colour(label) in html for label in (1, 2))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import shapely
 from scipy.spatial.transform import Rotation
+from scipy.stats import norm
 from synthetic import motion_about_vertical
 
 from caryatid.config import PlausibilityConfig, SupportConfig
@@ -18,7 +19,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.polygons import area, hull
 from caryatid.geometry.shapes import Box, Cylinder, Primitives, Sphere, Uncertainty
 from caryatid.geometry.transforms import rigid
-from caryatid.graph import SceneObject
+from caryatid.graph import SceneObject, Support
 from caryatid.support.contacts import find_contacts, find_gap
 from caryatid.support.plausibility import closing, drawn, reconcile
 from caryatid.support.relations import explain, infer, predict_removal
@@ -463,7 +464,7 @@ class TestInfer:
     def test_why_not(self):
         objects = [*tower(), SceneObject("o5", 5, block(0.283, 0, 0, (0.08, 0.08, 0.08)))]
         graph = infer(objects, CONFIG)
-        assert explain(graph, "o0", "o1", CONFIG) == graph.supports[0].why
+        assert explain(graph, "o0", "o1", CONFIG) == f"{graph.supports[0].why} Probability 1.00."
         assert "o0 lies below the plane that parts it from o1" in graph.supports[0].why
         assert "they do not touch, gap 80.0 mm" in explain(graph, "o0", "o2", CONFIG)
         assert "it lies above it" in explain(graph, "o2", "o1", CONFIG)
@@ -586,6 +587,25 @@ class TestRemoval:
         unsure_ = Uncertainty(np.full(3, sigma), np.zeros(3), np.zeros(3), np.zeros(6))
         objects = scene(*pillars, block(0, 0, 0.1, (0.3, 0.06, 0.02)), uncertainty=unsure_)
         assert self.effects(objects, "o2") == {"o3": certain}
+        graph = infer(objects, CONFIG)
+        (effect,) = predict_removal(graph, "o2", CONFIG)
+        of_loss = graph.support("o2", "o3").probability
+        assert effect.probability == pytest.approx(of_loss * norm.cdf(0.02 / sigma), abs=1e-3)
+
+    def test_what_falls_takes_others_along_as_likely_as_it_falls_and_they_rest_on_it(self):
+        objects = scene(*(block(0, 0, 0.1 * k, (0.1, 0.1, 0.1)) for k in range(3)))
+        said = {("o1", "o2"): 0.8, ("o2", "o3"): 0.5}
+        graph = infer(objects, CONFIG)
+        sure = {e.object_id: e.probability for e in predict_removal(graph, "o1", CONFIG)}
+        assert sure == {"o2": 1.0, "o3": 1.0}
+        told = replace(
+            graph, supports=tuple(replace(s, probability=said.get(s.pair, 1.0)) for s in graph.supports)
+        )
+        found = {e.object_id: e.probability for e in predict_removal(told, "o1", CONFIG)}
+        assert found == pytest.approx({"o2": 0.8, "o3": 0.8 * 0.5})
+        both = replace(told, supports=(*told.supports, Support("o1", "o3", "lean", probability=0.5)))
+        found = {e.object_id: e.probability for e in predict_removal(both, "o1", CONFIG)}
+        assert found["o3"] == pytest.approx(1.0 - (1.0 - 0.4) * (1.0 - 0.5))
 
     def test_a_loss_that_is_uncertain_makes_effects_that_are(self):
         assert self.effects(counterweight(), "o3") == {"o2": False}

@@ -138,7 +138,7 @@ def test_what_is_kept_of_a_step_is_small(step):
 def test_what_is_said_of_an_object(step, settings):
     graph, config = step.graph, settings.support
     text = describe_object(graph, "o1", config)
-    for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 falls:"):
+    for part in ("box", "o0 → o1", "o1 → o2", "Without o1", "o2 falls with probability 1.00:"):
         assert part in text
     assert "nothing falls" in describe_object(graph, "o2", config)
     assert "Without" not in describe_object(graph, "o0", config)

@@ -115,7 +115,7 @@ class Scene(Pictured):
         return explain(self.graph, supporter, supported, self.config.support)
 
     def predict_removal(self, object_id: str) -> tuple[Effect, ...]:
-        """Say which objects will move, for certain or possibly, when one is taken away; with the reason.
+        """Say which objects move when one is taken away, how likely and why.
 
         Args:
             object_id: Id of an object, such as `o3`.

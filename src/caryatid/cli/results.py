@@ -105,11 +105,13 @@ class OrderCommand(options.Command):
     """Find a safe order to take everything away, or to reach one object.
 
     Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others as likely.
+    The share of rehearsals in which nothing else moves is the probability given with it.
     If no order is safe, the output gives the least risky one and names the objects in each other's way.
 
     To try:
       caryatid order run
       caryatid order run --goal o3
+      caryatid order run --risk 0.2
     """
 
     settings: options.Modelling = options.Modelling()
@@ -119,6 +121,8 @@ class OrderCommand(options.Command):
     """Reach this object only, and take away no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
+    risk: Annotated[float | None, options.default_of("rehearsal.risk")] = None
+    """Accept lifts that move another object with this probability."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
@@ -127,7 +131,8 @@ class OrderCommand(options.Command):
         from caryatid.steps import read_run
         from caryatid.viz.tables import order_table
 
-        config, seed, graph = self.settings.read(), self.settings.seed, read_run(self.run).graph
+        config = self.settings.read({"rehearsal.risk": self.risk})
+        seed, graph = self.settings.seed, read_run(self.run).graph
         with self.output.working("rehearsing"):
             order = plan_order(graph, config, goal=self.goal, hands=self.hands, seed=seed, threads=cores())
         outcome = "a safe order" if order.safe else "no safe order"

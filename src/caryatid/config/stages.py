@@ -609,6 +609,8 @@ class RehearsalConfig:
     draws: Count = 8
     """Scenes that a lift is rehearsed in [1]: the shapes as extracted, and others as likely by their
     uncertainty; a risk of a third shows in one of eight with 96 %."""
+    risk: Share = 0.0
+    """Probability of moving another object up to which a lift is safe [1]: no rehearsal shows any."""
     settling: NotNegative = 0.5
     """Time the extracted shapes get to settle [s]; gaps of a millimetre close at once."""
 

@@ -18,7 +18,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.config import Config
+from caryatid.config import Config, RehearsalConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph
@@ -35,8 +35,8 @@ class TakeStep:
     Attributes:
         object_id: Which.
         hold: Ids of what the other hand holds meanwhile.
-        safe: No other object was disturbed in any rehearsal.
-        risk: Share of the rehearsals in which one was [1].
+        safe: The risk is no higher than `rehearsal.risk`.
+        risk: Probability that another object moves: the share of the rehearsals in which one did [1].
         why: What the step goes by, for a person to read.
     """
 
@@ -48,8 +48,8 @@ class TakeStep:
 
     def to_json(self) -> dict[str, Any]:
         """One entry of `steps` in what `--json` writes."""
-        hold = list(self.hold)
-        return {"object": self.object_id, "hold": hold, "safe": self.safe, "risk": self.risk, "why": self.why}
+        known = {"object": self.object_id, "hold": list(self.hold), "safe": self.safe, "risk": self.risk}
+        return known | {"probability": 1.0 - self.risk, "why": self.why}
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +90,10 @@ def plan_order(
 ) -> Order:
     """Find a safe order to take everything away, or to get at one object.
 
-    Greedy: of what is left that object is taken whose lift disturbs no other in any rehearsal, one that
-    supports nothing before one that does, higher ones first. Where there is none, the other hand holds what
-    would be disturbed most. Where that does not help either, the least risky lift is taken, and the order is
-    not safe.
+    Greedy: of what is left that object is taken whose lift disturbs another one with no higher probability
+    than `rehearsal.risk`, one that supports nothing before one that does, higher ones first. Where there is
+    none, the other hand holds what would be disturbed most. Where that does not help either, the least risky
+    lift is taken, and the order is not safe.
 
     Args:
         graph: What has been extracted.
@@ -115,9 +115,9 @@ def plan_order(
     while (left := rehearsal.left()) and (goal is None or goal in left):
         wanted = _in_turn(graph, left) if goal is None else _on_the_way(graph, goal, left, rehearsal)
         trial, tried = _safest(rehearsal, wanted, hands)
-        if trial.risk > 0.0 and not refusal:
+        if trial.risk > rehearsal.accepted and not refusal:
             refusal = _refusal(trial, tried)
-        steps.append(_step(graph, trial, left, config.rehearsal.draws))
+        steps.append(_step(graph, trial, left, config.rehearsal))
         rehearsal.take(trial)
     return Order(tuple(steps), refusal)
 
@@ -133,10 +133,10 @@ def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: 
     """The goal if it can be lifted; else what its lift disturbs, and what theirs do, the nearest first."""
     found = [goal]
     for object_id in found:
-        harmed = rehearsal.try_lift(object_id).harmed
-        if not harmed:
+        trial = rehearsal.try_lift(object_id)
+        if trial.risk <= rehearsal.accepted:
             return [object_id]
-        found += [i for i in _in_turn(graph, left) if i in harmed and i not in found]
+        found += [i for i in _in_turn(graph, left) if i in trial.harmed and i not in found]
     return found
 
 
@@ -145,7 +145,7 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
     tried: list[_Trial] = []
     for object_id in wanted:
         trial = rehearsal.try_lift(object_id)
-        if trial.risk == 0.0:
+        if trial.risk <= rehearsal.accepted:
             return trial, tried
         tried.append(trial)
     tried.sort(key=lambda t: (t.risk, len(t.harmed)))
@@ -156,19 +156,18 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
         trial = rehearsal.try_lift(object_id, [held])
         if trial.risk < best.risk:
             best = trial
-        if best.risk == 0.0:
+        if best.risk <= rehearsal.accepted:
             break
     return best, tried
 
 
-def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], draws: int) -> TakeStep:
+def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], config: RehearsalConfig) -> TakeStep:
     carried = [s.supported for s in graph.supports if s.supporter == trial.object_id and s.supported in left]
     what = f"supports {', '.join(carried)}" if carried else "supports nothing that is left"
     with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
-    worst = ", ".join(f"{i} in {share * draws:.0f}" for i, share in trial.harmed.items())
-    harm = f"nothing in {draws} rehearsals" if trial.risk == 0.0 else f"{worst} of {draws} rehearsals"
-    why = f"it {what}; lifting it{with_hold} disturbed {harm}"
-    return TakeStep(trial.object_id, trial.hold, trial.risk == 0.0, trial.risk, why)
+    worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.harmed.items())
+    why = f"it {what}; lifting it{with_hold} disturbed {worst or 'nothing'} in {config.draws} rehearsals"
+    return TakeStep(trial.object_id, trial.hold, trial.risk <= config.risk, trial.risk, why)
 
 
 def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
@@ -184,7 +183,7 @@ def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Trial:
-    """A lift rehearsed in every drawn scene: share in which others were disturbed, and share of each."""
+    """A lift rehearsed in every drawn scene: probability that others are disturbed, and that of each."""
 
     object_id: str
     hold: tuple[str, ...]
@@ -205,6 +204,7 @@ class _Rehearsal:
         if not self.ids:
             raise InputError("graph", "has no objects", "there is nothing to take away")
         self._graph, self._config, self._threads = graph, config, threads
+        self.accepted = config.rehearsal.risk
         self._trials: dict[tuple[str, ...], _Trial] = {}
         specs = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
         settled = self._each(lambda k: _settled(specs[k], self.ids, config))
@@ -229,13 +229,14 @@ class _Rehearsal:
                 return self._liftings[k].lift(state, index, how, held=held | also, to_the_end=False)
 
             lifts = self._each(lift)
-            harm = np.stack([lift.disturbed for lift in lifts])
-            # What is held in a scene, because it does not stay there, must not lose a support of the graph.
-            needs = {s.supported for s in self._graph.supports if s.supporter == object_id} - set(hold)
-            harm |= self._restless & np.isin(self.ids, list(needs.intersection(self.left())))
+            # What is held in a scene, because it does not stay there, moves if it loses a support it has.
+            free = set(self.left()) - set(hold)
+            supports = [self._graph.support(object_id, i) if i in free else None for i in self.ids]
+            loses = np.array([0.0 if s is None else s.belief for s in supports])
+            harm = np.maximum(np.stack([lift.disturbed for lift in lifts]), self._restless * loses)
             shares = zip(self.ids, harm.mean(axis=0).tolist(), strict=True)
             harmed = {i: share for i, share in shares if share > 0.0}
-            risk = float(harm.any(axis=1).mean())
+            risk = float(1.0 - np.prod(1.0 - harm, axis=1).mean())
             self._trials[asked] = _Trial(object_id, tuple(hold), risk, harmed, tuple(lifts))
         return self._trials[asked]
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError
@@ -62,11 +63,13 @@ class Effect:
         object_id: Which.
         certain: False where it may move, or may not.
         why: What it loses, for a person to read.
+        probability: Probability that it moves [1].
     """
 
     object_id: str
     certain: bool
     why: str
+    probability: float
 
 
 def infer(
@@ -152,7 +155,8 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
         raise InputError(supporter, "an object does not support itself", "ask about two different objects")
     edge = graph.support(supporter, supported)
     if edge is not None:
-        return edge.why
+        known = edge.probability is not None
+        return f"{edge.why} Probability {edge.probability:.2f}." if known else edge.why
     if b.role == "support_surface":
         return f"{supported} is the support surface: nothing supports it."
     touches = _find_touches([a, b], config.reach, config)[b.id]
@@ -180,6 +184,10 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
     support polygon than the fits' uncertainty explains. It may move where that is not so sure, or where only
     a support that is uncertain itself is lost. What falls takes its support from others in turn.
 
+    The probability that an object moves is that of losing a support it has, times that of falling without: a
+    support is lost with the probability that its supporter moves, one independently of the other, and the
+    centre of mass is off by the standard deviation of the fit. Where all supports and fits are sure it is 1.
+
     Args:
         graph: What is known.
         object_id: The object that is taken away.
@@ -197,7 +205,8 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
     for certain in (True, False):
         # First what moves for certain; then what may, once all that certainly moves is gone.
         while True:
-            gone = {object_id} | {i for i, e in effects.items() if e.certain or not certain}
+            moving = {i: e.probability for i, e in effects.items() if e.certain or not certain}
+            gone = {object_id: 1.0} | moving
             found = _next_effect(graph, gone, effects, certain, config)
             if found is None:
                 break
@@ -215,9 +224,13 @@ def _known(graph: SupportGraph, object_id: str) -> SceneObject:
 
 
 def _next_effect(
-    graph: SupportGraph, gone: Collection[str], known: Collection[str], certain: bool, config: SupportConfig
+    graph: SupportGraph,
+    gone: Mapping[str, float],
+    known: Collection[str],
+    certain: bool,
+    config: SupportConfig,
 ) -> Effect | None:
-    """One more object that moves once some are gone: for certain, or perhaps."""
+    """One more object that moves once some are gone, each with a probability: for certain, or perhaps."""
     staying = [o for o in graph.objects if o.id not in gone]
     losses = [(o, [s for s in graph.supporters(o.id) if s.supporter in gone]) for o in staying]
     losses = [(o, lost) for o, lost in losses if lost and o.id not in known]
@@ -234,7 +247,10 @@ def _next_effect(
             what = f"its centre of mass is {1000.0 * abs(overhang):.0f} mm {side} what is left to carry it"
         sure = overhang > slack and any(s.certain for s in lost)
         if sure if certain else overhang > -slack or not all(s.certain for s in lost):
-            return Effect(o.id, certain, f"it loses the support of {named}, and {what}")
+            loss = 1.0 - np.prod([1.0 - s.belief * gone[s.supporter] for s in lost])
+            fall = ndtr(2.0 * overhang / max(slack, 1e-9))
+            why = f"it loses the support of {named}, and {what}"
+            return Effect(o.id, certain, why, float(loss * fall))
     return None
 
 

@@ -279,7 +279,7 @@ def describe_object(graph: SupportGraph, object_id: str, config: SupportConfig) 
     facts = [(name, entry.text) for name, entry in zip(table.columns, row, strict=True)][2:]
     if item.role == "object":
         effects = predict_removal(graph, object_id, config)
-        falls = [f"{e.object_id} {'falls' if e.certain else 'may fall'}: {e.why}" for e in effects]
+        falls = [f"{e.object_id} falls with probability {e.probability:.2f}: {e.why}" for e in effects]
         facts += [(f"Without {object_id}", text) for text in falls or ["nothing falls"]]
     for supporter, supported, kind, certain, found, why in support_table(graph).rows:
         if object_id in (supporter.text, supported.text):

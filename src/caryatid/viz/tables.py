@@ -107,12 +107,12 @@ def order_table(order: Order) -> Table:
             str(number),
             Entry(step.object_id, object_colour(int(step.object_id[1:]))),
             ", ".join(step.hold) or "–",
-            Entry("yes" if step.safe else f"no, risk {step.risk:.0%}", doubt=not step.safe),
+            Entry(f"{1.0 - step.risk:.2f}{'' if step.safe else ', too low'}", doubt=not step.safe),
             step.why,
         )
         for number, step in enumerate(order.steps, 1)
     )
-    return Table.of("Steps", ("", "take", "hold", "safe", "why"), rows)
+    return Table.of("Steps", ("", "take", "hold", "probability that nothing else moves", "why"), rows)
 
 
 def size_of(shape: Shape) -> str:
