@@ -363,7 +363,8 @@ def _text(quantity: str, value: float, low: float, high: float) -> str:
     if quantity == "share":
         return f"{100.0 * value:.0f} %"
     if quantity == "brier gain":
-        return "–" if math.isnan(value) else f"{100.0 * value:.0f} % [{100.0 * low:.0f}, {100.0 * high:.0f}]"
+        text = f"{100.0 * value:.0f} %" if math.isfinite(value) else "–"
+        return f"{text} [{100.0 * low:.0f}, {100.0 * high:.0f}]" if math.isfinite(low + high) else text
     digits, sign = DIGITS.get(quantity, 3), "+" if quantity.endswith(" difference") else ""
 
     def number(value: float) -> str:
