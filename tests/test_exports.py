@@ -162,7 +162,7 @@ def test_dot_is_the_graph(tmp_path, graph):
     edges = {(e.get_source().strip('"'), e.get_destination().strip('"')): e for e in read.get_edges()}
     assert set(edges) == {s.pair for s in graph.supports}
     assert edges["o1", "o2"].get("style") == '"dashed"'
-    assert edges["o1", "o2"].get("label") == '"lean"'
+    assert edges["o1", "o2"].get("label") == '"lean 0.50"'
     assert edges["o0", "o1"].get("style") == '"solid"'
     assert read.get_node('"o3"')[0].get("shape") == '"circle"'
     assert read.get_node('"o3"')[0].get("fillcolor") == f'"{object_colour(3)}"'

@@ -53,7 +53,7 @@ def make_graph() -> SupportGraph:
     ball = SceneObject("o7", 7, Sphere(at(0.2, 0.2, TOP + 0.04), 0.04), occurrences=1, opportunities=2)
     supports = (
         Support("o0", "o1", occurrences=2, opportunities=2, why="the table lies below <o1>"),
-        Support("o1", "o2", occurrences=1, opportunities=2),
+        Support("o1", "o2", occurrences=1, opportunities=2, probability=0.83),
         Support("o0", "o2", certain=False, occurrences=1, opportunities=5, why="o2 tips"),
         Support("o2", "o1", "top-down", certain=False, occurrences=3, opportunities=4),
     )
@@ -185,7 +185,7 @@ def test_the_pdf_says_what_the_page_says_and_has_the_same_bytes_each_time(report
     text = " ".join(" ".join(sheet.extract_text() for sheet in pdf.pages).split())
     for said in (
         "Run <script>alert(1)</script> $x$", "a<b>.xml", "view <7> & more", "the table lies", "F1 0.900",
-        "top-down 3/4", "sees o2 & o7 best", "The graph did not change", "uncertain", "o7", "seen once <i>",
+        "top-down 0.50", "sees o2 & o7 best", "The graph did not change", "uncertain", "o7", "seen once <i>",
         "Contact sheet", "F1 over views", "Taken apart", "What the camera saw",
     ):  # fmt: skip
         assert said in text, said
@@ -304,8 +304,10 @@ def test_doubt_is_told_in_the_graph_without_colour():
         assert ("stroke-dasharray" in content) == kind.endswith(" uncertain")
     assert re.findall(r'class="node (\w+) unsupported"', svg) == ["o7"]
     words = Page(svg).text
-    for note in ("1/2", "1/5", "2/2", "top-down 3/4"):
+    for note in ("1.00", "0.83", "0.50", "top-down 0.50"):
         assert note in words
+    widths = dict(re.findall(r'<g class="edge (\w+ \w+) \w+">.*?stroke-width: ([\d.]+)', svg, re.DOTALL))
+    assert float(widths["o0 o2"]) < float(widths["o1 o2"]) < float(widths["o0 o1"])
     eighth = replace(graph.objects[1], id="o8", label=8)
     assert "pattern" not in svg
     assert "pattern" in picture_svg(draw_graph(SupportGraph((graph.objects[0], eighth))))
@@ -337,7 +339,7 @@ def test_objects_that_hold_each_other_are_joined_twice():
     graph = chain([("o0", "o1"), ("o0", "o2")], 3)
     both = (*graph.supports, Support("o1", "o2", "lean"), Support("o2", "o1", "lean"))
     svg = picture_svg(draw_graph(replace(graph, supports=both)))
-    assert svg.count("lean 1/1") == 2
+    assert svg.count("lean 1.00") == 2
     assert "nan" not in svg.lower()
 
 

@@ -102,12 +102,16 @@ def test_only_layers_that_changed_are_sent_again(step, drawn):
 def test_arrows_tell_direction_doubt_and_kind(step, drawn):
     objects = step.graph
     certain = drawn(with_supports(step, Support("o1", "o2")))
-    (arrow,) = certain["/supports/certain"].points
+    (arrow,) = certain["/supports/arrow 0"].points
     np.testing.assert_allclose(arrow, [objects["o1"].centre_world, objects["o2"].centre_world], atol=1e-6)
-    assert "/supports/dashes" not in certain
+    assert not {"/supports/dashes 0", "/supports/probability 0"} & certain.keys()
     doubtful = drawn(with_supports(step, Support("o1", "o2", certain=False)))
-    assert len(doubtful["/supports/dashes"].points) > 1
-    assert "/supports/certain" not in doubtful
+    assert len(doubtful["/supports/dashes 0"].points) > 1
+    assert doubtful["/supports/probability 0"].text == "0.50"
+    likely = drawn(with_supports(step, Support("o1", "o2", probability=0.83)))
+    assert likely["/supports/probability 0"].text == "0.83"
+    widths = [nodes["/supports/arrow 0"].shaft_radius for nodes in (doubtful, likely, certain)]
+    assert widths == sorted(set(widths))
     assert "/supports/lean 0" in drawn(with_supports(step, Support("o1", "o2", "lean")))
     assert "/supports/top-down 0" in drawn(with_supports(step, Support("o1", "o2", "top-down")))
 
@@ -143,7 +147,8 @@ def test_what_is_said_of_an_object(step, settings):
     assert "nothing falls" in describe_object(graph, "o2", config)
     assert "Without" not in describe_object(graph, "o0", config)
     doubtful = with_supports(step, Support("o1", "o2", certain=False)).graph
-    assert "o1 → o2</dt><dd>bottom-up, uncertain, 1 of 1" in describe_object(doubtful, "o1", config)
+    said = "o1 → o2</dt><dd>bottom-up, probability 0.50, uncertain, 1 of 1"
+    assert said in describe_object(doubtful, "o1", config)
     assert "not known" in describe_object(graph, "o9", config)
     named = replace(step, name="<img src=x onerror=alert(1)>")
     assert "<img" not in describe_view(named, None, 1)

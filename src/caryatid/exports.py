@@ -217,7 +217,8 @@ def _graphml(graph: SupportGraph) -> str:
         plain.add_node(item.id, **attributes)
     for support in graph.supports:
         names = ("kind", "certain", "occurrences", "opportunities")
-        plain.add_edge(*support.pair, **{name: getattr(support, name) for name in names})
+        known = {} if support.probability is None else {"probability": support.probability}
+        plain.add_edge(*support.pair, **known, **{name: getattr(support, name) for name in names})
     return "\n".join(nx.generate_graphml(plain)) + "\n"
 
 
@@ -241,10 +242,10 @@ def to_dot(graph: SupportGraph) -> str:
     for support in graph.supports:
         attributes = {
             "style": "solid" if support.certain else "dashed",
+            "penwidth": f"{max(0.6, 2.4 * support.belief):.2f}",
+            "label": f"{'' if support.kind == 'bottom-up' else f'{support.kind} '}{support.belief:.2f}",
             "tooltip": f"{support.kind}, found in {support.occurrences} of {support.opportunities} views",
         }
-        if support.kind != "bottom-up":
-            attributes["label"] = support.kind
         ends = " -> ".join(_quoted(name) for name in support.pair)
         lines.append(f"  {ends} [{_listed(attributes)}];")
     return "\n".join([*lines, "}"]) + "\n"

@@ -160,33 +160,36 @@ class SceneDrawing:
         """Line segments (N, 2, 3), if there are any."""
         return [self._scene.add_line_segments(name, ends, colours, **look)] if len(ends) else []
 
-    def _arrows(self, name: str, ends: Sequence[Array], colour: Colour) -> list[Any]:
-        return [self._scene.add_arrows(name, np.array(ends), colour, **ARROW)] if ends else []
+    def _arrow(self, name: str, start: Array, end: Array, colour: Colour, share: float = 1.0) -> Any:
+        """An arrow whose shaft has this share of the usual width."""
+        look = ARROW | {"shaft_radius": share * ARROW["shaft_radius"]}
+        return self._scene.add_arrows(name, np.array([[start, end]]), colour, **look)
 
     def _supports(self, graph: SupportGraph) -> list[Any]:
         """Arrows from supporter to supported; a ball stands for leaning, a cube for weight from above."""
-        arrows: dict[Colour, list[Array]] = {CERTAIN: [], UNCERTAIN: []}
-        nodes, dashes = [], [np.zeros((0, 2, 3))]
+        nodes: list[Any] = []
         for number, support in enumerate(graph.supports):
             start, end = _ends(support, graph)
             neck, length = start, float(np.linalg.norm(end - start))
             if length < 1e-6:
                 continue
+            colour, share = CERTAIN if support.certain else UNCERTAIN, max(support.belief, 0.3)
             if not support.certain:
                 neck = end - min(2.0 * ARROW["head_length"], 0.5 * length) * (end - start) / length
                 count = max(2, round(float(np.linalg.norm(neck - start)) / 0.016))
-                dashes.append(np.linspace(start, neck, 2 * count).reshape(-1, 2, 3))
-            colour = CERTAIN if support.certain else UNCERTAIN
-            arrows[colour].append(np.array([neck, end]))
+                dashes = np.linspace(start, neck, 2 * count).reshape(-1, 2, 3)
+                nodes += self._lines(f"/supports/dashes {number}", dashes, UNCERTAIN, thickness=0.007 * share)
+            nodes.append(self._arrow(f"/supports/arrow {number}", neck, end, colour, share))
+            if support.belief < 0.995:
+                text, at = f"{support.belief:.2f}", (start + end) / 2.0
+                nodes.append(self._label(f"/supports/probability {number}", text, at))
             name = f"/supports/{support.kind} {number}"
             look: dict[str, Any] = {"color": colour, "position": (start + end) / 2.0}
             if support.kind == "lean":
                 nodes.append(self._scene.add_icosphere(name, radius=0.011, **look))
             elif support.kind == "top-down":
                 nodes.append(self._scene.add_box(name, dimensions=(0.019, 0.019, 0.019), **look))
-        nodes += self._arrows("/supports/certain", arrows[CERTAIN], CERTAIN)
-        nodes += self._arrows("/supports/uncertain", arrows[UNCERTAIN], UNCERTAIN)
-        return nodes + self._lines("/supports/dashes", np.concatenate(dashes), UNCERTAIN, thickness=0.007)
+        return nodes
 
     def _sphere(self, sphere: ViewSphere, candidates: Any, decision: Any) -> list[Any]:
         """Where the camera can go, painted with saliency; where it cannot, pale and only above the table."""
@@ -256,7 +259,7 @@ class SceneDrawing:
         return [
             self._scene.add_cylinder("/robot/platform", radius=radius, height=height, **place),
             *self._lines("/robot/links", np.array([[top, middle], [middle, eye]]), ROBOT, thickness=0.1),
-            *self._arrows("/robot/front", [np.array([top, nose])], CERTAIN),
+            self._arrow("/robot/front", top, nose, CERTAIN),
         ]
 
 

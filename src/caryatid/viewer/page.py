@@ -256,7 +256,8 @@ def describe_view(step: Step, f1: float | None, last: int) -> str:
 def _describe_signs() -> str:
     """Say what the signs in the scene mean."""
     signs = {
-        "Arrow": "supporter → supported; dashed where uncertain",
+        "Arrow": "supporter → supported, thicker where more probable; dashed where uncertain",
+        "Number on an arrow": "the probability of the support, where it is less than 1",
         "Ball, cube on an arrow": "it leans; weight from above. Neither: supported from below",
         "Dots on the sphere": "where the robot can bring its camera, coloured by saliency",
         "Fine grey dots": "where it cannot",
@@ -281,9 +282,9 @@ def describe_object(graph: SupportGraph, object_id: str, config: SupportConfig) 
         effects = predict_removal(graph, object_id, config)
         falls = [f"{e.object_id} falls with probability {e.probability:.2f}: {e.why}" for e in effects]
         facts += [(f"Without {object_id}", text) for text in falls or ["nothing falls"]]
-    for supporter, supported, kind, certain, found, why in support_table(graph).rows:
+    for supporter, supported, kind, likely, found, why in support_table(graph).rows:
         if object_id in (supporter.text, supported.text):
-            evidence = f"{kind.text}{', uncertain' * certain.doubt}, {found.text}; {why.text}"
+            evidence = f"{kind.text}, probability {likely.text}, {found.text}; {why.text}"
             facts.append((f"{supporter.text} → {supported.text}", evidence))
     return cell_html(Section(item.id, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 

@@ -111,9 +111,9 @@ PITCH, NODE = np.array([78.0, -110.0]), np.array([56.0, 40.0])
 def draw_graph(graph: SupportGraph) -> Picture:
     """Draw the support graph: the table below, what it carries above it, doubt in dashes.
 
-    Edges run from supporter to supported and carry occurrences/opportunities; uncertain ones are dashed,
-    leaning and top-down ones say so. Vertices have the shape of their primitive, and a dashed rim where
-    nothing is known to support them.
+    Edges run from supporter to supported and carry their probability, the thicker the higher it is; uncertain
+    ones are dashed, leaning and top-down ones say so. Vertices have the shape of their primitive, and a
+    dashed rim where nothing is known to support them.
 
     Args:
         graph: What to draw.
@@ -132,8 +132,8 @@ def draw_graph(graph: SupportGraph) -> Picture:
             points[:, 0] += 8.0 * np.sign(points[0, 1] - points[-1, 1])  # Beside the edge that leads back.
         edges.append(_from_rim_to_rim(points, support, table))
         notes.append(edges[-1][-2:].mean(axis=0))
-        evidence = f"{support.occurrences}/{support.opportunities}"
-        words.append(evidence if support.kind == "bottom-up" else f"{support.kind} {evidence}")
+        kind = "" if support.kind == "bottom-up" else f"{support.kind} "
+        words.append(f"{kind}{support.belief:.2f}")
     plates = np.array([[7.4 * len(word) + 4.0, 16.0] for word in words]).reshape(-1, 2)
     plates_at = keep_apart(np.reshape(notes, (-1, 2)), plates, (width, height))
 
@@ -177,7 +177,8 @@ def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Arr
     curve = Path(corners, [Path.MOVETO, *[Path.CURVE4] * (len(corners) - 1)])
     arrow = FancyArrowPatch(
         path=curve, arrowstyle="-|>,head_length=0.5,head_width=0.22", mutation_scale=20.0, color=colour,
-        linewidth=1.7, linestyle="-" if support.certain else (0, (3.5, 2.6)), gid=f"{kind}|{title}",
+        linewidth=max(0.6, 2.4 * support.belief), linestyle="-" if support.certain else (0, (3.5, 2.6)),
+        gid=f"{kind}|{title}",
     )  # fmt: skip
     axes.add_patch(arrow)
     plate = {"facecolor": PANEL, "edgecolor": "none", "pad": 0.8}

@@ -232,9 +232,8 @@ def _figures(step: Step, width: int) -> list[Figure]:
         picture = draw_image(view, step.labels, graph, width)
         figures.append(Figure("What the camera saw", picture, caption))
     caption = (
-        "Arrows run from supporter to supported; beside them, in how many of the views that could have shown "
-        "it the relation was found. Dashed arrows are uncertain; an object with a dashed rim has no known "
-        "supporter."
+        "Arrows run from supporter to supported, with the probability of the support: the higher it is, the "
+        "thicker the arrow. Dashed arrows are uncertain; an object with a dashed rim has no known supporter."
     )
     picture = draw_graph(graph)
     # A graph of more than eight vertices beside each other cannot be read in half the width.

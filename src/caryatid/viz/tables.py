@@ -60,6 +60,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
         "shape": item.shape.kind,
         "size [mm]": size_of(item.shape),
         "in views": f"{item.occurrences} of {item.opportunities}",
+        "probability": "–" if item.probability is None else f"{item.probability:.2f}",
         "sides unseen": (unseen or "none") if any(item.seen) else "all",
         "residual [mm]": Entry(
             f"{item.residual * 1e3:.1f}{' poor fit' * item.poor_fit}", doubt=item.poor_fit
@@ -73,20 +74,20 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
 
 
 def support_table(graph: SupportGraph) -> Table:
-    """Say of each support what it is, how often it was found and why."""
+    """Say of each support what it is, how likely it is, how often it was found and why."""
     colour = {o.id: object_colour(o.label) for o in graph.objects}
     rows = (
         (
             Entry(s.supporter, colour[s.supporter]),
             Entry(s.supported, colour[s.supported]),
             s.kind,
-            Entry("yes" if s.certain else "uncertain", doubt=not s.certain),
+            Entry(f"{s.belief:.2f}{'' if s.certain else ', uncertain'}", doubt=not s.certain),
             f"{s.occurrences} of {s.opportunities}",
             s.why,
         )
         for s in graph.supports
     )
-    columns = ("supporter", "supported", "kind", "certain", "found in views", "evidence")
+    columns = ("supporter", "supported", "kind", "probability", "found in views", "evidence")
     return Table.of("Supports", columns, rows)
 
 
