@@ -28,8 +28,8 @@ def main() -> None:
 
     for support in step.graph.supports:
         seen = f"in {support.occurrences} of {support.opportunities} views"
-        doubt = "" if support.certain else ", uncertain"
-        print(f"{support.supporter} holds {support.supported} ({support.kind}, {seen}{doubt})")
+        likely = f"probability {support.belief:.2f}"
+        print(f"{support.supporter} holds {support.supported} ({support.kind}, {seen}, {likely})")
 
     assert f1[-1] > f1[0], "looking around must pay"
     assert f1[-1] > 0.9

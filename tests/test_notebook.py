@@ -164,7 +164,7 @@ def test_plain_lines_tell_one_from_another():
     box = ct.Box(upright, np.array([0.1, 0.2, 0.3]))
     assert repr(box) == "Box(0.100 × 0.200 × 0.300 m at (0.000, 0.000, 0.000))"
     doubtful = Support("o1", "o2", certain=False)
-    assert repr(doubtful) == "Support(o1 → o2, bottom-up, uncertain, found in 1 of 1)"
+    assert repr(doubtful) == "Support(o1 → o2, bottom-up, probability 0.50, found in 1 of 1)"
     many = repr(SupportGraph((SceneObject("o1", 1, ct.Sphere(upright, 0.1)),), edges))
     assert many.startswith("SupportGraph(vertices=1, edges=28: o1 → o2, ")
     assert many.endswith("…)")

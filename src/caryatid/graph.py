@@ -102,9 +102,9 @@ class Support:
         return self.probability
 
     def __repr__(self) -> str:
-        doubt = "" if self.certain else ", uncertain"
-        found = f"{self.occurrences} of {self.opportunities}"
-        return f"Support({self.supporter} → {self.supported}, {self.kind}{doubt}, found in {found})"
+        found = f"found in {self.occurrences} of {self.opportunities}"
+        likely = f"probability {self.belief:.2f}"
+        return f"Support({self.supporter} → {self.supported}, {self.kind}, {likely}, {found})"
 
 
 @dataclass(frozen=True, eq=False, slots=True)

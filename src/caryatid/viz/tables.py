@@ -113,7 +113,7 @@ def order_table(order: Order) -> Table:
         )
         for number, step in enumerate(order.steps, 1)
     )
-    return Table.of("Steps", ("", "take", "hold", "probability that nothing else moves", "why"), rows)
+    return Table.of("Steps", ("", "take", "hold", "nothing else moves", "why"), rows)
 
 
 def size_of(shape: Shape) -> str:
