@@ -54,6 +54,14 @@ def test_what_lies_elsewhere_is_a_new_object_with_a_label_never_given():
     assert names_of() == {}
 
 
+def test_a_part_of_another_colour_is_a_new_object_though_it_lies_on_a_shape():
+    part = seen(CRATE, seed=1)
+    unlike = np.zeros((len(part) + 5, len(KNOWN)), dtype=bool)
+    assert names_of(part, unlike=unlike) == {1: 3}
+    unlike[: 4 * len(part) // 5, 0] = True
+    assert names_of(part, unlike=unlike) == {1: 8}
+
+
 @pytest.mark.parametrize(("share", "name"), [(0.2, 8), (0.5, 3)])
 def test_how_much_must_overlap_is_a_setting(share, name):
     rng = np.random.default_rng(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -219,16 +220,19 @@ def test_halves_of_what_goes_around_an_axis_are_one():
     [((200, 30, 30), (30, 60, 190), False), ((200, 30, 30), (120, 18, 18), True), (None, None, True)],
     ids=["red beside blue", "shaded", "printed"],
 )
-def test_flush_boxes_are_two_where_each_has_a_colour_of_its_own(left, right, merged):
+def test_flush_boxes_are_two_where_a_view_showed_each_in_a_colour_of_its_own(left, right, merged):
     points, normals, _ = points_of([box((0.0, 0.0, 0.03), (0.06, 0.12, 0.06))])
-    rng, clouds = np.random.default_rng(2), {}
-    for label, (own, colour) in enumerate(
-        zip((points[:, 1] < 0.0, points[:, 1] >= 0.0), (left, right), strict=True), 1
-    ):
+    rng, on_left = np.random.default_rng(2), points[:, 1] < 0.0
+    rgb = np.zeros((len(points), 3), dtype=np.uint8)
+    for own, colour in ((on_left, left), (~on_left, right)):
         prints = rng.choice([(230, 200, 20), (200, 20, 20), (30, 30, 120)], own.sum())
-        rgb = np.clip((colour or prints) + rng.normal(0.0, 3.0, (own.sum(), 3)), 0, 255).astype(np.uint8)
-        clouds[label] = Cloud(points[own], normals[own], rgb=rgb)
+        rgb[own] = np.clip((colour or prints) + rng.normal(0.0, 3.0, (own.sum(), 3)), 0, 255)
+    clouds = {k: Cloud(points[own], normals[own], rgb=rgb[own]) for k, own in ((1, on_left), (2, ~on_left))}
     assert (pair_of(clouds) is not None) == merged
+    whole = gather(Cloud(points, normals, rgb=rgb))
+    for hints, divided in (([whole.points[:, 1] < 0.0], not merged), ([], False)):
+        groups = split(whole, alone_in(whole), partial(list, hints), up=UP, config=CONFIG, rng=rng)
+        assert (groups is not None) == divided
 
 
 def test_irregular_neighbours_stay_two_also_where_the_surface_goes_on():

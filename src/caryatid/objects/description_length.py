@@ -14,10 +14,8 @@ from caryatid.fitting.primitives import candidates, free_inside
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.objects.compounds import Compound, compounds, shape_costs
+from caryatid.segmentation.segments import PLAIN, colour_shares
 from caryatid.sensing.voxel_map import VoxelMap
-
-PLAIN = 0.02
-"""How much the shares of red and green differ on a thing of one colour [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -94,21 +92,23 @@ def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig
     if first.rgb is None or second.rgb is None:
         return 0.0
     sides = first.rgb, second.rgb, np.concatenate([first.rgb, second.rgb])
-    alone, other, both = (_colour_cost(rgb, config) for rgb in sides)
+    alone, other, both = (plain_colour(rgb, config)[0] for rgb in sides)
     return max(both - alone - other, 0.0)
 
 
-def _colour_cost(rgb: NDArray[np.uint8], config: ExplanationConfig) -> float:
-    """Cost [nats] of colours (N, 3): of one plain colour and outliers, or of a print.
-
-    Shading leaves the shares of red, green and blue as they are.
-    """
-    shares = (rgb + 1.0) / (rgb + 1.0).sum(axis=1, keepdims=True)
+def plain_colour(rgb: NDArray[np.uint8], config: ExplanationConfig) -> tuple[float, Array | None]:
+    """Cost [nats] of colours (N, 3), and the shares (3,) of the plain colour of most; None for a print."""
     # Enough of them to hold one of the most frequent colour.
-    tried = shares[:: max(1, len(shares) // 64)]
-    squares = cdist(shares[:, :2], tried[:, :2], "sqeuclidean") / (2.0 * PLAIN**2)
-    plain = float(np.minimum(squares, config.outlier).sum(axis=0).min())
-    return min(plain, config.irregular * len(rgb))
+    tried = rgb[:: max(1, len(rgb) // 64)]
+    costs = colour_costs(rgb, colour_shares(tried), config).sum(axis=0)
+    best, printed = int(costs.argmin()), config.irregular * len(rgb)
+    return (float(costs[best]), colour_shares(tried[best])) if costs[best] < printed else (printed, None)
+
+
+def colour_costs(rgb: NDArray[np.uint8], plain: Array, config: ExplanationConfig) -> Array:
+    """Cost (N, M) [nats] of colours (N, 3) on things of plain colours with shares (M, 3)."""
+    squares = cdist(colour_shares(rgb)[:, :2], plain[:, :2], "sqeuclidean") / (2.0 * PLAIN**2)
+    return np.minimum(squares, config.outlier)
 
 
 def best_explanation(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import combinations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from caryatid.config import Config
+from caryatid.config import Config, ExplanationConfig
 from caryatid.geometry.shapes import KINDS, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.objects.compounds import box_axes
@@ -46,7 +46,7 @@ class TwoObjects:
     Attributes:
         second: Which points (N,) are the second's.
         explanations: Of both.
-        cost: Of both and of the border between them [nats].
+        cost: Of both and of the border between them, less what their colours speak for two [nats].
     """
 
     second: Mask
@@ -118,7 +118,8 @@ def _parts(
         if further is None and not explained(explanation, own.select(side), config.explanation):
             return None
         parts += further or [(index[side], explanation.cost)]
-    compound = best_compound(own, config, sum(cost for _, cost in parts))
+    border = found.cost - sum(e.cost for e in found.explanations)
+    compound = best_compound(own, config, border + sum(cost for _, cost in parts))
     return parts if compound.shape is None else None
 
 
@@ -140,18 +141,35 @@ def _best_two(
     bad = own[near].mean(axis=1)
     excess = float(np.maximum(bad - costs.usual, 0.0).sum()) * evidence.weight
     free = whole.cost - price(whole.shape, costs) - float(own.sum()) * evidence.weight
-    if excess + free < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
-        return None
     starts = [h[index] for h in hints()]
     starts = [h for h in starts if h.any() and not h.all()]
+    hinted = len(starts)
+    colours = max((_colours(evidence, start, costs) for start in starts), default=0.0)
+    if excess + free + colours < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
+        return None
     starts += _hypotheses(evidence, bad, up, config)
     looks = _settled(evidence, starts, near, 0, config, rng, first_look=True)
+    looks = [_coloured(evidence, two, k < hinted, costs) for k, two in enumerate(looks)]
     # The best two of those with a shape for one side at least are settled with full fits.
     shaped = [k for k, look in enumerate(looks) if look and any(e.shape for e in look.explanations)]
-    tried = sorted((look.cost, k) for k, look in enumerate(looks) if look and k in shaped)[:2]
-    settled = _settled(evidence, [starts[k] for _, k in tried], near, config.split.rounds, config, rng)
+    tried = [k for _, k in sorted((look.cost, k) for k, look in enumerate(looks) if look and k in shaped)[:2]]
+    settled = _settled(evidence, [starts[k] for k in tried], near, config.split.rounds, config, rng)
+    settled = [_coloured(evidence, two, k < hinted, costs) for k, two in zip(tried, settled, strict=True)]
     better = [two for two in settled if two and two.cost < whole.cost and not _is_layer(evidence, two)]
     return min(better, key=lambda two: two.cost, default=None)
+
+
+def _coloured(
+    evidence: Evidence, two: TwoObjects | None, hinted: bool, costs: ExplanationConfig
+) -> TwoObjects | None:
+    """Weigh colours too where a view showed a border between the two: elsewhere it may be one of a print."""
+    if two is None or not hinted:
+        return two
+    return replace(two, cost=two.cost - _colours(evidence, two.second, costs))
+
+
+def _colours(evidence: Evidence, second: Mask, costs: ExplanationConfig) -> float:
+    return colour_evidence(evidence.select(~second), evidence.select(second), costs)
 
 
 def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:

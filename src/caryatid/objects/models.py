@@ -26,7 +26,9 @@ from caryatid.objects.description_length import (
     Explanation,
     best_compound,
     best_explanation,
+    colour_costs,
     explained,
+    plain_colour,
 )
 from caryatid.objects.model_selection import GROWTH, best_merge, split
 from caryatid.objects.solids import as_solid
@@ -220,10 +222,25 @@ class ObjectModels:
             self._config.segmentation,
             self.points.labels_used,
             masks=masks,
+            unlike=None if masks else self._unlike(observation),
         )
         if masks:
             self._distinct |= set(map(frozenset, combinations(np.unique(named[named > 0]).tolist(), 2)))
         return observation.with_labels(np.where(labels == SUPPORT_LABEL, labels, named))
+
+    def _unlike(self, observation: Observation) -> NDArray[np.bool_] | None:
+        """Which points (N,) of a view have another colour than plain objects (K,), ascending: (N, K)."""
+        config, rgb, names = self._config.explanation, observation.cloud.rgb, self.points.objects
+        if rgb is None:
+            return None
+        unlike = np.zeros((len(rgb), len(names)), dtype=bool)
+        rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
+        for column, name in enumerate(names):
+            colours = self.points.of(name, config.spacing).rgb
+            plain = None if colours is None else plain_colour(colours, config)[1]
+            if plain is not None:
+                unlike[rows, column] = colour_costs(rgb[rows], plain[None], config)[:, 0] >= config.outlier
+        return unlike
 
     def mislabelled(self, observation: Observation) -> tuple[int, int]:
         """How many labels of a view lie on objects that had other labels before, and how many there are."""
@@ -445,12 +462,14 @@ def associate(
     labels_used: int = 0,
     *,
     masks: bool = False,
+    unlike: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.int32]:
     """Give the points of each new segment the label of the object they belong to, or one never used before.
 
     An automatic segment that lies at several known objects, with a tenth of its points or more, is divided
-    among them: each point goes to the nearest. A mask is all that a view shows of one object: masks and
-    objects are matched one to one, so that they share as many points as possible.
+    among them: each point goes to the nearest, and to one of another colour only where it is near no other.
+    A mask is all that a view shows of one object: masks and objects are matched one to one, so that they
+    share as many points as possible.
 
     Args:
         points_world: (N, 3) [m].
@@ -460,6 +479,7 @@ def associate(
         config: Share that must overlap, and the distance that counts as overlap.
         labels_used: Highest label ever given; new objects are numbered from the next one.
         masks: Whether the segments are masks.
+        unlike: Which points have another colour than which known object (N, K); None where none has.
 
     Returns:
         Label of the object (N,) of each point; 0 where there was no segment.
@@ -473,7 +493,9 @@ def associate(
     shapes = [known_shapes.get(k) for k in names.tolist()]
     counts = np.bincount(labels, minlength=1)
     kept = most_central(points_world, labels, np.where(np.arange(len(counts)) > 0, spacing, 0.0))
-    owner = _nearest_objects(points_world[kept], points, owners, shapes, config.overlap_reach)
+    if unlike is None:
+        unlike = np.zeros((len(labels), len(names)), dtype=bool)
+    owner = _nearest_objects(points_world[kept], points, owners, shapes, unlike[kept], config.overlap_reach)
     segments = np.flatnonzero(counts[1:]) + 1
     shared = np.zeros((len(segments), len(names)), dtype=np.intp)
     near = owner >= 0
@@ -493,7 +515,7 @@ def associate(
             theirs = np.isin(owners, among)
             some = [shape if k in among else None for k, shape in enumerate(shapes)]
             nearest = _nearest_objects(
-                points_world[index], points[theirs], owners[theirs], some, config.overlap_reach
+                points_world[index], points[theirs], owners[theirs], some, unlike[index], config.overlap_reach
             )
             far = nearest < 0
             if far.any():
@@ -519,7 +541,12 @@ def _one_to_one(shared: NDArray[np.intp], shares: Array, least: float) -> list[N
 
 
 def _nearest_objects(
-    points: Array, known: Array, owners: NDArray[np.int32], shapes: list[Shape | None], reach: float
+    points: Array,
+    known: Array,
+    owners: NDArray[np.int32],
+    shapes: list[Shape | None],
+    unlike: NDArray[np.bool_],
+    reach: float,
 ) -> NDArray[np.int32]:
     """Which object (N,) is nearest to each point (N, 3), by its points or its shape's surface; −1 = none.
 
@@ -528,18 +555,22 @@ def _nearest_objects(
         known: Points (M, 3) [m] of all objects.
         owners: Object (M,) of each: 0 … K−1.
         shapes: Shape of each object, or None.
+        unlike: Points that have another colour than the object (N, K).
         reach: Objects from here on count as none [m].
     """
     nearest, gap = np.full(len(points), -1, dtype=np.int32), np.full(len(points), reach)
-    if len(known):
-        distance, index = cKDTree(known, compact_nodes=False, balanced_tree=False).query(
-            points, distance_upper_bound=reach
-        )
-        found = np.isfinite(distance)
-        nearest[found], gap[found] = owners[index[found]], distance[found]
     for number, shape in enumerate(shapes):
-        if shape is not None:
-            distance = np.abs(shape.signed_distance(points))
-            nearer = distance < gap
-            nearest[nearer], gap[nearer] = number, distance[nearer]
+        own = known[owners == number]
+        rows = np.flatnonzero(~unlike[:, number])
+        if len(own) and len(rows):
+            among = (points[rows] > own.min(axis=0) - reach) & (points[rows] < own.max(axis=0) + reach)
+            close = rows[among.all(axis=1)]
+            tree = cKDTree(own, compact_nodes=False, balanced_tree=False)
+            distance = tree.query(points[close], distance_upper_bound=reach)[0]
+            nearer = distance < gap[close]
+            nearest[close[nearer]], gap[close[nearer]] = number, distance[nearer]
+        if shape is not None and len(rows):
+            distance = np.abs(shape.signed_distance(points[rows]))
+            nearer = distance < gap[rows]
+            nearest[rows[nearer]], gap[rows[nearer]] = number, distance[nearer]
     return nearest

@@ -26,6 +26,9 @@ from caryatid.sensing.views import Cloud, View, depth_behind
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
+PLAIN = 0.02
+"""How much the shares of red, green and blue differ on a thing of one colour [1]."""
+
 
 def segment(
     view: View,
@@ -151,8 +154,7 @@ def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labe
     least, get numbers above n.
     """
     result = labels.copy()
-    shares: Array = rgb.astype(np.float64) + 1.0
-    shares /= shares.sum(axis=-1, keepdims=True)  # Shading leaves the shares of the colours as they are.
+    shares = colour_shares(rgb)
     patch = _colour_patches(labels, shares)
     sizes, part_of = np.bincount(patch.ravel()), np.zeros(int(patch.max()) + 1, dtype=np.int32)
     part_of[patch] = labels
@@ -162,8 +164,7 @@ def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labe
         if len(pieces) < 2 or sizes[pieces].sum() < 0.9 * sizes[part_of == part].sum():
             continue
         colours = {k: shares[patch == k] for k in pieces.tolist()}
-        # A plain colour spreads by a quarter of what sets two apart, 0.08.
-        if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours.values()) > 0.02:
+        if max(np.sqrt(colour.var(axis=0).sum()) for colour in colours.values()) > PLAIN:
             continue
         loose = ~np.isin(patch, pieces)
         nearest = ndimage.distance_transform_edt(loose, return_distances=False, return_indices=True)
@@ -172,6 +173,13 @@ def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labe
             for piece in pieces[1:]:
                 result[piece_of == piece] = result.max() + 1
     return result
+
+
+def colour_shares(rgb: NDArray[np.uint8]) -> Array:
+    """Shares of red, green and blue (N, 3) or (H, W, 3) of such colours, which shading leaves as they are."""
+    bright = rgb.astype(np.float64) + 1.0
+    shares: Array = bright / bright.sum(axis=-1, keepdims=True)
+    return shares
 
 
 def _colour_patches(labels: Labels, shares: Array) -> NDArray[np.intp]:
@@ -184,7 +192,7 @@ def _colour_patches(labels: Labels, shares: Array) -> NDArray[np.intp]:
     up, left = np.s_[:-1], np.s_[:, :-1]
     for here, there, between in ((down, up, np.s_[1::2, ::2]), (right, left, np.s_[::2, 1::2])):
         step = shares[here] - shares[there]
-        alike = np.einsum("hwc,hwc->hw", step, step) < 0.04**2
+        alike = np.einsum("hwc,hwc->hw", step, step) < (2.0 * PLAIN) ** 2
         connected[between] = alike & (labels[here] == labels[there]) & (labels[here] > 0)
     return np.asarray(ndimage.label(connected)[0][::2, ::2], dtype=np.intp)
 
@@ -196,7 +204,7 @@ def _borders_are_clean(piece_of: NDArray[np.intp], colours: dict[int, Array]) ->
         if len(border) < 3:
             continue
         bend, length = np.sqrt(np.linalg.eigvalsh(np.cov(border.T)))
-        alike = np.linalg.norm(colours[first] - colours[second]) <= 0.08
+        alike = np.linalg.norm(colours[first] - colours[second]) <= 4.0 * PLAIN
         if alike or bend > 1.0 + length / 4.0:  # Round bodies bend their borders more.
             return False
     return True
