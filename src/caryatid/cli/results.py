@@ -121,8 +121,8 @@ class OrderCommand(options.Command):
     """Reach this object only, and take away no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
-    risk: Annotated[float | None, options.default_of("rehearsal.risk")] = None
-    """Accept lifts that move another object with this probability."""
+    risk: Annotated[float | None, options.shown("P", "0")] = None
+    """Accept lifts that move another object with at most this probability."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
