@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import struct
 import zlib
@@ -42,6 +43,21 @@ def test_a_segment_of_three_points(tmp_path, views, refused):
     write_recording(tmp_path / "more", [view, *views[1:]])
     assert run_command("extract", tmp_path / "more", *options) == 0
     assert [len(v.graph.objects) for v in read_run(tmp_path / "run").views] == [2, 3, 3]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda v: v.with_pose(v.pose + np.outer([0.0, 0.3, 0.0, 0.0], [0, 0, 0, 1])), "where earlier views"),
+        (lambda v: replace(v, K=v.K * [[1.0], [1e26], [1.0]]), "K cannot be right .* 160×120 pixels"),
+    ],
+    ids=["pose", "camera"],
+)
+def test_a_view_that_cannot_be_right_is_left_out(tmp_path, views, refused, capsys, change, says):
+    write_recording(tmp_path / "wrong", [*views[:2], change(views[2])])
+    assert run_command("extract", tmp_path / "wrong", "--out", tmp_path / "run", "--no-report") == 0
+    assert re.search(f"{says}.*; the view is left out", capsys.readouterr().err)
+    assert len(read_run(tmp_path / "run").views) == 2
 
 
 def a_plane(width, height, T_world_camera, top=0.7):

@@ -31,6 +31,10 @@ class InputError(CaryatidError):
         return type(self), (self.source, self.reason, self.remedy)
 
 
+class WrongViewError(InputError):
+    """A view whose camera or pose cannot be right; others may be."""
+
+
 class PerceptionError(CaryatidError):
     """A view in which nothing can be perceived: no readings, or no support surface."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import NoSurfaceError
+from caryatid.errors import NoSurfaceError, WrongViewError
 from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed
@@ -26,6 +26,7 @@ from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
+from caryatid.segmentation.view_checks import check_camera, check_place
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View, seen_through
@@ -41,6 +42,9 @@ log = logging.getLogger(__name__)
 
 KEPT = "%s; this view is kept until a later one shows the table top"
 """What is logged of a view without a support surface."""
+
+LEFT_OUT = "%s; the view is left out"
+"""What is logged of a view that cannot be right."""
 
 
 class Scene(Pictured):
@@ -156,6 +160,7 @@ class Scene(Pictured):
 
         Raises:
             InputError: Labels are demanded and missing, or a later view has no pose.
+            WrongViewError: The camera or its pose cannot be right; nothing has changed.
             PerceptionError: There are no readings; or no support surface, and no pose.
         """
         kept = len(self.waiting)
@@ -175,13 +180,21 @@ class Scene(Pictured):
             NoSurfaceError: There is no support surface. A view with a pose is kept all the same.
             CaryatidError: As `update`.
         """
+        if isinstance(source, View):
+            check_camera(source, self.config.session.max_coordinate)
         try:
             if self.waiting:
                 self.surface = self._observed(source).surface
             waiting, self.waiting = self.waiting, ()
             for view in (*waiting, source):
-                self._take_in(view)
-                yield view
+                try:
+                    self._take_in(view)
+                except WrongViewError as error:
+                    if view is source:
+                        raise
+                    log.warning(LEFT_OUT, error)
+                else:
+                    yield view
         except NoSurfaceError:
             if isinstance(source, View) and source.T_world_camera is not None:
                 self.waiting = (*self.waiting, source)
@@ -285,14 +298,25 @@ class Scene(Pictured):
 
         Returns:
             The observation, moved, and the labels of the objects some of whose points moved.
+
+        Raises:
+            WrongViewError: Its pose cannot be right; nothing has changed.
         """
-        if not self.config.registration.enabled:
+        config = self.config
+        if not config.registration.enabled:
             return observation, set()
         if self._registration is None:
-            self._registration = ViewRegistration(observation.surface.point_world, self.config.registration)
-        moves = self._registration.add(observation.cloud, same_labels=named)
-        moved = self._models.move({v: T for v, T in moves.items() if v < self.views})
-        return observation.moved(moves[self.views]), moved
+            registration = ViewRegistration(observation.surface.point_world, config.registration)
+        else:
+            registration = self._registration.copy()
+        moves = registration.add(observation.cloud, same_labels=named)
+        observation = observation.moved(moves.pop(self.views))
+        seen = self._models.points.of(SUPPORT_LABEL)
+        if self.surface and self.voxels and observation.view and len(seen) >= config.surface.min_points:
+            aligned = registration.outcomes[-1] not in ("too few partners", "beyond the limits")
+            check_place(observation.cloud, aligned, self.surface, self.voxels, config)
+        self._registration = registration
+        return observation, self._models.move(moves)
 
     def _fused_surface(self, observation: Observation) -> SupportSurface:
         """The support surface from the points of all views."""

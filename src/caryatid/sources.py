@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from caryatid.config import Config, NoiseModel, SegmentationMethod
-from caryatid.errors import InputError, NoSurfaceError
+from caryatid.errors import InputError, NoSurfaceError, WrongViewError
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
@@ -22,7 +22,7 @@ from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
 from caryatid.robots import HUMANOID, Robot, find_robot
 from caryatid.robots.recording import RecordingCamera, RecordingRobot
-from caryatid.scene import KEPT
+from caryatid.scene import KEPT, LEFT_OUT
 from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import Camera, View
 from caryatid.simulation.scenes import load_scene
@@ -206,6 +206,10 @@ def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
             if not left:
                 raise
             log.warning(KEPT, error)
+        except WrongViewError as error:
+            if explorer.step is None:
+                raise
+            log.warning(LEFT_OUT, error)
 
 
 def _check_segments(source: str, points: Mapping[int, int], config: Config) -> None:

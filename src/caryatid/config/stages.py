@@ -574,7 +574,7 @@ class ExportConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class SessionConfig:
-    """Limits on views handed to a session."""
+    """Limits on images handed to a session, and on camera poses wherever views come from."""
 
     max_pixels: Count = 16_000_000
     """Maximum number of pixels of an image [1]; several times what depth cameras have; bounds memory."""
@@ -583,9 +583,8 @@ class SessionConfig:
     max_coordinate: Positive = 1e4
     """Maximum coordinate of a camera [m]; beyond it, units are wrong."""
     common: Share = 0.25
-    """Share of what a view shows around the table that must lie where earlier views saw something [1], within
-    what registration puts right; of right poses nearly all does, even from the other side, of wrong ones a
-    fifth."""
+    """Share of what a view that cannot be registered shows around the table that must lie where earlier views
+    saw something [1]; of right poses a third does, even from the other side, of wrong ones a fifth."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

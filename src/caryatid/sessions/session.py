@@ -42,8 +42,9 @@ from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
 from caryatid.runtime import fingerprint
 from caryatid.scene import KEPT, Scene
+from caryatid.segmentation.view_checks import described
 from caryatid.sensing.views import View
-from caryatid.sessions.captures import CameraRecord, Capture, check_view
+from caryatid.sessions.captures import CameraRecord, Capture
 from caryatid.sessions.next_view import NextView, given_candidates, reached_candidates, table_floor
 
 FORMAT: Final = {"format": "caryatid/session", "version": 1}
@@ -273,7 +274,7 @@ class Session:
                 )
             return self._added()
         decoded = self._decode(capture)
-        check_view(decoded, self.scene, self._first)
+        self._check_alike(decoded)
         scene = self.scene.copy()
         graph_text(scene.update(decoded))  # a view whose graph cannot be written is refused, and not kept
         with StagedFolder(self._folder(self.views), durable=True) as folder:
@@ -345,6 +346,22 @@ class Session:
     def _check_writable(self) -> None:
         if self._lock is None:
             raise InputError(self.path, "is closed, or open to be read only", "open it again to change it")
+
+    def _check_alike(self, view: View) -> None:
+        """Refuse a view without labels or with unexpected ones, or of another camera than the first's."""
+        first, segmentation = self._first, self.beginning.segmentation
+        if segmentation == "labels" and view.labels is None:
+            remedy = "give a label image, or a session with --segmentation auto"
+            raise InputError(view.name, "has no labels", remedy)
+        if first is None:
+            return
+        if segmentation is None and (first.labels is None) != (view.labels is None):
+            reason = f"has {'no ' if view.labels is None else ''}labels, unlike the views so far"
+            raise InputError(view.name, reason, "give them for every view, or for none")
+        same_size = view.depth.shape == first.depth.shape
+        if not same_size or not np.allclose(view.K, first.K, atol=1e-3 * float(first.K[0, 0])):
+            reason = f"its camera has {described(view)}, that of the views so far has {described(first)}"
+            raise InputError(view.name, reason, "use the same camera, or a new session")
 
     def _folder(self, number: int) -> Path:
         return self.path / "views" / f"{number:06d}"

@@ -1,0 +1,101 @@
+"""Which views cannot be right: by their camera, and by what earlier views have shown."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from caryatid.config import Config
+from caryatid.errors import WrongViewError
+from caryatid.geometry.transforms import Array
+from caryatid.segmentation.support_plane import SupportSurface
+from caryatid.sensing.views import Cloud, View
+from caryatid.sensing.voxel_map import FREE, VoxelMap
+
+NEAR = np.concatenate([np.zeros((1, 3), dtype=np.intp), np.eye(3, dtype=np.intp), -np.eye(3, dtype=np.intp)])
+"""A voxel and those that share a face with it."""
+COARSER = 4
+"""Edge of the cells in which views are compared [voxels]; points of small images are nearer to each other."""
+THROUGH, STRAY = 0.2, 0.01
+"""Shares of what a view shows over the table and of the table that may lie where earlier views looked through
+[1]: of right poses hardly anything does, of wrong ones most often a quarter and a tenth."""
+
+
+def check_camera(view: View, max_coordinate: float) -> None:
+    """Refuse a view whose camera or units cannot be right; coordinates are up to a largest one [m].
+
+    Raises:
+        WrongViewError: Its camera is implausible, or pose or depth are in other units than metres.
+    """
+    height, width = view.depth.shape
+    (fx, _, cx), (_, fy, cy) = view.K[:2]
+    pinhole = np.allclose(view.K, [[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], atol=1e-3 * fx)
+    # Focal lengths of 0.05 and 50 image widths are 168° and 1° of view.
+    wide = min(fx, fy) >= 0.05 * width and max(fx, fy) <= 50.0 * width
+    if not (pinhole and wide and -width <= cx <= 2 * width and -height <= cy <= 2 * height):
+        remedy = "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels of this image"
+        raise WrongViewError(view.name, f"K cannot be right for a camera with {described(view)}", remedy)
+    far = 0.0 if view.T_world_camera is None else float(np.abs(view.T_world_camera[:3, 3]).max())
+    if far > max_coordinate:
+        reason = f"the camera is {far:.4g} m from the world's origin"
+        raise WrongViewError(view.name, reason, "give T_world_camera in metres")
+    if float(view.depth.max(initial=0.0)) > max_coordinate:
+        raise WrongViewError(view.name, f"holds depths of {view.depth.max():.4g} m", "give depth in metres")
+
+
+def check_place(
+    cloud: Cloud, aligned: bool, surface: SupportSurface, voxels: VoxelMap, config: Config
+) -> None:
+    """Refuse a view whose camera is below the table, or that contradicts what earlier views saw.
+
+    Things may have been moved: then the table is still where it was, and the view can be aligned with it.
+
+    Args:
+        cloud: What the view shows, registered.
+        aligned: Whether registration found what it shows in earlier views.
+        surface: The support surface.
+        voxels: What earlier views saw around it.
+        config: All settings.
+
+    Raises:
+        WrongViewError: Its pose cannot be right.
+    """
+    wrong = _wrong_place(cloud, aligned, surface, voxels, config)
+    if wrong is not None:
+        convention = "p_world = T_world_camera @ p_camera, in metres, in the frame of the first view"
+        reason = f"its pose cannot be right, {wrong}"
+        raise WrongViewError(cloud.name, reason, f"check T_world_camera: {convention}")
+
+
+def _wrong_place(
+    cloud: Cloud, aligned: bool, surface: SupportSurface, voxels: VoxelMap, config: Config
+) -> str | None:
+    def height(points_world: Array) -> Array:
+        return (points_world - surface.point_world) @ surface.normal_world
+
+    eye_world = cloud.viewpoint_world
+    if eye_world is not None and height(eye_world) <= 0.0:
+        return f"the camera would be {-height(eye_world):.2f} m below the table top"
+    points = cloud.points_world[:: max(1, len(cloud.points_world) // 20_000)]
+    voxel = np.floor((points - voxels.origin_world) / voxels.config.size).astype(np.intp)
+    within = ((voxel > 0) & (voxel < np.array(voxels.hits.shape) - 1)).all(axis=1)
+    if not within.any():
+        return "nothing it shows is anywhere near the table"
+    seen = np.zeros(np.array(voxels.hits.shape) // COARSER + 1, dtype=np.bool_)
+    seen[tuple(voxels.occupied // COARSER)] = True
+    common = float(seen[tuple(voxel[within].T // COARSER)].mean())
+    if not aligned and common < config.session.common:
+        return f"only {common:.0%} of what it shows is where earlier views saw anything"
+    states = voxels.states[tuple((voxel[within][:, None] + NEAR).transpose(2, 0, 1))]
+    free, over = (states == FREE).all(axis=1), height(points[within]) > 2.0 * config.surface.tolerance
+    on = np.abs(height(points[within])) <= 2.0 * config.surface.tolerance
+    through, stray = (float(free[some].mean()) if some.any() else 0.0 for some in (over, on))
+    if through > THROUGH and (stray > STRAY or not aligned):
+        return f"{through:.0%} of what it shows over the table is where earlier views looked through"
+    return None
+
+
+def described(view: View) -> str:
+    """Size of its images, focal lengths and centre of a view's camera."""
+    height, width = view.depth.shape
+    (fx, _, cx), (_, fy, cy) = view.K[:2]
+    return f"{width}×{height} pixels, focal lengths {fx:.4g}, {fy:.4g} and centre {cx:.4g}, {cy:.4g} px"
