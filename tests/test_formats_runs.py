@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -130,6 +132,26 @@ def test_an_older_run_is_replaced_at_the_end_and_not_before(tmp_path):
     assert read_run(tmp_path / "RUN").record["seed"] == 2
     assert not (tmp_path / "RUN/views/02").exists()
     assert [p.name for p in tmp_path.iterdir()] == ["RUN"]
+
+
+def test_a_run_is_not_replaced_where_it_holds_what_no_run_wrote(tmp_path):
+    write_run(tmp_path / "RUN", views=2, seed=1)
+    (tmp_path / "RUN/views/notes.txt").write_text("mine")
+    with refusal(tmp_path / "RUN", "holds other files (views/notes.txt)"):
+        writer(tmp_path / "RUN")
+    assert read_run(tmp_path / "RUN").record["seed"] == 1
+
+
+def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    write_run(tmp_path / "RUN", views=1, seed=1)
+    (tmp_path / "RUN").rename(tmp_path / f".partial-RUN-{dead.pid}-0123abcd-replaced")
+    (tmp_path / f".partial-RUN-{dead.pid}-0123abcd").mkdir()
+    (tmp_path / f".partial-RUN-{os.getpid()}-0123abcd").mkdir()
+    with writer(tmp_path / "RUN", seed=2):
+        assert read_run(tmp_path / "RUN").record["seed"] == 1
+    assert {p.name for p in tmp_path.iterdir()} == {"RUN", f".partial-RUN-{os.getpid()}-0123abcd"}
 
 
 @pytest.mark.parametrize("name", ["run.json", "thesis.tex"])

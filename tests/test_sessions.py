@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import npy, wall_of
+from filelock import FileLock
 
 from caryatid.config import Config
 from caryatid.errors import CaryatidError, InputError, PlanningError
@@ -456,6 +457,10 @@ def test_a_folder_that_is_no_session_is_said(tmp_path):
         with pytest.raises(InputError, match="holds no session; begin one"):
             Session.open(path)
     assert not (tmp_path / "lock").exists()
+    Session.begin(tmp_path / "new").close()
+    (tmp_path / "new/views").rmdir()
+    with pytest.raises(InputError, match="new/views: the file is missing; put the folder of the views back"):
+        Session.open(tmp_path / "new")
 
 
 def test_a_session_is_not_begun_where_something_is(begun, tmp_path):
@@ -465,6 +470,10 @@ def test_a_session_is_not_begun_where_something_is(begun, tmp_path):
         with pytest.raises(SessionConflictError, match="holds a session or other files"):
             Session.begin(taken)
     assert contents(begun) == before
+    (tmp_path / "soon").mkdir()
+    with FileLock(tmp_path / "soon/lock"), pytest.raises(SessionBusyError):
+        Session.begin(tmp_path / "soon")
+    assert not (tmp_path / "soon/session.json").exists()
     with pytest.raises(InputError, match="no planner 'juggler'"):
         Session.begin(tmp_path / "new", planner="juggler")
     assert not (tmp_path / "new").exists()

@@ -44,7 +44,8 @@ class RunWriter(StagedFolder):
     """Writes a run folder step by step, in a `with` block at whose end the folder is put in its place.
 
     Ctrl-C ends the block too: the views so far are kept. Any other error leaves nothing behind. A run folder
-    already there is replaced at the end of the block and not before; any other folder is never touched.
+    already there is replaced at the end of the block and not before; a folder that holds anything else, be it
+    beside a run, is never touched.
 
     Args:
         folder: RUN.
@@ -60,7 +61,7 @@ class RunWriter(StagedFolder):
     """
 
     def __init__(self, folder: str | Path, config: Config, about: Mapping[str, Any]) -> None:
-        super().__init__(folder, replaces=is_run)
+        super().__init__(folder, replaces=_own_files)
         self.more: dict[str, Any] = {}
         self.files: dict[str, bytes] = {}
         self._about = dict(about) | {"settings": asdict(config)}
@@ -123,9 +124,9 @@ class RunWriter(StagedFolder):
         scores = [score for _, _, score in self._views if score is not None]
         document |= ({"scores": scores} if scores else {}) | self.more | more
         self.remove(_view_folder(len(self._views)))
-        written = {"graph.json": graph_text(graph).encode(), "run.json": json_text(document).encode()}
-        for path, content in (written | self.files).items():
+        for path, content in ({"graph.json": graph_text(graph).encode()} | self.files).items():
             self.write(path, content)
+        self.write("run.json", json_text(document | {"files": sorted(self.written)}).encode())
         self.publish()
 
 
@@ -238,6 +239,13 @@ def is_run(folder: Path) -> bool:
         return read_json(folder / "run.json").get("format") == FORMAT
     except InputError:
         return False
+
+
+def _own_files(folder: Path) -> set[str]:
+    """Files of a run folder that may be replaced: what run.json says was written, and what is made of it."""
+    if not is_run(folder):
+        return set()
+    return {"run.json", "report.html", *map(str, read_json(folder / "run.json").get("files", []))}
 
 
 def _view_folder(index: int) -> str:

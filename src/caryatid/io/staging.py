@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Self
 
 from caryatid.errors import InputError
 
-PARTIAL = ".partial-"
-"""Beginning of the names of files and folders in the making; a killed process leaves them behind."""
+PARTIAL, REPLACED = ".partial-", "-replaced"
+"""Beginning of the names of files and folders in the making, and end of those that give way; a killed process
+leaves them behind."""
 
 
 class StagedFolder:
@@ -25,24 +27,32 @@ class StagedFolder:
 
     Args:
         folder: Where the folder shall be.
-        replaces: Whether a folder that is not empty may be replaced; None replaces none.
+        replaces: Which files of a folder that is there may be replaced, by their paths in it; one that holds
+            others is left as it is. None replaces no file.
         durable: Wait until every file, and the folder itself, is on the disk.
 
     Attributes:
         folder: Where the folder shall be.
+        written: Paths of the files written so far.
 
     Raises:
         InputError: The place is taken by something that may not be replaced, or cannot be written.
     """
 
     def __init__(
-        self, folder: str | Path, *, replaces: Callable[[Path], bool] | None = None, durable: bool = False
+        self,
+        folder: str | Path,
+        *,
+        replaces: Callable[[Path], Collection[str]] | None = None,
+        durable: bool = False,
     ) -> None:
         self.folder = Path(folder)
         self._place = self.folder.resolve()
         self._replaces, self._durable = replaces, durable
         self._partial = _partial(self._place)
-        self._old = self._partial.with_name(f"{self._partial.name}-replaced")
+        self._old = self._partial.with_name(f"{self._partial.name}{REPLACED}")
+        self.written: set[str] = set()
+        _recover(self._place)
         self._made = [parent for parent in self._place.parents if not parent.exists()]
         self._check_place()
         try:
@@ -75,6 +85,7 @@ class StagedFolder:
         with write_errors(self.folder):
             path.parent.mkdir(parents=True, exist_ok=True)
             _write(path, content, self._durable)
+        self.written.add(name)
 
     def remove(self, name: str) -> None:
         """Remove a subfolder, `name` relative to the folder, if it is there."""
@@ -109,10 +120,12 @@ class StagedFolder:
         )
         if not self._place.is_dir():
             raise InputError(self.folder, "already exists and is not a folder", remedy)
+        own = self._replaces(self._place) if self._replaces else ()
         with write_errors(self.folder):
-            empty = not any(self._place.iterdir())
-        if not empty and not (self._replaces and self._replaces(self._place)):
-            raise InputError(self.folder, "already exists and holds other files", remedy)
+            for path in self._place.rglob("*"):
+                name = path.relative_to(self._place).as_posix()
+                if name not in own and (path.is_symlink() or not path.is_dir()):
+                    raise InputError(self.folder, f"already exists and holds other files ({name})", remedy)
 
 
 def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
@@ -208,7 +221,31 @@ def sync(path: Path) -> None:
 
 
 def _partial(path: Path) -> Path:
-    return path.with_name(f"{PARTIAL}{path.name}-{secrets.token_hex(4)}")
+    return path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{secrets.token_hex(4)}")
+
+
+def _recover(place: Path) -> None:
+    """Remove what killed processes left in the making of a folder; what had given way comes back."""
+    name = re.compile(rf"{re.escape(PARTIAL + place.name)}-(\d+)-[0-9a-f]{{8}}({REPLACED})?")
+    with suppress(OSError):
+        for path in place.parent.iterdir():
+            if (found := name.fullmatch(path.name)) and not _runs(int(found[1])):
+                if found[2] and not place.exists():
+                    path.rename(place)
+                else:
+                    shutil.rmtree(path, ignore_errors=True)
+
+
+def _runs(process: int) -> bool:
+    """Whether a process may still run: unless it is known not to."""
+    try:
+        if os.name == "posix":
+            os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 def _write(path: Path, content: bytes, durable: bool) -> None:

@@ -36,7 +36,15 @@ from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import png, read_mask
 from caryatid.io.json_files import parse_json, read_json
-from caryatid.io.staging import StagedFolder, clear_partials, remove_folder, sync, write_errors, write_file
+from caryatid.io.staging import (
+    StagedFolder,
+    clear_partials,
+    read_errors,
+    remove_folder,
+    sync,
+    write_errors,
+    write_file,
+)
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
 from caryatid.robots import HUMANOID, Surroundings, find_robot, view_sphere_of
@@ -194,18 +202,27 @@ class Session:
         """
         make_planner(planner)
         find_robot(robot)
+        mask = None if ignore is None else png(np.asarray(ignore, dtype=np.uint8))
+        beginning = Beginning(segmentation, seed, planner, robot, config or Config(), mask)
         folder = Path(path)
         with write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            if any(p.name != "views" and not p.name.startswith(".") for p in folder.iterdir()):
+            taken = any(p.name not in ("views", "lock") and p.name[0] != "." for p in folder.iterdir())
+        path = folder / "session.json"
+        lock = None if taken else _locked(folder / "lock")
+        try:
+            if lock is None or path.exists():
                 reason = "already holds a session or other files"
                 raise SessionConflictError(folder, reason, "use that session, or give a new folder")
-            (folder / "views").mkdir(exist_ok=True)
-        mask = None if ignore is None else png(np.asarray(ignore, dtype=np.uint8))
-        beginning = Beginning(segmentation, seed, planner, robot, config or Config(), mask)
-        write_file(folder / "session.json", beginning.to_json().encode(), durable=True)
-        sync(folder.resolve().parent)
-        return cls.open(folder)
+            with write_errors(folder):
+                (folder / "views").mkdir(exist_ok=True)
+            write_file(path, beginning.to_json().encode(), durable=True)
+            sync(folder.resolve().parent)
+            return cls(folder, beginning, lock)
+        except BaseException:
+            if lock is not None:
+                lock.release()
+            raise
 
     @classmethod
     def open(cls, path: str | PathLike[str], *, read_only: bool = False) -> Session:
@@ -367,7 +384,8 @@ class Session:
         return self.path / "views" / f"{number:06d}"
 
     def _kept(self) -> list[CameraRecord]:
-        folders = sorted((self.path / "views").glob("[0-9]*"))
+        with read_errors(self.path / "views", "put the folder of the views back"):
+            folders = sorted(p for p in (self.path / "views").iterdir() if p.name[0].isdigit())
         for number, folder in enumerate(folders):
             if folder != self._folder(number):
                 remedy = "put it back, or take the later ones out"
