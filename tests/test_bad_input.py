@@ -57,7 +57,9 @@ def test_a_view_that_cannot_be_right_is_left_out(tmp_path, views, refused, capsy
     write_recording(tmp_path / "wrong", [*views[:2], change(views[2])])
     assert run_command("extract", tmp_path / "wrong", "--out", tmp_path / "run", "--no-report") == 0
     assert re.search(f"{says}.*; the view is left out", capsys.readouterr().err)
-    assert len(read_run(tmp_path / "run").views) == 2
+    run = read_run(tmp_path / "run")
+    assert len(run.views) == 2
+    assert [w.endswith("; the view is left out") for w in run.record["warnings"]] == [True]
 
 
 def a_plane(width, height, T_world_camera, top=0.7):

@@ -28,11 +28,15 @@ class Output(logging.Handler):
     Args:
         json: Whether the result is one JSON document, and nothing else is printed.
         quiet: Whether no progress is printed.
+
+    Attributes:
+        warnings: What the package has warned of so far.
     """
 
     def __init__(self, *, json: bool, quiet: bool) -> None:
         super().__init__(logging.INFO)
         self.json = json
+        self.warnings: list[str] = []
         self.progress = Console(
             stderr=True,
             quiet=quiet or json,
@@ -46,7 +50,9 @@ class Output(logging.Handler):
         logger.setLevel(logging.INFO)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print what was logged."""
+        """Print what was logged, and keep warnings."""
+        if record.levelno >= logging.WARNING:
+            self.warnings.append(record.getMessage())
         self.say(record.getMessage())
 
     def say(self, text: str) -> None:

@@ -218,6 +218,8 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     config, record = read_config(run), run.record
     settings = {"source": record["source"], "seed": record["seed"]} | record["options"]
     settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
+    if record.get("warnings"):
+        settings["warnings"] = "; ".join(record["warnings"])
     report = make_report(
         f"caryatid: {Path(record['source']).name}",
         read_steps(run),

@@ -64,6 +64,7 @@ class RunCommand(options.Command):
         output.say(f"{name}: {census(graph)} after {count_of(len(writer.steps), 'view')}")
         output.say(f"run: {self.out}" + ("" if self.no_report else ", open its report.html"))
         document: dict[str, Any] = {"run": str(self.out), "graph": graph_to_json(graph)}
+        document["warnings"] = output.warnings
         if self.profile:
             document["profile"], shown = profile(writer.steps)
             output.result(document, shown)
@@ -380,6 +381,8 @@ def _record(
     from caryatid.evaluation.scores import score
 
     last = None
+    if writer is not None:
+        writer.more["warnings"] = output.warnings
     for step in steps:
         scored = None if truth is None else score(step.graph, truth)
         if writer is not None:
