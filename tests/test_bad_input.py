@@ -48,7 +48,10 @@ def test_a_segment_of_three_points(tmp_path, views, refused):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda v: v.with_pose(v.pose + np.outer([0.0, 0.3, 0.0, 0.0], [0, 0, 0, 1])), "where earlier views"),
+        (
+            lambda v: v.with_pose(v.pose + np.outer([0.0, 0.0, 0.4, 0.0], [0, 0, 0, 1])),
+            "where earlier views saw",
+        ),
         (lambda v: replace(v, K=v.K * [[1.0], [1e26], [1.0]]), "K cannot be right .* 160×120 pixels"),
     ],
     ids=["pose", "camera"],
@@ -60,6 +63,14 @@ def test_a_view_that_cannot_be_right_is_left_out(tmp_path, views, refused, capsy
     run = read_run(tmp_path / "run")
     assert len(run.views) == 2
     assert [w.endswith("; the view is left out") for w in run.record["warnings"]] == [True]
+
+
+def test_a_view_that_contradicts_earlier_ones_is_warned_of(tmp_path, views, capsys):
+    aside = views[2].with_pose(views[2].pose + np.outer([0.0, 0.3, 0.0, 0.0], [0, 0, 0, 1]))
+    for name, last in (("right", views[2]), ("wrong", aside)):
+        write_recording(tmp_path / name, [*views[:2], last])
+        assert run_command("extract", tmp_path / name, "--out", tmp_path / "run", "--no-report") == 0
+        assert ("where earlier views looked through" in capsys.readouterr().err) == (name == "wrong")
 
 
 def a_plane(width, height, T_world_camera, top=0.7):
