@@ -46,6 +46,20 @@ def test_it_ends_where_no_view_promises_more_than_its_path_costs():
     assert 1 < len(random) < 8, "what is left to see does not depend on who chooses"
 
 
+def test_with_a_goal_it_ends_once_it_is_known_what_that_moves():
+    alone, steps = len(exploration(LONG)), exploration(LONG, goal="o1")
+    assert len(steps) < alone
+    assert steps[-1].stop == "what moves without o1 is known with a probability of 0.95"
+    never = exploration(LONG, goal="o99")
+    assert len(never) == alone
+    assert never[-1].stop.endswith("; o99 has not been found")
+    assert [s.stop for s in exploration(LONG, until=0.6)][1:] == [
+        "every support is known with a probability of 0.6"
+    ]
+    with pytest.raises(InputError, match=r"0.5 is not above 0.5 and at most 1"):
+        exploration(until=0.5)
+
+
 def test_each_view_is_taken_where_the_one_before_decided(steps):
     assert steps[0].angle_travelled == steps[0].path_travelled == 0.0
     for before, after in itertools.pairwise(steps):

@@ -17,7 +17,7 @@ import pytest
 from conftest import SMALL
 from scipy.spatial import Delaunay
 
-from caryatid.config import ActiveVisionConfig, RobotConfig, VoxelConfig
+from caryatid.config import ActiveVisionConfig, RobotConfig, SupportConfig, VoxelConfig
 from caryatid.errors import InputError, PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere
@@ -34,6 +34,7 @@ from caryatid.planning.expected_visibility import (
     surface_samples,
     visibility,
 )
+from caryatid.planning.goals import settled
 from caryatid.planning.planners import BUILT_IN, VOLUMETRIC, make_planner
 from caryatid.planning.planners.baselines import STOPS, RandomPlanner
 from caryatid.planning.planners.volumetric import image_rays, ray_information
@@ -499,6 +500,37 @@ def worked_out():
 
 
 VISITED = np.stack([HOME, direction(2.0, 0.5), direction(-0.9, 0.6)])
+RIDER, ASIDE = box(2, (0.0, 0.0, 0.88), (0.06, 0.06, 0.06)), box(3, (0.2, -0.35, 0.8), (0.1, 0.1, 0.1))
+
+
+def about_aside(x, y, z):
+    return (np.abs(x - 0.2) < 0.1) & (np.abs(y + 0.35) < 0.1)
+
+
+def over_cube(x, y, z):
+    return (np.abs(x) < 0.05) & (np.abs(y) < 0.05) & (z > 0.85) & (z < 0.9)
+
+
+@pytest.mark.parametrize(
+    ("probability", "unseen", "expected"),
+    [
+        (0.96, None, True),
+        (0.04, None, True),
+        (0.94, None, False),
+        (0.06, None, False),
+        (1.0, over_cube, False),
+    ],
+)
+def test_a_goal_is_settled_once_it_is_known_what_moves_and_that_nothing_unseen_rests_on_it(
+    probability, unseen, expected
+):
+    supports = (replace(ON_TABLE, probability=0.7), Support("o1", "o2", probability=probability))
+    graph = SupportGraph((TABLE, CUBE, RIDER), supports)
+    voxels = half_known(unseen, TABLE, CUBE, RIDER) if unseen else known(TABLE, CUBE, RIDER)
+    assert settled(graph, "o1", 0.95, voxels, SupportConfig()) is expected
+    assert settled(graph, "o2", 0.95, voxels, SupportConfig())
+    assert not settled(graph, "o9", 0.95, voxels, SupportConfig())
+    assert settled(graph, None, 0.7, voxels, SupportConfig()) is (probability >= 0.7)
 
 
 class TestHiddenSurface:
@@ -558,6 +590,20 @@ class TestHiddenSurface:
         repelled = bumps + inhibition_of_return(VISITED, SPHERE.directions, config)
         elsewhere = np.setdiff1d(np.arange(40_000), OPEN.indices)
         np.testing.assert_allclose(decision.sphere_saliency[elsewhere], repelled[elsewhere])
+
+    def test_with_a_goal_only_what_its_removal_depends_on_counts(self):
+        objects, supports = (CUBE, RIDER, ASIDE), (ON_TABLE, Support("o1", "o2"), Support("o0", "o3"))
+        voxels = half_known(about_aside, TABLE, *objects)
+        now, saliency = replace(state(objects, supports), voxels=voxels), {}
+        asked = {"o1": {"o1", "o2"}, "o2": {"o1", "o2"}, "o3": {"o3", SPACE}, "o9": None, None: None}
+        for goal, expected in asked.items():
+            decision = decide("support", replace(now, goal=goal))
+            hidden = [p for p in decision.points_of_interest if "support" not in p.why]
+            found = {p.subject[0] if p.subject else SPACE for p in hidden}
+            assert found == (expected or {"o1", "o2", "o3", SPACE}), goal
+            saliency[goal] = decision.candidate_saliency
+        np.testing.assert_array_equal(saliency["o9"], saliency[None])
+        assert (saliency["o3"] <= saliency[None]).all(), "what counts is worth no more than without a goal"
 
     def test_the_more_a_path_costs_the_shorter_it_is(self):
         lengths = []

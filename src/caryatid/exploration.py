@@ -16,6 +16,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
+from caryatid.planning.goals import settled
 from caryatid.planning.planners import make_planner
 from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of, waypoints_of
@@ -26,6 +27,8 @@ from caryatid.scene import Scene, Stopwatch
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
 
+UNTIL = 0.95
+"""Probability from which what moves without the goal counts as known [1], where none is given."""
 ATTEMPTS = 20
 """Refusals by the robot in one step before the loop stops [1]; a coarse map errs about every tenth view."""
 
@@ -106,14 +109,19 @@ class Explorer:
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
         masks: Gives views their masks, or None to take them as they come.
+        goal: Id of an object that is to be taken away: what that depends on decides where planner `support`
+            looks, and when to stop. It may be one that no view has shown yet.
+        until: Probability [1], above 0.5, from which a support counts as known, or with a goal whether an
+            object moves; once all are, looking further does not pay. None = 0.95 with a goal, else never.
 
     Attributes:
         scene: What is known so far.
         robot: The robot.
+        goal: Id of the object that is to be taken away, or None.
         step: The newest step, or None before the first view.
 
     Raises:
-        InputError: There is no such planner, or masks are given and not to be used.
+        InputError: There is no such planner, masks are given and not to be used, or `until` is out of range.
     """
 
     def __init__(
@@ -126,11 +134,19 @@ class Explorer:
         segmentation: SegmentationMethod | None = None,
         seed: int = 0,
         masks: Callable[[View], View] | None = None,
+        goal: str | None = None,
+        until: float | None = None,
     ) -> None:
+        if until is not None and not 0.5 < until <= 1.0:
+            raise InputError(
+                "until", f"{until:g} is not above 0.5 and at most 1", "give a probability, such as 0.95"
+            )
         if masks is not None and segmentation == "auto":
             raise InputError("masks", "are given, segmentation auto uses none", "leave one of the two out")
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
         self._masks = masks
+        self.goal = goal
+        self._until = UNTIL if until is None and goal is not None else until
         self.robot = robot
         self.step: Step | None = None
         self._camera = camera
@@ -219,7 +235,7 @@ class Explorer:
         candidates: Candidates | None = None
         try:
             candidates = robot.candidates(step.sphere)
-            state = _state(self.scene, step.sphere, step.visited, candidates)
+            state = self._state(candidates)
             decision, candidates = _decide(state, robot, self._planner, self.scene.seed)
         except PlanningError as error:
             stop = str(error)
@@ -237,7 +253,13 @@ class Explorer:
         step = self._newest()
         if step.decision is None or step.candidates is None:
             return step.stop
-        state = _state(self.scene, step.sphere, step.visited, step.candidates)
+        state = self._state(step.candidates)
+        goal, until, config = self.goal, self._until, self.scene.config.support
+        # Without a goal nothing asks whether a first view hides objects.
+        asked = until if goal is not None or step.index > 0 else None
+        if asked is not None and settled(state.graph, goal, asked, state.voxels, config):
+            what = "every support" if goal is None else f"what moves without {goal}"
+            return f"{what} is known with a probability of {asked:g}"
         return reason_to_stop(state, self.scene.changed, self._planner, step.decision)
 
     def choose(self, chosen: Decision | int) -> Step:
@@ -267,7 +289,7 @@ class Explorer:
             raise PlanningError("there is no such view to choose")
         rated = step.decision.candidate_saliency
         saliency = 0.0 if rated is None else float(rated[index])
-        cost = float(path_cost(_state(self.scene, step.sphere, step.visited, step.candidates))[index])
+        cost = float(path_cost(self._state(step.candidates))[index])
         return replace(
             step.decision,
             T_world_camera=step.candidates.T_world_camera[index],
@@ -295,6 +317,10 @@ class Explorer:
             raise PlanningError("there is no camera; hand the view to look()")
         return self._camera.capture(self._moving().T_world_camera)
 
+    def _state(self, candidates: Candidates) -> PlanningState:
+        step = self._newest()
+        return replace(_state(self.scene, step.sphere, step.visited, candidates), goal=self.goal)
+
     def _moving(self) -> Robot:
         if self.robot is None:
             raise PlanningError("there is no robot to go anywhere")
@@ -315,6 +341,8 @@ def explore(
     segmentation: SegmentationMethod | None = None,
     seed: int = 0,
     masks: Callable[[View], View] | None = None,
+    goal: str | None = None,
+    until: float | None = None,
     early_stop: bool = True,
 ) -> Iterator[Step]:
     """Look around until no view is expected to show more than its path costs, or the views are used up.
@@ -327,7 +355,9 @@ def explore(
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
         masks: Gives views their masks, or None to take them as they come.
-        early_stop: Stop before the views are used up, as `config.active.stop` says.
+        goal: As of `Explorer`.
+        until: As of `Explorer`.
+        early_stop: Stop before the views are used up, as `config.active.stop` and `until` say.
 
     Yields:
         A step after each view.
@@ -336,7 +366,7 @@ def explore(
         CaryatidError: A view cannot be used, or the planner does not exist.
     """
     known: dict[str, Any] = {"config": config, "segmentation": segmentation, "seed": seed, "masks": masks}
-    explorer = Explorer(camera, robot, planner=planner, **known)
+    explorer = Explorer(camera, robot, planner=planner, goal=goal, until=until, **known)
     while True:
         step = explorer.look()
         if step.index + 1 < explorer.scene.config.active.max_views:
@@ -346,6 +376,8 @@ def explore(
             reason = _used_up(step.index + 1)
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
+        if step.stop is not None and goal is not None and all(o.id != goal for o in step.graph.objects):
+            step = replace(step, stop=f"{step.stop}; {goal} has not been found")
         yield step
         if step.decision is None:
             return

@@ -80,8 +80,8 @@ class Exploring(options.ExploringCommand):
     no_early_stop: options.Flag = False
     """Continue to the maximum number of views; otherwise stop when no view is worth its path."""
 
-    def explore(self, config: Config) -> tuple[Source, Iterator[Step]]:
-        """Open the source; returns it and the steps of its exploration."""
+    def explore(self, config: Config, **options: Any) -> tuple[Source, Iterator[Step]]:
+        """Open the source; returns it and the steps of its exploration, with these options of `explore`."""
         from caryatid.evaluation.oracle import planner_for
         from caryatid.exploration import explore
 
@@ -91,7 +91,7 @@ class Exploring(options.ExploringCommand):
             source = _opening(self, masks)(config)
         planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
         known |= {"planner": planner, "config": config, "masks": masks}
-        known["early_stop"] = not self.no_early_stop
+        known |= options | {"early_stop": not self.no_early_stop}
         return source, explore(camera, source.robot, **known)
 
 
@@ -106,6 +106,7 @@ class Explore(RunCommand, Exploring):
 
     To try:
       caryatid explore tower --noise carmine --out run
+      caryatid explore clutter --goal o3 --out run
       caryatid explore scene.xml --views 5 --out run
       caryatid explore tower --robot arm:arm.npz --out run
       caryatid explore recording/ --segmentation auto --out run
@@ -113,11 +114,15 @@ class Explore(RunCommand, Exploring):
 
     source: options.SourceName
     """Scene or recording."""
+    goal: Annotated[str | None, options.shown("ID")] = None
+    """Look only at what matters for taking this object away, and stop when it is known what that moves."""
+    until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
+    """Stop when every support is known with this probability, or with --goal what moves and what does not."""
     view: options.Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
 
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
-        source, steps = self.explore(config)
+        source, steps = self.explore(config, goal=self.goal, until=self.until)
         return source.name, source.truth, steps
 
     def __call__(self, config: Config | None = None) -> None:
@@ -360,7 +365,7 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
 
 def _about(command: RunCommand | Dismantle) -> dict[str, Any]:
     """What run.json says of the command."""
-    names = ("robot", "segmentation", "noise", "label_divisor", "level")
+    names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options["preset"] = command.settings.preset
     if isinstance(command, Exploring):

@@ -36,6 +36,7 @@ class PlanningState:
         visited: Unit directions (V, 3) from the centre to the views so far; the last is the current one.
         candidates: The views that can be reached.
         config: Settings of section IV.
+        goal: Id of the object that is to be taken away, which may not be known yet; None = all matter alike.
     """
 
     graph: SupportGraph
@@ -44,6 +45,7 @@ class PlanningState:
     visited: Array
     candidates: Candidates
     config: ActiveVisionConfig
+    goal: str | None = None
 
     def __repr__(self) -> str:
         views, candidates = len(self.visited), len(self.candidates)

@@ -67,7 +67,7 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
     config = config or PhysicsConfig()
     names = {0: scene.table, **scene.object_bodies}
     forces = mean_contact_forces(scene)
-    falling = {a: _displaced_without(scene, a, config) for a in {a for a, _ in forces} - {0}}
+    falling = {a: displaced_without(scene, a, config) for a in {a for a, _ in forces} - {0}}
     gravity = np.linalg.norm(scene.model.opt.gravity)
     weights = {a: scene.model.body_subtreemass[scene.body_id(a)] * gravity for a in names}
     kinds: dict[tuple[int, int], Kind] = {}
@@ -109,8 +109,8 @@ def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
     return {pair: total / steps for pair, total in sums.items()}
 
 
-def _displaced_without(scene: SimulatedScene, label: int, config: PhysicsConfig) -> set[int]:
-    """Which other objects have moved beyond the limits a while after one is taken away."""
+def displaced_without(scene: SimulatedScene, label: int, config: PhysicsConfig) -> set[int]:
+    """Labels of the objects that have moved beyond the limits a while after another one is taken away."""
     data = state_of(scene)
     joint = int(scene.model.body_jntadr[scene.body_id(label)])
     # 100 m up it falls 5 m in the second the others are watched.

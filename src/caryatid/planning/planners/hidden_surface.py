@@ -4,7 +4,7 @@ It keeps the frame of Algorithm 2, c = s − h with inhibition of return over th
 sphere, and asks of each candidate what it would show that no earlier view has: the surface of the fitted
 objects, most of those of which least has been seen; the unseen space on the table in which a supporter may
 stand, most of it among the objects; and the points of Algorithm 1. A point counts when its line of sight is
-free of what was seen occupied and of the fitted shapes.
+free of what was seen occupied and of the fitted shapes. With a goal, only what its removal depends on counts.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from caryatid.planning.expected_visibility import (
     unseen_shares,
     visibility,
 )
+from caryatid.planning.goals import matter
 from caryatid.planning.points_of_interest import (
     PointOfInterest,
     inhibition_of_return,
@@ -85,6 +86,7 @@ def _expected_gain(
     points = replace(points, weights=0.1 * points.weights)
     space = space_samples(state.graph, occluders)
     samples = join([surfaces, points, space])
+    samples = replace(samples, weights=samples.weights * matter(samples, state.graph, state.goal))
     before = np.concatenate([seen, np.zeros(len(space.weights))])
     return samples, shown_anew(samples, before, T_world_camera, occluders, config)
 

@@ -1,0 +1,132 @@
+"""What exploring with a goal saves: is it known what taking an object away moves, and after how many views?
+
+    python benchmarks/goals.py [SCENES…] --goals 2
+
+Goals are drawn at random among a scene's objects. Each is explored for by itself; one exploration without a
+goal, which ends by itself too, is asked about all of them. A prediction is right for an object when it says
+with a probability of at least 0.5 that it moves and it does, or neither. What moves is asked of physics: when
+the goal is taken away at once, as for the ground truth of supports, and when it is lifted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Set
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import tyro
+from measures import Spread, print_table, run_main
+from rich.console import Console
+
+from caryatid.benchmark.episodes import family, open_scene
+from caryatid.benchmark.suites import DENSE
+from caryatid.config import NoiseModel, PhysicsConfig
+from caryatid.config.settings import read_settings
+from caryatid.evaluation.scores import TrueScene
+from caryatid.exploration import explore
+from caryatid.graph import SupportGraph
+from caryatid.manipulation.dismantling import bodies_of, poses_of
+from caryatid.simulation.lifting import Lifting
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.truth import displaced_without
+from caryatid.support.relations import predict_removal
+
+PILES = tuple(f"pile-{6 + k}-{901 + k}" for k in range(16))
+
+
+@dataclass(frozen=True)
+class Args(Spread):
+    """Explore with and without a goal."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*DENSE, *PILES)
+    """Names of built-in scenes, or scene folders."""
+    goals: int = 2
+    """Goals in each scene."""
+    until: float | None = None
+    """Probability from which it is known what moves."""
+    planner: str = "support"
+    """Planner of the views."""
+    noise: NoiseModel = "carmine"
+    """Noise of the simulated camera."""
+    seed: int = 0
+    """Seed of the noise and of the choice of goals."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Settings, e.g. `--set active.effort=0.1`."""
+
+
+def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
+    """Explore one scene without a goal and with each goal: a row for each of these."""
+    name, args = task
+    config, (scene, truth) = read_settings(None, args.set), open_scene(name)
+    bodies = scene.object_bodies
+    names = list(bodies.values())
+
+    def explored(goal: str | None) -> tuple[int, SupportGraph]:
+        simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
+        known: dict[str, Any] = {"planner": args.planner, "segmentation": "labels", "seed": args.seed}
+        known |= {"config": config, "goal": goal, "until": args.until if goal else None}
+        *_, last = explore(simulation.camera, simulation.robot, **known)
+        return last.index + 1, last.graph
+
+    views, graph = explored(None)
+    lifting, rows = Lifting(scene.spec, names), []
+    rng = np.random.default_rng([args.seed, args.scenes.index(name)])
+    for label in rng.choice(list(bodies), min(args.goals, len(bodies)), replace=False).tolist():
+        taken = {bodies[k] for k in displaced_without(scene, label, PhysicsConfig())}
+        lift = lifting.lift(poses_of(scene), names.index(bodies[label]), config.lift)
+        lifted = {names[k] for k in np.flatnonzero(lift.disturbed)}
+        fewer, with_goal = explored(f"o{label}")
+        row = {
+            "scene": name,
+            "goal": f"o{label}",
+            "others": len(names) - 1,
+            "views": fewer,
+            "all views": views,
+        }
+        for which, found in (("", with_goal), ("all ", graph)):
+            moves = predicted(found, f"o{label}", truth, config)
+            for how, true in (("taken", taken), ("lifted", lifted)):
+                row |= {f"{how} moving": len(true), f"{which}{how} right": len(names) - 1 - len(moves ^ true)}
+        rows.append(row)
+    return rows
+
+
+def predicted(graph: SupportGraph, goal: str, truth: TrueScene, config: Any) -> Set[str]:
+    """Names of the bodies that are said to move with the goal; an object that is no body has its id."""
+    if all(o.id != goal for o in graph.objects):
+        return set()
+    bodies = bodies_of(graph, truth)
+    effects = predict_removal(graph, goal, config.support)
+    return {bodies.get(e.object_id, e.object_id) for e in effects if e.probability >= 0.5}
+
+
+def summary(rows: pd.DataFrame) -> dict[str, float]:
+    """Views with a goal and without, and shares of objects, and of goals with all objects, that are right."""
+    sums = rows.sum(numeric_only=True)
+    found = {"goals": len(rows), "views": rows["views"].mean(), "all views": rows["all views"].mean()}
+    found |= {"share of views": sums["views"] / sums["all views"]}
+    for how in ("taken", "lifted"):
+        found[f"{how}: moving"] = sums[f"{how} moving"] / sums["others"]
+        for which in ("", "all "):
+            right = f"{which}{how} right"
+            found[f"{how}: {which}right"] = sums[right] / sums["others"]
+            found[f"{how}: {which}wholly"] = (rows[right] == rows["others"]).mean()
+    return found
+
+
+def main() -> int:
+    """Run the measurement."""
+    args = tyro.cli(Args)
+    parts = args.each(measure, [(scene, args) for scene in args.scenes])
+    rows = pd.DataFrame([row for part in parts for row in part])
+    groups = {str(name): group for name, group in rows.groupby(rows["scene"].map(family))} | {"all": rows}
+    shown = pd.DataFrame({name: summary(group) for name, group in groups.items()})
+    print_table(shown.round(3).rename_axis("scenes").reset_index(), Console(width=160))
+    args.write(rows.to_dict("records"))
+    return 0
+
+
+if __name__ == "__main__":
+    run_main(main)

@@ -1,0 +1,76 @@
+"""A goal: an object that is to be taken away decides where to look, and when enough is known."""
+
+from __future__ import annotations
+
+from typing import TypeGuard
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from caryatid.config import SupportConfig
+from caryatid.geometry.polygons import hull
+from caryatid.graph import SupportGraph
+from caryatid.planning.expected_visibility import SPACE, Samples, surface_samples
+from caryatid.sensing.voxel_map import UNKNOWN, VoxelMap
+from caryatid.support.relations import predict_removal
+from caryatid.support.stability import ground_outline
+
+
+def relevant(graph: SupportGraph, goal: str) -> set[str]:
+    """Ids of the goal, of what it holds up, directly or not, and of whatever else holds any of these up."""
+    moving = {goal}
+    while above := {s.supported for s in graph.supports if s.supporter in moving} - moving:
+        moving |= above
+    return moving | {s.supporter for s in graph.supports if s.supported in moving}
+
+
+def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[np.bool_]:
+    """Whether each of the samples (K,) is about the goal's removal.
+
+    That is, about one of the relevant objects, or unseen space over the convex hull of their outlines.
+
+    Args:
+        samples: Points that views may show.
+        graph: What is known.
+        goal: Id of the object that is to be taken away. Without one, or before it is known, all matter.
+    """
+    if not _knows(goal, graph):
+        return np.ones(len(samples.weights), dtype=np.bool_)
+    ids = relevant(graph, goal)
+    outlines = [ground_outline(o.shape) for o in graph.objects if o.role == "object" and o.id in ids]
+    near = shapely.contains_xy(shapely.Polygon(hull(np.concatenate(outlines))), samples.points_world[:, :2])
+    about, space = (np.isin(samples.names, names)[samples.subjects] for names in ([*ids], [SPACE]))
+    return about | (space & near)
+
+
+def settled(
+    graph: SupportGraph, goal: str | None, until: float, voxels: VoxelMap, config: SupportConfig
+) -> bool:
+    """Whether all that is asked for is known with a probability of at least `until`.
+
+    Without a goal, that every support is there. With one, of each object that it moves or stays when the goal
+    is taken away, and that nothing unseen rests on the goal: so much of the free upper side of its shape is
+    next to space that has been seen.
+
+    Args:
+        graph: What is known.
+        goal: Id of the object that is to be taken away, or None.
+        until: The probability [1].
+        voxels: The space that has been seen.
+        config: The numbers the graph was inferred with.
+    """
+    if goal is None:
+        return all(s.belief >= until for s in graph.supports)
+    if not _knows(goal, graph) or any(
+        1.0 - until < e.probability < until for e in predict_removal(graph, goal, config)
+    ):
+        return False
+    samples = surface_samples(graph, voxels.occluders([o.shape for o in graph.objects]))
+    top = (samples.subjects == samples.names.index(goal)) & (samples.normals_world[:, 2] > 0.0)
+    above = samples.points_world[top] + 1.5 * voxels.config.size * samples.normals_world[top]
+    return bool((voxels.state_at(above) == UNKNOWN).sum() <= (1.0 - until) * len(above))
+
+
+def _knows(goal: str | None, graph: SupportGraph) -> TypeGuard[str]:
+    return any(o.id == goal for o in graph.objects)
