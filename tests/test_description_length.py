@@ -235,6 +235,18 @@ def test_flush_boxes_are_two_where_a_view_showed_each_in_a_colour_of_its_own(lef
         assert (groups is not None) == divided
 
 
+@pytest.mark.parametrize(("back", "merged"), [((200, 30, 30), True), ((30, 60, 190), False)])
+def test_opposite_sides_of_one_colour_are_one_where_a_shape_explains_both(back, merged):
+    points, normals = box((0.0, 0.0, 0.03), (0.06, 0.08, 0.06)).surface(0.003)
+    clouds = {}
+    for label, (side, colour) in enumerate(((-0.03, (200, 30, 30)), (0.03, back)), 1):
+        own = np.isclose(points[:, 0], side)
+        rgb = np.full((own.sum(), 3), colour, dtype=np.uint8)
+        clouds[label] = Cloud(points[own], normals[own], rgb=rgb)
+    assert (pair_of(clouds) is not None) == merged
+    assert pair_of({k: replace(cloud, rgb=None) for k, cloud in clouds.items()}) is None
+
+
 def test_irregular_neighbours_stay_two_also_where_the_surface_goes_on():
     rng = np.random.default_rng(1)
     xy = rng.uniform(-0.15, 0.15, (6000, 2))

@@ -25,10 +25,12 @@ from caryatid.objects.description_length import (
     colour_evidence,
     explain,
     explained,
+    plain_colour,
     point_costs,
     price,
 )
 from caryatid.runtime.parallel import on_threads
+from caryatid.segmentation.segments import PLAIN
 
 Groups = NDArray[np.intp]
 Mask = NDArray[np.bool_]
@@ -293,7 +295,7 @@ def best_merge(
     config: Config,
     seed: int,
 ) -> Pair | None:
-    """Find the pair of neighbours that it is best to take for one.
+    """Find the pair that it is best to take for one: neighbours, or sides of one colour.
 
     Args:
         known: Points of each object, by label, and their explanation as an object of its own.
@@ -309,13 +311,21 @@ def best_merge(
     """
     trees = {k: cKDTree(evidence.points) for k, (evidence, _) in known.items()}
     sizes = {k: len(evidence) for k, (evidence, _) in known.items()}
+    sides = {k: _sides(evidence, config.explanation) for k, (evidence, _) in known.items()}
+
+    def gap(a: int, b: int) -> float:
+        """Gap up to which two may be one [m]: as long as the longer one where they have the same colour."""
+        (length, colour), (other_length, other) = sides[a], sides[b]
+        alike = colour is not None and other is not None and np.linalg.norm(colour - other) <= PLAIN
+        return max(config.explanation.reach, length, other_length) if alike else config.explanation.reach
+
     pairs = [
         (a, b)
         for a, b in combinations(sorted(known), 2)
         if {a, b} & changed
         and frozenset((a, b)) not in distinct
         and sizes[a] + sizes[b] >= GROWTH * apart.get((a, b), 0)
-        and trees[a].count_neighbors(trees[b], config.explanation.reach) > 0
+        and trees[a].count_neighbors(trees[b], gap(a, b)) > 0
     ]
     best, most = None, 0.0
     gains = on_threads(lambda number: _gain(known, pairs[number], config, seed), len(pairs))
@@ -325,6 +335,12 @@ def best_merge(
         elif gain > most:
             best, most = ((a, b) if sizes[a] >= sizes[b] else (b, a)), gain
     return best
+
+
+def _sides(evidence: Evidence, costs: ExplanationConfig) -> tuple[float, Array | None]:
+    """Length of an object [m], and its plain colour (3,): sides of that colour so far off may be its own."""
+    colour = None if evidence.rgb is None else plain_colour(evidence.rgb, costs)[1]
+    return float(np.linalg.norm(np.ptp(evidence.points, axis=0))), colour
 
 
 def _gain(
