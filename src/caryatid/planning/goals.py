@@ -50,8 +50,8 @@ def settled(
     """Whether all that is asked for is known with a probability of at least `until`.
 
     Without a goal, that every support is there. With one, of each object that it moves or stays when the goal
-    is taken away, and that nothing unseen rests on the goal: so much of the free upper side of its shape is
-    next to space that has been seen.
+    is taken away, and that nothing unseen rests on the goal: so much of its free surface on which something
+    can, by `config.max_tilt`, is next to space that has been seen.
 
     Args:
         graph: What is known.
@@ -67,7 +67,8 @@ def settled(
     ):
         return False
     samples = surface_samples(graph, voxels.occluders([o.shape for o in graph.objects]))
-    top = (samples.subjects == samples.names.index(goal)) & (samples.normals_world[:, 2] > 0.0)
+    level = samples.normals_world[:, 2] > np.cos(np.radians(config.max_tilt))
+    top = level & (samples.subjects == samples.names.index(goal))
     above = samples.points_world[top] + 1.5 * voxels.config.size * samples.normals_world[top]
     return bool((voxels.state_at(above) == UNKNOWN).sum() <= (1.0 - until) * len(above))
 
