@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from synthetic import box, cylinder, surface_points
+from synthetic import box, cylinder, sphere, surface_points
 
 from caryatid.config import Config
 from caryatid.fitting.primitives import FitFailure
@@ -12,6 +12,7 @@ from caryatid.geometry import transforms
 from caryatid.objects.models import ObjectModels, ObjectPoints
 from caryatid.segmentation.observation import Observation
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
+from caryatid.sensing.voxel_map import VoxelMap
 
 CRATE, CAN = box((0.0, 0.0, 0.8), (0.16, 0.12, 0.1)), cylinder((0.0, 0.0, 0.91), 0.03, 0.12)
 
@@ -73,6 +74,20 @@ def test_two_united_without_a_shape_that_fits_are_not_looked_up_again(models, mo
     assert {old, new} == {1, 2}
     assert len(models.points.of(new)) == sum(counts.values())
     assert [o.label for o in models.objects()] == [3]
+
+
+@pytest.mark.parametrize(("plated", "kind"), [(True, "solid"), (False, "sphere")])
+def test_a_shape_that_another_object_would_fill_is_not_taken(models, plated, kind):
+    """The outside of a bowl with a plate on it is no ball: the plate was seen where the ball would be."""
+    ball, plate = sphere((0.0, 0.0, 0.83), 0.08), cylinder((0.0, 0.0, 0.84), 0.1, 0.02)
+    observation = observation_of((1, 2), (ball, plate))
+    points, labels = observation.cloud.points_world, observation.labels
+    shown = np.where((labels == 1) & (points[:, 2] > 0.83), 0, labels)
+    shown = shown if plated else np.where(shown == 2, 0, shown)
+    models.fit_all(models.add(observation.with_labels(shown.astype(np.int32)), 0))
+    assert models.objects()[0].shape.kind == "sphere"
+    models.form({1, 2}, VoxelMap.around(np.array([0.0, 0.0, 0.75]), Config().voxels))
+    assert models.objects()[0].shape.kind == kind
 
 
 def test_the_newest_view_alone_is_fitted_on_demand(models):

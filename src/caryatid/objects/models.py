@@ -359,17 +359,24 @@ class ObjectModels:
     def form(self, labels: set[int], voxels: VoxelMap | None) -> None:
         """Take solids for objects whose points cost less without any primitive.
 
+        Points of other objects inside a primitive count as ones it does not explain: they were seen there.
+
         Args:
             labels: Objects whose points have changed.
             voxels: Space seen free.
         """
-        noise = self._noise()
+        noise, config = self._noise(), self._config.explanation
         changed = sorted(labels & self.fits.keys())
+        seen = {k: self.points.of(k, config.spacing).points_world for k in self.fits}
 
         def formed(number: int) -> SceneObject | None:
             label = changed[number]
             evidence, explanation = self._explained(label, noise, voxels)
-            if explanation.shape is not None:
+            around = np.concatenate([np.empty((0, 3)), *(seen[k] for k in seen if k != label)])
+            inside = self.fits[label].shape.signed_distance(around) < -3.0 * noise
+            taken = config.outlier * evidence.weight * np.count_nonzero(inside)
+            irregular = best_explanation([], evidence, config)
+            if explanation.shape is not None and explanation.cost + taken <= irregular.cost:
                 return None
             cloud = self.points.of(label, self._config.cloud.voxel)
             others = [o.shape for k, o in self.fits.items() if k != label]
