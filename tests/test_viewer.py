@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import sys
+import urllib.error
 import urllib.request
 from dataclasses import replace
 from functools import partial
@@ -260,6 +261,30 @@ def test_view_serves_a_run_to_this_machine_until_it_is_stopped(scene_file, tmp_p
     assert all(len(step.cloud) and f1 is not None for step, f1 in shown)
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(address)
+
+
+def test_only_the_viewers_own_page_with_its_token_comes_in(page):
+    root, token = page.url.rsplit("/", 1)
+    assert len(token) > 16
+
+    def came(address, **headers):
+        try:
+            socket_headers = {"Upgrade": "websocket"} if headers.pop("socket", False) else {}
+            request = urllib.request.Request(address, headers=headers | socket_headers)
+            return urllib.request.urlopen(request).status
+        except urllib.error.HTTPError as error:
+            return error.code
+
+    assert came(page.url, Origin=root) == 200
+    strangers = [
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Host": "evil.example"},
+        {"Host": "[::1"},
+    ]
+    for socket in (False, True):
+        assert all(came(page.url, socket=socket, **headers) == 403 for headers in strangers)
+        assert {came(address, socket=socket) for address in (root, f"{root}/x", f"{root}/%C3%A9")} == {403}
 
 
 @pytest.mark.parametrize("source", ["nothing-here", "cloud.pcd"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import secrets
 import signal
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,6 +15,7 @@ from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from threading import RLock
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -45,7 +47,7 @@ class Page:
         small: It has little room, as within a notebook: panels begin folded up.
 
     Attributes:
-        url: Where the page is.
+        url: Where the page is; it holds a token, without which nothing is shown.
         server: The `viser.ViserServer`, for controls of one's own.
         drawing: The scene in the page.
         steps: What has been added so far.
@@ -66,8 +68,9 @@ class Page:
         small: bool = False,
     ) -> None:
         self.working = RLock()
-        self.server: Any = _serve(title, host, port)
-        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
+        token = secrets.token_urlsafe(16)
+        self.server: Any = _serve(title, host, port, token)
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}/{token}"
         self.steps: list[Step] = []
         self.scores: list[float | None] = []
         self.drawing = SceneDrawing(self.server, self.describe)
@@ -353,9 +356,10 @@ def _log_failure(drawn: Future[None]) -> None:
         logging.getLogger(__name__).error("a view could not be drawn", exc_info=error)
 
 
-def _serve(title: str, host: str, port: int) -> Any:
+def _serve(title: str, host: str, port: int, token: str) -> Any:
     with needs_extra("view", "viewer"):
         import viser
+        from websockets.asyncio import server as sockets
 
     class Server(viser.ViserServer):
         """A server whose page stays on this machine: nobody can ask for a public address."""
@@ -363,8 +367,37 @@ def _serve(title: str, host: str, port: int) -> Any:
         def request_share_url(self, verbose: bool = True) -> str | None:
             return None
 
-    with _silent():
-        return Server(host=host, port=port, label=title, verbose=False)
+    whole = sockets.serve
+
+    def guarded(*given: Any, process_request: Any, **options: Any) -> Any:
+        def answer(connection: Any, request: Any) -> Any:
+            if not _may_come(request, host, token):
+                return connection.respond(403, "open the whole address that caryatid printed\n")
+            request.path = request.path.removeprefix(f"/{token}")
+            return process_request(connection, request)
+
+        return whole(*given, process_request=answer, **options)
+
+    # viser has no option for who may come; it serves before it returns.
+    setattr(sockets, "serve", guarded)  # noqa: B010  (mypy knows the class)
+    try:
+        with _silent():
+            return Server(host=host, port=port, label=title, verbose=False)
+    finally:
+        setattr(sockets, "serve", whole)  # noqa: B010
+
+
+def _may_come(request: Any, host: str, token: str) -> bool:
+    """Whether a request bears the token, names this machine, and comes from no page but the viewer's own."""
+    named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+    try:
+        name = urlsplit(f"//{named[0]}").hostname if len(named) == 1 else None
+    except ValueError:
+        return False
+    known = name in {"127.0.0.1", "localhost", "::1", host} or (name and host in ("0.0.0.0", "::", ""))
+    ours = all(origin in (f"http://{named[0]}", f"https://{named[0]}") for origin in origins)
+    first = request.path.partition("?")[0].split("/")[1]
+    return bool(known and ours and secrets.compare_digest(first.encode(), token.encode()))
 
 
 @contextlib.contextmanager
