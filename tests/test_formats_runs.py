@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -140,6 +141,14 @@ def test_a_run_is_not_replaced_where_it_holds_what_no_run_wrote(tmp_path):
     with refusal(tmp_path / "RUN", "holds other files (views/notes.txt)"):
         writer(tmp_path / "RUN")
     assert read_run(tmp_path / "RUN").record["seed"] == 1
+
+
+def test_a_run_that_does_not_list_its_files_is_not_replaced_and_the_way_out_is_said(tmp_path):
+    write_run(tmp_path / "RUN", views=1, seed=1)
+    path = tmp_path / "RUN/run.json"
+    path.write_text(json.dumps({k: v for k, v in json.loads(path.read_text()).items() if k != "files"}))
+    with refusal(tmp_path / "RUN", "an earlier caryatid", "move or delete the folder"):
+        writer(tmp_path / "RUN")
 
 
 def test_what_a_killed_process_left_is_recovered_or_removed(tmp_path):

@@ -245,7 +245,11 @@ def _own_files(folder: Path) -> set[str]:
     """Files of a run folder that may be replaced: what run.json says was written, and what is made of it."""
     if not is_run(folder):
         return set()
-    return {"run.json", "report.html", *map(str, read_json(folder / "run.json").get("files", []))}
+    files = read_json(folder / "run.json").get("files")
+    if files is None:
+        reason = "holds a run of an earlier caryatid, which does not say which files are its own"
+        raise InputError(folder, reason, "move or delete the folder, or give a new one")
+    return {"run.json", "report.html", *map(str, files)}
 
 
 def _view_folder(index: int) -> str:
