@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 
 UP: Array = np.array([0.0, 0.0, 1.0])
 """The world's vertical (3,)."""
+FARTHEST = 1e6
+"""Largest coordinate of a translation [m]: beyond it float64 leaves no nanometre, and units are wrong."""
 RIGID_TOLERANCE = 1e-4
 """How far RᵀR may be from the identity (per entry, no unit) before a matrix is refused as a rotation."""
 
@@ -25,7 +27,8 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
         name: What to call it in the error.
 
     Raises:
-        InputError: The matrix has another shape, holds NaN, is no proper rotation or has a wrong last row.
+        InputError: The matrix has another shape, holds NaN, is no proper rotation or has a wrong last row, or
+            the translation is beyond `FARTHEST`.
     """
     matrix = np.asarray(T, dtype=np.float64)
     if matrix.shape != (4, 4):
@@ -34,6 +37,8 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
         raise InputError(name, "holds NaN or infinity", "give a finite rigid transform")
     if not np.allclose(matrix[3], (0.0, 0.0, 0.0, 1.0), atol=RIGID_TOLERANCE):
         raise InputError(name, "the last row is not 0 0 0 1", "give a homogeneous rigid transform")
+    if np.abs(matrix[:3, 3]).max() > FARTHEST:
+        raise InputError(name, f"is over {FARTHEST:g} m from the world's origin", "give it in metres")
     R = matrix[:3, :3]
     if not np.allclose(R.T @ R, np.eye(3), atol=RIGID_TOLERANCE) or np.linalg.det(R) < 0.0:
         raise InputError(

@@ -6,7 +6,6 @@ import io
 import struct
 import warnings
 import zlib
-from math import inf
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +18,9 @@ from caryatid.errors import InputError
 DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
-_BAD_BYTES: Final = (SyntaxError, ValueError, EOFError, struct.error, zlib.error)
+MAX_PIXELS: Final = 64_000_000
+"""Pixels an image may have where no settings say otherwise: 8000 × 6000 take 1 GB."""
+_BAD_BYTES: Final = (SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error)
 """What Pillow raises on a broken image, …"""
 _TOO_LARGE: Final = (Image.DecompressionBombError, Image.DecompressionBombWarning)
 """… and on one that says it is larger than any camera's."""
@@ -59,7 +60,7 @@ def decode_image(
     name: str = "",
     modes: tuple[str, ...] | None = None,
     what: str = "",
-    most: float = inf,
+    most: float = MAX_PIXELS,
 ) -> NDArray[Any]:
     """Decode a PNG or JPEG: (H, W), or (H, W, 3) where colour is allowed; grey then has three equal channels.
 
@@ -101,7 +102,7 @@ def decode_image(
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
 
 
-def read_mask(image: Path | bytes, name: str = "", most: float = inf) -> NDArray[np.bool_]:
+def read_mask(image: Path | bytes, name: str = "", most: float = MAX_PIXELS) -> NDArray[np.bool_]:
     """Read where a grey PNG (H, W), a file or its content, is not 0.
 
     Raises:
