@@ -5,13 +5,16 @@ from __future__ import annotations
 import base64
 import json
 import socket
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
@@ -71,7 +74,6 @@ def graph_of(views):
 
 
 def test_a_session_over_http_is_the_session(client, views):
-    assert client.get("/docs").status_code == 200
     assert client.get("/sessions/a/next").status_code == 409
     answers = [client.post("/sessions/a/views", json=body(view)) for view in views[:2]]
     for number, answer in enumerate(answers):
@@ -159,7 +161,11 @@ NOT_BEGUN = (
     ({"name": "b", "planner": "juggler"}, 422, "no planner 'juggler'"),
     ({"name": "b", "settings": {"fit": {"hypotheses": 0}}}, 422, "fit.hypotheses"),
     ({"name": "b", "settings": {"voxels": {"size": 1e-6}}}, 422, "voxels"),
-    ({"name": "b", "settings": {"active": {"sphere_points": 10**9}}}, 422, "sphere_points"),
+    ({"name": "b", "settings": {"active": {"sphere_points": 10**6}}}, 422, "sphere_points"),
+    ({"name": "b", "settings": {"fit": {"hypotheses": 10**20}}}, 422, "fit.hypotheses"),
+    ({"name": "b", "settings": {"robot": {"cell": 1e-5}}}, 422, "more than tenfold away"),
+    ({"name": "b", "settings": {"session": {"max_pixels": 10**9}}}, 422, "a limit of the service"),
+    ({"name": "b", "settings": {"voxels": {"max_voxels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "seed": -1}, 422, "seed"),
     ({"name": "a"}, 409, "holds a session or other files"),
 )
@@ -181,7 +187,19 @@ def test_a_session_that_cannot_be_begun_is_not(client):
         refused = client.post("/sessions", json=given)
         assert refused.status_code == status
         assert said in refused.json()["detail"]
+        assert str(client.pool.folder) not in refused.text
     assert client.get("/sessions").json() == {"sessions": ["a"]}
+
+
+@pytest.mark.parametrize("limit", [{"max_sessions": 1}, {"min_free": 1e18}])
+def test_a_service_that_is_full_takes_nothing_new(client, limit, views):
+    config = client.pool.config
+    client.pool.config = replace(config, session=replace(config.session, **limit))
+    refused = client.post("/sessions", json={"name": "b"})
+    assert refused.status_code == 503
+    assert f"session.{next(iter(limit))}" in refused.json()["detail"]
+    added = client.post("/sessions/a/views", json=body(views[0]))
+    assert added.status_code == (503 if "min_free" in limit else 201)
 
 
 def test_what_is_not_there_is_said(client):
@@ -238,10 +256,15 @@ def test_where_there_is_a_token_it_is_demanded(tmp_path):
     with serving(tmp_path, token=TOKEN, base="http://robot.example") as client:
         for headers in [{}, *({"Authorization": sent} for sent in others)]:
             assert client.post("/sessions", json={"name": "a"}, headers=headers).status_code == 401
-            assert client.get("/sessions", headers=headers).status_code == 401
+            for page in ("/sessions", "/openapi.json", "/docs"):
+                assert client.get(page, headers=headers).status_code == 401
+            unread = {"Content-Type": "application/json"} | headers
+            assert client.post("/sessions", content=b"{", headers=unread).status_code == 401
         assert not (tmp_path / "a").exists()
         right = {"Authorization": f"Bearer {TOKEN}"}
         assert client.post("/sessions", json={"name": "a"}, headers=right).status_code == 201
+        page = client.get("/openapi.json", headers=right)
+        assert "https://" not in page.text
 
 
 @pytest.mark.parametrize(
@@ -280,3 +303,22 @@ def test_a_port_that_is_taken_is_said_in_one_line(tmp_path, capsys):
     said = capsys.readouterr().err
     assert said.startswith(f"error: 127.0.0.1:{port}: cannot be listened at (address already in use")
     assert said.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_half_requests_do_not_keep_others_out(tmp_path):
+    command = [sys.executable, "-m", "caryatid", "serve", tmp_path / "s", "--port", "0", "--json"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service, ExitStack() as held:
+        held.callback(service.kill)
+        address = json.loads("".join(iter(service.stdout.readline, "}\n")) + "}")["address"]
+        there = urlsplit(address)
+        for _ in range(63):
+            half = held.enter_context(socket.create_connection((there.hostname, there.port)))
+            half.sendall(b"GET /sessions HTTP/1.1\r\nHost:")
+        assert httpx.get(f"{address}/sessions").status_code == 503
+        deadline = time.monotonic() + 15.0
+        while (status := httpx.get(f"{address}/sessions").status_code) == 503 and time.monotonic() < deadline:
+            with suppress(OSError):
+                half.sendall(b"x")
+            time.sleep(1.0)
+    assert status == 200

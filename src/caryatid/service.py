@@ -9,35 +9,38 @@ from __future__ import annotations
 import asyncio
 import ipaddress
 import secrets
+import shutil
 import signal
 import socket
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial, wraps
 from importlib.metadata import version
-from math import prod
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import uvicorn
-from fastapi import Depends, FastAPI, HTTPException, Request, Response
+from fastapi import Depends, FastAPI, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
+from fastapi.security import HTTPBearer
 from pydantic import Base64Bytes, BaseModel, ConfigDict, Field
 from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import changed_settings
-from caryatid.errors import CaryatidError, InputError, PlanningError
+from caryatid.errors import CaryatidError, InputError, PlanningError, in_one_line
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import Reachable
-from caryatid.sessions.session import SessionConflictError
+from caryatid.sessions.session import Added, SessionConflictError
 
 
 class FullError(CaryatidError):
@@ -48,13 +51,18 @@ class MissingError(CaryatidError):
     """There is no session of that name."""
 
 
-STATUS: dict[type[CaryatidError], int] = {
+STATUS: dict[type[Exception], int] = {
     MissingError: 404,
     SessionConflictError: 409,
     PlanningError: 409,
     FullError: 503,
+    OSError: 503,
+    MemoryError: 503,
 }
 """Statuses of errors; of all others 422: what was given cannot be used."""
+
+PATIENCE = 30.0
+"""Time that a request's body may take to arrive [s]: 16 MB at half a megabyte per second."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 SessionName = Annotated[Name, PathParameter(description="Name of the session")]
@@ -221,13 +229,14 @@ class SessionPool:
         """Begin a session; the options are those of `Session.begin`.
 
         Raises:
-            InputError: There is one of that name, or a setting asks for more memory than a session may have.
+            InputError: There is one of that name, or a setting is beyond what a client may ask for.
+            FullError: There are too many sessions, or the disk is full.
         """
-        # 25 times the defaults: 128 MB of voxels.
-        if prod(length / config.voxels.size for length in config.voxels.extent) > 64e6:
-            raise InputError("voxels.size", "makes too many voxels", "64 million are allowed")
-        if config.active.sphere_points > 1_000_000:
-            raise InputError("active.sphere_points", "is too large", "1 million are allowed")
+        _check_limits(self.config, config)
+        self._check_room()
+        if len(self.names()) >= self.config.session.max_sessions:
+            reason = f"there are {self.config.session.max_sessions} sessions"
+            raise FullError(f"{reason}, the limit session.max_sessions of this service")
         return self._opened(name, Session.begin(self.folder / name, config, **options))
 
     def session(self, name: str) -> Session:
@@ -242,6 +251,22 @@ class SessionPool:
         if not (self.folder / name / "session.json").is_file():
             raise MissingError(f"there is no session '{name}'; begin it first")
         return self._opened(name, Session.open(self.folder / name))
+
+    def add(self, name: str, view: Capture, number: int | None) -> Added:
+        """Add a view to a session; as `Session.add`.
+
+        Raises:
+            FullError: The disk is full.
+        """
+        self._check_room()
+        return self.session(name).add(view, number)
+
+    def _check_room(self) -> None:
+        free, least = shutil.disk_usage(self.folder).free, self.config.session.min_free
+        if free < least:
+            raise FullError(
+                f"the disk has {free / 1e9:.1f} GB left; session.min_free is {least / 1e9:.1f} GB"
+            )
 
     def _opened(self, name: str, session: Session) -> Session:
         """Keep a session open, as the one used last."""
@@ -278,16 +303,19 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
         summary="Sessions of active vision: views in, support graph and next view out",
         version=version("caryatid"),
         lifespan=lambda app: pool,
+        docs_url=None,  # they load scripts from elsewhere; /openapi.json says the same
+        redoc_url=None,
         max_body_size=max_request,
         responses=PROBLEMS,
-        dependencies=[] if token is None else [Depends(_bearer(token))],
+        dependencies=[] if token is None else [Depends(BEARER)],
     )
+    app.add_middleware(Gate, token=token)
     if token is None:
         # Pages from elsewhere that a browser here shows are refused: they name another host.
         local = ["127.0.0.1", "localhost", "[::1]", host]
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=local)
-    app.add_exception_handler(CaryatidError, _refuse)
-    app.add_exception_handler(RequestValidationError, _refuse)
+    for kind in (CaryatidError, RequestValidationError, OSError, MemoryError):
+        app.add_exception_handler(kind, partial(_refuse, pool.folder))
     _add_pages(app, pool)
     return app
 
@@ -333,7 +361,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @queued
     def add_view(name: SessionName, given: NewView) -> Any:
         """Take in a view; when this answers, it is on the disk and stays."""
-        return pool.session(name).add(given.capture(), given.number).to_json()
+        return pool.add(name, given.capture(), given.number).to_json()
 
     @app.delete("/sessions/{name}/views/last", response_model=UndoAnswer)
     @queued
@@ -361,23 +389,85 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         return pool.session(name).next(given.T_world_camera, given.path_length).to_json()
 
 
-def _bearer(token: str) -> Callable[..., Any]:
-    def check(given: Annotated[HTTPAuthorizationCredentials | None, Depends(BEARER)]) -> None:
-        sent = "" if given is None else given.credentials
-        if not secrets.compare_digest(sent.encode(), token.encode()):
-            raise HTTPException(401, "the token is missing or wrong", {"WWW-Authenticate": "Bearer"})
+class Gate:
+    """Before anything of a request is read: its token, and how long its body may take.
 
-    return check
+    Args:
+        app: What is behind it.
+        token: What requests have to bear; None = nothing.
+    """
+
+    def __init__(self, app: ASGIApp, token: str | None) -> None:
+        self._app = app
+        self._borne = None if token is None else f"Bearer {token}".encode()
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through, or answer 401."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        sent = dict(scope["headers"]).get(b"authorization", b"")
+        if self._borne is not None and not secrets.compare_digest(sent, self._borne):
+            problem = {"detail": "the token is missing or wrong"}
+            await JSONResponse(problem, 401, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
+            return
+        deadline = asyncio.get_running_loop().time() + PATIENCE
+
+        async def timely() -> Message:
+            async with asyncio.timeout_at(deadline):
+                return await receive()
+
+        await self._app(scope, timely, send)
 
 
-async def _refuse(request: Request, error: Exception) -> Response:
-    """Say what does not fit in one sentence, and not what was sent."""
+class PatientProtocol(H11Protocol):
+    """HTTP whose keep-alive time also holds for the headers of a request: halves do not stay for ever."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin to wait for the first request."""
+        super().connection_made(transport)
+        wait, close = self.timeout_keep_alive, self.timeout_keep_alive_handler
+        self.timeout_keep_alive_task = self.loop.call_later(wait, close)
+
+    def data_received(self, data: bytes) -> None:
+        """Take bytes; the waiting ends with a whole request, which uvicorn's own ends with any byte."""
+        self.conn.receive_data(data)
+        self.handle_events()
+
+
+def _check_limits(own: Config, asked: Config) -> None:
+    """Refuse settings of a client that lift the limits of the service, or are far from its own.
+
+    Raises:
+        InputError: A setting of the service itself is changed, or another more than tenfold.
+    """
+    for stage, values in asdict(asked).items():
+        for name, value in values.items():
+            before = getattr(getattr(own, stage), name)
+            if value == before:
+                continue
+            remedy = "leave it to those who run the service"
+            if stage == "session" or name == "max_voxels":
+                raise InputError(f"{stage}.{name}", "is a limit of the service", remedy)
+            given, ours = np.ravel(value), np.ravel(before)
+            if given.dtype.kind not in "if" or not ours.any():
+                continue
+            given, ours = np.abs(given), np.abs(ours)
+            smallest, largest = ours[ours > 0].min() / 10.0, 10.0 * ours.max()
+            if len(given) > 10 * len(ours) or ((given > 0) & ((given < smallest) | (given > largest))).any():
+                reason = f"is more than tenfold away from this service's {before}"
+                raise InputError(f"{stage}.{name}", reason, remedy)
+
+
+async def _refuse(folder: Path, request: Request, error: Exception) -> Response:
+    """Say what does not fit in one sentence, and neither what was sent nor where sessions are kept."""
     status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 422)
-    text = str(error)
+    text = in_one_line(error)
     if isinstance(error, RequestValidationError):
         first = error.errors()[0]
         text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
     # Names that were sent may hold halves of characters, which no answer can.
+    text = text.replace(f"{folder}/", "").replace(str(folder), "its folder")
     detail = " ".join(text.encode("utf-8", "replace").decode().splitlines())
     return JSONResponse({"detail": detail}, status, {"Retry-After": "1"} if status == 503 else None)
 
@@ -416,6 +506,7 @@ def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], N
     server = uvicorn.Server(
         uvicorn.Config(
             app,
+            http=PatientProtocol,
             log_level="warning",
             access_log=False,
             limit_concurrency=64,  # with the size of a request this bounds what is held in memory

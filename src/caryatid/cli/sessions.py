@@ -181,7 +181,7 @@ class SessionCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(SessionStep):
-    """Serve sessions over HTTP to robot software in any language; /docs shows the OpenAPI page.
+    """Serve sessions over HTTP to robot software in any language; /openapi.json describes it.
 
     At 127.0.0.1 only programs on this machine can connect, and need no token. Any other --host requires one,
     sent as `Authorization: Bearer TOKEN`; there is no encryption, so use it within a network you trust.
@@ -215,7 +215,7 @@ class Serve(SessionStep):
         from caryatid.runtime.compiling import compile_kernels
 
         def listening(address: str) -> None:
-            text = f"serving {self.folder} at {address}, its pages at {address}/docs; Ctrl-C stops"
+            text = f"serving {self.folder} at {address}, described by {address}/openapi.json; Ctrl-C stops"
             self.show({"address": address, "folder": self.folder}, text)
 
         token = self.token or os.environ.get("CARYATID_TOKEN") or None

@@ -105,6 +105,8 @@ def _parse_flag(flag: str) -> dict[str, Any]:
 def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -> InputError:
     """The first fault, in one sentence."""
     fault = error.errors(include_url=False, include_context=False)[0]
+    if not fault["loc"]:
+        return InputError(source, fault["msg"], "correct it, or see `caryatid config`")
     stage, *names = map(str, fault["loc"])
     name = ".".join([stage, *names[:1]])
     if fault["type"] == "unexpected_keyword_argument":

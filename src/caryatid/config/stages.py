@@ -6,9 +6,10 @@ A value outside its range raises `pydantic.ValidationError`. Values are the pape
 from __future__ import annotations
 
 from dataclasses import field
+from math import inf, prod
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, ConfigDict, Field
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 
 from caryatid.config.choices import FusionMethod, MaskIdentity, ShapeKind
@@ -22,6 +23,13 @@ def _rising(values: tuple[float, float]) -> tuple[float, float]:
     return values
 
 
+def _few_voxels(extent: tuple[float, float, float], info: ValidationInfo) -> tuple[float, float, float]:
+    size, most = info.data.get("size", inf), info.data.get("max_voxels", inf)
+    if prod(length / size for length in extent) > most:
+        raise ValueError(f"with voxels of {size} m there should be at most voxels.max_voxels = {most}")
+    return extent
+
+
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -33,8 +41,8 @@ Acute = Annotated[float, Field(ge=0, lt=90)]
 """An angle whose cosine is divided by."""
 Elevation = Annotated[float, Field(ge=-90, le=90)]
 Azimuth = Annotated[float, Field(ge=-360, le=360)]
-Count = Annotated[int, Field(ge=1)]
-WholeNumber = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
+WholeNumber = Annotated[int, Field(ge=0, le=1_000_000_000)]
 Lengths = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 """Smallest and largest length."""
 
@@ -76,7 +84,7 @@ class SurfaceConfig:
     """How far the normal may lean from the vertical where the view has a pose [deg]."""
     max_deviation: Angle = 25.0
     """How far a point's normal may lean from its plane's [deg]; 3σ of normals from depth."""
-    gap: NotNegative = 0.3
+    gap: Positive = 0.3
     """Parts of one plane further apart than this are two surfaces [m]; shadows of objects are narrower."""
     min_area: NotNegative = 0.05
     """Seen area a table has at least [m²]; more than most objects' tops."""
@@ -108,7 +116,7 @@ class RegistrationConfig:
     """Size of the patches of the support surface [m]."""
     sample: Count = 600
     """Patches of a view that are matched with another view [1]."""
-    reaches: tuple[Positive, ...] = (0.1, 0.05, 0.025)
+    reaches: Annotated[tuple[Positive, ...], Field(min_length=1)] = (0.1, 0.05, 0.025)
     """Maximum distance of a match [m], coarse to fine."""
     min_points: Count = 100
     """Minimum number of matches that determine a pose [1]."""
@@ -174,7 +182,7 @@ class MaskConfig:
 class FitConfig:
     """Primitive fitting."""
 
-    shapes: tuple[ShapeKind, ...] = ("box", "cylinder", "sphere")
+    shapes: Annotated[tuple[ShapeKind, ...], Field(min_length=1)] = ("box", "cylinder", "sphere")
     """Shapes that are tried; the paper's three."""
     hypotheses: Count = 100
     """Maximum number of RANSAC hypotheses per shape [1]."""
@@ -346,7 +354,11 @@ class VoxelConfig:
 
     size: Positive = 0.01
     """Edge of a voxel [m]; the paper's leaf size."""
-    extent: tuple[Positive, Positive, Positive] = (1.6, 1.6, 1.0)
+    max_voxels: Count = 64_000_000
+    """Maximum number of voxels [1]: 25 times the defaults; a map of them takes 128 MB."""
+    extent: Annotated[
+        tuple[Positive, Positive, Positive], AfterValidator(_few_voxels), Field(validate_default=True)
+    ] = (1.6, 1.6, 1.0)
     """Size of the map around the view sphere's centre [m]: a table with its margin."""
     below: NotNegative = 0.1
     """How far the map reaches below the sphere's centre [m]."""
@@ -574,7 +586,7 @@ class ExportConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class SessionConfig:
-    """Limits on images handed to a session, and on camera poses wherever views come from."""
+    """Limits on images and camera poses wherever views come from, and on what a service keeps."""
 
     max_pixels: Count = 16_000_000
     """Maximum number of pixels of an image [1]; several times what depth cameras have; bounds memory."""
@@ -582,6 +594,10 @@ class SessionConfig:
     """Maximum size of a file [bytes]; larger than any camera's image."""
     max_coordinate: Positive = 1e4
     """Maximum coordinate of a camera [m]; beyond it, units are wrong."""
+    max_sessions: Count = 1000
+    """Maximum number of sessions of a service [1]; a folder of each stays until it is removed by hand."""
+    min_free: NotNegative = 1e9
+    """A service takes nothing new where the disk has less left [bytes]; others write there too."""
     common: Share = 0.25
     """Share of what a view that cannot be registered shows around the table that must lie where earlier views
     saw something [1]; of right poses a third does, even from the other side, of wrong ones a fifth."""
