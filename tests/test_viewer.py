@@ -447,7 +447,7 @@ def test_a_click_on_an_object_says_what_falls_without_it(page, tab):
     crate = page.steps[-1].graph["o1"]
     click(page, crate.centre_world - (0.0, 0.0, crate.shape.extents[2] / 4.0), tab)
     tab.wait_for_text("Without o1")
-    tab.wait_for_text("falls:")
+    tab.wait_for_text("falls with probability")
     assert "o2" in tab.page.locator(".caryatid-cell").last.inner_text()
 
 
