@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test chromium check notebooks package accuracy-gate bench bench-gate docs pictures gif format clean
+.PHONY: install demo test chromium check notebooks package accuracy-gate bench bench-gate docs pictures gif samples format clean
 
 install: $(VENV)/.installed
 
@@ -73,6 +73,9 @@ pictures: install
 
 gif: install
 	$(BIN)/python docs/pictures/draw.py film
+
+samples: install
+	$(BIN)/python tools/samples.py
 
 format: install
 	$(BIN)/ruff check --fix-only .

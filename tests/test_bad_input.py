@@ -188,7 +188,7 @@ def test_clouds_that_do_not_do(points, write_pcd, refused):
     ("command", "name", "says"),
     [
         ("explore", "nowhere", "hidden_stack, shelf"),
-        ("explore", "no where/scene.xml", "no such scene"),
+        ("explore", "no where/scene.xml", "no such file or scene"),
         ("extract", "nowhere", "there is no such file"),
         ("extract", "nowhere.pcd", "missing"),
     ],
@@ -210,11 +210,11 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
     (strange / "gt.json").write_text('{"vertices": ["table", "ghost"], "edges": []}')
     for scored, truth, says in (
         (tmp_path / "nowhere", scene_file.parent, "is not a folder"),
-        (run, tmp_path / "nowhere", "is not a folder"),
+        (run, tmp_path / "nowhere", "there is no such scene or recording"),
         (recording, scene_file.parent, "run.json: the file is missing"),
         (run, recording, "gt.json: the file is missing"),
         (run, strange, "gt.json names 'ghost', which is no body of the scene"),
-        (run, tmp_path, "has neither scene.xml nor scene_camera.json"),
+        (run, tmp_path, "is neither a scene nor a recording"),
         (broken, scene_file.parent, str(broken / "views/01/graph.json")),
     ):
         capsys.readouterr()

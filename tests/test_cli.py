@@ -16,6 +16,7 @@ from synthetic import hausdorff, simulated_views
 from caryatid.config import Config
 from caryatid.geometry import transforms
 from caryatid.io.bop import read_recording, write_recording
+from caryatid.io.datasets import SAMPLES
 from caryatid.sensing.views import SUPPORT_LABEL
 from caryatid.steps import read_run
 
@@ -157,7 +158,31 @@ def test_a_cloud_is_extracted_by_labels_that_number_parts(tmp_path, points, writ
     assert {s.pair for s in run.graph.supports} == {("o0", "o1"), ("o1", "o2")}
 
 
-# evaluate, demo, config
+# evaluate, demo, config, scenes
+
+
+def test_a_run_is_scored_against_the_ground_truth_of_its_own_source(tmp_path, kept_run, scene_file, capsys):
+    def scored(*arguments):
+        capsys.readouterr()
+        assert run_command("evaluate", *arguments, "--json") == 0
+        return capsys.readouterr().out
+
+    assert scored(kept_run) == scored(kept_run, scene_file.parent) == scored(kept_run, scene_file)
+    run = tmp_path / "run"
+    assert run_command("extract", "sample-recording", "--out", run, "--no-report") == 0
+    assert json.loads(scored(run))["views"][-1]["f1"] == 1.0
+    assert scored(run) == scored(run, "sample-recording")
+
+
+def test_scenes_and_samples_are_listed_and_a_name_spelt_wrong_is_guessed(tmp_path, capsys):
+    assert run_command("scenes", "--json") == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert {"tower", "pile-SIZE-SEED"} <= set(listed["scenes"])
+    assert set(listed["samples"]) == {path.stem for path in SAMPLES.iterdir()}
+    assert run_command("extract", "sample-cloud", "--out", tmp_path / "run", "--no-report", "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["graph"]["supports"]) == 10
+    assert run_command("explore", "towr", "--out", tmp_path / "other") == 1
+    assert "did you mean tower?" in capsys.readouterr().err
 
 
 def test_a_run_is_scored_against_its_scene(kept_run, scene_file, capsys):

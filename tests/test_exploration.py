@@ -7,6 +7,7 @@ from dataclasses import fields, is_dataclass, replace
 
 import numpy as np
 import pytest
+from conftest import refusal
 from synthetic import FEW_VIEWS, model_of, simulated_scene, simulated_views
 
 from caryatid.errors import InputError, PlanningError
@@ -106,6 +107,20 @@ def test_the_next_view_can_be_asked_for_alone():
     visited = scene.sphere.direction_of(views[0].pose)[None]
     given = next_best_view(scene, None, visited, candidates=candidates)
     assert (given.index, given.score) == (decision.index, decision.score)
+    poses = candidates.T_world_camera
+    alone = next_best_view(scene, candidates=poses, path_length=candidates.path_length)
+    assert (alone.index, alone.score, alone.waypoints) == (given.index, given.score, ())
+    for wrong, named in (
+        ("left", "candidates"),
+        (poses[:, :3], "candidates"),
+        (2.0 * poses, "candidates[0]"),
+    ):
+        with refusal(named):
+            next_best_view(scene, candidates=wrong)
+    with refusal("path_length"):
+        next_best_view(scene, candidates=poses, path_length=[1.0])
+    with refusal("scene"):
+        next_best_view(scene.graph, candidates=poses)
     scene.update(views[1])
     robot.move_to(views[1].pose)
     after_two = next_best_view(scene, robot)
@@ -113,7 +128,7 @@ def test_the_next_view_can_be_asked_for_alone():
         "2 of 2 views"
     }
     with pytest.raises(PlanningError, match="there is no robot"):
-        next_best_view(scene, None, visited)
+        next_best_view(scene)
     with pytest.raises(PlanningError, match="nothing has been seen yet"):
         next_best_view(Scene(), stage().robot)
 

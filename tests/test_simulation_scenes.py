@@ -256,7 +256,7 @@ def test_sizes_and_seeds_out_of_range_are_refused(name: str):
 
 
 def test_names():
-    assert list_scenes()[: len(DESIGNED)] == list(DESIGNED)
+    assert list(list_scenes())[: len(DESIGNED)] == list(DESIGNED)
     assert is_builtin("clutter")
     assert is_builtin("pile-8-3")
     assert not is_builtin("scenes/clutter")

@@ -14,11 +14,13 @@ if TYPE_CHECKING:
     from caryatid.fitting.primitives import fit
     from caryatid.geometry.shapes import Box, Cylinder, Sphere
     from caryatid.graph import SceneObject, Support, SupportGraph
+    from caryatid.io.bop import read_recording
     from caryatid.planning.decision import Planner
     from caryatid.robots import Robot
     from caryatid.scene import Scene
     from caryatid.sensing.views import Camera, Cloud, View
     from caryatid.sessions.session import Session
+    from caryatid.sources import simulate
 
 __version__ = "0.2.0"
 
@@ -50,6 +52,8 @@ __all__ = [
     "explore",
     "fit",
     "next_best_view",
+    "read_recording",
+    "simulate",
 ]
 
 if not TYPE_CHECKING:
@@ -63,8 +67,10 @@ if not TYPE_CHECKING:
             "planning.decision": ["Planner"],
             "fitting.primitives": ["fit"],
             "robots": ["Robot"],
+            "io.bop": ["read_recording"],
             "scene": ["Scene"],
             "sessions.session": ["Session"],
+            "sources": ["simulate"],
             "geometry.shapes": ["Box", "Cylinder", "Sphere"],
             "sensing.views": ["Camera", "Cloud", "View"],
         },
@@ -72,4 +78,4 @@ if not TYPE_CHECKING:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(["__version__", *__all__])

@@ -31,6 +31,17 @@ class InputError(CaryatidError):
         return type(self), (self.source, self.reason, self.remedy)
 
 
+def check_type(name: str, value: object, wanted: str | type | tuple[type, ...], remedy: str) -> None:
+    """Refuse an argument of the wrong type, or without a method of this name.
+
+    Raises:
+        InputError: Names the argument and the type of what was given.
+    """
+    fits = hasattr(value, wanted) if isinstance(wanted, str) else isinstance(value, wanted)
+    if not fits:
+        raise InputError(name, f"has the wrong type, {type(value).__name__}", remedy)
+
+
 class WrongViewError(InputError):
     """A view whose camera or pose cannot be right; others may be."""
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from types import NoneType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import InputError, PlanningError
+from caryatid.errors import InputError, PlanningError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
@@ -21,6 +22,7 @@ from caryatid.planning.planners import make_planner
 from caryatid.planning.planners.hidden_surface import SupportPlanner
 from caryatid.robots import Posture, Robot, refusal_of, view_sphere_of, waypoints_of
 from caryatid.robots.arm import ArmRobot
+from caryatid.robots.protocol import straight_lengths
 from caryatid.runtime.display import Pictured
 from caryatid.runtime.parallel import one_blas_thread
 from caryatid.scene import Scene, Stopwatch
@@ -137,6 +139,11 @@ class Explorer:
         goal: str | None = None,
         until: float | None = None,
     ) -> None:
+        check_type("until", until, (float, int, NoneType), "give a probability, such as 0.95")
+        if camera is not None:
+            check_type("camera", camera, "capture", "give a Camera: an object with its method capture()")
+        if robot is not None:
+            check_type("robot", robot, "candidates", "give a Robot: an object with its methods")
         if until is not None and not 0.5 < until <= 1.0:
             raise InputError(
                 "until", f"{until:g} is not above 0.5 and at most 1", "give a probability, such as 0.95"
@@ -411,38 +418,77 @@ def _used_up(views: int) -> str:
 
 def next_best_view(
     scene: Scene,
-    robot: Robot | None,
+    robot: Robot | None = None,
     visited: Array | None = None,
     *,
-    candidates: Candidates | None = None,
+    candidates: Candidates | ArrayLike | None = None,
+    path_length: ArrayLike | None = None,
     planner: Planner | str = "support",
 ) -> Decision:
     """Choose where to look next (Algorithm 2).
 
     Args:
         scene: What is known, of at least one view.
-        robot: Says which views it can reach; None where they are given, with `visited`.
+        robot: Says which views it can reach; None where `candidates` are given.
         visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
             current one last; None = those of the scene, or where the robot is if they have no poses.
-        candidates: The views to choose from; None = those the robot reaches.
+        candidates: Camera poses (N, 4, 4) to choose from; None = those the robot reaches.
+        path_length: Path length (N,) [m] to each of these poses; None = straight lines.
         planner: Chooses among them, or its name.
 
     Returns:
-        The decision: `T_world_camera` is the view, `waypoints` the way there, `why` the reason.
+        The decision: `T_world_camera` is the view, `index` its place among the candidates, `waypoints` the
+        way there, `why` the reason.
 
     Raises:
+        InputError: The candidates are not poses, or path lengths do not fit them.
         PlanningError: No view is known yet, or none can be reached.
     """
+    check_type("scene", scene, Scene, "give a Scene that has seen a view")
     if scene.sphere is None:
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
-    sphere = view_sphere_of(robot, scene.sphere)
-    if robot is not None and visited is None:
-        visited = sphere.direction_of(np.stack(scene.T_world_cameras or (robot.T_world_camera,)))
-    if robot is not None and candidates is None:
+    if robot is None and candidates is None:
+        raise PlanningError("there is no robot; give the poses to choose from as candidates")
+    if robot is not None:
+        check_type("robot", robot, "candidates", "give a Robot, or None with candidates")
+    sphere, poses = view_sphere_of(robot, scene.sphere), scene.T_world_cameras
+    if not poses and robot is not None:
+        poses = (robot.T_world_camera,)
+    if visited is None:
+        if not poses:
+            raise PlanningError("no view had a camera pose; give visited, the directions of the views so far")
+        visited = sphere.direction_of(np.stack(poses))
+    if np.ndim(visited) != 2 or np.shape(visited)[1] != 3:
+        raise InputError("visited", f"has shape {np.shape(visited)}", "give unit directions (V, 3)")
+    if candidates is None:
+        assert robot is not None
         candidates = robot.candidates(sphere)
-    if visited is None or candidates is None:
-        raise PlanningError("there is no robot; give the views so far, and those to choose from")
+    elif not isinstance(candidates, Candidates):
+        candidates = given_candidates(candidates, path_length, poses[-1] if poses else None, sphere)
     return _decide(_state(scene, sphere, visited, candidates), robot, make_planner(planner), scene.seed)[0]
+
+
+def given_candidates(
+    poses: ArrayLike, path_length: ArrayLike | None, T_world_camera: Array | None, sphere: ViewSphere
+) -> Candidates:
+    """Check camera poses that a robot whose camera is at a pose (4, 4) can reach.
+
+    Raises:
+        InputError: They are not poses (N, 4, 4), or path lengths (N,) [m] are not as many or negative.
+    """
+    try:
+        named = enumerate(np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4))
+        lengths = None if path_length is None else np.asarray(path_length, dtype=np.float64)
+    except (TypeError, ValueError):
+        remedy = "give camera poses (N, 4, 4), and a path length (N,) [m] for each if they are known"
+        raise InputError("candidates", "are not an array of poses", remedy) from None
+    rigid = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
+    if lengths is None:
+        lengths = straight_lengths(T_world_camera, rigid)
+    if lengths.shape != (len(rigid),) or not (lengths >= 0.0).all():
+        reason = f"has shape {lengths.shape} or negative values for {len(rigid)} candidates"
+        raise InputError("path_length", reason, "give one length of 0 or more for each candidate")
+    return Candidates(rigid, sphere.direction_of(rigid), lengths, {})
 
 
 @one_blas_thread

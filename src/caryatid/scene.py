@@ -8,13 +8,14 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from time import perf_counter
+from types import NoneType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
-from caryatid.errors import NoSurfaceError, WrongViewError
+from caryatid.errors import InputError, NoSurfaceError, WrongViewError, check_type
 from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed
@@ -74,6 +75,12 @@ class Scene(Pictured):
     def __init__(
         self, config: Config | None = None, *, segmentation: SegmentationMethod | None = None, seed: int = 0
     ) -> None:
+        check_type("config", config, (Config, NoneType), "give a caryatid.Config")
+        check_type("seed", seed, (int, np.integer), "give a whole number of at least 0")
+        if segmentation not in (None, "labels", "auto"):
+            raise InputError("segmentation", f"'{segmentation}' is not known", "choose labels, auto or None")
+        if seed < 0:
+            raise InputError("seed", f"is {seed}", "give a whole number of at least 0")
         compile_kernels()
         self.config = config or Config()
         self.segmentation = segmentation
@@ -180,6 +187,7 @@ class Scene(Pictured):
             NoSurfaceError: There is no support surface. A view with a pose is kept all the same.
             CaryatidError: As `update`.
         """
+        check_type("source", source, (View, Cloud), "give a View or a Cloud")
         if isinstance(source, View):
             check_camera(source, self.config.session.max_coordinate)
         try:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import NoneType
 
 import numpy as np
 
 from caryatid.config import Config, NoiseModel, SegmentationMethod
-from caryatid.errors import InputError, NoSurfaceError, WrongViewError
+from caryatid.errors import InputError, NoSurfaceError, WrongViewError, check_type
 from caryatid.evaluation.scores import TrueScene
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import Explorer, Step
-from caryatid.io.datasets import Dataset, Frame, format_of, open_dataset
+from caryatid.io.datasets import Dataset, Frame, find_sample, format_of, open_dataset
 from caryatid.io.importing import choose_frames, levelled
 from caryatid.io.mask_sources import MaskSource, without_ignored
 from caryatid.io.point_clouds import read_stored_cloud
@@ -46,14 +47,20 @@ class Source:
     """
 
     name: str
-    camera: Camera
-    robot: Robot
-    truth: TrueScene | None
+    camera: Camera = field(repr=False)
+    robot: Robot = field(repr=False)
+    truth: TrueScene | None = field(repr=False)
 
 
 def is_recording(source: str) -> bool:
     """Whether SOURCE is a dataset of a known format."""
-    return Path(source).exists() and format_of(Path(source)) is not None
+    path = find_sample(source)
+    return path.exists() and format_of(path) is not None
+
+
+def is_cloud(source: str) -> bool:
+    """Whether SOURCE is the name of a cloud."""
+    return find_sample(source).suffix.lower() in CLOUD_SUFFIXES
 
 
 def open_source(
@@ -86,7 +93,7 @@ def open_source(
             robot, a robot is given for a recording, or a mask of what to ignore for a simulation.
         PlanningError: The robot reaches no view of the table.
     """
-    if Path(source).suffix.lower() in CLOUD_SUFFIXES:
+    if is_cloud(source):
         raise InputError(source, "is a single cloud, and there is nowhere to go", "use `caryatid extract`")
     if is_recording(source):
         if robot != HUMANOID:
@@ -97,11 +104,40 @@ def open_source(
         return Source(recording.path.name, RecordingCamera(recording), RecordingRobot(poses), None)
     if ignore is not None:
         raise InputError(source, "is simulated, with nothing of the robot in the image", "leave --ignore out")
-    make = find_robot(robot)
-    scene = load_scene(source)
-    truth = true_scene_from_simulation(scene)
-    stage = make_simulation(scene, config, noise=noise, seed=seed, robot=make)
-    return Source(scene.name, stage.camera, stage.robot, truth)
+    return simulate(source, noise=noise, robot=robot, seed=seed, config=config)
+
+
+def simulate(
+    scene: str | Path = "clutter",
+    *,
+    noise: NoiseModel = "carmine",
+    robot: str = HUMANOID,
+    seed: int = 0,
+    config: Config | None = None,
+) -> Source:
+    """Simulate a scene, a robot in front of it, and the robot's camera.
+
+    Args:
+        scene: Name of a built-in scene, an MJCF file, or a folder with a `scene.xml`.
+        noise: Noise of the camera: `carmine`, or `none`.
+        robot: Name of the robot: `humanoid`, `arm:FILE.npz` or `module:callable`.
+        seed: Seed of the noise.
+        config: All settings, or None for the defaults.
+
+    Returns:
+        The camera, the robot at its first view, and the ground truth.
+
+    Raises:
+        InputError: There is no such scene, noise model or robot.
+        PlanningError: The robot reaches no view of the table.
+    """
+    check_type("scene", scene, (str, Path), "give the name of a built-in scene, or an MJCF file")
+    check_type("config", config, (Config, NoneType), "give a caryatid.Config")
+    check_type("robot", robot, str, "give the name of a robot, such as humanoid")
+    make, loaded = find_robot(robot), load_scene(scene)
+    truth = true_scene_from_simulation(loaded)
+    made = make_simulation(loaded, config or Config(), noise=noise, seed=seed, robot=make)
+    return Source(loaded.name, made.camera, made.robot, truth)
 
 
 def open_recording(
@@ -174,7 +210,7 @@ def extract(
         PerceptionError: A cloud shows no support surface.
     """
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
-    if Path(source).suffix.lower() not in CLOUD_SUFFIXES:
+    if not is_cloud(source):
         recording = open_recording(source, config, segmentation, masks, ignore, level)
         return _look_at_all(explorer, recording)
     if masks is not None or ignore is not None:

@@ -43,6 +43,7 @@ COMMANDS = {
     "benchmark": "benchmark:Benchmark",
     "session": "sessions:SessionCommand",
     "serve": "sessions:Serve",
+    "scenes": "commands:Scenes",
     "config": "commands:ShowConfig",
     "completion": "commands:Completion",
 }
@@ -90,6 +91,27 @@ def _any_command() -> Any:
         subcommands.append(Annotated[Any, spec])
     # Where there is no help text, tyro looks for one in the sources of `typing`, which takes long.
     return Annotated[Union[tuple(subcommands)], tyro.conf.arg(help="")]  # noqa: UP007
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scenes(Command):
+    """List the built-in scenes, and the samples that come with caryatid.
+
+    To try:
+      caryatid scenes
+    """
+
+    def __call__(self) -> None:
+        from caryatid.cli.output import table
+        from caryatid.io.datasets import DESCRIPTIONS
+        from caryatid.simulation.scenes import list_scenes
+
+        scenes = list_scenes()
+        shown = [
+            table(title, ("name", "what it shows"), what.items())
+            for title, what in (("Scenes to simulate", scenes), ("Samples to read", DESCRIPTIONS))
+        ]
+        self.output.result({"scenes": scenes, "samples": DESCRIPTIONS}, *shown)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -77,13 +77,14 @@ class Evaluate(options.Command):
     objects that were found.
 
     To try:
+      caryatid evaluate run
       caryatid evaluate run scenes/tower
     """
 
     run: options.RunPath
     """Run folder."""
-    truth: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="GT")]
-    """Scene folder (scene.xml and gt.json), or recording with masks and gt.json."""
+    truth: Annotated[str | None, tyro.conf.Positional, options.shown("GT", "the run's source")] = None
+    """Scene (built-in name, scene.xml or its folder), or recording with masks and gt.json."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
@@ -96,7 +97,8 @@ class Evaluate(options.Command):
             "average_precision": "average\nprecision",
         }  # fmt: skip
         rows = [[f"{view['view']:02d}", *(f"{view[name]:.3f}" for name in columns)] for view in views]
-        shown = table(f"{self.run} against {self.truth}", ["view", *columns.values()], rows, figures=True)
+        truth = self.truth or "the ground truth of its source"
+        shown = table(f"{self.run} against {truth}", ["view", *columns.values()], rows, figures=True)
         self.output.result({"views": views}, shown)
 
 

@@ -11,6 +11,7 @@ from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.scores import Score, TrueObject, TrueScene, score, score_masks
 from caryatid.io.bop import read_recording
+from caryatid.io.datasets import find_sample
 from caryatid.simulation import world
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, load_scene
 from caryatid.simulation.truth import GroundTruth, ground_truth, read_truth
@@ -47,37 +48,39 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
 
 
 def evaluate_run(
-    run_folder: str | Path, truth_folder: str | Path, config: EvaluationConfig | None = None
+    run_folder: str | Path, truth: str | Path | None = None, config: EvaluationConfig | None = None
 ) -> tuple[Score, ...]:
-    """Score every view of a run, in their order: what `caryatid evaluate RUN GT` does.
+    """Score every view of a run, in their order: what `caryatid evaluate RUN [GT]` does.
 
     Args:
         run_folder: A run.
-        truth_folder: A scene folder (`scene.xml` and `gt.json`), or a recording with masks and `gt.json`.
+        truth: Name of a built-in scene, an MJCF file or scene folder, with `gt.json` beside it or else scored
+            against physics; or a recording with masks and `gt.json`. None = the run's own source.
         config: Least IoU, tolerance of the table's height, points a pair.
 
     Raises:
         InputError: The run or the truth is missing or broken, or they do not fit each other.
     """
-    folder = Path(truth_folder)
     run = read_run(run_folder)
-    if not folder.is_dir():
-        raise InputError(folder, "is not a folder", "give a scene folder or a recording with gt.json")
-    if (folder / SCENE_FILE).is_file():
-        truth = read_truth(folder / TRUTH_FILE)
-        scene = true_scene_from_simulation(load_scene(folder / SCENE_FILE), truth)
+    source = str(run.record["source"] if truth is None else truth)
+    folder = find_sample(source)
+    if is_builtin(source) or (folder / SCENE_FILE).is_file() or folder.suffix == ".xml":
+        scene = true_scene_from_simulation(load_scene(source))
         scores = [score(view.graph, scene, config=config) for view in run.views]
     elif (folder / "scene_camera.json").is_file():
-        truth, recording = read_truth(folder / TRUTH_FILE), read_recording(folder)
+        known, recording = read_truth(folder / TRUTH_FILE), read_recording(folder)
         # A recording of one frame needs no names.
         lone = recording.frames[0] if len(recording) == 1 else None
         true_labels = [(lone or recording.frame(view.name)).load_labels() for view in run.views]
-        labels, edges = [view.load_labels() for view in run.views], frozenset(truth.pairs)
+        labels, edges = [view.load_labels() for view in run.views], frozenset(known.pairs)
         scores = [
-            score_masks(view.graph, labels[:n], true_labels[:n], truth.vertices, edges, config)
+            score_masks(view.graph, labels[:n], true_labels[:n], known.vertices, edges, config)
             for n, view in enumerate(run.views, 1)
         ]
     else:
-        why = "has neither scene.xml nor scene_camera.json"
-        raise InputError(folder, why, "give a scene folder or a recording")
+        why = (
+            "is neither a scene nor a recording" if folder.exists() else "there is no such scene or recording"
+        )
+        remedy = "give a scene (scene.xml), or a recording with scene_camera.json and gt.json"
+        raise InputError(source, why, remedy)
     return tuple(scores)

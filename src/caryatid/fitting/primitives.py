@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from caryatid.config import FitConfig
+from caryatid.errors import InputError, check_type
 from caryatid.fitting.hidden_faces import Seen, close_hidden_faces
 from caryatid.fitting.least_squares import CONVERGED, levenberg_marquardt
 from caryatid.fitting.search import TRIM, search
@@ -78,7 +79,16 @@ def fit(
         config: Limits and thresholds.
         rng: Source of the samples.
         space: What has been seen free, where points are in the world frame: shapes do not fill it.
+
+    Raises:
+        InputError: Points and normals differ in shape, or an argument is of another type.
     """
+    check_type("config", config, FitConfig, "give a FitConfig, such as caryatid.Config().fit")
+    check_type("rng", rng, np.random.Generator, "give a generator, such as np.random.default_rng(0)")
+    for name, values in (("points", points), ("normals", normals)):
+        if np.shape(values) != (len(points), 3):
+            reason = f"has shape {np.shape(values)}"
+            raise InputError(name, reason, "give points (N, 3) [m] and a unit normal (N, 3) for each")
     points, normals = _finite(points, normals)
     if len(points) < config.min_points:
         return FitFailure(f"{len(points)} points are fewer than the {config.min_points} a shape needs")

@@ -49,6 +49,11 @@ class Shape(Pictured):
     spread: ClassVar[tuple[float, float, float]] = (1.0 / 12.0, 1.0 / 12.0, 1.0 / 12.0)
     T_world_object: Array
 
+    def __post_init__(self) -> None:
+        if np.shape(self.T_world_object) != (4, 4):
+            reason = f"has shape {np.shape(self.T_world_object)}"
+            raise InputError("T_world_object", reason, "give a homogeneous rigid transform (4, 4)")
+
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         KINDS[cls.kind] = cls
@@ -145,6 +150,14 @@ class Shape(Pictured):
         T_object_world = transforms.invert(self.T_world_object)
         return trimesh.convex.convex_hull(transforms.transform(T_object_world, self.outline()))
 
+    def to_trimesh(self, corners: int = 48) -> Any:
+        """The shape as a `trimesh.Trimesh` in the world frame [m].
+
+        Args:
+            corners: Corners that stand for a circle [1].
+        """
+        return self.mesh(corners).apply_transform(self.T_world_object)
+
     def lines(self, eye_world: Array) -> list[Array]:
         """Lines (M, 3) [m] that draw the shape: edges, rims, and the silhouette seen from a point (3,)."""
         eye = transforms.transform(transforms.invert(self.T_world_object), eye_world)
@@ -191,6 +204,12 @@ class Box(Shape):
     extents: Array
     kind: ClassVar[str] = "box"
     fill: ClassVar[float] = 1.0
+
+    def __post_init__(self) -> None:
+        Shape.__post_init__(self)
+        if np.shape(self.extents) != (3,):
+            raise InputError("extents", f"has shape {np.shape(self.extents)}", "give three edge lengths [m]")
+        object.__setattr__(self, "extents", np.asarray(self.extents, dtype=np.float64))
 
     @classmethod
     def from_extents(cls, T_world_object: Array, extents: Array) -> Box:

@@ -30,7 +30,10 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
         InputError: The matrix has another shape, holds NaN, is no proper rotation or has a wrong last row, or
             the translation is beyond `FARTHEST`.
     """
-    matrix = np.asarray(T, dtype=np.float64)
+    try:
+        matrix = np.asarray(T, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(name, "is not a matrix", "give a homogeneous rigid transform (4, 4)") from None
     if matrix.shape != (4, 4):
         raise InputError(name, f"shape {matrix.shape} is not (4, 4)", "give a homogeneous rigid transform")
     if not np.isfinite(matrix).all():

@@ -12,11 +12,11 @@ from annotated_types import Ge, Gt, Lt
 from numpy.typing import NDArray
 
 from caryatid.config import RecordingConfig
-from caryatid.errors import InputError
+from caryatid.errors import InputError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.io import images
-from caryatid.io.datasets import Dataset, Frame, OpenOptions
+from caryatid.io.datasets import Dataset, Frame, OpenOptions, find_sample
 from caryatid.io.json_files import Numbers, json_text, parse_json, read_json
 from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import SUPPORT_LABEL, View, check_intrinsics
@@ -65,14 +65,15 @@ def read_recording(folder: str | Path) -> Dataset:
     has drifted from orthonormal by less than 0.02 is replaced by the nearest rotation.
 
     Args:
-        folder: The scene folder. Lengths in it are millimetres.
+        folder: The scene folder, or `sample-recording`. Lengths in it are millimetres.
 
     Raises:
         InputError: A table is missing or broken, a camera or pose is not valid, a mask names no object,
             several frames have no poses, or there is no frame. Loading a frame raises it where an image is
             missing, broken, of another size or mode, or where masks overlap.
     """
-    folder = Path(folder)
+    check_type("folder", folder, (str, Path), "give a scene folder of the BOP format")
+    folder = find_sample(folder)
     if not folder.is_dir():
         raise InputError(folder, "is not a folder", "give a scene folder of the BOP format")
     path = folder / "scene_camera.json"

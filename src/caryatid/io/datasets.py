@@ -31,6 +31,20 @@ NO_POSE: Final = "no pose"
 """Why a frame of a video does not become a view."""
 
 
+SAMPLES: Final = Path(__file__).parents[1] / "samples"
+"""Folder of what comes with the package."""
+DESCRIPTIONS: Final = {
+    "sample-recording": "eight views of the simulated scene clutter, with noise, masks and ground truth",
+    "sample-cloud": "points of the same scene from all sides, with normals and labels",
+}
+"""What each sample in there is."""
+
+
+def find_sample(source: str | Path) -> Path:
+    """Return the path of the sample with this name, or else the given path."""
+    return next(SAMPLES.glob(f"{source}*")) if str(source) in DESCRIPTIONS else Path(source)
+
+
 @dataclass(frozen=True, eq=False, slots=True)
 class Frame:
     """One frame of a dataset, not decoded yet.
@@ -147,14 +161,14 @@ def open_dataset(
     """Open a dataset of any known format.
 
     Args:
-        path: BOP scene folder, TUM RGB-D folder, bag, or what another package recognises.
+        path: BOP scene folder, TUM RGB-D folder, bag, `sample-recording`, or what another package recognises.
         config: Limits of time and range.
         options: What the format may need to know.
 
     Raises:
         InputError: It does not exist, is of no known format, or is damaged.
     """
-    path = Path(path)
+    path = find_sample(path)
     if not path.exists():
         raise InputError(path, "there is no such file or folder", "give a recording")
     known = format_of(path)

@@ -16,6 +16,7 @@ from caryatid.config import CloudConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.io.datasets import find_sample
 from caryatid.io.staging import read_errors
 from caryatid.sensing.clouds import estimate_normals
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
@@ -87,7 +88,7 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
     """Read all points of a PCD or PLY file.
 
     Args:
-        path: A file that ends in .pcd or .ply.
+        path: A file that ends in .pcd or .ply, or `sample-cloud`.
         label_divisor: The object number is the field `label` divided by this, rounded down. Sets that number
             the parts of objects, as mOSD does with object = label // 10, need 10.
 
@@ -95,7 +96,7 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
         InputError: The file is missing, of another kind, broken, its header lies, it holds no readings, or
             its labels are no object numbers.
     """
-    path = Path(path)
+    path = find_sample(path)
     parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
     if parse is None:
         raise InputError(path, "is no .pcd or .ply file", "convert it to one of these")

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from caryatid.errors import InputError
 from caryatid.geometry import points as kernels
@@ -55,7 +55,7 @@ class View(Pictured):
     ignored: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
-        depth = np.asarray(self.depth, dtype=np.float32)
+        depth = _numbers(self.depth, np.float32, f"{self.name}: depth")
         if depth.ndim != 2 or depth.size == 0:
             raise InputError(
                 self.name, f"depth has shape {depth.shape}", "give a depth image (H, W) in metres"
@@ -69,6 +69,8 @@ class View(Pictured):
         if self.T_world_camera is not None:
             T = transforms.as_rigid(self.T_world_camera, f"{self.name}: T_world_camera")
             object.__setattr__(self, "T_world_camera", T)
+        if self.labels_are not in ("objects", "segments"):
+            raise InputError(self.name, f"labels_are is '{self.labels_are}'", "choose objects or segments")
         if self.labels is not None and np.ndim(self.labels) == 3:
             object.__setattr__(self, "labels", labels_from_masks(self.labels))
             object.__setattr__(self, "labels_are", "segments")
@@ -77,13 +79,21 @@ class View(Pictured):
             image = getattr(self, field)
             if image is None:
                 continue
-            image = np.asarray(image)
+            image = _numbers(image, None, f"{self.name}: {field}")
             if image.shape[:2] != depth.shape:
                 raise InputError(
                     self.name,
                     f"{field} is {_size(image)}, depth is {_size(depth)}",
                     "register the images to one size",
                 )
+            if field == "rgb" and (image.dtype != np.uint8 or image.shape[2:] != (3,)):
+                reason = f"rgb has shape {image.shape} and type {image.dtype}"
+                raise InputError(
+                    self.name, reason, "give (H, W, 3) uint8, such as (255 * rgb).astype(np.uint8)"
+                )
+            if field == "labels" and (image.dtype.kind == "f" and (image != np.rint(image)).any()):
+                remedy = "give whole numbers (H, W), or a stack of masks (N, H, W)"
+                raise InputError(self.name, "labels are not whole numbers", remedy)
             if field == "labels" and ((image < 0).any() or (image >= SUPPORT_LABEL).any()):
                 raise InputError(
                     self.name, f"labels leave 0…{SUPPORT_LABEL - 1}", "number objects from 1, 0 = nothing"
@@ -155,6 +165,9 @@ class Cloud(Pictured):
         rgb: (N, 3) uint8, or None.
         viewpoint_world: Where the sensor was (3,) [m], or None.
         name: What to call the cloud in messages.
+
+    Raises:
+        InputError: Sizes differ, or something is not an array of numbers.
     """
 
     points_world: Array
@@ -163,6 +176,18 @@ class Cloud(Pictured):
     rgb: NDArray[np.uint8] | None = None
     viewpoint_world: Array | None = None
     name: str = "cloud"
+
+    def __post_init__(self) -> None:
+        for field, shape in {"points_world": (3,), "normals_world": (3,), "labels": (), "rgb": (3,)}.items():
+            if (values := getattr(self, field)) is None and field in ("labels", "rgb"):
+                continue
+            array = _numbers(values, None, f"{self.name}: {field}")
+            if array.shape != (len(self.points_world), *shape):
+                wanted = ", ".join(["N", *map(str, shape)])
+                raise InputError(
+                    self.name, f"{field} has shape {array.shape}", f"give ({wanted}), one for each point"
+                )
+            object.__setattr__(self, field, array)
 
     def __len__(self) -> int:
         return len(self.points_world)
@@ -244,7 +269,7 @@ def check_intrinsics(K: Array, name: str) -> Array:
     Raises:
         InputError: Wrong shape, NaN, or a focal length that is not positive.
     """
-    matrix = np.asarray(K, dtype=np.float64)
+    matrix = _numbers(K, np.float64, f"{name}: K")
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         raise InputError(name, "K is not a finite 3×3 matrix", "give [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     if matrix[0, 0] <= 0.0 or matrix[1, 1] <= 0.0:
@@ -254,6 +279,23 @@ def check_intrinsics(K: Array, name: str) -> Array:
             "give positive focal lengths in pixels",
         )
     return matrix
+
+
+def _numbers(values: Any, dtype: DTypeLike | None, name: str) -> NDArray[Any]:
+    """The values as an array of numbers of a type; None = as they are.
+
+    Raises:
+        InputError: They are none.
+    """
+    try:
+        array = np.asarray(values, dtype=dtype)
+    except (TypeError, ValueError):
+        array = np.array(None)
+    if array.dtype.kind not in "biuf":
+        raise InputError(
+            name, f"is not an array of numbers but {type(values).__name__}", "give a NumPy array"
+        )
+    return array
 
 
 def _size(image: NDArray[np.generic]) -> str:

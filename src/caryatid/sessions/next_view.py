@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from caryatid.errors import InputError, PlanningError
+from caryatid.errors import PlanningError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
@@ -83,25 +82,6 @@ def table_floor(scene: Scene) -> FloorGrid:
     extents = np.array([*shape.extents[:2], max(abs(top), 2.0 * STEP)])
     box = Box(T_world_box, extents)
     return FloorGrid.from_boxes([box], scene.config.robot, scene.sphere.centre_world[:2])
-
-
-def given_candidates(
-    poses: ArrayLike, path_length: ArrayLike | None, T_world_camera: Array, sphere: ViewSphere
-) -> Candidates:
-    """What a robot whose camera is at a pose (4, 4) says it reaches, checked.
-
-    Raises:
-        InputError: One of the poses (N, 4, 4) is none, or path lengths (N,) [m] are not as many or negative.
-    """
-    named = enumerate(np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4))
-    rigid = np.array([transforms.as_rigid(T, f"candidates[{n}]") for n, T in named]).reshape(-1, 4, 4)
-    if path_length is None:
-        path_length = straight_lengths(T_world_camera, rigid)
-    lengths = np.asarray(path_length, dtype=np.float64)
-    if lengths.shape != (len(rigid),) or not (lengths >= 0.0).all():
-        remedy = "give as many as candidates, 0 or more"
-        raise InputError("path_length", "is not one length a candidate", remedy)
-    return Candidates(rigid, sphere.direction_of(rigid), lengths, {})
 
 
 def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:

@@ -31,7 +31,7 @@ from pydantic import Base64Bytes
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError
-from caryatid.exploration import next_best_view, reason_to_stop
+from caryatid.exploration import given_candidates, next_best_view, reason_to_stop
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import png, read_mask
@@ -53,7 +53,7 @@ from caryatid.scene import KEPT, Scene
 from caryatid.segmentation.view_checks import described
 from caryatid.sensing.views import View
 from caryatid.sessions.captures import CameraRecord, Capture
-from caryatid.sessions.next_view import NextView, given_candidates, reached_candidates, table_floor
+from caryatid.sessions.next_view import NextView, reached_candidates, table_floor
 
 FORMAT: Final = {"format": "caryatid/session", "version": 1}
 """How session.json begins."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
+from difflib import get_close_matches
 from os import PathLike, fspath
 from pathlib import Path
 from types import MappingProxyType
@@ -26,7 +28,6 @@ from caryatid.simulation.world import (
 
 DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
     {
-        # Four on top of each other: each is held by the one below alone.
         "tower": (
             box((0.14, 0.14, 0.08), at=(0.0, 0.0, 0.04)),
             cylinder(0.05, 0.09, at=(0.0, 0.005, 0.125)),
@@ -34,7 +35,6 @@ DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
             cylinder(0.03, 0.07, at=(0.0, 0.0, 0.265)),
             sphere(0.035, at=(-0.12, 0.18, 0.035)),
         ),
-        # A plank on two pillars with a load in the middle: two supporters.
         "bridge": (
             box((0.07, 0.08, 0.12), at=(0.0, -0.13, 0.06)),
             cylinder(0.04, 0.12, at=(0.0, 0.13, 0.06)),
@@ -42,21 +42,18 @@ DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
             box((0.08, 0.08, 0.08), at=(0.0, 0.02, 0.185), turn=(0.0, 0.0, 20.0)),
             sphere(0.035, at=(0.02, 0.0, 0.035)),
         ),
-        # A plank that would tip over its pedestal but for the weight on its short end: top-down.
         "counterweight": (
             box((0.11, 0.1, 0.1), at=(0.0, 0.0, 0.05)),
             box((0.07, 0.38, 0.02), at=(0.0, -0.13, 0.11), density=500.0),
             cylinder(0.04, 0.08, at=(0.0, 0.012, 0.16), density=3000.0),
             box((0.06, 0.06, 0.05), at=(0.02, -0.26, 0.025)),
         ),
-        # A smooth plank that stands only because it leans on a heavy block.
         "leaning_plank": (
             box((0.1, 0.14, 0.28), at=(0.05, 0.0, 0.14), density=1200.0, friction=0.1),
             box((0.02, 0.09, 0.24), at=(-0.039, 0.0, 0.1215), turn=(0.0, 14.0, 0.0), friction=0.1),
             cylinder(0.035, 0.1, at=(-0.03, 0.2, 0.05)),
             box((0.05, 0.05, 0.05), at=(-0.03, 0.2, 0.125)),
         ),
-        # What a big box hides from where the robot starts: a stack of three and a ball.
         "hidden_stack": (
             box((0.09, 0.3, 0.26), at=(-0.13, 0.0, 0.13)),
             box((0.12, 0.12, 0.06), at=(0.04, -0.02, 0.03)),
@@ -64,7 +61,6 @@ DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
             cylinder(0.03, 0.08, at=(0.045, -0.02, 0.15)),
             sphere(0.04, at=(0.06, 0.13, 0.04)),
         ),
-        # A board on two cans over things that stand under it: hidden from above, open at the sides.
         "shelf": (
             cylinder(0.035, 0.13, at=(0.0, -0.16, 0.065)),
             cylinder(0.035, 0.13, at=(0.0, 0.16, 0.065)),
@@ -74,7 +70,6 @@ DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
             box((0.09, 0.07, 0.1), at=(0.0, -0.08, 0.2)),
             cylinder(0.03, 0.06, at=(0.0, 0.1, 0.18)),
         ),
-        # The table of the paper's figures: stacks before and behind each other, a bridge, a ball.
         "clutter": (
             box((0.17, 0.22, 0.1), at=(0.07, 0.02, 0.05)),
             box((0.1, 0.13, 0.06), at=(0.07, -0.01, 0.13)),
@@ -89,6 +84,22 @@ DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
     }
 )
 """Bodies of each designed scene, by name; heights count from the table top."""
+
+DESCRIPTIONS: Final[Mapping[str, str]] = {
+    "tower": "a stack of four and a ball",
+    "bridge": "a plank on two pillars with a load in the middle: two supporters",
+    "counterweight": "a plank that tips unless the weight on its short end stays: top-down support",
+    "leaning_plank": "a smooth plank that stands only because it leans on a heavy block",
+    "hidden_stack": "a stack of three and a ball, hidden behind a large box at first",
+    "shelf": "a board on two cans above other objects: hidden from above, visible from the sides",
+    "clutter": "the table in the paper's figures: stacks in front of each other, a bridge, a ball",
+    "pile": "primitives dropped in a pile",
+    "dense": "a heap between screens and walls",
+    "packed": "objects that touch each other",
+    "house": "household objects on and in each other: trays, bowls, mugs, plates, books, bottles",
+    "blocks": "equal boxes in a row, a wall or a pyramid",
+}
+"""What each designed scene and each kind of generated one shows."""
 
 
 SCENE_FILE = "scene.xml"
@@ -122,8 +133,10 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
     if path.is_dir():
         path = path / SCENE_FILE
     if not path.exists():
-        remedy = f"give an MJCF file or one of the built-in scenes: {', '.join(list_scenes())}"
-        raise InputError(path, "no such scene", remedy)
+        remedy = f"give an MJCF file or the name of a built-in scene: {', '.join(list_scenes())}"
+        if meant := get_close_matches(text, DESIGNED, 1):
+            remedy = f"did you mean {meant[0]}? `caryatid scenes` lists all"
+        raise InputError(path, "no such file or scene", remedy)
     if not path.is_file():
         raise InputError(path, "Not a file", "give an MJCF file")
     try:
@@ -136,9 +149,10 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
     return scene_from_spec(spec, name or path.stem, str(path), config)
 
 
-def list_scenes() -> list[str]:
-    """Names `load_scene` knows: the designed scenes, then the generators with their range of sizes."""
-    return [*DESIGNED, *(f"{kind}-SIZE-SEED (SIZE {a}…{b})" for kind, (a, b) in SIZES.items())]
+def list_scenes() -> dict[str, str]:
+    """Names `load_scene` knows, and what each scene shows: the designed scenes, then the generated kinds."""
+    generated = {f"{kind}-SIZE-SEED": f"{DESCRIPTIONS[kind]}; SIZE {a}–{b}" for kind, (a, b) in SIZES.items()}
+    return {name: DESCRIPTIONS[name] for name in DESIGNED} | generated
 
 
 def is_builtin(source: str | PathLike[str]) -> bool:

@@ -6,7 +6,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING
 
-from caryatid.errors import InputError
+from caryatid.errors import InputError, check_type
 
 if TYPE_CHECKING:
     from caryatid.planning.decision import Planner
@@ -52,6 +52,7 @@ def make_planner(name: Planner | str) -> Planner:
     """
     planner: Planner
     if not isinstance(name, str):
+        check_type("planner", name, "plan", "give the name of a planner, or an object with its method plan()")
         return name
     if name in BUILT_IN:
         module, maker, *arguments = BUILT_IN[name]
