@@ -2,7 +2,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: install demo test chromium check notebooks package accuracy-gate bench bench-gate docs pictures gif samples format clean
+.PHONY: install demo test fuzz chromium check notebooks package accuracy-gate bench bench-gate docs pictures gif samples format clean
 
 install: $(VENV)/.installed
 
@@ -22,6 +22,10 @@ demo: $(VENV)/.usable
 
 test: install
 	$(BIN)/python -m pytest
+
+# Hostile input at every door; SEED=1 makes up other cases.
+fuzz: install
+	$(BIN)/python -m pytest tests/fuzz.py -n 2 --hypothesis-seed=$(or $(SEED),0)
 
 # What the viewer's tests look at it with. Elsewhere than on Debian and its like, install one and set CHROMIUM.
 chromium:

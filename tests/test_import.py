@@ -283,30 +283,13 @@ def test_an_empty_bag(tmp_path, kind, unfit):
 
 
 @EACH_KIND
-def test_a_bag_that_was_cut_off_or_has_wrong_bytes_is_read_or_refused_in_one_line(
-    tmp_path, views, kind, capsys, unfit
-):
+def test_a_bag_that_was_cut_off(tmp_path, views, kind, unfit):
     bag = bag_of(tmp_path, views, kind)
     (file,) = [bag] if bag.is_file() else [p for p in bag.iterdir() if p.suffix in (".db3", ".mcap")]
     whole = file.read_bytes()
     for share in (0.001, 0.3, 0.99):
         file.write_bytes(whole[: int(share * len(whole))])
         unfit(bag, *ALL, says="rosbags cannot read it (")
-    rng = np.random.default_rng(0)
-    for _ in range(15):
-        damaged = bytearray(whole)
-        for place in rng.integers(0, len(whole), 40):
-            damaged[place] = rng.integers(0, 256)
-        # Names, sizes and indices stand at both ends, pixels in between.
-        damaged[rng.integers(100, 6000)] ^= 255
-        damaged[-rng.integers(1, 3000)] ^= 255
-        file.write_bytes(bytes(damaged))
-        status = run_command("import", bag, *ALL, "--out", tmp_path / "out")
-        told = capsys.readouterr().err
-        assert "a fault in caryatid" not in told
-        assert (tmp_path / "out").exists() == (status == 0)
-        assert status == 0 or told.count("\n") == 1
-        shutil.rmtree(tmp_path / "out", ignore_errors=True)
 
 
 # Folders of the TUM RGB-D benchmark

@@ -134,9 +134,10 @@ def simulate(
     check_type("scene", scene, (str, Path), "give the name of a built-in scene, or an MJCF file")
     check_type("config", config, (Config, NoneType), "give a caryatid.Config")
     check_type("robot", robot, str, "give the name of a robot, such as humanoid")
-    make, loaded = find_robot(robot), load_scene(scene)
+    config = config or Config()
+    make, loaded = find_robot(robot), load_scene(scene, config.physics)
     truth = true_scene_from_simulation(loaded)
-    made = make_simulation(loaded, config or Config(), noise=noise, seed=seed, robot=make)
+    made = make_simulation(loaded, config, noise=noise, seed=seed, robot=make)
     return Source(loaded.name, made.camera, made.robot, truth)
 
 

@@ -323,8 +323,8 @@ def _read_step(folder: Path) -> Step:
         stored: dict[str, Any] = dict(np.load(io.BytesIO(content), allow_pickle=False))
         stored |= json.loads(stored.pop("document").tobytes())
         return _decoded(stored | {"graph": read_graph(folder / "graph.json")})
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(path, f"is not a step of a run ({error})", remedy) from error
+    except Exception as error:  # a damaged archive raises almost anything
+        raise InputError(path, f"is not a step of a run ({' '.join(str(error).split())})", remedy) from error
 
 
 def _decoded(stored: dict[str, Any]) -> Step:

@@ -18,6 +18,7 @@ from filelock import FileLock, Timeout
 
 from caryatid.benchmark.episodes import MEASURES, Episode, Outcome
 from caryatid.errors import InputError, needs_extra
+from caryatid.io.json_files import parse_json
 from caryatid.runtime import LIBRARIES
 
 if TYPE_CHECKING:
@@ -36,6 +37,30 @@ class Member:
     method: str
     condition: str
     family: str
+
+
+@dataclass(frozen=True, slots=True)
+class _First:
+    """The first line."""
+
+    about: dict[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """A line that says what a suite consists of."""
+
+    suite: str
+    members: list[Member]
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    """A line that says what came of an episode."""
+
+    key: str
+    rows: tuple[dict[str, int | float | list[tuple[float, float, bool]] | None], ...]
+    error: str | None
 
 
 class ResultStore:
@@ -120,7 +145,10 @@ class ResultStore:
         about = ("method", "condition", "family", *Episode.__slots__)
         columns = [*about, "view", *MEASURES, "forecasts", "error"]
         table = import_pandas().DataFrame(rows, columns=columns)
-        return table.astype({"view": "Int64", "error": "string", **dict.fromkeys(MEASURES, "float64")})
+        try:
+            return table.astype({"view": "Int64", "error": "string", **dict.fromkeys(MEASURES, "float64")})
+        except (ValueError, TypeError):
+            raise InputError(self.path, "is not a result file", "choose another folder") from None
 
     def _key(self, episode: Episode) -> str:
         return episode.key(self.about["fingerprint"])
@@ -147,15 +175,17 @@ class ResultStore:
         whole = content[: content.rfind(b"\n") + 1]
         try:
             about, *lines = [json.loads(line) for line in whole.splitlines()] or [{"about": {}}]
-            self.about = about["about"]
+            self.about = parse_json(_First, about, self.path).about
             for line in lines:
                 if "suite" in line:
-                    self.suites[line["suite"]] = [_member(**member) for member in line["members"]]
+                    plan = parse_json(_Plan, line, self.path)
+                    self.suites[plan.suite] = plan.members
                 else:
-                    self._keep(line["key"], Outcome(tuple(line["rows"]), line["error"]))
+                    done = parse_json(_Done, line, self.path)
+                    self._keep(done.key, Outcome(done.rows, done.error))
             if not whole and (self._file is None or not b'{"about"'.startswith(content[:8])):
                 raise ValueError
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, TypeError, RecursionError, InputError):
             raise InputError(self.path, "is not a result file", "choose another folder") from None
         if self._file is not None and len(whole) < len(content):
             self._file.truncate(len(whole))
@@ -217,10 +247,6 @@ def describe_provenance(about: Mapping[str, str]) -> str:
         f"caryatid {known['version']}, commit {known['commit'][:12]}{changed}, on {known['processor']}, "
         f"{known['cores']} cores, {known['platform']}, Python {known['python']}; {about.get('libraries', '')}"
     )
-
-
-def _member(episode: dict[str, Any], **about: str) -> Member:
-    return Member(Episode(**episode | {"settings": tuple(episode["settings"])}), **about)
 
 
 def _git(folder: Path, *arguments: str) -> str:

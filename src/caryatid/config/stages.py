@@ -516,6 +516,10 @@ class PhysicsConfig:
     """An object displaced by more than this has moved [m]."""
     turned: Angle = 8.0
     """An object turned by more than this has moved [deg]."""
+    max_copies: Count = 1000
+    """Maximum number of copies that one element of an MJCF file makes [1]; 1,000 settle in 4 s."""
+    max_cells: Count = 4_000_000
+    """Maximum number of cells of a height field and of pixels of a texture in an MJCF file [1]: 0.2 GB."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

@@ -19,6 +19,8 @@ from caryatid.io.staging import read_errors
 
 T = TypeVar("T")
 
+LARGEST: Final = 2.0**63
+"""No number of a file is larger, in no unit: its square is finite, and it is a whole number of 64 bits."""
 DECIMALS: Final = 9
 """Decimals floats are written with: a nanometre, far below the sensor's noise, far above rounding errors."""
 
@@ -62,7 +64,7 @@ class Numbers:
             array = array.reshape(0, *self.shape[1:])
         shape = tuple(n if n < 0 else m for n, m in zip(self.shape, array.shape, strict=False))
         fits = array.ndim == len(self.shape) and shape == self.shape and array.dtype.kind in "if"
-        if not fits or not np.isfinite(array).all():
+        if not fits or not (np.abs(array) <= LARGEST).all():
             sizes = "×".join("N" if n < 0 else str(n) for n in self.shape)
             raise ValueError(f"must be {sizes} finite numbers")
         array = array.astype(np.float64)
@@ -87,6 +89,8 @@ def parse_json(
         InputError: A key is missing, or a value is of another type; the sentence names the key.
     """
     try:
+        if not _largest(document) <= LARGEST:
+            raise ValueError(f"a number is larger than {LARGEST:.2g}")
         read: T = _adapter(kind).validate_json(json.dumps(document, allow_nan=False), strict=True)
     except ValidationError as error:
         raise InputError(str(source), _sentence(error.errors()[0]), remedy) from None
@@ -146,6 +150,18 @@ def plain(value: Any) -> Any:
 
 
 _adapter = cache(TypeAdapter[Any])
+
+
+def _largest(value: Any) -> float:
+    """The largest absolute value of all numbers in a document."""
+    match value:
+        case Mapping():
+            return max(map(_largest, value.values()), default=0)
+        case list():
+            return max(map(_largest, value), default=0)
+        case int() | float():
+            return abs(value)
+    return 0
 
 
 def _sentence(error: Any) -> str:

@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from math import hypot, isfinite
+from math import hypot
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
@@ -253,5 +253,5 @@ class TransformTree:
 
 
 def is_pose(numbers: Sequence[float]) -> bool:
-    """Whether numbers are a translation and a quaternion: seven, finite, the quaternion not of length 0."""
-    return len(numbers) == 7 and all(map(isfinite, numbers)) and hypot(*numbers[3:]) > 1e-6
+    """Whether numbers are a translation and a quaternion: seven, none huge, no quaternion of length 0."""
+    return len(numbers) == 7 and all(abs(n) <= 1e9 for n in numbers) and hypot(*numbers[3:]) > 1e-6

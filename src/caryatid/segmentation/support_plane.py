@@ -165,7 +165,7 @@ class _Scene(NamedTuple):
         size = cells.max(axis=1) + 1
         owner = cells[0] * size[1] + cells[1]
         count = np.bincount(owner, minlength=int(size.prod())).reshape(size)
-        reach = int(np.ceil(self.config.gap / cell / 2.0))
+        reach = int(min(np.ceil(self.config.gap / cell / 2.0), size.max()))
         near = ndimage.distance_transform_edt(np.pad(count == 0, reach))[reach:-reach, reach:-reach] <= reach
         part, _ = ndimage.label(near)
         main = int(np.argmax(np.bincount(part.ravel(), weights=count.ravel())))

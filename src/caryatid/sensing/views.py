@@ -64,6 +64,8 @@ class View(Pictured):
         if np.isinf(depth).any() or (depth < 0.0).any():
             bad = "infinite" if np.isinf(depth).any() else "negative"
             raise InputError(self.name, f"depth holds {bad} values", "mark missing readings with 0 or NaN")
+        # What is nearer than a micrometre is no reading, and its inverse may be infinite.
+        depth = np.where(depth < 1e-6, np.float32(0.0), depth)
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "K", check_intrinsics(self.K, self.name))
         if self.T_world_camera is not None:
@@ -299,4 +301,4 @@ def _numbers(values: Any, dtype: DTypeLike | None, name: str) -> NDArray[Any]:
 
 
 def _size(image: NDArray[np.generic]) -> str:
-    return f"{image.shape[1]}×{image.shape[0]}"
+    return "×".join(map(str, image.shape[1::-1])) or "a single number"

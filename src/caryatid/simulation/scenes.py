@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from difflib import get_close_matches
+from math import prod
 from os import PathLike, fspath
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, cast
+from xml.etree import ElementTree
 
 import mujoco
 
@@ -108,6 +111,12 @@ SCENE_FILE = "scene.xml"
 TRUTH_FILE = "gt.json"
 """Name of the ground truth beside it."""
 
+_COPIES = ("replicate", "composite", "flexcomp")
+_SIZED: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
+    {"hfield": ("nrow", "ncol"), "texture": ("width", "height")} | dict.fromkeys(_COPIES, ("count",))
+)
+"""Elements of MJCF that may take much memory → attributes that say how much."""
+
 _GENERATED = re.compile(r"(pile|dense|packed|house|blocks)-(\d+)-(\d+)")
 
 
@@ -139,6 +148,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         raise InputError(path, "no such file or scene", remedy)
     if not path.is_file():
         raise InputError(path, "Not a file", "give an MJCF file")
+    _check_sizes(path, config or PhysicsConfig())
     try:
         with mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
@@ -147,6 +157,28 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         raise InputError(path, f"Not an MJCF file ({reason})", "mend the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     return scene_from_spec(spec, name or path.stem, str(path), config)
+
+
+def _check_sizes(path: Path, config: PhysicsConfig) -> None:
+    """Refuse what would take all memory before MuJoCo, which expands it while it reads, begins to.
+
+    Raises:
+        InputError: An element makes too many copies, or a height field or texture is too large.
+    """
+    copies = [1.0]
+    # What is no XML, or no number, MuJoCo refuses itself, with the line.
+    with suppress(ElementTree.ParseError, ValueError, OSError):
+        for event, element in ElementTree.iterparse(path, ("start", "end")):
+            if event == "end":
+                copies.pop()
+                continue
+            many, asked = element.tag in _COPIES, _SIZED.get(element.tag, ())
+            size = prod(float(word) for name in asked for word in element.get(name, "1").split())
+            copies.append(copies[-1] * size if many else copies[-1])
+            size, most = (copies[-1], config.max_copies) if many else (size, config.max_cells)
+            if size > most:
+                reason = f"its {element.tag} has {size:.4g} elements, {most} are allowed"
+                raise InputError(path, reason, "make it smaller")
 
 
 def list_scenes() -> dict[str, str]:

@@ -88,6 +88,9 @@ def scene_from_spec(
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(source, f"MuJoCo refuses it: {reason}", "mend the MJCF") from None
+    rest, step = (config or PhysicsConfig()).rest_window, model.opt.timestep
+    if not 1e-5 <= step <= rest:
+        raise InputError(source, f"its time step is {step:g} s", f"give option timestep 0.00001 to {rest:g}")
     if not np.isfinite(model.qpos0).all():
         raise InputError(source, "a body's pose holds NaN or infinity", "give finite positions")
     table = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, TABLE)
