@@ -86,6 +86,8 @@ def in_one_line(error: Exception) -> str:
             text = str(error)
         case OSError(filename=str() as name, strerror=str() as reason):
             text = f"{name}: {reason.lower()}"
+        case OSError(strerror=str() as reason):
+            text = reason.lower()
         case OSError():
             text = str(error)
         case MemoryError():

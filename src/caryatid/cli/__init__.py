@@ -7,8 +7,10 @@ there. Errors end in `main`, in one line.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NoReturn
 
 from caryatid import __version__
@@ -67,7 +69,18 @@ def _interrupted(error: BaseException | None) -> bool:
 
 
 def run_from_shell() -> NoReturn:
-    """Run the command line of the shell and end the process with its exit status."""
+    """Run the command line of the shell and end the process with its exit status.
+
+    SIGTERM and the end of the terminal are as Ctrl-C. What goes to a closed stdout or stderr is dropped.
+    """
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name) or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+        stream.reconfigure(errors="backslashreplace")  # JSON and TOML read these escapes
+        setattr(sys, name, stream)
+    for name in ("SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
     status = main()
     if status == INTERRUPTED:
         # Threads and libraries take their time to end; whoever pressed Ctrl-C does not wait for them.

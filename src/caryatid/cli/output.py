@@ -69,7 +69,7 @@ class Output(logging.Handler):
             from caryatid.io.json_files import json_text
 
             shown = (json_text(document),)
-        for item in shown:
+        for item in filter(None, shown):
             if isinstance(item, str):
                 sys.stdout.write(item)
             else:

@@ -15,11 +15,11 @@ import logging
 import os
 import platform
 import re
+import shutil
 import subprocess
 import sys
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -40,12 +40,16 @@ MARK = "CARYATID_COMPILES"
 """Set in the environment of the processes that warm up: they start no more of their kind."""
 
 CODE = """
-import sys
+import os, sys, threading
+threading.Thread(target=lambda: os._exit(len(sys.stdin.read()) + 1), daemon=True).start()
 sys.path.append(sys.argv[1])
 from caryatid.runtime.compiling import warm_up
 warm_up(sys.argv[2], int(sys.argv[3]))
 """
-"""What such a process runs; where it does not find caryatid otherwise, it looks where this process did."""
+"""What such a process runs; it ends with the one that started it.
+
+Where it does not find caryatid otherwise, it looks where this process did.
+"""
 
 
 def compile_kernels() -> None:
@@ -69,13 +73,13 @@ def compile_kernels() -> None:
         done = _read(stamp)
         if done == wanted:
             return
-        log.info("compiling kernels, once after installation: about 30 s")
+        log.info("compiling kernels, once after installation: about a minute")
         for module in wanted.keys() - {name for name, digest in done.items() if wanted.get(name) == digest}:
             # numba itself does not see that a kernel of another module, which this one calls, has changed.
             source = ROOT / f"{module.replace('.', '/')}.py"
             for index in cache_of(source.parent).glob(f"{source.stem}.*.nbi"):
                 index.unlink(missing_ok=True)
-        _run_processes()
+        _run_processes(folder)
         stamp.write_text(json.dumps(wanted), encoding="utf-8")
 
 
@@ -109,29 +113,34 @@ def cache_of(folder: Path) -> Path:
         ) from None
 
 
-def _run_processes() -> None:
-    """Rehearse in several processes, and wait for them."""
-    with TemporaryDirectory(prefix="caryatid-compiling-") as work:
-        processes: list[subprocess.Popen[bytes]] = []
-        try:
-            for number in range(min(cores(), 4)):  # more would wait for the kernels that take longest
-                process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", CODE, str(ROOT.parent), work, str(number)],
-                    env=os.environ | {MARK: "1", "NUMBA_NUM_THREADS": "1"},
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    process_group=0,  # Ctrl-C reaches this process only.
-                )
-                processes.append(process)
-            for process in processes:
-                process.wait(1200.0)  # [s], far more than a machine busy with other work needs
-        except (OSError, subprocess.TimeoutExpired) as error:
-            log.debug("kernels are compiled at their first calls: %s", error)
-        finally:
-            for process in processes:
-                process.kill()
-                process.wait()
+def _run_processes(folder: Path) -> None:
+    """Rehearse in several processes that take turns by locks in a folder, and wait for them."""
+    # A killed process leaves the folder, and the next one takes it over.
+    work, processes = folder / "compiling", list[subprocess.Popen[bytes]]()
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir()
+    try:
+        for number in range(min(cores(), 4)):  # more would wait for the kernels that take longest
+            process = subprocess.Popen(
+                [sys.executable, "-P", "-c", CODE, str(ROOT.parent), str(work), str(number)],
+                env=os.environ | {MARK: "1", "NUMBA_NUM_THREADS": "1"},
+                stdin=subprocess.PIPE,  # it closes when this process ends, however it does
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                process_group=0,  # Ctrl-C reaches this process only.
+            )
+            processes.append(process)
+        for process in processes:
+            process.wait(1200.0)  # [s], far more than a machine busy with other work needs
+    except (OSError, subprocess.TimeoutExpired) as error:
+        log.debug("kernels are compiled at their first calls: %s", error)
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+            assert process.stdin is not None
+            process.stdin.close()
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def _take_turns(folder: Path) -> None:

@@ -10,12 +10,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache, wraps
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
 import numpy as np
 from numba import types
+from numba.core.caching import FunctionCache
 from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
@@ -25,9 +28,17 @@ SHARES = 16
 """Shares into which threads divide points, pixels or hypotheses [1]: enough for usual numbers of cores."""
 
 
+@cache
 def cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Threads to use: CARYATID_THREADS, or the cores that affinity and control group allow."""
+    asked = os.environ.get("CARYATID_THREADS", "")
+    if asked.isdecimal() and int(asked) > 0:
+        return int(asked)
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with suppress(OSError, ValueError):  # "max 100000" where there is no limit
+        quota, period = map(int, Path("/sys/fs/cgroup/cpu.max").read_text("ascii").split())
+        return max(1, min(own, round(quota / period)))
+    return own
 
 
 def one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
@@ -70,13 +81,24 @@ def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
         for index in indices:
             results[index] = task(index)
 
-    helpers = min(numba.get_num_threads(), count) - 1
+    helpers = min(numba.get_num_threads(), cores(), count) - 1
     shares = [_threads(os.getpid()).submit(take_share) for _ in range(helpers)]
     take_share()
     for share in shares:
         share.result()
     return results
 
+
+def _read_or_forget(self: FunctionCache, signature: Any, context: Any) -> Any:
+    """A kept kernel; what is damaged, or names types that have since been renamed, is compiled again."""
+    try:
+        return _read_kernel(self, signature, context)
+    except Exception:
+        self.flush()
+        return None
+
+
+_read_kernel, FunctionCache.load_overload = FunctionCache.load_overload, _read_or_forget
 
 _kept: dict[tuple[Any, ...], Any] = {}
 """Compiled work by kernel and layout of its data; `numba.typeof` takes a quarter of a millisecond."""
@@ -86,13 +108,7 @@ def _compiled(work: Any, data: tuple[Any, ...]) -> Any:
     layout = (work, type(data), *map(_layout, data))
     if layout not in _kept:
         work.targetoptions |= {"nogil": True, "no_cpython_wrapper": False}
-        signature = (types.int64, numba.typeof(data))
-        try:
-            _kept[layout] = work.compile(signature)
-        except (AttributeError, ImportError):
-            # What is kept on disk names types that have since been renamed.
-            work._cache.flush()
-            _kept[layout] = work.compile(signature)
+        _kept[layout] = work.compile((types.int64, numba.typeof(data)))
     return _kept[layout]
 
 
