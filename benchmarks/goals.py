@@ -27,10 +27,11 @@ from caryatid.config.settings import read_settings
 from caryatid.evaluation.scores import TrueScene
 from caryatid.exploration import explore
 from caryatid.graph import SupportGraph
-from caryatid.manipulation.dismantling import bodies_of, poses_of
+from caryatid.manipulation.dismantling import bodies_of
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.truth import displaced_without
+from caryatid.simulation.world import poses_of
 from caryatid.support.relations import predict_removal
 
 PILES = tuple(f"pile-{6 + k}-{901 + k}" for k in range(16))

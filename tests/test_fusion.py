@@ -184,14 +184,6 @@ def test_pc_holds_what_the_newest_graph_holds():
         assert ("o2" in vertices(fused_of(FULL, GONE, config=config))) == there
 
 
-@pytest.mark.parametrize("config", [SG, BOTH], ids=lambda c: c.method)
-def test_a_vertex_that_views_contradict_vanishes_with_its_edges(config):
-    hidden = fused_of(FULL, GONE, GONE, config=config, contradicted={"o2": 1})
-    assert (hidden["o2"].occurrences, hidden["o2"].opportunities) == (1, 2)
-    fused = fused_of(FULL, GONE, GONE, config=config, contradicted={"o2": 2})
-    assert (vertices(fused), edges(fused)) == ({"o0", "o1"}, {("o0", "o1")})
-
-
 def test_sg_merges_the_shapes_and_the_others_take_the_newest():
     shifted = graph(shapes={1: CRATE.moved(shift(0.01)), 2: CAN})
     for config, x in ((SG, 0.005), (PC, 0.01), (BOTH, 0.01)):

@@ -16,11 +16,11 @@ from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry.shapes import Uncertainty
 from caryatid.graph import Support, SupportGraph
-from caryatid.manipulation.dismantling import bodies_of, dismantle, posed, poses_of
+from caryatid.manipulation.dismantling import bodies_of, dismantle
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.truth import ground_truth
-from caryatid.simulation.world import TABLE_HEIGHT, Body, build_spec, scene_from_spec
+from caryatid.simulation.world import TABLE_HEIGHT, Body, build_spec, posed, poses_of, scene_from_spec
 from caryatid.steps import read_run
 from caryatid.support.relations import infer
 

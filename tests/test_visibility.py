@@ -10,7 +10,7 @@ from raycast import TABLE, from_the_side, table_scene
 from synthetic import box, sphere
 
 from caryatid.geometry import transforms
-from caryatid.sensing.views import seen_through
+from caryatid.objects.changes import ODDS, Sight, likelihood_ratio
 
 EYE = from_the_side(azimuth=180.0)
 CRATE = box((0.0, 0.0, TABLE + 0.06), (0.1, 0.1, 0.12))
@@ -57,5 +57,14 @@ HALF = np.where(np.arange(640) % 2 == 0, 0.0, EMPTY.depth)
         pytest.param(CRATE, replace(EMPTY, depth=HALF), True, id="every other reading"),
     ],
 )
-def test_a_shape_is_seen_through_where_most_readings_lie_behind_it(shape, view, expected):
-    assert seen_through(shape, view) == expected
+def test_a_shape_is_gone_where_readings_lie_behind_its_surface(shape, view, expected):
+    through, there = Sight(view).cells(*shape.surface(0.01))
+    assert (likelihood_ratio(through, there) > ODDS) == expected
+
+
+def test_more_that_is_contradicted_and_less_that_is_confirmed_speak_for_a_change():
+    assert likelihood_ratio(0, 0) == pytest.approx(0.0)
+    ratios = np.array([[likelihood_ratio(n, m) for m in range(0, 400, 40)] for n in range(0, 400, 40)])
+    assert np.isfinite(ratios).all()
+    assert (np.diff(ratios, axis=0) > 0.0).all()
+    assert (np.diff(ratios, axis=1) < 0.0).all()

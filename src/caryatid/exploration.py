@@ -14,7 +14,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SupportGraph
+from caryatid.graph import Change, SupportGraph
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
 from caryatid.planning.goals import settled
@@ -74,6 +74,7 @@ class Step(Pictured):
             a robot, of the camera.
         stop: Why this is the last step, or None.
         robot: How the robot holds its camera, or None where that is not known.
+        changes: What has happened to objects since the view before, seen or reported.
     """
 
     index: int
@@ -91,6 +92,7 @@ class Step(Pictured):
     path_travelled: float
     stop: str | None
     robot: RobotPose | None = None
+    changes: tuple[Change, ...] = ()
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
@@ -225,6 +227,7 @@ class Explorer:
             scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
             None, None, {"capture": captured} | scene.timings, angle, path, None,
             None if robot is None else _robot_pose(robot, scene.config),
+            tuple(change for change in scene.changes if change.view == scene.views - 1),
         )  # fmt: skip
 
     def plan(self) -> Step:

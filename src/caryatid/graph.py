@@ -16,6 +16,8 @@ Role = Literal["object", "support_surface"]
 """What a vertex is."""
 Kind = Literal["bottom-up", "lean", "top-down"]
 """How a support holds: from below, from the side, or by weight from above."""
+ChangeKind = Literal["removed", "moved", "added"]
+"""What happens to objects."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -185,6 +187,23 @@ class Stability:
     def stable(self) -> bool:
         """Neither test fired."""
         return not (self.small_area or self.tips)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What happened to an object between two views, or what the robot said it did.
+
+    Attributes:
+        kind: `removed`, `moved` to where `object_id` is now, or `added` where nothing was.
+        object_id: Of the object; one that was removed and is found again keeps its id.
+        view: Number of the view before which it happened, 0 the first.
+        why: What says so, with figures.
+    """
+
+    kind: ChangeKind
+    object_id: str
+    view: int
+    why: str
 
 
 def object_id(label: int) -> str:

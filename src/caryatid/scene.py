@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from time import perf_counter
 from types import NoneType
@@ -16,9 +15,12 @@ from numpy.typing import NDArray
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, WrongViewError, check_type
+from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import UP, Array
-from caryatid.graph import SUPPORT_SURFACE_ID, SceneObject, SupportGraph, object_id
-from caryatid.objects.fusion import changed, fuse, fused_graph, renamed
+from caryatid.graph import SUPPORT_SURFACE_ID, Change, ChangeKind, SceneObject, SupportGraph, object_id
+from caryatid.objects.changes import ODDS, Sight, alike, distinct, likelihood_ratio
+from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
 from caryatid.runtime.compiling import compile_kernels
@@ -30,7 +32,7 @@ from caryatid.segmentation.support_plane import SupportSurface, refitted
 from caryatid.segmentation.view_checks import check_camera, check_place
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
-from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View, seen_through
+from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.sensing.voxel_map import VoxelMap
 from caryatid.support.plausibility import reconcile
 from caryatid.support.relations import Effect, explain, infer, predict_removal
@@ -43,6 +45,9 @@ log = logging.getLogger(__name__)
 
 KEPT = "%s; this view is kept until a later one shows the table top"
 """What is logged of a view without a support surface."""
+
+UNTIED = ("too few partners", "beyond the limits")
+"""Outcomes of a registration by whose pose nobody can tell what has changed."""
 
 LEFT_OUT = "%s; the view is left out"
 """What is logged of a view that cannot be right."""
@@ -69,6 +74,7 @@ class Scene(Pictured):
         views: How many views the model is made of.
         waiting: Views kept until a later one shows the support surface.
         changed: Whether the newest view changed the graph.
+        changes: What has happened to objects since the first view, in this order.
         timings: Seconds the stages of the newest update took.
     """
 
@@ -95,12 +101,16 @@ class Scene(Pictured):
         self.views = 0
         self.waiting: tuple[View, ...] = ()
         self.changed = False
+        self.changes: tuple[Change, ...] = ()
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
         self._registration: ViewRegistration | None = None
         self._graphs: tuple[SupportGraph, ...] = ()
         self._shown: tuple[frozenset[str], ...] = ()
-        self._contradicted: Counter[str] = Counter()
+        self._ids: dict[int, str] = {}
+        self._odds: dict[str, float] = {}
+        self._gone: dict[str, SceneObject] = {}
+        self._fresh: frozenset[int] = frozenset()
 
     @property
     def supports(self) -> nx.DiGraph:
@@ -156,8 +166,108 @@ class Scene(Pictured):
         other = copy.copy(self)
         other._models = self._models.copy()
         other._registration = None if self._registration is None else self._registration.copy()
-        other._contradicted = self._contradicted.copy()
+        other._gone = self._gone.copy()
         return other
+
+    def removed(self, object_id: str) -> SupportGraph:
+        """Say that an object was taken away; what is known of it is dropped, and where it was is unknown.
+
+        Args:
+            object_id: Id of an object, such as `o3`.
+
+        Returns:
+            The graph without it.
+
+        Raises:
+            InputError: There is no such object, or it is the support surface.
+        """
+        self._forget(self._object(object_id))
+        self._reported("removed", object_id)
+        return self.graph
+
+    def moved(self, object_id: str, T: Array) -> SupportGraph:
+        """Say that an object was moved: its points and its shape move along, its supports are found anew.
+
+        Args:
+            object_id: Id of an object, such as `o3`.
+            T: Rigid transform (4, 4) of the world that takes it from where it was to where it is.
+
+        Returns:
+            The graph with it where it is now.
+
+        Raises:
+            InputError: There is no such object, it is the support surface, or T is no rigid transform.
+        """
+        self._forget(self._object(object_id), transforms.as_rigid(T, "T"))
+        self._reported("moved", object_id)
+        return self.graph
+
+    def added(self, shape: Shape) -> str:
+        """Say that an object was put somewhere.
+
+        Args:
+            shape: What it is and where, in the world frame.
+
+        Returns:
+            Id of the new object.
+
+        Raises:
+            InputError: No view is known yet.
+        """
+        if self.voxels is None:
+            raise InputError("scene", "has no views", "look first")
+        label = self._models.put(shape, self.views - 1)
+        self.voxels = self.voxels.forgotten(self.voxels.within(shape, np.zeros((0, 3))))
+        self._reported("added", object_id(label))
+        return object_id(label)
+
+    def _object(self, object_id: str) -> SceneObject:
+        """The object with this id.
+
+        Raises:
+            InputError: There is none, or it is the support surface.
+        """
+        for o in self.graph.objects:
+            if o.id == object_id and o.role == "object":
+                return o
+        known = ", ".join(o.id for o in self.graph.objects if o.role == "object")
+        raise InputError(object_id, "is not an object of the graph", f"there are {known or 'none'}")
+
+    def _forget(self, o: SceneObject, T: Array | None = None) -> None:
+        """Drop what is known of an object, or let its points and shape move by T; its supports go with it."""
+        label = self._label_of(o.id)
+        points = np.zeros((0, 3)) if label is None else self._models.points.of(label).points_world
+        if self.voxels is not None:
+            which = self.voxels.within(o.shape, points)
+            if T is not None:
+                which |= self.voxels.within(o.shape.moved(T), np.zeros((0, 3)))
+            self.voxels = self.voxels.forgotten(which)
+        if label is not None and T is None:
+            self._models.forget({label})
+        elif label is not None and T is not None:
+            self._models.relocate(label, T)
+        self._graphs = tuple(without(graph, {o.id}) for graph in self._graphs)
+        self._shown = tuple(ids - {o.id} for ids in self._shown)
+
+    def _label_of(self, object_id: str) -> int | None:
+        """Label by which models know an object of the graph; None where they do not."""
+        for label, known in self._ids.items():
+            if known == object_id:
+                return label
+        return None if self.config.fusion.method == "sg" else int(object_id[1:])
+
+    def _reported(self, kind: ChangeKind, object_id: str) -> None:
+        """Note what the robot did, and read the graph again."""
+        assert self.surface is not None
+        assert self.voxels is not None
+        self.changes = (*self.changes, Change(kind, object_id, self.views, "reported"))
+        newest = self._inferred(self.surface, self.voxels)
+        names = {o.id: self._ids.get(o.label, o.id) for o in newest.objects if o.role == "object"}
+        newest = renamed(newest, names)
+        self._graphs = (*self._graphs[:-1], newest)
+        if kind != "removed":
+            self._shown = (*self._shown[:-1], self._shown[-1] | {object_id})
+        self._set_graph(newest)
 
     def update(self, source: View | Cloud) -> SupportGraph:
         """Take in one view, or one cloud with z up, and return the fused graph.
@@ -226,11 +336,14 @@ class Scene(Pictured):
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
         watch.lap("register")
+        gone, new = self._noticed(observation, named)
         if not named and (given or self.config.fusion.method != "sg"):
             known = self._models.objects()
             if self.config.fusion.method == "sg":  # its models have the newest view's objects alone
                 known = [o for o in self.graph.objects if o.role == "object"]
-            observation = self._models.associate(observation, known, masks=given)
+            segments = observation.labels
+            observation = self._models.associate(observation, known, masks=given, new=new.keys())
+            new = {int(observation.labels[segments == k][0]): why for k, why in new.items()}
         if named and self.views:
             self._check_identity(observation, source.name)
         shown = self._models.add(observation, self.views) | moved
@@ -238,15 +351,13 @@ class Scene(Pictured):
         surface, voxels = self._bounds(observation)
         watch.lap("map")
         observation = self._fitted(observation, shown, voxels, given, named)
+        if not named:
+            observation, new = self._recognised(observation, new)
         watch.lap("fit")
-        fitted = self._models.objects()
-        if self.config.completion.enabled:
-            fitted = complete(fitted, surface, voxels, self.config.completion)
-        table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
-        plausible = reconcile([table, *fitted], self.config.plausibility)
-        newest = infer(plausible, self.config.support)
+        newest = self._inferred(surface, voxels)
         watch.lap("infer")
         observation = self._fused(observation, newest, given)
+        self._note(gone, new)
         self.labels = label_image(observation, source)
         self.T_world_camera = None if observation.view is None else observation.view.pose
         if self.T_world_camera is not None:
@@ -367,30 +478,128 @@ class Scene(Pictured):
             observation = self._models.nearest(observation, changed)
         given_up = self._models.unite(shown | changed, voxels)
         self._models.form(shown | changed | set(given_up.values()), voxels)
+        return self._renamed(observation, given_up)
+
+    def _renamed(self, observation: Observation, given_up: Mapping[int, int]) -> Observation:
+        """Let objects have other labels, now and in the graphs so far: old → new."""
         if given_up and self.config.fusion.matching == "points":
             names = {object_id(old): object_id(new) for old, new in given_up.items()}
             self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
             self._shown = tuple(frozenset(names.get(i, i) for i in ids) for ids in self._shown)
-        return observation.relabelled(given_up)
+        return observation.relabelled(dict(given_up))
+
+    def _noticed(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
+        """Find what is not as it was, and drop it before anything is added to it.
+
+        Returns:
+            Ids of the objects that are not where they were, and labels of the segments that are where space
+            was free; each with why.
+        """
+        view, voxels, config = observation.view, self.voxels, self.config
+        gone, new = dict[str, str](), dict[int, str]()
+        registered = not self._registration or self._registration.outcomes[-1] not in UNTIED
+        if view is None or voxels is None or not registered:
+            return gone, new
+        sight, odds = Sight(view), dict[str, float]()
+        for id_, (points, normals) in self._surfaces().items():
+            through, there = sight.cells(points, normals)
+            odds[id_] = max(self._odds.get(id_, 0.0) + likelihood_ratio(through, there), 0.0)
+            if odds[id_] > ODDS:
+                gone[id_] = f"{view.name} looks through {through} of {through + there} places of its surface"
+        cloud, method = observation.cloud, config.fusion.method
+        for label in sorted(set(observation.shown) - {0, SUPPORT_LABEL}) if method != "sg" else ():
+            points = cloud.points_world[observation.labels == label]
+            among = voxels.free_around(points)
+            free, other = distinct(points[among]), distinct(points[~among])
+            if likelihood_ratio(free, other) > ODDS:
+                new[label] = f"{view.name} shows {free} of {free + other} places of it where space was free"
+        if named:
+            known = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
+            gone = known | gone
+        self._odds = {i: value for i, value in odds.items() if i not in gone}
+        for id_ in gone:
+            o = next((o for o in self.graph.objects if o.id == id_), None)
+            if o is None:
+                self._models.forget({int(id_[1:])})
+            else:
+                self._forget(o)
+                self._gone[id_] = o
+        if new:
+            pixels = np.zeros(view.depth.shape, dtype=np.bool_)
+            pixels.ravel()[observation.pixels] = np.isin(observation.labels, sorted(new))
+            assert self.voxels is not None
+            which = self.voxels.behind(view, pixels, config.fit.max_extent)
+            self.voxels = self.voxels.forgotten(which & (self.voxels.hits == 0))
+        return gone, new
+
+    def _surfaces(self) -> dict[str, tuple[Array, Array]]:
+        """Points and normals of the objects by id: as seen, or with `sg` of their shapes."""
+        if self.config.fusion.method == "sg":
+            return {o.id: o.shape.surface(0.01) for o in self.graph.objects if o.role == "object"}
+        models, found = self._models.points, dict[str, tuple[Array, Array]]()
+        for label in models.objects:
+            cloud = models.of(label, self.config.cloud.voxel)
+            found[self._ids.get(label, object_id(label))] = cloud.points_world, cloud.normals_world
+        return found
+
+    def _recognised(
+        self, observation: Observation, new: dict[int, str]
+    ) -> tuple[Observation, dict[int, str]]:
+        """Give what is new the labels of the objects that are gone, where the shapes are alike."""
+        new = {k: why for k, why in new.items() if k in self._models.fits}
+        self._fresh = (self._fresh | new.keys()) & self._models.fits.keys()
+        found: dict[int, int] = {}
+        for id_, o in self._gone.items():
+            label = self._label_of(id_)
+            among = [k for k in sorted(self._fresh - found.keys()) if alike(self._models.fits[k], o)]
+            if among and label is not None:
+                found[among[0]] = label
+        for old, label in found.items():
+            self._models.rename(old, label)
+        self._fresh -= found.keys()
+        return self._renamed(observation, found), {found.get(k, k): why for k, why in new.items()}
+
+    def _note(self, gone: Mapping[str, str], new: Mapping[int, str]) -> None:
+        """Say what has changed: what is gone from one place and there again was moved."""
+        there = {self._ids.get(k, object_id(k)) for k in self._models.points.objects}
+        appeared = {self._ids.get(k, object_id(k)): why for k, why in new.items()}
+        told: list[Change] = []
+        for id_ in sorted(self._gone.keys() | appeared.keys()):
+            why = gone.get(id_) or appeared.get(id_, "it is found again")
+            if id_ in there:
+                told.append(Change("moved" if id_ in self._gone else "added", id_, self.views, why))
+                self._gone.pop(id_, None)
+            elif id_ in gone:
+                told.append(Change("removed", id_, self.views, why))
+        self.changes = (*self.changes, *told)
+
+    def _inferred(self, surface: SupportSurface, voxels: VoxelMap) -> SupportGraph:
+        """The support graph of the objects as they are known now."""
+        fitted = self._models.objects()
+        if self.config.completion.enabled:
+            fitted = complete(fitted, surface, voxels, self.config.completion)
+        table = SceneObject(SUPPORT_SURFACE_ID, SUPPORT_LABEL, surface.shape, "support_surface")
+        return infer(reconcile([table, *fitted], self.config.plausibility), self.config.support)
 
     def _fused(self, observation: Observation, newest: SupportGraph, given: bool) -> Observation:
         """Add the newest graph to the earlier ones; its labels become those of the fused objects."""
         config = self.config.fusion
         same_labels = config.matching == "points" and (given or config.method != "sg")
         self._graphs, names = fuse(self._graphs, newest, config, same_labels=same_labels)
-        observation = observation.relabelled({int(o[1:]): int(n[1:]) for o, n in names.items() if o != n})
+        self._ids = {int(o[1:]): n for o, n in names.items()}
+        observation = observation.relabelled({k: int(n[1:]) for k, n in self._ids.items() if k != int(n[1:])})
         seen = {SUPPORT_SURFACE_ID if k == SUPPORT_LABEL else object_id(k) for k in observation.shown}
         self._shown = (*self._shown, frozenset(seen))
-        if observation.view is not None:
-            for o in self.graph.objects:
-                if o.role == "object" and o.id not in seen and seen_through(o.shape, observation.view):
-                    self._contradicted[o.id] += 1
-        fused = fused_graph(self._graphs, config, shown=self._shown, contradicted=self._contradicted)
-        ids = {o.id for o in fused.objects}
-        stability = {names[i]: verdict for i, verdict in newest.stability.items() if names[i] in ids}
-        before, self.graph = self.graph, replace(fused, stability=stability)
-        self.changed = changed(before, self.graph, config)
+        self._set_graph(renamed(newest, names))
         return observation
+
+    def _set_graph(self, newest: SupportGraph) -> None:
+        """Read the fused graph off all graphs; the newest one, with fused ids, says what is stable."""
+        fused = fused_graph(self._graphs, self.config.fusion, shown=self._shown)
+        ids = {o.id for o in fused.objects}
+        stability = {i: verdict for i, verdict in newest.stability.items() if i in ids}
+        before, self.graph = self.graph, replace(fused, stability=stability)
+        self.changed = changed(before, self.graph, self.config.fusion)
 
 
 class Stopwatch:

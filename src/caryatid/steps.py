@@ -19,7 +19,7 @@ from caryatid.config import Config
 from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
 from caryatid.exploration import RobotPose, Step
-from caryatid.graph import SupportGraph
+from caryatid.graph import Change, SupportGraph
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
@@ -266,6 +266,7 @@ def _read_view(folder: Path) -> RunView:
 def _summary(step: Step) -> dict[str, Any]:
     """What view.json says of the camera, the candidates and the choice of the next view."""
     record: dict[str, Any] = {key: getattr(step.view, key, None) for key in ("T_world_camera", "K")}
+    record["changes"] = [asdict(change) for change in step.changes]
     if step.candidates is not None:
         record["candidates"] = {"reachable": len(step.candidates), "rejected": step.candidates.rejected}
     if step.decision is not None:
@@ -304,6 +305,8 @@ def _encoded(step: Step) -> bytes:
         arrays[name] = arrays[name].astype(np.float32)
     if step.robot is not None:
         document["robot"] = step.robot
+    if step.changes:
+        document["changes"] = step.changes
     arrays["document"] = np.frombuffer(json.dumps(document, default=_plain).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
     # Higher levels of compression take longer and save little.
@@ -346,6 +349,7 @@ def _decoded(stored: dict[str, Any]) -> Step:
     if "robot" in stored:
         posture = Posture(**_with_arrays(stored["robot"]["posture"]))
         stored["robot"] = RobotPose(**_with_arrays(stored["robot"]) | {"posture": posture})
+    stored["changes"] = tuple(Change(**change) for change in stored.get("changes", ()))
     return Step(**stored)
 
 

@@ -22,12 +22,12 @@ from caryatid.evaluation.scores import Score, TrueScene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
 from caryatid.graph import SupportGraph
-from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
+from caryatid.manipulation.dismantling import bodies_of, dismantle
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.planning.planners import offered
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, list_scenes, load_scene
 from caryatid.simulation.setup import make_simulation
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, poses_of
 
 OrderName = Literal["", "one hand", "two hands", "highest first", "random", "true graph"]
 """How objects are ordered for removal; with the empty name nothing is removed."""

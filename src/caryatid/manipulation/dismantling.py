@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from caryatid.config import Config, EvaluationConfig
@@ -15,7 +14,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.manipulation.order import Order, TakeStep
 from caryatid.simulation.lifting import Lifting
-from caryatid.simulation.world import SimulatedScene, state_of
+from caryatid.simulation.world import SimulatedScene, poses_of
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -91,21 +90,3 @@ def dismantling_record(order: Order, taken: Sequence[Taken], left: Sequence[str]
     """What came of an order whose steps were done; `left` names the bodies that nobody took."""
     success = not left and all(t.ok for t in taken)
     return {"success": success, **order.to_json(), "steps": [t.to_json() for t in taken], "left": list(left)}
-
-
-def poses_of(scene: SimulatedScene) -> Array:
-    """State (N, 7) of a scene's objects: positions [m] and quaternions, w first."""
-    return np.asarray(scene.data.qpos[_addresses(scene)])
-
-
-def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
-    """Return a scene with its objects in another state (N, 7), as of `poses_of`, for pictures."""
-    data = state_of(scene)
-    data.qpos[_addresses(scene)] = state
-    mujoco.mj_forward(scene.model, data)
-    return replace(scene, data=data)
-
-
-def _addresses(scene: SimulatedScene) -> Array:
-    joints = [scene.model.body_jntadr[scene.body_id(label)] for label in scene.object_bodies]
-    return np.asarray(scene.model.jnt_qposadr[joints][:, None] + np.arange(7))

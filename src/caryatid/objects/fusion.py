@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 from typing import Any
 
@@ -67,15 +67,18 @@ def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:
         a, b = (names.get(i, i) for i in s.pair)
         if a != b:
             supports[a, b] = replace(s, supporter=a, supported=b)
-    return SupportGraph(tuple(objects.values()), tuple(supports.values()))
+    stability = {names.get(i, i): verdict for i, verdict in graph.stability.items()}
+    return SupportGraph(tuple(objects.values()), tuple(supports.values()), stability)
+
+
+def without(graph: SupportGraph, ids: Set[str]) -> SupportGraph:
+    """Return a graph without some objects and their supports."""
+    objects = tuple(o for o in graph.objects if o.id not in ids)
+    return SupportGraph(objects, tuple(s for s in graph.supports if ids.isdisjoint(s.pair)))
 
 
 def fused_graph(
-    graphs: Graphs,
-    config: FusionConfig,
-    *,
-    shown: Sequence[frozenset[str]] | None = None,
-    contradicted: Mapping[str, int] | None = None,
+    graphs: Graphs, config: FusionConfig, *, shown: Sequence[frozenset[str]] | None = None
 ) -> SupportGraph:
     """Read the fused graph off those of all views.
 
@@ -87,9 +90,7 @@ def fused_graph(
         config: Method and the share an edge must keep.
         shown: Ids of the objects each view showed; without it, those in its graph. Only a view that showed
             both ends could have shown an edge.
-        contradicted: Per object id, in how many views something behind it was seen instead.
     """
-    contradicted = contradicted or {}
     newest, (sightings, edges) = len(graphs) - 1, _by_view(graphs)
     showing: dict[str, set[int]] = {i: set() for i in sightings}
     for view, ids in enumerate(shown or [{o.id for o in graph.objects} for graph in graphs]):
@@ -99,15 +100,8 @@ def fused_graph(
     for i, seen in sightings.items():
         if config.method == "pc" and newest not in seen:
             continue
-        occurrences = len(showing[i])
-        opportunities = occurrences + contradicted.get(i, 0)
-        if occurrences >= config.keep_share * opportunities:
-            vertex = _vertex(seen, config)
-            likely = vertex.probability
-            likely = None if likely is None else likely * occurrences / max(opportunities, 1)
-            objects[i] = replace(
-                vertex, occurrences=occurrences, opportunities=opportunities, probability=likely
-            )
+        count = len(showing[i])
+        objects[i] = replace(_vertex(seen, config), occurrences=count, opportunities=count)
     supports = []
     for pair, found in edges.items():
         if pair[0] not in objects or pair[1] not in objects:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -111,6 +111,20 @@ class ObjectPoints:
             kept[rows[last_in_voxels(self._cloud.points_world[rows], voxel, depth)]] = True
             self._reorder(np.flatnonzero(kept), self._labels, {label})
 
+    def forget(self, labels: set[int]) -> None:
+        """Drop the points of some objects."""
+        kept = np.flatnonzero(~np.isin(self._labels, sorted(labels)))
+        self._reorder(kept, self._labels, labels)
+
+    def relocate(self, label: int, T: Array) -> None:
+        """Move the points of an object by T (4, 4)."""
+        which = (self._labels == label).astype(np.intp)
+        poses = np.stack([np.eye(4), T])
+        points = kernels.transform(poses, which, self._cloud.points_world)
+        normals = kernels.rotate(poses, which, self._cloud.normals_world)
+        self._cloud = replace(self._cloud, points_world=points, normals_world=normals)
+        self._relabel(self._labels, {label})
+
     def move(self, T: Mapping[int, Array]) -> set[int]:
         """Move the points of some views, view → (4, 4); returns the labels that have such points."""
         moving = np.isin(self._views, list(T))
@@ -198,8 +212,47 @@ class ObjectModels:
         other._distinct = self._distinct.copy()
         return other
 
+    def forget(self, labels: set[int]) -> None:
+        """Drop what is known of some objects: points and shapes."""
+        self.points.forget(labels)
+        for label in labels:
+            for known in (self.fits, self._solids, self._compounds):
+                known.pop(label, None)
+        self._forget(labels)
+
+    def relocate(self, label: int, T: Array) -> None:
+        """Move an object, points and shape, by T (4, 4)."""
+        self.points.relocate(label, T)
+        for known in (self.fits, self._solids):
+            if label in known:
+                known[label] = replace(known[label], shape=known[label].shape.moved(T))
+        self._compounds.pop(label, None)
+        self._forget({label})
+
+    def rename(self, old: int, new: int) -> None:
+        """Let an object have another label, which no object has."""
+        self.points.merge(old, new)
+        for known in (self.fits, self._solids):
+            if old in known:
+                known[new] = replace(known.pop(old), id=object_id(new), label=new)
+        self._compounds.pop(old, None)
+        self._distinct = {frozenset(new if k == old else k for k in two) for two in self._distinct}
+        self._forget({old, new})
+
+    def put(self, shape: Shape, view: int) -> int:
+        """Add an object of this shape, as if a view had shown it from all sides; returns its label."""
+        label, (points, normals) = self.points.labels_used + 1, shape.surface(self._config.cloud.voxel)
+        self.points.add(Cloud(points, normals), np.full(len(points), label, dtype=np.int32), view)
+        self.fits[label] = SceneObject(object_id(label), label, shape)
+        return label
+
     def associate(
-        self, observation: Observation, known: Sequence[SceneObject], *, masks: bool = False
+        self,
+        observation: Observation,
+        known: Sequence[SceneObject],
+        *,
+        masks: bool = False,
+        new: Set[int] = frozenset(),
     ) -> Observation:
         """Give a view's segments the labels of the objects they belong to, or new ones.
 
@@ -207,6 +260,7 @@ class ObjectModels:
             observation: The view.
             known: The objects so far.
             masks: Its segments are given; two of one view are two objects for good.
+            new: Labels of segments that are no known object's.
         """
         points, labels = observation.cloud.points_world, observation.labels
         segments = np.where(labels == SUPPORT_LABEL, 0, labels)
@@ -223,6 +277,7 @@ class ObjectModels:
             self.points.labels_used,
             masks=masks,
             unlike=None if masks else self._unlike(observation),
+            new=new,
         )
         if masks:
             self._distinct |= set(map(frozenset, combinations(np.unique(named[named > 0]).tolist(), 2)))
@@ -470,6 +525,7 @@ def associate(
     *,
     masks: bool = False,
     unlike: NDArray[np.bool_] | None = None,
+    new: Set[int] = frozenset(),
 ) -> NDArray[np.int32]:
     """Give the points of each new segment the label of the object they belong to, or one never used before.
 
@@ -487,6 +543,7 @@ def associate(
         labels_used: Highest label ever given; new objects are numbered from the next one.
         masks: Whether the segments are masks.
         unlike: Which points have another colour than which known object (N, K); None where none has.
+        new: Segments that belong to no known object.
 
     Returns:
         Label of the object (N,) of each point; 0 where there was no segment.
@@ -507,6 +564,7 @@ def associate(
     shared = np.zeros((len(segments), len(names)), dtype=np.intp)
     near = owner >= 0
     np.add.at(shared, (np.searchsorted(segments, labels[kept][near]), owner[near]), 1)
+    shared[np.isin(segments, sorted(new))] = 0
     shares = shared / np.bincount(labels[kept], minlength=len(counts))[segments, None]
     chosen = _one_to_one(shared, shares, config.overlap) if masks else _all_near(shares, config.overlap)
     fresh = max(labels_used, int(names.max(initial=0)))

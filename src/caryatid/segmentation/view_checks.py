@@ -11,12 +11,10 @@ from caryatid.errors import WrongViewError
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
-from caryatid.sensing.voxel_map import FREE, VoxelMap
+from caryatid.sensing.voxel_map import VoxelMap
 
 log = logging.getLogger(__name__)
 
-NEAR = np.concatenate([np.zeros((1, 3), dtype=np.intp), np.eye(3, dtype=np.intp), -np.eye(3, dtype=np.intp)])
-"""A voxel and those that share a face with it."""
 COARSER = 4
 """Edge of the cells in which views are compared [voxels]; points of small images are nearer to each other."""
 THROUGH = 0.2
@@ -85,8 +83,8 @@ def check_place(
     common = float(seen[tuple(voxel[within].T // COARSER)].mean())
     if not aligned and common < config.session.common:
         raise refused(f"only {common:.0%} of what it shows is where earlier views saw anything")
-    over = voxel[within][height(points[within]) > 2.0 * config.surface.tolerance]
-    free = (voxels.states[tuple((over[:, None] + NEAR).transpose(2, 0, 1))] == FREE).all(axis=1)
+    over = points[within][height(points[within]) > 2.0 * config.surface.tolerance]
+    free = voxels.free_around(over)
     if free.sum() > THROUGH * len(free):
         log.warning(
             "%s: %.0f%% of what it shows over the table is where earlier views looked through; its pose is "

@@ -232,14 +232,6 @@ class Camera(Protocol):
         ...
 
 
-def seen_through(shape: Shape, view: View) -> bool:
-    """Whether a view with a pose looks through most of where a shape in the world frame should be."""
-    behind = depth_behind(shape.moved(transforms.invert(view.pose)), view.depth, view.K)
-    read = np.isfinite(behind)
-    # A reading 2 cm behind a point contradicts it: 2σ of registration and depth together.
-    return bool(read.any()) and bool((behind[read] > 0.02).mean() > 0.5)
-
-
 def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
     """How far readings lie behind the surface of a shape where it faces the camera.
 

@@ -19,6 +19,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import VoxelConfig
+from caryatid.geometry import transforms
 from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.signed_distance import gradient, local
@@ -28,6 +29,8 @@ from caryatid.sensing.views import View
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
+NEAR = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+"""A voxel and those that share a face with it."""
 FULLY = float(np.cos(np.deg2rad(60.0)))
 """Cosine of the angle to its normal up to which a point is shown fully [1]."""
 
@@ -108,6 +111,41 @@ class VoxelMap:
         for_each(_count_marks, SHARES, (self.hits, self.passes, hits, passes))
         return VoxelMap(self.origin_world, hits, passes, config)
 
+    def forgotten(self, which: NDArray[np.bool_]) -> VoxelMap:
+        """Return the map as if nobody had looked at some of its voxels (X, Y, Z)."""
+        hits, passes = (np.where(which, np.uint8(0), counts) for counts in (self.hits, self.passes))
+        return VoxelMap(self.origin_world, hits, passes, self.config)
+
+    def within(self, shape: Shape, points_world: Array) -> NDArray[np.bool_]:
+        """Which voxels (X, Y, Z) a shape reaches into, or hold one of some points (N, 3) [m]."""
+        which = np.zeros(self.hits.shape, dtype=np.bool_)
+        size, outline = self.config.size, shape.surface(self.config.size)[0]
+        low = np.floor((outline.min(axis=0) - self.origin_world) / size).astype(np.intp) - 1
+        high = np.floor((outline.max(axis=0) - self.origin_world) / size).astype(np.intp) + 2
+        low, high = (np.clip(corner, 0, which.shape) for corner in (low, high))
+        axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
+        index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        touched = shape.signed_distance(self.centres_world(index)) < size
+        held = np.floor((points_world - self.origin_world) / size).astype(np.intp)
+        held = held[((held >= 0) & (held < which.shape)).all(axis=1)]
+        which[tuple(np.concatenate([index[touched], held]).T)] = True
+        return which
+
+    def behind(self, view: View, pixels: NDArray[np.bool_], depth: float) -> NDArray[np.bool_]:
+        """Which voxels (X, Y, Z) a view has behind the readings of some pixels (H, W), to a depth [m]."""
+        which = np.zeros(self.hits.shape, dtype=np.bool_)
+        index = np.stack(np.nonzero(self.passes), axis=-1)
+        points = transforms.transform(transforms.invert(view.pose), self.centres_world(index))
+        index, points = index[points[:, 2] > 0.0], points[points[:, 2] > 0.0]
+        u, v = np.rint((points @ view.K.T)[:, :2] / points[:, 2:]).astype(np.intp).T
+        height, width = view.depth.shape
+        rows = np.flatnonzero((u >= 0) & (u < width) & (v >= 0) & (v < height))
+        rows = rows[pixels[v[rows], u[rows]]]
+        beyond = points[rows, 2] - view.depth[v[rows], u[rows]]
+        rows = rows[(beyond > -self.config.size) & (beyond < depth)]
+        which[tuple(index[rows].T)] = True
+        return which
+
     def occluders(self, shapes: Sequence[Shape] = ()) -> Occluders:
         """What blocks lines of sight: the voxels seen occupied, and everything inside the shapes.
 
@@ -152,6 +190,11 @@ class VoxelMap:
     def state_at(self, points_world: Array) -> NDArray[np.int8]:
         """State (N,) of the voxels that hold points (N, 3) [m]; 0 outside the map."""
         return _values_at(self.states, points_world, self.origin_world, self.config.size)
+
+    def free_around(self, points_world: Array) -> NDArray[np.bool_]:
+        """Whether the voxels (N,) that hold points (N, 3) [m], and those beside them, were seen free."""
+        around = points_world[:, None] + NEAR * self.config.size
+        return np.asarray((self.state_at(around.reshape(-1, 3)).reshape(-1, len(NEAR)) == FREE).all(axis=1))
 
     def empty_at(self, points_world: Array) -> NDArray[np.bool_]:
         """Whether the voxels (N,) that hold points (N, 3) [m] were looked through and never hit.

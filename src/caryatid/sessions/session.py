@@ -60,7 +60,6 @@ FORMAT: Final = {"format": "caryatid/session", "version": 1}
 
 KNOWN: Final = {
     ("builtins", "set"),
-    ("collections", "Counter"),
     ("numpy", "dtype"),
     ("numpy", "ndarray"),
     ("numpy._core.multiarray", "_reconstruct"),

@@ -108,8 +108,11 @@ class SimulatedCamera:
         noise_config: Figures of the noise.
         rng: Where the seed of all captures is drawn from.
         sensor: Image size, focal length and light.
-        around: Gives the scene with the body of the robot that holds the camera at a pose (4, 4), which is
+        around: Gives a scene with the body of the robot that holds the camera at a pose (4, 4), which is
             seen where it is in the image, or None where none can stand there. None = it floats.
+
+    Attributes:
+        scene: What it looks at; another state of the same scene may take its place.
 
     Raises:
         InputError: The noise model is not one of the two.
@@ -122,7 +125,7 @@ class SimulatedCamera:
         noise_config: NoiseConfig | None = None,
         rng: np.random.Generator | None = None,
         sensor: SensorConfig | None = None,
-        around: Callable[[Array], SimulatedScene | None] | None = None,
+        around: Callable[[SimulatedScene, Array], SimulatedScene | None] | None = None,
     ) -> None:
         if noise not in ("none", "carmine"):
             raise InputError("noise", f"'{noise}' is no noise model", "choose none or carmine")
@@ -153,7 +156,7 @@ class SimulatedCamera:
             InputError: The pose is no rigid transform.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
-        scene = None if self._around is None else self._around(T)
+        scene = None if self._around is None else self._around(self.scene, T)
         image = render(scene or self.scene, T, self.K, self.sensor)
         number = self._captures
         rng = np.random.default_rng([self._seed, number])

@@ -62,11 +62,12 @@ class HumanoidBody:
         data.mocap_pos[-1] = (*posture.platform_world[:2], 0.0)
         mujoco.mj_kinematics(model, data)
 
-    def around(self, T_world_camera: Array) -> SimulatedScene | None:
-        """The scene with the body that holds the camera at a pose (4, 4), or None where it cannot stand."""
+    def around(self, scene: SimulatedScene, T_world_camera: Array) -> SimulatedScene | None:
+        """A state of the scene with the body that holds a camera (4, 4), or None where it cannot stand."""
         posture = self._robot.solve(T_world_camera)
         if not isinstance(posture, Posture):
             return None
+        self.scene.data.qpos[:] = scene.data.qpos
         self.place(posture)
         return self.scene
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import mujoco
@@ -171,6 +171,24 @@ def state_of(scene: SimulatedScene) -> Any:
     data.mocap_quat[:] = scene.data.mocap_quat
     mujoco.mj_forward(scene.model, data)
     return data
+
+
+def poses_of(scene: SimulatedScene) -> Array:
+    """State (N, 7) of a scene's objects: positions [m] and quaternions, w first."""
+    return np.asarray(scene.data.qpos[_addresses(scene)])
+
+
+def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
+    """Return a scene with its objects in another state (N, 7), as of `poses_of`."""
+    data = state_of(scene)
+    data.qpos[_addresses(scene)] = state
+    mujoco.mj_forward(scene.model, data)
+    return replace(scene, data=data)
+
+
+def _addresses(scene: SimulatedScene) -> Array:
+    joints = [scene.model.body_jntadr[scene.body_id(label)] for label in scene.object_bodies]
+    return np.asarray(scene.model.jnt_qposadr[joints][:, None] + np.arange(7))
 
 
 def _subtree(model: Any, body: int) -> list[int]:

@@ -20,14 +20,14 @@ from caryatid.evaluation.scores import score
 from caryatid.exploration import Explorer, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.manipulation.dismantling import bodies_of, dismantle, poses_of
+from caryatid.manipulation.dismantling import bodies_of, dismantle
 from caryatid.manipulation.order import TakeStep, plan_order
 from caryatid.planning.decision import Decision
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 from caryatid.runtime.parallel import cores
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.lifting import ASIDE
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, poses_of
 from caryatid.viewer.page import Page
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from PIL import Image
 from caryatid.config import Config, ReportConfig
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
-from caryatid.manipulation.dismantling import Taken, posed
+from caryatid.manipulation.dismantling import Taken
 from caryatid.sensing.views import Cloud, View
 from caryatid.simulation.camera import intrinsics, render
 from caryatid.simulation.lifting import ASIDE
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, posed
 from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_layers, draw_sphere, draw_stands
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, picture_png, picture_svg

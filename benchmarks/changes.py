@@ -1,0 +1,160 @@
+"""Whether a change that nobody reports is noticed: one object taken away, moved or added between two views.
+
+    python benchmarks/changes.py [SCENES…] --segmentation auto
+
+Each scene is looked at three times; then one object that supports nothing is taken away, is moved by 12 cm,
+or appears. Two views later the changes the model tells of are compared with what was done, and its graph with
+the scene as it is by then. A run without a change has ten views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import pandas as pd
+import tyro
+from measures import Spread, print_table, run_main
+from rich.console import Console
+
+from caryatid.benchmark.episodes import open_scene
+from caryatid.config import NoiseModel, SegmentationMethod
+from caryatid.config.settings import read_settings
+from caryatid.evaluation.scores import TrueScene, score
+from caryatid.evaluation.truths import true_scene_from_simulation
+from caryatid.exploration import Explorer
+from caryatid.geometry.transforms import Array
+from caryatid.simulation.lifting import ASIDE, Lifting
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.truth import GroundTruth, ground_truth
+from caryatid.simulation.world import SimulatedScene, bounds, posed, poses_of, strayed
+
+PILES = tuple(f"pile-{5 + k % 8}-{400 + k}" for k in range(60))
+"""Piles of 5–12 primitives, of seeds nothing else is measured with."""
+BEFORE, AFTER, UNCHANGED, SHIFT = 3, 2, 10, 0.12
+"""Views before and after a change, views without one, and how far an object is moved [m]."""
+KINDS = ("removed", "moved", "added", "nothing")
+
+
+@dataclass(frozen=True)
+class Args(Spread):
+    """Change scenes between two views and see what is noticed."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = PILES
+    """Names of built-in scenes, or scene folders."""
+    kinds: tuple[str, ...] = KINDS
+    """What is done to them."""
+    segmentation: SegmentationMethod = "labels"
+    """Where segments come from."""
+    noise: NoiseModel = "carmine"
+    """Noise of the simulated camera."""
+    seed: int = 0
+    """Seed of the noise and of the choice of objects."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Settings, e.g. `--set registration.enabled=false`."""
+
+
+def measure(task: tuple[str, str, Args]) -> dict[str, Any] | None:
+    """One run; None where there is nothing that can be moved so."""
+    name, kind, args = task
+    scene, _ = open_scene(name)
+    rng = np.random.default_rng([args.seed, KINDS.index(kind), args.scenes.index(name)])
+    begin = end = poses_of(scene)
+    if kind != "nothing":
+        changed = change(scene, kind, rng)
+        if changed is None:
+            return None
+        begin, end = changed
+    config = read_settings(None, (f"active.max_views={UNCHANGED}", *args.set))
+    simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
+    known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
+    explorer = Explorer(simulation.camera, simulation.robot, **known)
+    simulation.camera.scene = posed(scene, begin)
+    told: list[str] = []
+    for number in range(UNCHANGED if kind == "nothing" else BEFORE + AFTER):
+        if number == BEFORE:
+            simulation.camera.scene = posed(scene, end)
+        if number > 0:
+            explorer.plan()
+            explorer.go()
+        step = explorer.look()
+        told += [f"{c.kind} {c.object_id} in view {number + 1}: {c.why}" for c in step.changes]
+        early = number < BEFORE or kind == "nothing"
+        if early:
+            false = len(told)
+    found = score(step.graph, truth_of(simulation.camera.scene))
+    noticed = kind == "nothing" or any(t.startswith(kind) for t in told[false:])
+    other = sum(not t.startswith(kind) for t in told[false:])
+    row = {"scene": name, "kind": kind, "noticed": float(noticed), "f1": found.f1, "false": false}
+    return row | {"other": other, "told": told}
+
+
+def change(scene: SimulatedScene, kind: str, rng: np.random.Generator) -> tuple[Array, Array] | None:
+    """States (N, 7) of the objects before and after a change; None where no object can be moved so."""
+    state, names = poses_of(scene), list(scene.object_bodies.values())
+    carrying = {edge.supporter for edge in ground_truth(scene).edges}
+    free = [k for k, body in enumerate(names) if body not in carrying]
+    for k in rng.permutation(free).tolist():
+        if kind != "moved":
+            without = state.copy()
+            without[k, :3] = 0.0, 0.0, ASIDE + k
+            return (state, without) if kind == "removed" else (without, state)
+        moved = shifted(scene, state, k, rng)
+        if moved is not None:
+            return state, moved
+    return None
+
+
+def shifted(scene: SimulatedScene, state: Array, index: int, rng: np.random.Generator) -> Array | None:
+    """The state once an object was set down 12 cm away; None where it falls over, or meets others."""
+    names = list(scene.object_bodies.values())
+    lifting = Lifting(scene.spec, names)
+    (low, high), top = bounds(scene, index + 1), float(bounds(scene, 0)[1][2])
+    others = [bounds(scene, k + 1) for k in range(len(names)) if k != index]
+    table = bounds(scene, 0)
+    for angle in rng.permutation(8) * np.pi / 4.0:
+        step = np.array([SHIFT * np.cos(angle), SHIFT * np.sin(angle), top + 0.001 - low[2]])
+        a, b = low + step, high + step
+        clear = all(((b[:2] + 0.01 < o[0][:2]) | (o[1][:2] < a[:2] - 0.01)).any() for o in others)
+        if not clear or (a[:2] < table[0][:2]).any() or (b[:2] > table[1][:2]).any():
+            continue
+        placed = state.copy()
+        placed[index, :3] += step
+        rested = lifting.rest(placed, (), 2.0)
+        if not strayed(placed, rested, 0.01, 8.0).any():
+            return rested
+    return None
+
+
+def truth_of(scene: SimulatedScene) -> TrueScene:
+    """The ground truth without what was put aside."""
+    names = scene.object_bodies.values()
+    gone = {body for body, height in zip(names, poses_of(scene)[:, 2], strict=True) if height > ASIDE / 2.0}
+    truth = ground_truth(scene)
+    vertices = tuple(v for v in truth.vertices if v not in gone)
+    edges = tuple(e for e in truth.edges if not gone & {e.supporter, e.supported})
+    return true_scene_from_simulation(scene, GroundTruth(vertices, edges))
+
+
+def main() -> int:
+    """Run the measurement."""
+    args = tyro.cli(Args)
+    tasks = [(scene, kind, args) for scene in args.scenes for kind in args.kinds]
+    rows = [row for row in args.each(measure, tasks) if row is not None]
+    frame = pd.DataFrame(rows)
+    means = frame.groupby("kind").agg(
+        runs=("f1", "size"), noticed=("noticed", "mean"), f1=("f1", "mean"),
+        false=("false", "sum"), other=("other", "sum"),
+    )  # fmt: skip
+    console = Console(width=160)
+    print_table(means.round(3).reset_index(), console)
+    for row in rows:
+        if not row["noticed"] or row["f1"] < 0.9 or row["false"] or row["other"]:
+            console.print(f"{row['scene']} {row['kind']}: F1 {row['f1']:.3f}; {row['told']}")
+    args.write(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    run_main(main)
