@@ -288,6 +288,17 @@ def test_a_compound_explains_what_no_primitive_does(make, kind):
     assert compound.cost < primitive.cost
 
 
+def test_stray_points_do_not_move_the_walls_of_an_open_box():
+    clean = visible(generation._tray(np.random.default_rng(1)))
+    rng, number = np.random.default_rng(2), len(clean) // 25
+    places = clean.points.max(axis=0) + rng.uniform((0.0, -0.3, -0.03), (0.05, 0.0, 0.0), (number, 3))
+    strays = replace(clean, points=places, normals=transforms.unit(rng.normal(size=(number, 3))))
+    cost = best_compound(clean, CONFIG, np.inf).cost
+    strayed = best_compound(clean.joined(strays), CONFIG, np.inf)
+    assert isinstance(strayed.shape, OpenBox)
+    assert strayed.cost < cost + 1.1 * COSTS.outlier * number * clean.weight
+
+
 def test_two_things_that_share_no_axis_are_no_compound():
     for second in (box((0.03, 0.05, 0.025), (0.06, 0.08, 0.05)), sphere((0.0, 0.07, 0.03), 0.03)):
         first = visible(cylinder((0.0, 0.0, 0.05), 0.04, 0.1))

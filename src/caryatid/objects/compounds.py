@@ -283,13 +283,17 @@ class OpenBox:
         return np.min(slabs, axis=0)
 
     def free(self, voxels: VoxelMap) -> int:
-        """How many voxels it fills that were seen free."""
+        """How many voxels it fills that were seen free, and so were those on either side of them."""
         size, count = voxels.config.size, 0
         for slab in self.slabs:
             axes = [_middles(n) - 0.5 for n in slab.extents / size]
             local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * slab.extents
-            places = transforms.transform(slab.T_world_object, local)
-            count += int(np.count_nonzero(voxels.empty_at(places)))
+            # What was seen of a surface may lie in the voxel beside it.
+            beside = 0.5 * size * np.eye(3)[slab.extents.argmin()]
+            free = np.ones(len(local), dtype=np.bool_)
+            for off in (-beside, 0.0, beside):
+                free &= voxels.empty_at(transforms.transform(slab.T_world_object, local + off))
+            count += int(np.count_nonzero(free))
         return count
 
 
@@ -306,21 +310,36 @@ def _open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[Ope
     if np.linalg.det(R) < 0.0:
         R[:, 2] *= -1.0
     local, facing = points @ R, normals @ R
-    # At the low and the high end of each axis: where points end, and where faces that look inwards lie.
+    # At the low and the high end of each axis: where faces that look outwards and inwards lie.
     outer = np.quantile(local, (0.01, 0.99), axis=0).T
+    middle = outer.mean(axis=1)
     inner, gap = np.full((3, 2), np.nan), np.full((3, 2), np.nan)
     for axis, end in product(range(3), range(2)):
-        inwards = facing[:, axis] * (1.0, -1.0)[end]
-        depth = np.abs(local[:, axis] - outer[axis, end])
-        near = (inwards > ALIKE) & (depth < np.ptp(outer[axis]) / 2.0)
-        if np.count_nonzero(near) < FEW:
-            continue
-        inner[axis, end] = np.median(local[near, axis])
-        if np.count_nonzero((inwards < -ALIKE) & (depth < thickness)) >= FEW:
-            gap[axis, end] = abs(inner[axis, end] - outer[axis, end])
+        sign = (-1.0, 1.0)[end]
+        here = sign * (local[:, axis] - middle[axis]) > 0.0
+        out, into = (
+            _level(local[here & (way * sign * facing[:, axis] > ALIKE), axis], thickness)
+            for way in (1.0, -1.0)
+        )
+        outer[axis, end] = outer[axis, end] if out is None else out
+        if into is not None:
+            inner[axis, end] = into
+            if out is not None and sign * (out - into) > 0.0:
+                gap[axis, end] = abs(out - into)
     for axis, end in product(range(3), range(2)):
         if np.isfinite(inner).any():
             yield from _open_box(R, outer, inner, gap, axis, end, thickness)
+
+
+def _level(heights: Array, width: float) -> float | None:
+    """Median [m] of the heights in the band of this width that holds most; None where those make no face."""
+    heights = np.sort(heights)
+    ends = np.searchsorted(heights, heights + width, side="right")
+    counts = ends - np.arange(len(heights))
+    if counts.max(initial=0) < FEW:
+        return None
+    first = int(counts.argmax())
+    return float(np.median(heights[first : ends[first]]))
 
 
 def _open_box(

@@ -88,19 +88,22 @@ def explained(explanation: Explanation, evidence: Evidence, config: ExplanationC
 
 
 def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig) -> float:
-    """How much [nats] colours speak for two objects rather than one; of two printed ones they say nothing."""
+    """How much [nats] colours speak for two objects, or, if negative, for one; two prints say nothing."""
     if first.rgb is None or second.rgb is None:
         return 0.0
     sides = first.rgb, second.rgb, np.concatenate([first.rgb, second.rgb])
     alone, other, both = (plain_colour(rgb, config)[0] for rgb in sides)
-    return max(both - alone - other, 0.0)
+    return both - alone - other
 
 
 def plain_colour(rgb: NDArray[np.uint8], config: ExplanationConfig) -> tuple[float, Array | None]:
-    """Cost [nats] of colours (N, 3), and the shares (3,) of the plain colour of most; None for a print."""
+    """Cost [nats] of colours (N, 3), and the shares (3,) of the plain colour of most; None for a print.
+
+    A plain colour has two parameters: the shares add up to 1.
+    """
     # Enough of them to hold one of the most frequent colour.
     tried = rgb[:: max(1, len(rgb) // 64)]
-    costs = colour_costs(rgb, colour_shares(tried), config).sum(axis=0)
+    costs = colour_costs(rgb, colour_shares(tried), config).sum(axis=0) + 2.0 * config.parameter_cost
     best, printed = int(costs.argmin()), config.irregular * len(rgb)
     return (float(costs[best]), colour_shares(tried[best])) if costs[best] < printed else (printed, None)
 

@@ -362,14 +362,15 @@ def _gain(
         if one.cost > two.cost + price(None, costs):
             break
     colours = colour_evidence(first, second, costs)
-    gain, most = two.cost - one.cost - colours, costs.irregular
+    gain = 0.0 if one.shape is None else two.cost - one.cost - colours
+    most = costs.irregular
     if not all(isinstance(e.shape, Shape) and explained(e, own, costs) for own, e in pair):
         # A compound has creases of its own: to it a border without one means nothing.
         apart = alone.cost + other.cost - colours
         compound = best_compound(both, config, apart - max(gain, 0.0))
         if compound.shape is not None:
             one, gain, most = compound, apart - compound.cost, costs.usual
-    if one.shape is None:
+    if gain <= 0.0:
         return 0.0
     cost = point_costs(one.shape, both, costs)
     is_one = max(cost[two.second].mean(), cost[~two.second].mean()) <= most
