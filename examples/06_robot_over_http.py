@@ -29,9 +29,12 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "caryatid", "serve", folder, "--port", "0", "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
-            assert service.stdout is not None
+            output = service.stdout
+            assert output is not None
             try:
-                told = "".join(iter(service.stdout.readline, "}\n")) + "}"
+                told = "".join(iter(lambda: output.readline() or "}\n", "}\n")) + "}"
+                if len(told) == 1:  # the service ended, and has said why on stderr
+                    sys.exit("the service did not start")
                 graph = drive(RobotClient(json.loads(told)["address"]), stage)
             finally:
                 service.terminate()

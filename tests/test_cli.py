@@ -212,11 +212,11 @@ def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
     said = capsys.readouterr()
     lines = said.err.splitlines()
     assert said.out == ""
-    assert re.fullmatch(r"view 00: \d objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
+    assert re.fullmatch(r"view 1: \d objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
     assert lines[1].startswith("  found: o1 (")
     assert " held by " in lines[1]
     assert lines[2].startswith("  next view: ")
-    assert any(line.startswith("view 01: ") for line in lines)
+    assert any(line.startswith("view 2: ") for line in lines)
     assert "  done: 2 views were asked for" in lines
     assert str(tmp_path / "run") in lines[-1]
     assert ESCAPE not in said.err
@@ -281,7 +281,7 @@ def test_a_profile_tells_the_time_of_each_stage_and_view(tmp_path, scene_file, c
         line.split()[0]: line.split()[1:] for line in capsys.readouterr().out.splitlines() if line.strip()
     }
     fit = [1000.0 * step["timings"]["fit"] for step in read_run(out).record["steps"]]
-    found = [table[name][table["view"].index("fit")] for name in ("00", "01", "median")]
+    found = [table[name][table["view"].index("fit")] for name in ("1", "2", "median")]
     assert found == [f"{time:.1f}" for time in (*fit, np.median(fit))]
 
     assert run_command(*words, "--json") == 0

@@ -55,7 +55,7 @@ def whole(folder, views):
     return run
 
 
-@pytest.mark.parametrize("moment", ["view 00", "view 02"])
+@pytest.mark.parametrize("moment", ["view 1:", "view 3:"])
 def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     folder = tmp_path / "runs" / "run"
     words = ["explore", scene_file, "--out", folder, "--no-early-stop", *SMALL]
@@ -64,13 +64,13 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     command.wait_for(moment)
     status, out, told = command.interrupt()
     assert (status, out) == (130, "")
-    run = whole(folder, 3 if moment == "view 02" else 1)
+    run = whole(folder, 3 if moment == "view 3:" else 1)
     count = "1 view is" if len(run.views) == 1 else f"{len(run.views)} views are"
     assert told == f"interrupted: {count} kept in {folder}; `caryatid report {folder}` makes the report"
     assert len(run.record["scores"]) == len(run.views)
 
 
-@pytest.mark.parametrize("moments", [["view 01"], ["view 01", "done: ", "o"]], ids=["views", "lifts"])
+@pytest.mark.parametrize("moments", [["view 2:"], ["view 2:", "done: ", "o"]], ids=["views", "lifts"])
 def test_a_dismantling_keeps_its_views_and_lifts(tmp_path, moments):
     folder = tmp_path / "runs" / "run"
     folder.parent.mkdir()
@@ -99,7 +99,7 @@ def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):
 def test_two_interrupts_end_it_too(tmp_path, scene_file):
     words = ["explore", scene_file, "--out", tmp_path / "run", "--views", 50, "--no-early-stop", *SMALL]
     command = Command(*words)
-    command.wait_for("view 01")
+    command.wait_for("view 2:")
     os.killpg(command._process.pid, signal.SIGINT)
     assert command.interrupt()[0] == 130
     assert [path.name for path in tmp_path.iterdir() if path.name != "run"] == []

@@ -342,7 +342,7 @@ def test_a_scene_shows_itself_in_a_notebook_if_viser_is_there(views, monkeypatch
     finally:
         shown.close()
     monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(InputError, match=r'pip install "caryatid\[view\]"'):
+    with pytest.raises(InputError, match=r'-m pip install ".*\[view\]"'):
         scene.show()
 
 

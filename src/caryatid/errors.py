@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from os import PathLike
+from pathlib import Path
 
 
 class CaryatidError(Exception):
@@ -60,7 +62,9 @@ class PlanningError(CaryatidError):
 
 def missing_extra(extra: str, library: str, source: str | PathLike[str]) -> InputError:
     """The error of a library that comes with an extra of the package and is not installed."""
-    return InputError(source, f"needs {library}", f'pip install "caryatid[{extra}]"')
+    clone = Path(__file__).parents[2]
+    package = clone if (clone / "pyproject.toml").is_file() else "caryatid"
+    return InputError(source, f"needs {library}", f'{sys.executable} -m pip install "{package}[{extra}]"')
 
 
 @contextmanager

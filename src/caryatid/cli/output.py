@@ -81,7 +81,7 @@ class Output(logging.Handler):
         from caryatid.viz.tables import census, changes
 
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
-        self.say(f"view {step.index:02d}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
+        self.say(f"view {step.index + 1}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
         for line in changes(before, step.graph):
             self.say(f"  {line}")
         if step.decision is not None:
@@ -121,7 +121,7 @@ def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], T
     """
     stages = [*dict.fromkeys(stage for step in steps for stage in step["timings"]), "turn"]
     views = [{"view": s["view"]} | s["timings"] | {"turn": turn(s["timings"])} for s in steps]
-    times = {f"{view['view']:02d}": view for view in views}
+    times = {f"{view['view'] + 1}": view for view in views}
     times["median"] = {stage: median(view[stage] for view in views if stage in view) for stage in stages}
     rows = [
         [name, *(f"{1000.0 * view[stage]:.1f}" if stage in view else "" for stage in stages)]

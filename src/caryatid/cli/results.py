@@ -96,7 +96,7 @@ class Evaluate(options.Command):
             "edge_recall": "edge\nrecall", "mean_iou": "mean\nIoU", "brier": "Brier\nscore",
             "average_precision": "average\nprecision",
         }  # fmt: skip
-        rows = [[f"{view['view']:02d}", *(f"{view[name]:.3f}" for name in columns)] for view in views]
+        rows = [[f"{view['view'] + 1}", *(f"{view[name]:.3f}" for name in columns)] for view in views]
         truth = self.truth or "the ground truth of its source"
         shown = table(f"{self.run} against {truth}", ["view", *columns.values()], rows, figures=True)
         self.output.result({"views": views}, shown)

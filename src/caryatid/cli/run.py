@@ -37,7 +37,7 @@ class RunCommand(options.Command):
 
     source: str
     settings: options.Modelling = options.Modelling()
-    out: options.OutPath
+    out: options.OutPath = Path("run")
     """Run folder to write; replaces an earlier run."""
     no_report: options.Flag = False
     """Leave out report.html."""
@@ -47,6 +47,16 @@ class RunCommand(options.Command):
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
         """Open the source; returns its name, what is really there, and the steps of the run."""
         raise NotImplementedError
+
+    def conditions(self) -> str:
+        """Where segments come from, and the noise of a simulation."""
+        from caryatid.sources import is_cloud, is_recording
+
+        simulated = not is_cloud(self.source) and not is_recording(self.source)
+        masks = self.settings.masks_from or ("simulator" if simulated else "of the source, if it has any")
+        segments = "automatic" if getattr(self, "segmentation", None) == "auto" else f"masks: {masks}"
+        text = segments if segments.startswith("masks") else f"segments: {segments}"
+        return f"{text}, noise: {getattr(self, 'noise', 'none')}" if simulated else text
 
     def run(self, config: Config, page: PageProcess | None = None) -> None:
         """Keep all steps, write the report and print what came of the run."""
@@ -58,7 +68,8 @@ class RunCommand(options.Command):
         output = self.output
         with RunWriter(self.out, config, _about(self)) as writer:
             name, truth, steps = self.open(config)
-            graph = _record(writer, steps, truth, output, page).graph
+            writer.more["conditions"] = conditions = self.conditions()
+            graph = _record(writer, steps, truth, output, page, f"{name}: {conditions}").graph
         if not self.no_report:
             _draw_report(self.out, output)
         output.say(f"{name}: {census(graph)} after {count_of(len(writer.steps), 'view')}")
@@ -136,11 +147,10 @@ class Demo(RunCommand):
     """Explore a built-in cluttered table in simulation and print what every view finds.
 
     To try:
-      caryatid demo --out run
+      caryatid demo
+      caryatid demo --scene bridge --view
     """
 
-    out: options.OutPath = Path("demo-run")
-    """Run folder to write; replaces an earlier run."""
     source: Annotated[str, tyro.conf.arg(name="scene", metavar="NAME")] = "clutter"
     """A built-in scene, such as tower, bridge or dense-12-0."""
     views: Annotated[options.OptionalCount, options.shown(default=5)] = None
@@ -381,6 +391,7 @@ def _record(
     truth: TrueScene | None,
     output: Output,
     page: PageProcess | None = None,
+    heading: str = "",
 ) -> Step:
     """Score, keep, print and show every step; returns the last."""
     from caryatid.evaluation.scores import score
@@ -392,6 +403,8 @@ def _record(
         scored = None if truth is None else score(step.graph, truth)
         if writer is not None:
             writer.add(step, None if scored is None else asdict(scored))
+        if heading and last is None:
+            output.say(heading)
         output.step(step, None if last is None else last.graph, scored)
         if page is not None:
             page.add(step, None if scored is None else scored.f1)

@@ -7,6 +7,7 @@ import textwrap
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -75,13 +76,33 @@ def write_settings(config: Config) -> str:
     lines: list[str] = []
     for stage in fields(config):
         section = getattr(config, stage.name)
-        reasons = field_docs(type(section))
+        reasons, ranges = field_docs(type(section)), _ranges(type(section))
         lines.append(f"[{stage.name}]")
         for f in fields(section):
-            lines += textwrap.wrap(reasons[f.name], 100, initial_indent="# ", subsequent_indent="# ")
+            lines += textwrap.wrap(
+                f"{reasons[f.name]}{ranges[f.name]}", 100, initial_indent="# ", subsequent_indent="# "
+            )
             lines.append(f"{f.name} = {json.dumps(getattr(section, f.name))}")
         lines.append("")
     return "\n".join(lines)
+
+
+def _ranges(stage: Any) -> dict[str, str]:
+    """What each setting of a stage may be, in words; empty where anything of its type may."""
+    words = {
+        "minimum": "at least",
+        "exclusiveMinimum": "above",
+        "maximum": "at most",
+        "exclusiveMaximum": "below",
+    }
+    found = {}
+    for name, schema in TypeAdapter(stage).json_schema()["properties"].items():
+        values = next(iter(schema.get("prefixItems", ())), schema.get("items", schema))
+        limits = [f"{word} {values[key]:g}" for key, word in words.items() if key in values]
+        if "enum" in values:
+            limits.append(f"one of {', '.join(map(str, values['enum']))}")
+        found[name] = f" Range: {', '.join(limits)}." if limits else ""
+    return found
 
 
 def field_docs(stage: Any) -> dict[str, str]:
@@ -111,8 +132,11 @@ def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -
     name = ".".join([stage, *names[:1]])
     if fault["type"] == "unexpected_keyword_argument":
         known = fields(Config) if not names else fields(getattr(Config(), stage))
-        listed = ", ".join(field.name for field in known)
-        return InputError(source, f"there is no setting '{name}'", f"there are {listed}")
+        listed = [field.name for field in known]
+        meant = get_close_matches(name.rpartition(".")[2], listed, 1)
+        remedy = f"did you mean {meant[0]}? " if meant else ""
+        remedy += f"there are {', '.join(listed)}"
+        return InputError(source, f"there is no setting '{name}'", remedy)
     if not names:
         return InputError(source, f"'{stage}' is a table of settings", f"write [{stage}]")
     wanted = fault["msg"].removeprefix("Value error, ").replace("Input should", "the value should")

@@ -43,7 +43,7 @@ class RecordingRobot(SimulatedRobot):
             why = f"the nearest of its {len(self._recorded)} views is {nearest:.2f} m away"
             return Unreachable(f"the recording has no view from there; {why}")
         if index in self._used:
-            return Unreachable(f"view {index} of the recording has already been used")
+            return Unreachable(f"view {index + 1} of the recording has already been used")
         forward = T[:3, 2]
         return posture_at(T, np.array([T[0, 3], T[1, 3], np.arctan2(forward[1], forward[0])]))
 

@@ -128,7 +128,7 @@ class SimulatedCamera:
         around: Callable[[SimulatedScene, Array], SimulatedScene | None] | None = None,
     ) -> None:
         if noise not in ("none", "carmine"):
-            raise InputError("noise", f"'{noise}' is no noise model", "choose none or carmine")
+            raise InputError("noise", f"'{noise}' is not a noise model", "choose none or carmine")
         self.scene = scene
         self.noise = noise
         self.noise_config = noise_config or NoiseConfig()
@@ -160,7 +160,7 @@ class SimulatedCamera:
         image = render(scene or self.scene, T, self.K, self.sensor)
         number = self._captures
         rng = np.random.default_rng([self._seed, number])
-        name = f"{self.scene.name} view {number}"
+        name = f"{self.scene.name} view {number + 1}"
         self._captures += 1
         if self.noise == "none":
             depth, T_reported = image.depth, T

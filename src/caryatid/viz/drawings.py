@@ -327,7 +327,7 @@ def draw_stands(steps: Sequence[Step]) -> Picture:
             axes.add_patch(cone)
             axes.plot(*platform, "o", markersize=6.0, color=VISITED, zorder=6.5)
             x, y = (eye if robot.arm else platform).tolist()
-            tags.append(Tag(x, y - 15.0, str(number), VISITED))
+            tags.append(Tag(x, y - 15.0, str(number + 1), VISITED))
         put_tags(axes, tags, 13.0)
         axes.plot([12.0, 12.0 + 0.5 * scale], [height - 12.0] * 2, color=SOFT, linewidth=2.0)
         axes.text(12.0, height - 18.0, "0.5 m", fontsize=11.0, color=SOFT)
@@ -373,7 +373,9 @@ def draw_sphere(step: Step) -> Picture:
             axes.plot(*ends[1], "o", markersize=8.0, color=colour, zorder=6.0, gid=f"point|{title}", **rim)
         axes.plot(*places(dots).T, "o", markersize=6.4, color="white", zorder=6.5, **rim)
         axes.plot(*places(step.visited).T, "o-", markersize=7.0, color=VISITED, linewidth=1.4, zorder=6.5)
-        tags = [Tag(x, y - 15.0, str(k), VISITED) for k, (x, y) in enumerate(places(step.visited).tolist())]
+        tags = [
+            Tag(x, y - 15.0, str(k), VISITED) for k, (x, y) in enumerate(places(step.visited).tolist(), 1)
+        ]
         if decision is not None:
             ((x, y),) = places(sphere.direction_of(decision.T_world_camera)).tolist()
             axes.plot(x, y, "o", markersize=14.0, color="white", zorder=6.5, **rim)
@@ -385,7 +387,7 @@ def draw_sphere(step: Step) -> Picture:
         for left, text in ((-165.0, "saliency"), (-128.0, "−1"), (-18.0, "+1")):
             axes.text(side + left, side - 7.0, text, **look)
 
-    return Picture(f"view sphere with its saliency after view {step.index}", side, side, draw)
+    return Picture(f"view sphere with its saliency after view {step.index + 1}", side, side, draw)
 
 
 def _painted(step: Step) -> tuple[NDArray[np.uint8], Array]:
@@ -435,8 +437,16 @@ def draw_chart(title: str, y_name: str, lines: Mapping[str, Sequence[float]]) ->
         for k, (name, values) in enumerate(lines.items()):
             form = ("o-", "s--", "D:", "^-.")[k]
             look: dict[str, Any] = {"color": colours.PALETTE[k], "label": name, "zorder": 3.0 - 0.1 * k}
-            chart.plot(values, form, linewidth=2.0, markersize=5.0 + 2.0 * k, clip_on=False, **look)
-        chart.set_xlim(0.0, max(len(values) - 1, 1))
+            chart.plot(
+                range(1, len(values) + 1),
+                values,
+                form,
+                linewidth=2.0,
+                markersize=5.0 + 2.0 * k,
+                clip_on=False,
+                **look,
+            )
+        chart.set_xlim(1.0, max(len(values), 2))
         chart.set_ylim(bottom=0.0)
         chart.set_xlabel("view", fontsize=11.0)
         chart.set_ylabel(y_name, fontsize=11.0)

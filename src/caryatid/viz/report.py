@@ -217,7 +217,7 @@ def _view(step: Step, before: Step | None, f1: str, width: int) -> Section:
     if step.stop:
         facts.append(("Stopped", _sentence(step.stop)))
     text = " · ".join(filter(None, parts))
-    return Section(f"View {step.index:02d}", text, _figures(step, width), facts, tables)
+    return Section(f"View {step.index + 1}", text, _figures(step, width), facts, tables)
 
 
 def _figures(step: Step, width: int) -> list[Figure]:
