@@ -219,7 +219,7 @@ def test_a_run_that_cannot_be_scored(tmp_path, recording, scene_file, capsys):
         (run, tmp_path / "nowhere", "there is no such scene or recording"),
         (recording, scene_file.parent, "run.json: the file is missing"),
         (run, recording, "gt.json: the file is missing"),
-        (run, strange, "gt.json names 'ghost', which is no body of the scene"),
+        (run, strange, "gt.json names 'ghost', which is not a body of the scene"),
         (run, tmp_path, "is neither a scene nor a recording"),
         (broken, scene_file.parent, str(broken / "views/01/graph.json")),
     ):

@@ -145,7 +145,7 @@ def test_an_empty_mask_is_an_object_out_of_sight(folder):
         ("scene_camera.json", lambda d: d["1"]["cam_K"].__setitem__(0, 0.0), "focal lengths 0"),
         ("scene_camera.json", lambda d: d["1"].pop("depth_scale"), "'depth_scale' is missing"),
         ("scene_camera.json", lambda d: d["1"].pop("cam_t_w2c"), "'cam_t_w2c' is missing"),
-        ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[0.0] * 9), "no rotation"),
+        ("scene_camera.json", lambda d: d["1"].update(cam_R_w2c=[0.0] * 9), "not a rotation"),
         ("scene_camera.json", lambda d: d.pop("1"), "no entry in scene_camera.json"),
         ("scene_camera.json", dict.clear, "has no frames"),
         ("scene_camera.json", lambda d: d.update({"first": d["1"]}), "must be a valid integer"),

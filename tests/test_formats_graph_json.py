@@ -116,7 +116,7 @@ def change(document, *path_and_value):
         (("objects", 1, "role", "hero"), "hero"),
         (("objects", 1, "role", "support_surface"), "two support surfaces"),
         (("objects", 1, "label", 70000), "70000"),
-        (("objects", 1, "T_world_object", np.diag([2.0, 2, 2, 1]).tolist()), "no rotation"),
+        (("objects", 1, "T_world_object", np.diag([2.0, 2, 2, 1]).tolist()), "not a rotation"),
         (("objects", 1, "shape", "banana"), "banana"),
         (("objects", 1, "size", [0.1, -0.1, 0.1]), "not positive"),
         (("objects", 1, "occurrences", -3), "occurrences"),

@@ -173,7 +173,7 @@ def test_files_of_no_use_are_refused(tmp_path):
     refused(tmp_path / "nowhere.pcd", "missing")
     refused(tmp_path / "nowhere.ply", "missing")
     (tmp_path / "a.xyz").write_text("1 2 3")
-    refused(tmp_path / "a.xyz", "no .pcd or .ply")
+    refused(tmp_path / "a.xyz", "not a .pcd or .ply")
     (tmp_path / "folder.pcd").mkdir()
     refused(tmp_path / "folder.pcd", "cannot be read")
     data = plane()

@@ -218,7 +218,7 @@ def test_a_disk_that_refuses_is_said_clearly_and_nothing_is_left(tmp_path, monke
         ("views/01/graph.json", None, "missing"),
         ("views/01/view.json", b"{}", "'name' is missing"),
         ("views/01/labels.png", None, "missing"),
-        ("views/01/labels.png", b"text", "no image"),
+        ("views/01/labels.png", b"text", "not an image"),
         ("views/01/labels.npy", b"\x93NUMPY\x01\x00", "labels.npy"),
     ],
 )

@@ -112,7 +112,8 @@ def test_a_command_in_the_background_goes_on(tmp_path, scene_file):
         [sys.executable, "-m", "caryatid", *map(str, words)], stderr=subprocess.PIPE, text=True,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
     )  # fmt: skip
-    assert process.stderr.readline().startswith("view 00")
+    assert "masks: simulator" in process.stderr.readline()
+    assert process.stderr.readline().startswith("view 1:")
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
     assert process.returncode == 0

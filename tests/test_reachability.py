@@ -84,7 +84,7 @@ class TestReachabilityMap:
         (lambda joints: gantry(joints)[:, :3], LIMITS, 10, r"returned shape \(1, 3, 4\) for 1 postures"),
         (lambda joints: gantry(joints)[:-1], LIMITS, 10, r"returned shape \(0, 4, 4\)"),
         (lambda joints: 2.0 * gantry(joints), LIMITS, 10, "last row"),
-        (lambda joints: gantry(joints) * np.array([-1.0, 1.0, 1.0, 1.0]), LIMITS, 10, "no rotation"),
+        (lambda joints: gantry(joints) * np.array([-1.0, 1.0, 1.0, 1.0]), LIMITS, 10, "not a rotation"),
         (lambda joints: np.full((len(joints), 4, 4), np.nan), LIMITS, 10, "no posture possible"),
     ],
 )

@@ -319,7 +319,7 @@ def test_truth_files_come_back_and_the_kind_may_be_missing(tmp_path: Path):
         (json.dumps({**EASY, "vertices": ["table", "a", "a"]}), "twice"),
         (json.dumps({"vertices": ["table"]}), "'edges'"),
         (json.dumps({**EASY, "edges": [3]}), "edges: '0' is 3"),
-        (json.dumps({**EASY, "vertices": ["table", "b"]}), "'a', which is no vertex"),
+        (json.dumps({**EASY, "vertices": ["table", "b"]}), "'a', which is not a vertex"),
         (json.dumps({**EASY, "edges": [{"supported": "a"}]}), "edges.0: the key 'supporter' is missing"),
         (json.dumps({**EASY, "edges": [{**EASY["edges"][0], "kind": "glue"}]}), "glue.*bottom-up"),
     ],

@@ -38,7 +38,7 @@ def broken(change):
         (broken(lambda T: T.__setitem__((0, 3), np.nan)), "NaN"),
         (broken(lambda T: T.__setitem__((0, 3), np.inf)), "infinity"),
         (broken(lambda T: T.__setitem__((3, 0), 0.1)), "last row"),
-        (broken(lambda T: T.__setitem__((0, 0), 1.01)), "no rotation"),
+        (broken(lambda T: T.__setitem__((0, 0), 1.01)), "not a rotation"),
         (np.diag([1.0, 1.0, -1.0, 1.0]), "mirrored"),
         (np.zeros((4, 4)), "last row"),
     ],

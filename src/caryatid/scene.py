@@ -196,7 +196,7 @@ class Scene(Pictured):
             The graph with it where it is now.
 
         Raises:
-            InputError: There is no such object, it is the support surface, or T is no rigid transform.
+            InputError: There is no such object, it is the support surface, or T is not a rigid transform.
         """
         self._forget(self._object(object_id), transforms.as_rigid(T, "T"))
         self._reported("moved", object_id)

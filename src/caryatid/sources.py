@@ -250,7 +250,7 @@ def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
 
 
 def _check_segments(source: str, points: Mapping[int, int], config: Config) -> None:
-    """Refuse a segment with fewer points than a shape needs; 0 is no object."""
+    """Refuse a segment with fewer points than a shape needs; 0 is not an object."""
     least = config.fit.min_points
     small = sorted(label for label, count in points.items() if label != 0 and count < least)
     if small:

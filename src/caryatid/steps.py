@@ -197,7 +197,7 @@ def read_run(folder: str | Path) -> Run:
     """Read a run folder; label images are loaded when asked for.
 
     Raises:
-        InputError: It is no run folder, or a file in it is missing or broken.
+        InputError: It is not a run folder, or a file in it is missing or broken.
     """
     folder, remedy = Path(folder), "give the folder a run was written to with --out"
     if not folder.is_dir():

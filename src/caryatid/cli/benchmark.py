@@ -146,7 +146,7 @@ class Benchmark(options.Command):
                     self.output.say(f"{suite}: {done} of {total} episodes")
 
     def _report(self, store: ResultStore) -> None:
-        """Write tables, figures and pages, and print what there is."""
+        """Write tables, figures and pages, and print the summary."""
         from caryatid.benchmark.report import write_report
 
         results = write_report(store, self.out, reference=self.reference, document=self.docs)

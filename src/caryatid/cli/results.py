@@ -208,7 +208,7 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
         The files that were written.
 
     Raises:
-        InputError: It is no run, a file in it is broken, or a file cannot be written; an older report.html
+        InputError: It is not a run, a file in it is broken, or a file cannot be written; an older report.html
             is left as it was.
     """
     from caryatid.io.staging import write_file

@@ -120,7 +120,7 @@ def _parse_flag(flag: str) -> dict[str, Any]:
             return tomllib.loads(f"{name} = {text}")
         except tomllib.TOMLDecodeError:
             continue
-    raise InputError("--set", f"'{value}' is not a TOML value", "write it as in TOML")
+    raise InputError("--set", f"'{value}' is not TOML value", "write it as in TOML")
 
 
 def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -> InputError:

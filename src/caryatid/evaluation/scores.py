@@ -285,7 +285,7 @@ def mask_ious(
         labels: Label images (H, W), or labels of points (N,).
         true_labels: The true ones, (H, W) or (N,) as those.
         found: F label numbers in `labels`.
-        true: T label numbers in `true_labels`; numbers that are no object's match nothing.
+        true: T label numbers in `true_labels`; numbers that are not object's match nothing.
 
     Raises:
         InputError: Images differ in number or size.
@@ -358,7 +358,7 @@ def _harmonic_mean(a: float, b: float) -> float:
 
 
 def _object_number(name: str) -> int:
-    """Label of a vertex `object<obj_id>`; 0, which is no object, for any other name."""
+    """Label of a vertex `object<obj_id>`; 0, which is not an object, for any other name."""
     digits = name.removeprefix("object")
     return int(digits) if name.startswith("object") and digits.isascii() and digits.isdigit() else 0
 

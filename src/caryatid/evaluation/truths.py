@@ -35,7 +35,7 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
         truth = read_truth(file) if known else ground_truth(scene)
     labels = {scene.table: 0} | {body: label for label, body in scene.object_bodies.items()}
     if strange := [name for name in truth.vertices if name not in labels]:
-        why = f"gt.json names '{strange[0]}', which is no body of the scene"
+        why = f"gt.json names '{strange[0]}', which is not a body of the scene"
         raise InputError(scene.source, why, f"the bodies are {', '.join(labels)}")
     solids = [(name, labels[name]) for name in truth.vertices if name != scene.table]
     objects = tuple(

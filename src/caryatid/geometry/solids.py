@@ -83,7 +83,7 @@ class Polytope:
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Solid(Shape):
-    """The union of convex parts: what is no box, no cylinder and no ball, and what is hollow.
+    """The union of convex parts: what is not a box, no cylinder and no ball, and what is hollow.
 
     Its axes are the world's where it was first seen; its centre is that of the box around it.
 

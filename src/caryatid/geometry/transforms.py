@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from caryatid.errors import InputError
 
 Array = NDArray[np.float64]
-"""An array of float64; its shape is told where it is used."""
+"""An array of float64; its shape is given where it is used."""
 
 
 UP: Array = np.array([0.0, 0.0, 1.0])
@@ -27,7 +27,7 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
         name: What to call it in the error.
 
     Raises:
-        InputError: The matrix has another shape, holds NaN, is no proper rotation or has a wrong last row, or
+        InputError: The matrix has another shape, holds NaN, is not a rotation or has a wrong last row, or
             the translation is beyond `FARTHEST`.
     """
     try:
@@ -46,7 +46,7 @@ def as_rigid(T: ArrayLike, name: str = "transform") -> Array:
     if not np.allclose(R.T @ R, np.eye(3), atol=RIGID_TOLERANCE) or np.linalg.det(R) < 0.0:
         raise InputError(
             name,
-            "its 3×3 part is no rotation (not orthonormal, or mirrored)",
+            "its 3×3 part is not a rotation (not orthonormal, or mirrored)",
             "check units and row order; p_world = T_world_camera @ p_camera",
         )
     return matrix

@@ -166,7 +166,7 @@ def open_dataset(
         options: What the format may need to know.
 
     Raises:
-        InputError: It does not exist, is of no known format, or is damaged.
+        InputError: It does not exist, has an unknown format, or is damaged.
     """
     path = find_sample(path)
     if not path.exists():
@@ -176,6 +176,6 @@ def open_dataset(
         remedy = (
             "give a BOP scene folder, a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), or a TUM "
         )
-        raise InputError(path, "is of no known format", remedy + "RGB-D folder with depth.txt")
+        raise InputError(path, "has an unknown format", remedy + "RGB-D folder with depth.txt")
     dataset: Dataset = known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
     return dataset

@@ -97,7 +97,7 @@ def decode_image(
         reason = f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
         raise BrokenImageError(source, reason, "give a smaller image") from None
     except UnidentifiedImageError as error:
-        raise BrokenImageError(source, "is no image", remedy) from error
+        raise BrokenImageError(source, "is not an image", remedy) from error
     except (*_BAD_BYTES, OSError) as error:
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
 

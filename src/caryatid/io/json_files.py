@@ -107,7 +107,7 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
         remedy: What the user can do where it is missing or broken.
 
     Raises:
-        InputError: The file is missing, unreadable, no JSON, holds NaN or infinity, or is no object.
+        InputError: The file is missing, unreadable, no JSON, holds NaN or infinity, or is not an object.
     """
     with read_errors(path, remedy):
         content = path.read_bytes()

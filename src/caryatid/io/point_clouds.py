@@ -94,12 +94,12 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
 
     Raises:
         InputError: The file is missing, of another kind, broken, its header lies, it holds no readings, or
-            its labels are no object numbers.
+            its labels are not object numbers.
     """
     path = find_sample(path)
     parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
     if parse is None:
-        raise InputError(path, "is no .pcd or .ply file", "convert it to one of these")
+        raise InputError(path, "is not a .pcd or .ply file", "convert it to one of these")
     with read_errors(path, "give a .pcd or .ply file"):
         content = path.read_bytes()
     try:

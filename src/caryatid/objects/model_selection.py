@@ -108,7 +108,7 @@ def _parts(
 ) -> list[tuple[Groups, float]] | None:
     """Points of each object among those with this index, and its cost [nats]; None where they are one.
 
-    A shape must explain each: pieces of a thing that has no shape are no objects.
+    A shape must explain each: pieces of a thing that has no shape are not objects.
     """
     own = evidence.select(index)
     found = _best_two(own, whole, index, hints, up, config, rng)
@@ -272,7 +272,7 @@ def _components(points: Array, gap: float = 0.02) -> Groups:
 
 
 def _connected(points: Array, second: Mask) -> Mask:
-    """Keep the largest connected part of the second side, and of the first all that is no crumb (2 cm²)."""
+    """Keep the largest connected part of the second side, and of the first all but crumbs (2 cm²)."""
     result = second.copy()
     for side, least in ((True, np.inf), (False, 8)):
         index = np.flatnonzero(result == side)

@@ -260,7 +260,7 @@ class ObjectModels:
             observation: The view.
             known: The objects so far.
             masks: Its segments are given; two of one view are two objects for good.
-            new: Labels of segments that are no known object's.
+            new: Labels of segments that are not known object's.
         """
         points, labels = observation.cloud.points_world, observation.labels
         segments = np.where(labels == SUPPORT_LABEL, 0, labels)

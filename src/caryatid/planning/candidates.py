@@ -1,4 +1,4 @@
-"""The views a robot can reach, and the few of them that stand for all: so many tell what there is to see."""
+"""The views a robot can reach, and the few of them that stand for all."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
             is reached by a path of length 0.
 
     Raises:
-        InputError: A pose is no rigid transform.
+        InputError: A pose is not a rigid transform.
     """
 
     def __init__(

@@ -18,7 +18,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.support.stability import ground_outline
 
 STEP = 0.02
-"""Anything on the floor lower than this is no obstacle to the platform [m]."""
+"""Anything on the floor lower than this is not an obstacle to the platform [m]."""
 
 TABLE_MARGIN = 0.1
 """Furniture met this near to the view sphere's centre is the table, not a wall in the line of sight [m]."""

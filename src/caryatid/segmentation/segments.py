@@ -61,7 +61,7 @@ def segment(
     edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
     part = convex_parts(points, normals, edges, config, steps)
     wide = wide_parts(samples.image(part))
-    # What stands beside the surface, as at its edge or in the room behind, is no object on it.
+    # What stands beside the surface, as at its edge or in the room behind, is not an object on it.
     over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
     part = number_by_appearance(_with_share(np.where(wide[part], part, 0), over, 0.5) - 1)
     if samples.rgb is not None:

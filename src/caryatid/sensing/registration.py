@@ -238,8 +238,8 @@ class ViewRegistration:
             if not moved.any():
                 break
             stale = self._edges[moved]
-            anew = self._matched(zip(stale["still"].tolist(), stale["moving"].tolist(), strict=True))
-            self._edges = np.concatenate([self._edges[~moved], anew])
+            again = self._matched(zip(stale["still"].tolist(), stale["moving"].tolist(), strict=True))
+            self._edges = np.concatenate([self._edges[~moved], again])
         if self._mean_misfit(self._edges) > self._mean_misfit(edges_before) + 0.3 * self._config.noise:
             self._now, self._edges = before, edges_before
             self._let_go([])

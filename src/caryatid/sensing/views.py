@@ -64,7 +64,7 @@ class View(Pictured):
         if np.isinf(depth).any() or (depth < 0.0).any():
             bad = "infinite" if np.isinf(depth).any() else "negative"
             raise InputError(self.name, f"depth holds {bad} values", "mark missing readings with 0 or NaN")
-        # What is nearer than a micrometre is no reading, and its inverse may be infinite.
+        # What is nearer than a micrometre is not a reading, and its inverse may be infinite.
         depth = np.where(depth < 1e-6, np.float32(0.0), depth)
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "K", check_intrinsics(self.K, self.name))
@@ -135,7 +135,7 @@ class View(Pictured):
         """Return the same view seen from another pose (4, 4).
 
         Raises:
-            InputError: The pose is no rigid transform.
+            InputError: The pose is not a rigid transform.
         """
         other = copy.copy(self)
         T = transforms.as_rigid(T_world_camera, f"{self.name}: T_world_camera")

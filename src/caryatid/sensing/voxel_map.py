@@ -254,7 +254,7 @@ class Occluders:
         clearance: float,
         cone: float,
     ) -> Array:
-        """Worth of what each camera shows of each point anew.
+        """Worth of what each camera shows of each point for the first time.
 
         A camera shows a point fully up to 60° from its normal, then as well as the cosine; not at all where
         the point lies outside its image or the line of sight is blocked.
@@ -390,7 +390,7 @@ def _show(share, data):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
 def _face(data, p, first, end):  # type: ignore[no-untyped-def]
-    """Write what each camera shows of one point anew where nothing is in between."""
+    """Write what each camera shows of one point for the first time, where nothing is in between."""
     _, _, _, points, normals, befores, weights, eyes, axes, _, cone, worths = data
     x, y, z = points[p, 0], points[p, 1], points[p, 2]
     a, b, c = normals[p, 0], normals[p, 1], normals[p, 2]

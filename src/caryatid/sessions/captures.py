@@ -64,7 +64,7 @@ class CameraRecord:
         """Read camera.json.
 
         Raises:
-            InputError: It is missing or broken, or the pose is no rigid transform.
+            InputError: It is missing or broken, or the pose is not a rigid transform.
         """
         return parse_json(cls, read_json(path, remedy), path, remedy)
 
@@ -146,8 +146,8 @@ class Capture:
         """Decode the images.
 
         Raises:
-            InputError: One is broken, too large, of the wrong kind, or sizes differ; the camera is no pinhole
-                camera, or its pose no rigid transform.
+            InputError: One is broken, too large, of the wrong kind, or sizes differ; the camera is not a
+                pinhole camera, or its pose is not a rigid transform.
         """
         camera = self.camera
         decoded = {

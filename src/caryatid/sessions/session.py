@@ -233,7 +233,7 @@ class Session:
 
         Raises:
             SessionBusyError: Another writer has it open.
-            InputError: It is no session, or a view is broken.
+            InputError: It is not a session, or a view is broken.
         """
         folder = Path(path)
         beginning = Beginning.read(folder / "session.json")
@@ -313,7 +313,7 @@ class Session:
 
         Raises:
             PlanningError: There is no view yet, or none can be reached.
-            InputError: Candidates are no poses.
+            InputError: Candidates are not poses.
         """
         sphere, robot = self.scene.sphere, None
         if sphere is None:

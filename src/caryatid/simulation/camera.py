@@ -153,7 +153,7 @@ class SimulatedCamera:
             registration believes in; labels stay as seen also where depth is missing.
 
         Raises:
-            InputError: The pose is no rigid transform.
+            InputError: The pose is not a rigid transform.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
         scene = None if self._around is None else self._around(self.scene, T)

@@ -1,6 +1,6 @@
 """Objects lifted, held and taken away in MuJoCo, and what happens to the others meanwhile.
 
-A grasp is a weld to a body that moves as it is told (a mocap body), one for each object: the object that is
+A grasp is a weld to a body that moves as commanded (a mocap body), one for each object: the object that is
 lifted follows it straight up at constant speed, those that are held stay where they are.
 """
 

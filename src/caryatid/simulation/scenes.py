@@ -154,7 +154,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(path, f"Not an MJCF file ({reason})", "mend the XML") from None
+        raise InputError(path, f"Not an MJCF file ({reason})", "correct the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     return scene_from_spec(spec, name or path.stem, str(path), config)
 
@@ -166,7 +166,7 @@ def _check_sizes(path: Path, config: PhysicsConfig) -> None:
         InputError: An element makes too many copies, or a height field or texture is too large.
     """
     copies = [1.0]
-    # What is no XML, or no number, MuJoCo refuses itself, with the line.
+    # MuJoCo itself refuses what is not XML or not a number, with the line.
     with suppress(ElementTree.ParseError, ValueError, OSError):
         for event, element in ElementTree.iterparse(path, ("start", "end")):
             if event == "end":

@@ -129,7 +129,7 @@ def read_truth(path: Path) -> GroundTruth:
     """Read a gt.json.
 
     Raises:
-        InputError: The file is missing, is no JSON, or its edges do not fit its vertices.
+        InputError: The file is missing, is not JSON, or its edges do not fit its vertices.
     """
     truth = parse_json(GroundTruth, read_json(path, _REMEDY), path, _REMEDY)
     if not truth.vertices:
@@ -138,7 +138,7 @@ def read_truth(path: Path) -> GroundTruth:
         raise InputError(path, "'vertices' names a body twice", "name each body once")
     for name in [name for edge in truth.edges for name in (edge.supporter, edge.supported)]:
         if name not in truth.vertices:
-            raise InputError(path, f"names {name!r}, which is no vertex", "name one of the vertices")
+            raise InputError(path, f"names {name!r}, which is not a vertex", "name one of the vertices")
     return truth
 
 

@@ -87,7 +87,7 @@ def scene_from_spec(
             model = spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(source, f"MuJoCo refuses it: {reason}", "mend the MJCF") from None
+        raise InputError(source, f"MuJoCo refuses it: {reason}", "correct the MJCF") from None
     rest, step = (config or PhysicsConfig()).rest_window, model.opt.timestep
     if not 1e-5 <= step <= rest:
         raise InputError(source, f"its time step is {step:g} s", f"give option timestep 0.00001 to {rest:g}")
@@ -440,7 +440,7 @@ def _true_shape(scene: SimulatedScene, label: int) -> Shape:
 
 
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
-    """Oriented boxes around the geoms that belong to no object, the table's first; planes are no obstacle."""
+    """Oriented boxes around the geoms of no object, the table's first; planes are not obstacle."""
     flat = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
     geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels == 0).tolist()])
     return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
@@ -533,4 +533,4 @@ def _mesh_vertices(model: Any, geom: int) -> Array:
 def _unsupported(model: Any, geom: int) -> InputError:
     body = model.body(model.geom_bodyid[geom]).name
     kind = _GEOM(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-    return InputError(f"body '{body}'", f"a {kind} geom is no solid shape", "use primitives or meshes")
+    return InputError(f"body '{body}'", f"a {kind} geom is not a solid shape", "use primitives or meshes")

@@ -49,7 +49,8 @@ class SupportPlanner:
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
 
-        s is the worth of what a candidate shows anew, h the cost of going there, `config.effort` times that
+        s is the worth of what a candidate shows for the first time, h the cost of going there,
+        `config.effort` times that
         of eq. 3, and so is the inhibition of return: both only decide where views show about as much.
         """
         check_candidates(state)
@@ -74,7 +75,7 @@ class SupportPlanner:
 def _expected_gain(
     state: PlanningState, relations: list[PointOfInterest], T_world_camera: Array
 ) -> tuple[Samples, Array]:
-    """Samples, and what cameras (C, 4, 4) show of them anew (K, C)."""
+    """Samples, and what cameras (C, 4, 4) show of them for the first time (K, C)."""
     config = state.config
     occluders = state.voxels.occluders([o.shape for o in state.graph.objects])
     surfaces, points = surface_samples(state.graph, occluders), relation_samples(relations)

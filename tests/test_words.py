@@ -1,0 +1,46 @@
+"""English that a native reader would stumble over, in messages, help, docstrings and pages."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TEXTS = [
+    *(ROOT / "src").rglob("*.py"), *(ROOT / "examples").rglob("*.py"), *(ROOT / "docs").glob("*.md"),
+    ROOT / "README.md",
+]  # fmt: skip
+COMPARED = "longer|more|smaller|larger|higher|wider|later|surer|better|shorter|difference|inhibition|IG"
+"""Words that may follow `is no`."""
+BANNED = {
+    rf"(?<!here )\b(?:is|are) no (?!{COMPARED}|w\b|\W)\w+": "is not a …",
+    r"\b(?:is|are) told\b": "give, say",
+    r"\bof no known\b": "unknown",
+    r"\banew\b": "again, for the first time",
+    r"\bwhat there is\b": "what it is",
+    r"\bmend the\b": "correct the",
+    r"\bviews? 0\b(?!\d|[.,]\d)": "people count views from 1",
+}
+"""Pattern → what to write in its place."""
+
+
+@pytest.mark.parametrize("pattern", BANNED)
+def test_no_text_holds_a_banned_phrase(pattern):
+    found = [
+        f"{path.relative_to(ROOT)}:{text.count(chr(10), 0, match.start()) + 1}: {match[0]}"
+        for path in TEXTS
+        for text in [path.read_text()]
+        for match in re.finditer(pattern, text)
+    ]
+    assert not found, "\n".join([f"write '{BANNED[pattern]}'", *found])
+
+
+def test_the_readme_fits_on_a_screen_and_has_short_sentences():
+    text = (ROOT / "README.md").read_text()
+    assert len(text.splitlines()) <= 120
+    prose = re.sub(r"```.*?```|^\|.*$|^#.*$|^!\[.*$", "\n\n", text, flags=re.S | re.M)
+    prose = re.sub(r"\]\([^)]*\)", "]", prose)
+    for sentence in re.split(r"(?<=[.:?!])\s+|\n\n", prose):
+        assert len(sentence.split()) <= 30, sentence
