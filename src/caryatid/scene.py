@@ -186,7 +186,7 @@ class Scene(Pictured):
         return self.graph
 
     def moved(self, object_id: str, T: Array) -> SupportGraph:
-        """Say that an object was moved: its points and its shape move along, its supports are found anew.
+        """Say that an object was moved: its points and its shape move along, its supports are found again.
 
         Args:
             object_id: Id of an object, such as `o3`.
