@@ -36,7 +36,7 @@ from test_benchmark import fill
 from test_service import body, serving
 
 from caryatid.benchmark.store import RESULTS, ResultStore
-from caryatid.config import Config, SessionConfig
+from caryatid.config import Config, RecordingConfig, SessionConfig
 from caryatid.config.settings import changed_settings, read_settings, write_settings
 from caryatid.errors import CaryatidError, in_one_line
 from caryatid.exports import ENDINGS, export_graph
@@ -350,7 +350,7 @@ def open_session(folder):
 
 def open_capture(folder):
     files = {"depth": folder / "depth.png", "labels": folder / "labels.png"}
-    Capture.from_files(files, folder / "camera.json", SessionConfig()).decode(SessionConfig())
+    Capture.from_files(files, folder / "camera.json", SessionConfig()).decode(RecordingConfig().max_pixels)
 
 
 def open_masks(folder):

@@ -13,7 +13,7 @@ import pytest
 from conftest import SMALL, TWO_ON_A_TABLE, run_command, without_labels, without_poses
 
 from caryatid.geometry import transforms
-from caryatid.io import write_recording
+from caryatid.io import read_recording, write_recording
 from caryatid.sensing.views import View
 from caryatid.steps import read_run
 
@@ -137,6 +137,18 @@ def test_an_image_larger_than_any_cameras(recording, refused, width, says):
         path.read_bytes()[:12] + header + struct.pack(">I", zlib.crc32(header)) + path.read_bytes()[33:]
     )
     refused("extract", recording, names=path, says=says)
+
+
+def test_one_setting_limits_the_size_of_images(recording, refused, tmp_path, capsys):
+    depth = recording / "depth/000000.png"
+    height, width = read_recording(recording)[0].depth.shape
+    few, enough = (f"--set=recording.max_pixels={n}" for n in (height * width - 1, height * width))
+    refused("extract", recording, few, names=depth, says="raise recording.max_pixels")
+    png = recording / "mask_visib" / "000000_000000.png"
+    for limit, status in ((few, 1), (enough, 0)):
+        words = ("session", "new", tmp_path / limit[-3:], "--ignore", png, limit, "--quiet")
+        assert run_command(*words) == status
+    assert "raise recording.max_pixels" in capsys.readouterr().err
 
 
 # MJCF

@@ -164,7 +164,7 @@ NOT_BEGUN = (
     ({"name": "b", "settings": {"active": {"sphere_points": 10**6}}}, 422, "sphere_points"),
     ({"name": "b", "settings": {"fit": {"hypotheses": 10**20}}}, 422, "fit.hypotheses"),
     ({"name": "b", "settings": {"robot": {"cell": 1e-5}}}, 422, "more than tenfold away"),
-    ({"name": "b", "settings": {"session": {"max_pixels": 10**9}}}, 422, "a limit of the service"),
+    ({"name": "b", "settings": {"recording": {"max_pixels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "settings": {"voxels": {"max_voxels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "seed": -1}, 422, "seed"),
     ({"name": "a"}, 409, "holds a session or other files"),

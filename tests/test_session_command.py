@@ -43,7 +43,7 @@ def test_a_session_from_the_first_view_to_the_last(folder, files, capsys, views)
         told = json.loads(capsys.readouterr().out)
         images = {name: folder.parent / f"{name}.png" for name in ("depth", "labels")}
         capture = Capture.from_files(images, folder.parent / "camera.json", Config().session)
-        scene.update(capture.decode(Config().session))
+        scene.update(capture.decode(Config().recording.max_pixels))
         assert told["view"] == number
         assert json.dumps(told["graph"], indent=1, ensure_ascii=False) + "\n" == graph_text(scene.graph)
 

@@ -441,7 +441,7 @@ def test_a_view_comes_back_bit_by_bit(tmp_path, views):
     first = Capture.of(view)
     for name, content in first.files().items():
         (tmp_path / name).write_bytes(content)
-    again = Capture.read(tmp_path).decode(Config().session)
+    again = Capture.read(tmp_path).decode(Config().recording.max_pixels)
     for field in ("depth", "K", "T_world_camera", "rgb", "labels", "normals_camera"):
         assert np.array_equal(getattr(again, field), getattr(view, field))
     assert again.labels_are == "segments"

@@ -348,7 +348,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         config = changed_settings(pool.config, given.settings, "settings")
         options = given.model_dump(include={"segmentation", "seed", "planner"})
         if given.ignore is not None:
-            options["ignore"] = read_mask(given.ignore, "ignore", config.session.max_pixels)
+            options["ignore"] = read_mask(given.ignore, "ignore", config.recording.max_pixels)
         return described(given.name, pool.begin(given.name, config, **options))
 
     @app.get("/sessions/{name}", response_model=SessionAnswer)
@@ -447,7 +447,7 @@ def _check_limits(own: Config, asked: Config) -> None:
             if value == before:
                 continue
             remedy = "leave it to those who run the service"
-            if stage == "session" or name == "max_voxels":
+            if stage == "session" or name in ("max_voxels", "max_pixels"):
                 raise InputError(f"{stage}.{name}", "is a limit of the service", remedy)
             given, ours = np.ravel(value), np.ravel(before)
             if given.dtype.kind not in "if" or not ours.any():

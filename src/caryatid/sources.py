@@ -163,7 +163,9 @@ def open_recording(
     if recording.is_video:
         recording = choose_frames(recording, config.recording)
     if ignore is not None:
-        frames = [replace(f, load=partial(_seen, f, ignore)) for f in recording.frames]
+        frames = [
+            replace(f, load=partial(_seen, f, ignore, config.recording.max_pixels)) for f in recording.frames
+        ]
         recording = replace(recording, frames=frames)
     if level:
         recording = levelled(recording, config)
@@ -229,9 +231,9 @@ def extract(
     return (replace(step, labels=stored.spread(step.labels)) for step in steps)
 
 
-def _seen(frame: Frame, ignore: Path) -> View:
+def _seen(frame: Frame, ignore: Path, max_pixels: int) -> View:
     """The view of a frame, without what a mask says to ignore."""
-    return without_ignored(frame.load(), ignore)
+    return without_ignored(frame.load(), ignore, max_pixels)
 
 
 def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:

@@ -48,14 +48,16 @@ class New(SessionStep, options.PlanningCommand):
         from caryatid.robots import located
         from caryatid.sessions import Session
 
+        config = self.settings.read()
+        most = config.recording.max_pixels
         session = Session.begin(
             self.folder,
-            self.settings.read(),
+            config,
             segmentation=self.segmentation,
             seed=self.settings.seed,
             planner=self.chosen_planner,
             robot=located(self.robot),
-            ignore=None if self.ignore is None else read_mask(self.ignore),
+            ignore=None if self.ignore is None else read_mask(self.ignore, max_pixels=most),
         )
         with session:
             self.show({"session": self.folder, "views": 0}, f"session: {self.folder}")

@@ -554,8 +554,11 @@ class ReportConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class RecordingConfig:
-    """Which frames of a recording become views."""
+    """Which images and frames become views."""
 
+    max_pixels: Count = 16_000_000
+    """Maximum number of pixels of an image, wherever it comes from [1]; several times what depth cameras
+    have, and it bounds memory."""
     max_views: Count = 30
     """Maximum number of views [1]; those farthest apart are kept. A table is known after 5 to 10."""
     min_distance: Positive = 0.10
@@ -592,8 +595,6 @@ class ExportConfig:
 class SessionConfig:
     """Limits on images and camera poses wherever views come from, and on what a service keeps."""
 
-    max_pixels: Count = 16_000_000
-    """Maximum number of pixels of an image [1]; several times what depth cameras have; bounds memory."""
     max_bytes: Count = 100_000_000
     """Maximum size of a file [bytes]; larger than any camera's image."""
     max_coordinate: Positive = 1e4

@@ -69,8 +69,9 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     info_topic = bag.require("--info", options.info, "cameras")
     rgb_topic = None if options.rgb is None else bag.require("--rgb", options.rgb, "images")
     cameras, distorts = _read_cameras(bag, info_topic)
-    depths = bag.images(depth_topic, _depth)
-    colours = None if rgb_topic is None else bag.images(rgb_topic, _colour)
+    depths = bag.images(depth_topic, partial(_depth, max_pixels=config.max_pixels))
+    colour = partial(_colour, max_pixels=config.max_pixels)
+    colours = None if rgb_topic is None else bag.images(rgb_topic, colour)
     pose_at, notes = None, []
     if options.world is None:
         notes.append("no --tf FRAME: poses are not known, a single frame is taken")
@@ -195,10 +196,10 @@ def _stamp(header: Any, received: int) -> int:
     return int(header.stamp.sec * SECOND + header.stamp.nanosec) or received
 
 
-def _depth(message: Any, source: str) -> NDArray[np.float32]:
+def _depth(message: Any, source: str, max_pixels: int) -> NDArray[np.float32]:
     """Depth (H, W) [m] of an image message, compressed or not; 0 where it is NaN, infinite or negative."""
     if message.__msgtype__ == COMPRESSED:
-        depth = _compressed_depth(message, source)
+        depth = _compressed_depth(message, source, max_pixels)
     else:
         kind = _known(message, DEPTH_ENCODINGS, source)
         pixels = _pixels(message, kind, 1, source)[:, :, 0]
@@ -206,15 +207,15 @@ def _depth(message: Any, source: str) -> NDArray[np.float32]:
     return np.where(np.isfinite(depth) & (depth > 0.0), depth, 0.0).astype(np.float32)
 
 
-def _compressed_depth(message: Any, source: str) -> NDArray[np.floating[Any]]:
+def _compressed_depth(message: Any, source: str, max_pixels: int) -> NDArray[np.floating[Any]]:
     encoding, _, codec = (part.strip() for part in message.format.partition(";"))
     data = message.data.tobytes()
     if "rvl" in codec.lower() or "jpeg" in message.format or "jpg" in message.format:
         reason = f"its depth is compressed as '{message.format}'"
         raise InputError(source, reason, "record it raw, or compressed as PNG")
     if "compressedDepth" not in codec:
-        return images.read_units(data, source) * 0.001
-    units = images.read_units(data[_CONFIG_HEADER.size :], source)
+        return images.read_units(data, source, max_pixels) * 0.001
+    units = images.read_units(data[_CONFIG_HEADER.size :], source, max_pixels)
     if encoding != "32FC1":
         return units * 0.001
     _, scale, offset = _CONFIG_HEADER.unpack_from(data)
@@ -222,10 +223,10 @@ def _compressed_depth(message: Any, source: str) -> NDArray[np.floating[Any]]:
         return np.where(units > 0, scale / (units - np.float64(offset)), 0.0)
 
 
-def _colour(message: Any, source: str) -> NDArray[np.uint8]:
+def _colour(message: Any, source: str, max_pixels: int) -> NDArray[np.uint8]:
     """Colour (H, W, 3) of an image message, compressed or not; grey images have three equal channels."""
     if message.__msgtype__ == COMPRESSED:
-        return images.decode_image(message.data.tobytes(), source)
+        return images.decode_image(message.data.tobytes(), source, max_pixels=max_pixels)
     count, channels = _known(message, COLOUR_ENCODINGS, source)
     return np.ascontiguousarray(_pixels(message, "u1", count, source)[:, :, channels])
 

@@ -55,10 +55,10 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     Raises:
         InputError: It is broken.
     """
-    return read_recording(path)
+    return read_recording(path, config)
 
 
-def read_recording(folder: str | Path) -> Dataset:
+def read_recording(folder: str | Path, config: RecordingConfig | None = None) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
     Cameras, poses and the table of masks are checked here, images when a view is asked for. A rotation that
@@ -66,6 +66,7 @@ def read_recording(folder: str | Path) -> Dataset:
 
     Args:
         folder: The scene folder, or `sample-recording`. Lengths in it are millimetres.
+        config: Maximum size of images.
 
     Raises:
         InputError: A table is missing or broken, a camera or pose is not valid, a mask names no object,
@@ -85,8 +86,10 @@ def read_recording(folder: str | Path) -> Dataset:
         if image.stem not in {f"{number:06d}" for number in cameras}:
             remedy = "add its camera there, or take the image out"
             raise InputError(image, "has no entry in scene_camera.json", remedy)
-    masks = _read_masks(folder, set(cameras))
-    frames = tuple(_frame(folder, n, cameras[n], masks.get(n), f"{path}: frame {n}") for n in sorted(cameras))
+    masks, most = _read_masks(folder, set(cameras)), (config or RecordingConfig()).max_pixels
+    frames = tuple(
+        _frame(folder, n, cameras[n], masks.get(n), f"{path}: frame {n}", most) for n in sorted(cameras)
+    )
     without = [f.number for f in frames if f.T_world_camera is None]
     if len(frames) > 1 and without:
         reason = f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c)"
@@ -148,7 +151,9 @@ def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
     folder.publish()
 
 
-def _frame(folder: Path, number: int, camera: _Camera, masks: Masks | None, source: str) -> Frame:
+def _frame(
+    folder: Path, number: int, camera: _Camera, masks: Masks | None, source: str, max_pixels: int
+) -> Frame:
     K = check_intrinsics(camera.cam_K.reshape(3, 3), f"{source}: cam_K")
     T_world_camera = _pose(camera, source)
     depth_path, rgb_path = folder / f"depth/{number:06d}.png", None
@@ -158,22 +163,22 @@ def _frame(folder: Path, number: int, camera: _Camera, masks: Masks | None, sour
     name = f"{folder.resolve().name}/{number:06d}"
 
     def load() -> View:
-        depth = images.read_depth(depth_path, camera.depth_scale)
+        depth = images.read_depth(depth_path, camera.depth_scale, max_pixels)
         if not depth.any():
             reason = "the frame is empty: no pixel has a depth reading"
             raise InputError(depth_path, reason, "leave this frame out")
-        rgb = None if rgb_path is None else images.decode_image(rgb_path)
-        labels = None if masks is None else _read_labels(masks, depth)
+        rgb = None if rgb_path is None else images.decode_image(rgb_path, max_pixels=max_pixels)
+        labels = None if masks is None else _read_labels(masks, depth, max_pixels)
         return View(depth, K, T_world_camera, rgb, labels, name=name)
 
     return Frame(name, number, load, T_world_camera, has_labels=masks is not None)
 
 
-def _read_labels(masks: Masks, depth: NDArray[np.float32]) -> NDArray[np.int32]:
+def _read_labels(masks: Masks, depth: NDArray[np.float32], max_pixels: int) -> NDArray[np.int32]:
     """Object number of each pixel (H, W), 0 = nothing."""
     labels = np.zeros(depth.shape, dtype=np.int32)
     for path, label in masks:
-        mask = images.read_mask(path)
+        mask = images.read_mask(path, max_pixels=max_pixels)
         if mask.shape != depth.shape:
             (height, width), (rows, columns) = mask.shape, depth.shape
             reason = f"is {width}×{height} pixels, the depth image is {columns}×{rows}"

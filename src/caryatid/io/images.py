@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
+from caryatid.config import RecordingConfig
 from caryatid.errors import InputError
 
 DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
-MAX_PIXELS: Final = 64_000_000
-"""Pixels an image may have where no settings say otherwise: 8000 × 6000 take 1 GB."""
+MAX_PIXELS: Final = RecordingConfig().max_pixels
+"""Maximum number of pixels of an image where no settings are given."""
 _BAD_BYTES: Final = (SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error)
 """What Pillow raises on a broken image, …"""
 _TOO_LARGE: Final = (Image.DecompressionBombError, Image.DecompressionBombWarning)
@@ -30,29 +31,30 @@ class BrokenImageError(InputError):
     """An image that cannot be decoded; others of its recording may be whole."""
 
 
-def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
+def read_depth(path: Path, depth_scale: float, max_pixels: int = MAX_PIXELS) -> NDArray[np.float32]:
     """Read a 16-bit depth PNG.
 
     Args:
         path: The file.
         depth_scale: One unit [mm].
+        max_pixels: As for `decode_image`.
 
     Returns:
         Depth (H, W) [m], 0 = no reading.
 
     Raises:
-        InputError: Missing, truncated, or not 16 bit.
+        InputError: Missing, truncated, too large, or not 16 bit.
     """
-    return (read_units(path) * (depth_scale / 1000.0)).astype(np.float32)
+    return (read_units(path, max_pixels=max_pixels) * (depth_scale / 1000.0)).astype(np.float32)
 
 
-def read_units(image: Path | bytes, name: str = "") -> NDArray[np.int32]:
+def read_units(image: Path | bytes, name: str = "", max_pixels: int = MAX_PIXELS) -> NDArray[np.int32]:
     """Read a 16-bit grey PNG (H, W), a file or its content, as it is: depth in units of its own, or labels.
 
     Raises:
-        InputError: Missing, truncated or not 16 bit.
+        InputError: Missing, truncated, too large or not 16 bit.
     """
-    return decode_image(image, name, DEPTH_MODES, "a 16-bit grey PNG").astype(np.int32)
+    return decode_image(image, name, DEPTH_MODES, "a 16-bit grey PNG", max_pixels).astype(np.int32)
 
 
 def decode_image(
@@ -60,7 +62,7 @@ def decode_image(
     name: str = "",
     modes: tuple[str, ...] | None = None,
     what: str = "",
-    most: float = MAX_PIXELS,
+    max_pixels: int = MAX_PIXELS,
 ) -> NDArray[Any]:
     """Decode a PNG or JPEG: (H, W), or (H, W, 3) where colour is allowed; grey then has three equal channels.
 
@@ -69,7 +71,7 @@ def decode_image(
         name: What to call content in errors.
         modes: Pillow modes allowed; None allows all.
         what: What the image ought to be, for the error where the mode is another.
-        most: Pixels it may have; a larger one is not decoded.
+        max_pixels: Maximum number of pixels; a larger image is not decoded.
 
     Raises:
         InputError: It is missing or broken, larger, or not such an image.
@@ -87,9 +89,9 @@ def decode_image(
                 if modes is not None and opened.mode not in modes:
                     reason = f"has pixels of mode {opened.mode}, not {what}"
                     raise BrokenImageError(source, reason, f"save it as {what}")
-                if width * height > most:
-                    reason = f"has {width}×{height} pixels, {most} are allowed"
-                    raise InputError(source, reason, "give a smaller image")
+                if width * height > max_pixels:
+                    reason = f"has {width}×{height} pixels, {max_pixels} are allowed"
+                    raise InputError(source, reason, "give a smaller image, or raise recording.max_pixels")
                 return np.array(opened.convert("RGB") if modes is None or "RGB" in modes else opened)
     except FileNotFoundError:
         raise BrokenImageError(source, "the file is missing", remedy) from None
@@ -102,13 +104,13 @@ def decode_image(
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
 
 
-def read_mask(image: Path | bytes, name: str = "", most: float = MAX_PIXELS) -> NDArray[np.bool_]:
+def read_mask(image: Path | bytes, name: str = "", max_pixels: int = MAX_PIXELS) -> NDArray[np.bool_]:
     """Read where a grey PNG (H, W), a file or its content, is not 0.
 
     Raises:
         InputError: As `decode_image`.
     """
-    return decode_image(image, name, MASK_MODES, "a grey PNG", most) > 0
+    return decode_image(image, name, MASK_MODES, "a grey PNG", max_pixels) > 0
 
 
 def read_npy(array: Path | bytes, name: str = "") -> NDArray[Any]:

@@ -44,16 +44,17 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
     folder = Path(name)
     if not folder.is_dir():
         raise InputError(name, "is not a directory of masks", "give one, or onnx:FILE")
-    return partial(with_stored_masks, folder)
+    return partial(with_stored_masks, folder, max_pixels=config.recording.max_pixels)
 
 
-def with_stored_masks(folder: Path, view: View) -> View:
+def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
     """Return a view with the masks of a file named as it is: a label image `NAME.png`, or `NAME.npy`.
 
     Args:
         folder: Holds the files.
         view: The view; NAME is its name after the last slash. A `.npy` holds labels (H, W) or a stack of
             masks (N, H, W), boolean or scores.
+        max_pixels: Maximum number of pixels of a label image.
 
     Raises:
         InputError: There is no such file, or it is broken or of another size.
@@ -61,7 +62,7 @@ def with_stored_masks(folder: Path, view: View) -> View:
     name = view.name.rpartition("/")[2]
     image, array = folder / f"{name}.png", folder / f"{name}.npy"
     if image.exists():
-        labels = decode_image(image, modes=MASK_MODES, what="a grey PNG")
+        labels = decode_image(image, modes=MASK_MODES, what="a grey PNG", max_pixels=max_pixels)
     elif array.exists():
         labels = read_npy(array)
     else:
@@ -69,18 +70,19 @@ def with_stored_masks(folder: Path, view: View) -> View:
     return replace(view, labels=labels, labels_are="segments")
 
 
-def without_ignored(view: View, ignore: Path) -> View:
+def without_ignored(view: View, ignore: Path, max_pixels: int) -> View:
     """Return a view without the pixels where a mask is not 0, such as those of the robot's own arm.
 
     Args:
         view: The view.
         ignore: A grey PNG for every view of a camera, or a folder of one for each: NAME.png, as there.
+        max_pixels: Maximum number of pixels of the mask.
 
     Raises:
         InputError: The mask is missing, broken, or of another size.
     """
     mask = ignore / f"{view.name.rpartition('/')[2]}.png" if ignore.is_dir() else ignore
-    return replace(view, ignored=read_mask(mask))
+    return replace(view, ignored=read_mask(mask, max_pixels=max_pixels))
 
 
 class OnnxMasks:

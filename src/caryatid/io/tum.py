@@ -63,8 +63,10 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     file, size, note = _read_camera(path, options.camera_file)
     K = np.array([[file.fx, 0.0, file.cx], [0.0, file.fy, file.cy], [0.0, 0.0, 1.0]])
     camera = TimedCamera(f"{path}: camera", 0, _CAMERA, check_intrinsics(K, str(options.camera_file)), size)
-    depths = _read_list(path / "depth.txt", partial(images.read_depth, depth_scale=file.depth_scale))
-    colours = _read_list(path / "rgb.txt", images.decode_image) if (path / "rgb.txt").is_file() else None
+    limit: dict[str, Any] = {"max_pixels": config.max_pixels}
+    depths = _read_list(path / "depth.txt", partial(images.read_depth, depth_scale=file.depth_scale, **limit))
+    decode = partial(images.decode_image, **limit)
+    colours = _read_list(path / "rgb.txt", decode) if (path / "rgb.txt").is_file() else None
     pose_at, notes = None, [note]
     if (path / "groundtruth.txt").is_file():
         pose_at = partial(_read_poses(path / "groundtruth.txt", config.pose_gap).between, _WORLD)

@@ -142,8 +142,8 @@ class Capture:
         files = {f"{key}{_suffix(content)}": content for key, content in self.images.items()}
         return files | {"camera.json": f"{document}\n".encode()}
 
-    def decode(self, config: SessionConfig) -> View:
-        """Decode the images.
+    def decode(self, max_pixels: int) -> View:
+        """Decode the images, each of up to a maximum number of pixels.
 
         Raises:
             InputError: One is broken, too large, of the wrong kind, or sizes differ; the camera is not a
@@ -151,7 +151,7 @@ class Capture:
         """
         camera = self.camera
         decoded = {
-            key: _decoded(key, content, f"{camera.name}: {key}", config.max_pixels)
+            key: _decoded(key, content, f"{camera.name}: {key}", max_pixels)
             for key, content in self.images.items()
         }
         depth = decoded["depth"]
@@ -179,7 +179,7 @@ def _decoded(key: str, content: bytes, name: str, max_pixels: int) -> NDArray[An
         raise InputError(name, f"is {array.shape} of {array.dtype}", f"give {wanted}")
     if array.shape[0] * array.shape[1] > max_pixels:
         reason = f"has shape {array.shape}, {max_pixels} pixels are allowed"
-        raise InputError(name, reason, "give a smaller image")
+        raise InputError(name, reason, "give a smaller image, or raise recording.max_pixels")
     return np.ascontiguousarray(array)
 
 

@@ -162,7 +162,8 @@ class Session:
         self.beginning = beginning
         self._lock = lock
         mask = beginning.ignore
-        self._ignored = None if mask is None else read_mask(mask, f"{path / 'session.json'}: ignore")
+        most, name = beginning.settings.recording.max_pixels, f"{path / 'session.json'}: ignore"
+        self._ignored = None if mask is None else read_mask(mask, name, most)
         if lock is not None:
             for folder in (path, path / "views", path / "state"):
                 clear_partials(folder)
@@ -395,7 +396,7 @@ class Session:
         return self._decode(Capture.read(self._folder(number)))
 
     def _decode(self, capture: Capture) -> View:
-        view = capture.decode(self.beginning.settings.session)
+        view = capture.decode(self.beginning.settings.recording.max_pixels)
         return view if self._ignored is None else replace(view, ignored=self._ignored)
 
     def _after(self, records: Sequence[CameraRecord]) -> Scene:
