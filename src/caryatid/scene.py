@@ -299,7 +299,7 @@ class Scene(Pictured):
         """
         check_type("source", source, (View, Cloud), "give a View or a Cloud")
         if isinstance(source, View):
-            check_camera(source, self.config.session.max_coordinate)
+            check_camera(source, self.config.cloud.max_coordinate)
         try:
             if self.waiting:
                 self.surface = self._observed(source).surface

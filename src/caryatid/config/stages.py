@@ -51,6 +51,8 @@ Lengths = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 class CloudConfig:
     """From depth image to oriented points."""
 
+    max_coordinate: Positive = 1e4
+    """Maximum depth and coordinate of a camera [m]; beyond it, units are wrong."""
     max_depth: Positive = 3.0
     """Readings beyond this are dropped [m]; the paper's working range."""
     min_depth: NotNegative = 0.1
@@ -126,6 +128,9 @@ class RegistrationConfig:
     """A longer move is refused [m]."""
     max_rotation: Angle = 5.0
     """A larger turn is refused [deg]."""
+    common: Share = 0.25
+    """Share of what a view that cannot be registered shows around the table that must lie where earlier views
+    saw something [1]; of right poses a third does, even from the other side, of wrong ones a fifth."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -593,19 +598,14 @@ class ExportConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class SessionConfig:
-    """Limits on images and camera poses wherever views come from, and on what a service keeps."""
+    """Limits on the files a session takes, and on what a service keeps."""
 
     max_bytes: Count = 100_000_000
     """Maximum size of a file [bytes]; larger than any camera's image."""
-    max_coordinate: Positive = 1e4
-    """Maximum coordinate of a camera [m]; beyond it, units are wrong."""
     max_sessions: Count = 1000
     """Maximum number of sessions of a service [1]; a folder of each stays until it is removed by hand."""
     min_free: NotNegative = 1e9
     """A service takes nothing new where the disk has less left [bytes]; others write there too."""
-    common: Share = 0.25
-    """Share of what a view that cannot be registered shows around the table that must lie where earlier views
-    saw something [1]; of right poses a third does, even from the other side, of wrong ones a fifth."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

@@ -81,7 +81,7 @@ def check_place(
     seen = np.zeros(np.array(voxels.hits.shape) // COARSER + 1, dtype=np.bool_)
     seen[tuple(voxels.occupied // COARSER)] = True
     common = float(seen[tuple(voxel[within].T // COARSER)].mean())
-    if not aligned and common < config.session.common:
+    if not aligned and common < config.registration.common:
         raise refused(f"only {common:.0%} of what it shows is where earlier views saw anything")
     over = points[within][height(points[within]) > 2.0 * config.surface.tolerance]
     free = voxels.free_around(over)
