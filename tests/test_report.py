@@ -172,6 +172,31 @@ def test_it_names_each_object_edge_figure_and_setting(report, html):
         assert said in page.text, said
 
 
+HOSTILE = """"'><script>alert(1)</script><g onload="x"|]]>&lt;$x$"""
+
+
+def test_an_id_is_text_whatever_it_holds(make_step, html):
+    def named(name):
+        return HOSTILE if name == "o2" else name
+
+    graph = make_graph()
+    objects = tuple(replace(item, id=named(item.id)) for item in graph.objects)
+    supports = tuple(
+        replace(s, supporter=named(s.supporter), supported=named(s.supported), why=HOSTILE)
+        for s in graph.supports
+    )
+    stability = {named(name): value for name, value in graph.stability.items()}
+    graph = replace(graph, objects=objects, supports=supports, stability=stability)
+    steps = [replace(make_step(number), graph=graph, name=HOSTILE) for number in range(2)]
+    page = render_html(make_report(HOSTILE, steps, settings={"source": HOSTILE}, config=SMALL))
+
+    def attributes(text):
+        return {(part.tag, name) for part in ElementTree.fromstring(text).iter() for name in part.attrib}
+
+    assert attributes(page) <= attributes(html)
+    assert Page(page).text.count(HOSTILE) > 10
+
+
 @pytest.mark.slow
 def test_the_pdf_says_what_the_page_says_and_has_the_same_bytes_each_time(report):
     content = render_pdf(report)
