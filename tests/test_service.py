@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import socket
@@ -22,6 +23,7 @@ import pytest
 from anyio.from_thread import start_blocking_portal
 from conftest import npy, run_command, wall_of
 
+from caryatid import service
 from caryatid.config import Config
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import png
@@ -303,6 +305,25 @@ def test_a_port_that_is_taken_is_said_in_one_line(tmp_path, capsys):
     said = capsys.readouterr().err
     assert said.startswith(f"error: 127.0.0.1:{port}: cannot be listened at (address already in use")
     assert said.count("\n") == 1
+
+
+def test_a_body_that_does_not_arrive_in_time_is_refused(client, monkeypatch):
+    """Each byte comes soon after the one before, the whole does not."""
+    monkeypatch.setattr(service, "PATIENCE", 0.5)
+    sent = []
+
+    async def trickle():
+        for _ in range(100):
+            sent.append(b" ")
+            yield b" "
+            await asyncio.sleep(0.05)
+
+    began = time.monotonic()
+    answer = client.post("/sessions", content=trickle(), headers={"content-type": "application/json"})
+    assert (answer.status_code, answer.json()["detail"]) == (408, "the body did not arrive within 0.5 s")
+    assert time.monotonic() - began < 3.0
+    assert len(sent) < 50
+    assert client.post("/sessions", json={"name": "b"}).status_code == 201
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import uvicorn
-from fastapi import Depends, FastAPI, Request, Response
+from fastapi import Depends, FastAPI, HTTPException, Request, Response
 from fastapi import Path as PathParameter
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
@@ -414,8 +414,11 @@ class Gate:
         deadline = asyncio.get_running_loop().time() + PATIENCE
 
         async def timely() -> Message:
-            async with asyncio.timeout_at(deadline):
-                return await receive()
+            try:
+                async with asyncio.timeout_at(deadline):
+                    return await receive()
+            except TimeoutError:
+                raise HTTPException(408, f"the body did not arrive within {PATIENCE:g} s") from None
 
         await self._app(scope, timely, send)
 
