@@ -112,6 +112,9 @@ class TestOrder:
             plan_order(tower(), CONFIG, goal="o9")
         with pytest.raises(InputError, match="no support surface"):
             plan_order(SupportGraph(tower().objects[1:]), CONFIG)
+        crowd = [replace(tower().objects[1], id=f"o{number}") for number in range(1000)]
+        with pytest.raises(InputError, match=r"1000 objects.* 4\.6 GB a thread; raise rehearsal.max_objects"):
+            plan_order(SupportGraph((table_object(TOP), *crowd)), CONFIG)
 
 
 def in_physics(*shapes):

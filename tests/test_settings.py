@@ -72,6 +72,7 @@ def test_an_unknown_name_lists_the_valid_ones(flag, listed):
         ("robot.pitch=[1, 2, 3]", "at most 2 items"),
         ("robot.pitch=[low, 2]", "a valid array"),
         ("voxels.size=0", "greater than 0"),
+        ("voxels.extent=[16, 16, 10]", "voxels of 0.01 m take 5.12 GB, voxels.max_voxels = 64000000"),
         ("fusion.keep_share=1.01", "less than or equal to 1"),
         ("robot.pitch=[20, -60]", "in rising order"),
     ],

@@ -104,7 +104,8 @@ def plan_order(
         threads: How many of them run at a time.
 
     Raises:
-        InputError: There is no support surface, or no object to take, or no such goal.
+        InputError: There is no support surface, no object to take, more than `rehearsal.max_objects` of
+            them, or no such goal.
     """
     config = config or Config()
     rehearsal = _Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
@@ -203,6 +204,12 @@ class _Rehearsal:
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
         if not self.ids:
             raise InputError("graph", "has no objects", "there is nothing to take away")
+        if len(self.ids) > config.rehearsal.max_objects:
+            reserved = 0.6 * (len(self.ids) / 300) ** 1.7  # two arenas [GB], measured with 300 and 1,000
+            reason = (
+                f"has {len(self.ids)} objects, for which MuJoCo reserves about {reserved:.1f} GB a thread"
+            )
+            raise InputError("graph", reason, "raise rehearsal.max_objects, or give a part of the scene")
         self._graph, self._config, self._threads = graph, config, threads
         self.accepted = config.rehearsal.risk
         self._trials: dict[tuple[str, ...], _Trial] = {}
