@@ -29,17 +29,13 @@ def main() -> None:
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "caryatid", "serve", folder, "--port", "0", "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
-            output = service.stdout
-            assert output is not None
             try:
-                told = "".join(iter(lambda: output.readline() or "}\n", "}\n")) + "}"
-                if len(told) == 1:  # the service ended, and has said why on stderr
-                    sys.exit("the service did not start")
+                told = "".join(iter(lambda: service.stdout.readline() or "}\n", "}\n")) + "}"  # type: ignore[union-attr]
+                assert len(told) > 1, "the service ended; see its error above"
                 graph = drive(RobotClient(json.loads(told)["address"]), stage)
             finally:
                 service.terminate()
-    for support in graph["supports"]:
-        print(f"{support['supporter']} holds {support['supported']} ({support['kind']})")
+    print(*(f"{s['supporter']} holds {s['supported']} ({s['kind']})" for s in graph["supports"]), sep="\n")
     assert len(graph["supports"]) >= 3
     assert service.returncode == 0
 

@@ -210,8 +210,9 @@ def test_the_demo_says_view_by_view_what_it_found(tmp_path, capsys):
     words = ["demo", "--scene", "tower", *SMALL, "--config", file, "--out", tmp_path / "run"]
     assert run_command(*words) == 0
     said = capsys.readouterr()
-    lines = said.err.splitlines()
+    conditions, *lines = said.err.splitlines()
     assert said.out == ""
+    assert conditions == "tower: masks: simulator, noise: carmine"
     assert re.fullmatch(r"view 1: \d objects, \d supports.*, F1 \d\.\d{3} \(\d+\.\d s\)", lines[0])
     assert lines[1].startswith("  found: o1 (")
     assert " held by " in lines[1]

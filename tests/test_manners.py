@@ -143,6 +143,7 @@ WORKING = {
     "session next": ("{session}", {"T_world_camera", "why"}),
     "session graph": ("{session}", {"objects", "supports"}),
     "session undo": ("{session}", {"views", "graph"}),
+    "scenes": ("", {"scenes", "samples"}),
     "config": ("", {"fit", "fusion"}),
     "completion": ("bash", {"shell", "script"}),
 }

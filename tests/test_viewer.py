@@ -481,7 +481,7 @@ def test_a_view_is_chosen_by_hand(page, tab):
     click(page, eye, tab)
     tab.wait_for_text("your view is next")
     tab.press("next view")
-    tab.wait_for_text(f"View {number}")
+    tab.wait_for_node(f"/cameras/{number}")
     taken = page.steps[number].view.T_world_camera
     assert page.steps[number - 1].decision.why == "chosen by hand"
     assert not np.allclose(taken, step.decision.T_world_camera)

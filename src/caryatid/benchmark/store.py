@@ -59,7 +59,7 @@ class _Done:
     """A line that says what came of an episode."""
 
     key: str
-    rows: tuple[dict[str, int | float | list[tuple[float, float, bool]] | None], ...]
+    rows: tuple[dict[str, int | float | list[list[float | bool]] | None], ...]
     error: str | None
 
 
