@@ -19,7 +19,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import UP, Array
 from caryatid.graph import SUPPORT_SURFACE_ID, Change, ChangeKind, SceneObject, SupportGraph, object_id
-from caryatid.objects.changes import ODDS, Sight, alike, distinct, likelihood_ratio
+from caryatid.objects.changes import ChangeDetector, appeared
 from caryatid.objects.fusion import changed, fuse, fused_graph, renamed, without
 from caryatid.objects.hidden_extents import complete
 from caryatid.objects.models import ObjectModels
@@ -46,9 +46,6 @@ log = logging.getLogger(__name__)
 KEPT = "%s; this view is kept until a later one shows the table top"
 """What is logged of a view without a support surface."""
 
-UNTIED = ("too few partners", "beyond the limits")
-"""Outcomes of a registration by whose pose nobody can tell what has changed."""
-
 LEFT_OUT = "%s; the view is left out"
 """What is logged of a view that cannot be right."""
 
@@ -74,7 +71,6 @@ class Scene(Pictured):
         views: How many views the model is made of.
         waiting: Views kept until a later one shows the support surface.
         changed: Whether the newest view changed the graph.
-        changes: What has happened to objects since the first view, in this order.
         timings: Seconds the stages of the newest update took.
     """
 
@@ -101,21 +97,23 @@ class Scene(Pictured):
         self.views = 0
         self.waiting: tuple[View, ...] = ()
         self.changed = False
-        self.changes: tuple[Change, ...] = ()
         self.timings: dict[str, float] = {}
         self._models = ObjectModels(self.config, seed)
         self._registration: ViewRegistration | None = None
         self._graphs: tuple[SupportGraph, ...] = ()
         self._shown: tuple[frozenset[str], ...] = ()
         self._ids: dict[int, str] = {}
-        self._odds: dict[str, float] = {}
-        self._gone: dict[str, SceneObject] = {}
-        self._fresh: frozenset[int] = frozenset()
+        self._detector = ChangeDetector()
 
     @property
     def supports(self) -> nx.DiGraph:
         """The support graph as a DiGraph, supporter → supported."""
         return self.graph.to_networkx()
+
+    @property
+    def changes(self) -> tuple[Change, ...]:
+        """What has happened to objects since the first view, in this order."""
+        return self._detector.history
 
     @property
     def cloud(self) -> Cloud:
@@ -166,7 +164,7 @@ class Scene(Pictured):
         other = copy.copy(self)
         other._models = self._models.copy()
         other._registration = None if self._registration is None else self._registration.copy()
-        other._gone = self._gone.copy()
+        other._detector = self._detector.copy()
         return other
 
     def removed(self, object_id: str) -> SupportGraph:
@@ -260,7 +258,7 @@ class Scene(Pictured):
         """Note what the robot did, and read the graph again."""
         assert self.surface is not None
         assert self.voxels is not None
-        self.changes = (*self.changes, Change(kind, object_id, self.views, "reported"))
+        self._detector.history += (Change(kind, object_id, self.views, "reported"),)
         newest = self._inferred(self.surface, self.voxels)
         names = {o.id: self._ids.get(o.label, o.id) for o in newest.objects if o.role == "object"}
         newest = renamed(newest, names)
@@ -357,9 +355,11 @@ class Scene(Pictured):
         newest = self._inferred(surface, voxels)
         watch.lap("infer")
         observation = self._fused(observation, newest, given)
-        self._note(gone, new)
+        names = {k: self._ids.get(k, object_id(k)) for k in (*self._models.points.objects, *new)}
+        present = {names[k] for k in self._models.points.objects}
+        self._detector.record(self.views, gone, {names[k]: why for k, why in new.items()}, present)
         self.labels = label_image(observation, source)
-        self.T_world_camera = None if observation.view is None else observation.view.pose
+        self.T_world_camera = None if observation.view is None else observation.view.T_world_camera
         if self.T_world_camera is not None:
             self.T_world_cameras = (*self.T_world_cameras, self.T_world_camera)
         self.views += 1
@@ -431,16 +431,15 @@ class Scene(Pictured):
         moves = registration.add(observation.cloud, same_labels=named)
         observation = observation.moved(moves.pop(self.views))
         seen = self._models.points.of(SUPPORT_LABEL)
-        if self.surface and self.voxels and observation.view and len(seen) >= config.surface.min_points:
-            aligned = registration.outcomes[-1] not in ("too few partners", "beyond the limits")
-            check_place(observation.cloud, aligned, self.surface, self.voxels, config)
+        if self.surface and self.voxels and observation.view and len(seen.points_world) >= config.surface.min_points:
+            check_place(observation.cloud, registration.aligned, self.surface, self.voxels, config)
         self._registration = registration
         return observation, self._models.move(moves)
 
     def _fused_surface(self, observation: Observation) -> SupportSurface:
         """The support surface from the points of all views."""
         table = self._models.points.of(SUPPORT_LABEL)
-        if self.views == 0 or len(table) < self.config.surface.min_points:
+        if self.views == 0 or len(table.points_world) < self.config.surface.min_points:
             return observation.surface
         known, config = self.surface or observation.surface, self.config.surface
         fused = refitted(known, table.points_world, table.normals_world, UP, config)
@@ -495,40 +494,30 @@ class Scene(Pictured):
             Ids of the objects that are not where they were, and labels of the segments that are where space
             was free; each with why.
         """
-        view, voxels, config = observation.view, self.voxels, self.config
-        gone, new = dict[str, str](), dict[int, str]()
-        registered = not self._registration or self._registration.outcomes[-1] not in UNTIED
-        if view is None or voxels is None or not registered:
-            return gone, new
-        sight, odds = Sight(view), dict[str, float]()
-        for id_, (points, normals) in self._surfaces().items():
-            through, there = sight.cells(points, normals)
-            odds[id_] = max(self._odds.get(id_, 0.0) + likelihood_ratio(through, there), 0.0)
-            if odds[id_] > ODDS:
-                gone[id_] = f"{view.name} looks through {through} of {through + there} places of its surface"
-        cloud, method = observation.cloud, config.fusion.method
-        for label in sorted(set(observation.shown) - {0, SUPPORT_LABEL}) if method != "sg" else ():
-            points = cloud.points_world[observation.labels == label]
-            among = voxels.free_around(points)
-            free, other = distinct(points[among]), distinct(points[~among])
-            if likelihood_ratio(free, other) > ODDS:
-                new[label] = f"{view.name} shows {free} of {free + other} places of it where space was free"
+        view, voxels, registration = observation.view, self.voxels, self._registration
+        if view is None or voxels is None or (registration and not registration.aligned):
+            return {}, {}
+        gone = self._detector.gone(view, self._surfaces())
+        new = dict[int, str]()
+        if self.config.fusion.method != "sg":
+            rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
+            points = observation.cloud.points_world[rows]
+            new = appeared(view.name, points, observation.labels[rows], voxels.free_around(points))
         if named:
             known = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
             gone = known | gone
-        self._odds = {i: value for i, value in odds.items() if i not in gone}
         for id_ in gone:
             o = next((o for o in self.graph.objects if o.id == id_), None)
+            self._detector.lose(id_, o)
             if o is None:
                 self._models.forget({int(id_[1:])})
             else:
                 self._forget(o)
-                self._gone[id_] = o
         if new:
             pixels = np.zeros(view.depth.shape, dtype=np.bool_)
             pixels.ravel()[observation.pixels] = np.isin(observation.labels, sorted(new))
             assert self.voxels is not None
-            which = self.voxels.behind(view, pixels, config.fit.max_extent)
+            which = self.voxels.behind(view, pixels, self.config.fit.max_extent)
             self.voxels = self.voxels.forgotten(which & (self.voxels.hits == 0))
         return gone, new
 
@@ -547,31 +536,10 @@ class Scene(Pictured):
     ) -> tuple[Observation, dict[int, str]]:
         """Give what is new the labels of the objects that are gone, where the shapes are alike."""
         new = {k: why for k, why in new.items() if k in self._models.fits}
-        self._fresh = (self._fresh | new.keys()) & self._models.fits.keys()
-        found: dict[int, int] = {}
-        for id_, o in self._gone.items():
-            label = self._label_of(id_)
-            among = [k for k in sorted(self._fresh - found.keys()) if alike(self._models.fits[k], o)]
-            if among and label is not None:
-                found[among[0]] = label
+        found = self._detector.found_again(self._models.fits, new, self._label_of)
         for old, label in found.items():
             self._models.rename(old, label)
-        self._fresh -= found.keys()
         return self._renamed(observation, found), {found.get(k, k): why for k, why in new.items()}
-
-    def _note(self, gone: Mapping[str, str], new: Mapping[int, str]) -> None:
-        """Say what has changed: what is gone from one place and there again was moved."""
-        there = {self._ids.get(k, object_id(k)) for k in self._models.points.objects}
-        appeared = {self._ids.get(k, object_id(k)): why for k, why in new.items()}
-        told: list[Change] = []
-        for id_ in sorted(self._gone.keys() | appeared.keys()):
-            why = gone.get(id_) or appeared.get(id_, "it is found again")
-            if id_ in there:
-                told.append(Change("moved" if id_ in self._gone else "added", id_, self.views, why))
-                self._gone.pop(id_, None)
-            elif id_ in gone:
-                told.append(Change("removed", id_, self.views, why))
-        self.changes = (*self.changes, *told)
 
     def _inferred(self, surface: SupportSurface, voxels: VoxelMap) -> SupportGraph:
         """The support graph of the objects as they are known now."""

@@ -285,7 +285,7 @@ def mask_ious(
         labels: Label images (H, W), or labels of points (N,).
         true_labels: The true ones, (H, W) or (N,) as those.
         found: F label numbers in `labels`.
-        true: T label numbers in `true_labels`; numbers that are not object's match nothing.
+        true: T label numbers in `true_labels`; numbers that belong to no object match nothing.
 
     Raises:
         InputError: Images differ in number or size.

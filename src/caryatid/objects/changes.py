@@ -1,14 +1,17 @@
-"""Whether objects are still where they were: what a new view should show of them against what it shows."""
+"""Change detection: whether a new view shows the objects where earlier ones showed them."""
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable, Mapping
+
 import numpy as np
-from scipy.ndimage import minimum_filter
+from numpy.typing import NDArray
 from scipy.special import betainc
 
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SceneObject
+from caryatid.graph import Change, ChangeKind, SceneObject
 from caryatid.sensing.views import View
 
 BEYOND = 0.02
@@ -27,6 +30,117 @@ ALIKE = 0.2
 """Share by which sizes of one object may differ [1], beyond what the fits' uncertainty explains."""
 
 
+class ChangeDetector:
+    """Finds objects that were removed, moved or added between views, and keeps the history of them.
+
+    Attributes:
+        history: All changes so far, oldest first.
+    """
+
+    def __init__(self) -> None:
+        self.history: tuple[Change, ...] = ()
+        self._odds: dict[str, float] = {}
+        self._lost: dict[str, SceneObject] = {}
+        self._fresh: frozenset[int] = frozenset()
+
+    def copy(self) -> ChangeDetector:
+        """Return a detector that knows the same and goes on by itself."""
+        other = copy.copy(self)
+        other._lost = self._lost.copy()
+        return other
+
+    def gone(self, view: View, surfaces: Mapping[str, tuple[Array, Array]]) -> dict[str, str]:
+        """Find objects that views look through where they were.
+
+        Args:
+            view: The newest view.
+            surfaces: Points and outward normals (N, 3) of each object.
+
+        Returns:
+            Ids of these objects, each with the reason.
+        """
+        sight, gone = Sight(view), dict[str, str]()
+        odds, self._odds = self._odds, {}
+        for object_id, (points, normals) in surfaces.items():
+            through, confirmed = sight.cells(points, normals)
+            self._odds[object_id] = max(odds.get(object_id, 0.0) + likelihood_ratio(through, confirmed), 0.0)
+            if self._odds[object_id] > ODDS:
+                total = through + confirmed
+                gone[object_id] = f"{view.name} looks through {through} of {total} places of its surface"
+        return gone
+
+    def lose(self, object_id: str, o: SceneObject | None) -> None:
+        """Take an object as gone; by its shape it can be found again."""
+        self._odds.pop(object_id, None)
+        if o is not None:
+            self._lost[object_id] = o
+
+    def found_again(
+        self, fits: Mapping[int, SceneObject], new: Mapping[int, str], label_of: Callable[[str], int | None]
+    ) -> dict[int, int]:
+        """Match new objects with lost ones of the same shape.
+
+        Args:
+            fits: Fitted shape of each object, by label.
+            new: Labels of the objects that appeared in free space in the newest view.
+            label_of: Gives the label of a lost object.
+
+        Returns:
+            Label of the new object → label it had before.
+        """
+        self._fresh = (self._fresh | new.keys()) & fits.keys()
+        found: dict[int, int] = {}
+        for object_id, o in self._lost.items():
+            label = label_of(object_id)
+            among = [k for k in sorted(self._fresh - found.keys()) if alike(fits[k], o)]
+            if among and label is not None:
+                found[among[0]] = label
+        self._fresh -= found.keys()
+        return found
+
+    def record(
+        self, view: int, gone: Mapping[str, str], appeared: Mapping[str, str], present: set[str]
+    ) -> None:
+        """Add the changes before a view to the history.
+
+        Args:
+            view: Its number.
+            gone: Ids of the objects that are not where they were, each with the reason.
+            appeared: Ids of the objects that are where space was free, each with the reason.
+            present: Ids of all objects there are; one both lost and present was moved.
+        """
+        for object_id in sorted(self._lost.keys() | appeared.keys()):
+            why = gone.get(object_id) or appeared.get(object_id, "it is found again")
+            if object_id in present:
+                kind: ChangeKind = "moved" if self._lost.pop(object_id, None) else "added"
+                self.history = (*self.history, Change(kind, object_id, view, why))
+            elif object_id in gone:
+                self.history = (*self.history, Change("removed", object_id, view, why))
+
+
+def appeared(
+    name: str, points_world: Array, labels: NDArray[np.int32], free: NDArray[np.bool_]
+) -> dict[int, str]:
+    """Find segments that lie where earlier views saw free space.
+
+    Args:
+        name: Name of the view.
+        points_world: Points (N, 3) [m] of its segments.
+        labels: Segment (N,) of each.
+        free: Whether space was free around each (N,).
+
+    Returns:
+        Labels of these segments, each with the reason.
+    """
+    new = dict[int, str]()
+    for label in np.unique(labels).tolist():
+        own = labels == label
+        there, other = distinct(points_world[own & free]), distinct(points_world[own & ~free])
+        if likelihood_ratio(there, other) > ODDS:
+            new[label] = f"{name} shows {there} of {there + other} places of it where space was free"
+    return new
+
+
 class Sight:
     """What a view shows at points known from earlier ones.
 
@@ -36,10 +150,9 @@ class Sight:
 
     def __init__(self, view: View) -> None:
         self._view = view
-        depth = np.where(view.depth > 0.0, view.depth, np.inf)
-        typical = float(np.median(depth[np.isfinite(depth)])) if np.isfinite(depth).any() else 1.0
-        reach = max(1, round(ASIDE * float(view.K[0, 0]) / typical))
-        self._nearest = minimum_filter(depth, 2 * reach + 1)
+        readings = view.depth[view.depth > 0.0]
+        typical = float(np.median(readings)) if len(readings) else 1.0
+        self._reach = max(1, round(ASIDE * float(view.K[0, 0]) / typical))
         assert view.T_world_camera is not None
         self._T_camera_world = transforms.invert(view.T_world_camera)
 
@@ -65,10 +178,21 @@ class Sight:
         )
         u, v, z = u[rows], v[rows], z[rows]
         beyond = BEYOND * np.maximum(1.0, (z / 1.5) ** 2)
-        nearest, reading = self._nearest[v, u], self._view.depth[v, u]
-        through = np.isfinite(nearest) & (nearest > z + beyond)
+        reading = self._view.depth[v, u]
         confirmed = (reading > 0.0) & (np.abs(reading - z) <= beyond)
+        deeper = np.flatnonzero((reading <= 0.0) | (reading > z + beyond))
+        around = self._nearest(u[deeper], v[deeper])
+        through = deeper[np.isfinite(around) & (around > (z + beyond)[deeper])]
         return distinct(points_world[rows[through]]), distinct(points_world[rows[confirmed]])
+
+    def _nearest(self, u: NDArray[np.intp], v: NDArray[np.intp]) -> Array:
+        """Nearest reading (N,) [m] around each pixel (N,); infinite where there is none."""
+        step = np.arange(-self._reach, self._reach + 1)
+        height, width = self._view.depth.shape
+        columns = np.clip(u[:, None] + step, 0, width - 1)[:, None, :]
+        lines = np.clip(v[:, None] + step, 0, height - 1)[:, :, None]
+        depth = self._view.depth[lines, columns]
+        return np.asarray(np.where(depth > 0.0, depth, np.inf).min(axis=(1, 2)))
 
 
 def likelihood_ratio(contradicted: int, confirmed: int) -> float:
@@ -83,7 +207,8 @@ def likelihood_ratio(contradicted: int, confirmed: int) -> float:
 
 def distinct(points_world: Array) -> int:
     """How many cells hold points (N, 3) [m]."""
-    return len(np.unique(np.floor(points_world / CELL), axis=0))
+    cells = np.floor(points_world / CELL).astype(np.int64) + (1 << 20)
+    return len(np.unique(cells @ np.array([1 << 42, 1 << 21, 1])))
 
 
 def alike(a: SceneObject, b: SceneObject) -> bool:

@@ -32,7 +32,7 @@ def labels_from_masks(
         Label image (H, W) int32: k where mask k − 1 is on top, 0 where none is.
 
     Raises:
-        InputError: The masks are not stack of images of one size, or hold values that are neither true and
+        InputError: The masks are not a stack of images of one size, or hold values that are neither true and
             false nor scores in [0, 1]; or there is not one finite score a mask.
     """
     config = config or MaskConfig()

@@ -77,6 +77,11 @@ class ViewRegistration:
         self._now = np.zeros((0, 6))
         self._edges: NDArray[Any] = np.zeros(0, EDGE)
 
+    @property
+    def aligned(self) -> bool:
+        """Whether enough of the newest view agrees with the others to trust its pose."""
+        return self.outcomes[-1] not in ("too few partners", "beyond the limits")
+
     def copy(self) -> ViewRegistration:
         """Return a registration that knows the same and goes on by itself; the views so far are shared."""
         other = copy.copy(self)

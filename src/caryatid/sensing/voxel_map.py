@@ -29,7 +29,7 @@ from caryatid.sensing.views import View
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
 """States of a voxel."""
-NEAR = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+NEIGHBOURS = np.concatenate([np.eye(3), -np.eye(3)])
 """A voxel and those that share a face with it."""
 FULLY = float(np.cos(np.deg2rad(60.0)))
 """Cosine of the angle to its normal up to which a point is shown fully [1]."""
@@ -193,8 +193,12 @@ class VoxelMap:
 
     def free_around(self, points_world: Array) -> NDArray[np.bool_]:
         """Whether the voxels (N,) that hold points (N, 3) [m], and those beside them, were seen free."""
-        around = points_world[:, None] + NEAR * self.config.size
-        return np.asarray((self.state_at(around.reshape(-1, 3)).reshape(-1, len(NEAR)) == FREE).all(axis=1))
+        free = self.state_at(points_world) == FREE
+        rows = np.flatnonzero(free)
+        around = points_world[rows, None] + NEIGHBOURS * self.config.size
+        states = self.state_at(around.reshape(-1, 3)).reshape(-1, len(NEIGHBOURS))
+        free[rows] = (states == FREE).all(axis=1)
+        return free
 
     def empty_at(self, points_world: Array) -> NDArray[np.bool_]:
         """Whether the voxels (N,) that hold points (N, 3) [m] were looked through and never hit.

@@ -440,7 +440,7 @@ def _true_shape(scene: SimulatedScene, label: int) -> Shape:
 
 
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
-    """Oriented boxes around the geoms of no object, the table's first; planes are not obstacle."""
+    """Oriented boxes around the geoms of no object, the table's first; planes are not obstacles."""
     flat = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
     geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels == 0).tolist()])
     return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
