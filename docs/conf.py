@@ -95,12 +95,12 @@ html_static_path = ["static"]
 html_css_files = ["caryatid.css"]
 html_theme_options = {
     "show_prev_next": True,
-    "secondary_sidebar_items": {"**": ["page-toc"], "settings": [], "commands": [], "index": []},
+    "secondary_sidebar_items": {"**": ["page-toc"], "settings": [], "reference": [], "index": []},
     "footer_start": [],
     "footer_end": ["theme-version"],
     "navigation_with_keys": False,
 }
-html_sidebars = {"index": [], "start": [], "concepts": []}
+html_sidebars = {"index": [], "concepts": []}
 html_copy_source = False
 html_show_sourcelink = False
 

@@ -22,7 +22,7 @@ from caryatid.simulation import load_scene
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.setup import make_simulation
 
-PAGE = ROOT / "docs/how-to-robot.md"
+PAGE = ROOT / "docs/robot.md"
 
 TOP = (0.0, 0.0, 0.75)
 BESIDE = (0.1, 0.0, 0.8)

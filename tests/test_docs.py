@@ -121,10 +121,11 @@ def workplace(prepared, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUNNING, ids=name_of)
-def test_blocks_run_as_they_stand(page, workplace, capsys):
+def test_blocks_run_in_order(page, workplace, capsys):
+    names: dict = {"__name__": "__main__"}
     for language, text in runs(page):
         if language == "python":
-            exec(compile(text, str(page), "exec"), {"__name__": "__main__"})
+            exec(compile(text, str(page), "exec"), names)
         else:
             for line in text.replace("\\\n", " ").splitlines():
                 run_line(shlex.split(line, comments=True), capsys)
@@ -242,9 +243,9 @@ def test_the_errors_the_questions_quote_are_what_the_code_says():
 
 
 def test_a_message_of_ros_becomes_a_view_as_the_page_does_it(workplace, views):
-    (text,) = [text for language, text in runs(DOCS / "how-to-robot.md") if "def view_of" in text]
+    (text,) = [text for language, text in runs(DOCS / "robot.md") if "def view_of" in text]
     names: dict = {}
-    exec(compile(text, "how-to-robot.md", "exec"), names)
+    exec(compile(text, "robot.md", "exec"), names)
     image = np.round(1e3 * views[0].depth).astype("<u2")
     rows = np.pad(image, ((0, 0), (0, 3)))  # drivers may pad rows
     depth = SimpleNamespace(
