@@ -431,7 +431,12 @@ class Scene(Pictured):
         moves = registration.add(observation.cloud, same_labels=named)
         observation = observation.moved(moves.pop(self.views))
         seen = self._models.points.of(SUPPORT_LABEL)
-        if self.surface and self.voxels and observation.view and len(seen.points_world) >= config.surface.min_points:
+        if (
+            self.surface
+            and self.voxels
+            and observation.view
+            and len(seen.points_world) >= config.surface.min_points
+        ):
             check_place(observation.cloud, registration.aligned, self.surface, self.voxels, config)
         self._registration = registration
         return observation, self._models.move(moves)
