@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import shutil
 import sys
 import urllib.error
 import urllib.request
@@ -348,13 +346,6 @@ def test_a_scene_shows_itself_in_a_notebook_if_viser_is_there(views, monkeypatch
 
 # In a real browser: what a person would see and press, one thing after the other in one page
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
-"""What the program is called, in order of preference; the environment's CHROMIUM goes before."""
-ARGUMENTS = [
-    "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-    "--disable-quic", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-]  # fmt: skip
-
 
 class Tab:
     """A page in Chromium, cut off from all but this machine; its errors, and the hosts it wanted to ask."""
@@ -410,21 +401,13 @@ class Tab:
 
 
 @pytest.fixture(scope="module")
-def tab(page):
+def tab(page, browser):
     """The page in Chromium; whatever a test does, no error is logged and nothing leaves this machine."""
-    program = os.environ.get("CHROMIUM") or next(filter(None, map(shutil.which, NAMES)), None)
-    if program is None:
-        if os.environ.get("CI"):
-            pytest.fail("there is no Chromium: `make chromium` installs it")
-        pytest.skip("there is no Chromium")
-    playwright = pytest.importorskip("playwright.sync_api")
     page.redraw()  # Other tests had it draw something else.
-    with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=program, args=ARGUMENTS)
-        tab = Tab(browser.new_page(viewport={"width": 1280, "height": 720}))
-        tab.open(page.url)
-        yield tab
-        browser.close()
+    tab = Tab(browser.new_page(viewport={"width": 1280, "height": 720}))
+    tab.open(page.url)
+    yield tab
+    tab.page.close()
     assert tab.errors == []
     assert tab.hosts == {"127.0.0.1"}
 

@@ -8,6 +8,7 @@ import platform
 import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -118,6 +119,7 @@ class RunWriter(StagedFolder):
         """Write what a run says as a whole, and put the folder in its place."""
         last, graph, _ = self._views[-1]
         document = {"format": FORMAT, "version": 2, "views": len(self._views)} | self._about
+        document["date"] = datetime.now(UTC).isoformat(timespec="seconds")
         document["versions"] = {"python": platform.python_version()} | {p: version(p) for p in PACKAGES}
         document |= {name: last[name] for name in ("angle_travelled", "path_travelled")}
         document["steps"] = self.steps

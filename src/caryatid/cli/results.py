@@ -222,9 +222,12 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
     settings |= {"fusion": config.fusion.method, "views": config.active.max_views}
     if record.get("warnings"):
         settings["warnings"] = "; ".join(record["warnings"])
+    made_by = f"caryatid {record.get('versions', {}).get('caryatid', '')}".rstrip()
+    about = [record.get("conditions"), made_by, record.get("date", "")[:16].replace("T", " ")]
     report = make_report(
-        f"caryatid: {Path(record['source']).name}",
+        Path(record["source"]).name,
         read_steps(run),
+        about=" · ".join(filter(None, about)),
         settings=settings,
         scores=record.get("scores", ()),
         strip=read_lifts(folder),

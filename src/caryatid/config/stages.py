@@ -555,7 +555,7 @@ class ReportConfig:
     """The pictures of the report; nothing here changes a result."""
 
     image_width: Count = 640
-    """Width to which camera images are reduced [px]; a report of ten views stays below 8 MB."""
+    """Width to which camera images are reduced [px]; a report of four views stays below 3 MB."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)

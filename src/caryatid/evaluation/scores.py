@@ -94,6 +94,9 @@ class Score:
         forecasts: Of each support in the graph with both ends matched, and of each true one between matched
             vertices that the graph lacks, with probability 0. What is neither is not listed. Supports of
             vertices that are not matched say nothing of probabilities; they count in precision and recall.
+        wrong: Extracted supports that are not in the truth.
+        missing: True supports that were not extracted; ends that are matched have their extracted names.
+        unfound: True vertices that are not matched.
     """
 
     precision: float
@@ -109,6 +112,9 @@ class Score:
     matches: Mapping[str, str] = field(default_factory=dict)
     ious: Mapping[str, float] = field(default_factory=dict)
     forecasts: tuple[Forecast, ...] = ()
+    wrong: tuple[tuple[str, str], ...] = ()
+    missing: tuple[tuple[str, str], ...] = ()
+    unfound: tuple[str, ...] = ()
 
     @property
     def vertex_f1(self) -> float:
@@ -230,7 +236,11 @@ def _score_matches(
     brier = float(np.mean([(f.probability - f.true) ** 2 for f in forecasts])) if forecasts else 0.0
     of_forecasts = brier, average_precision(forecasts)
     shares = precision, recall, f1, *of_edges, *of_vertices, mean_iou, *of_forecasts
-    return Score(*shares, matches, ious, forecasts)
+    known_as = {true: name for name, true in matches.items()}
+    wrong = [(a, b) for a, b in found_edges if (matches.get(a, ""), matches.get(b, "")) not in edges]
+    missing = [(known_as.get(a, a), known_as.get(b, b)) for a, b in sorted(edges - named.keys())]
+    unfound = tuple(name for name in vertices if name not in there)
+    return Score(*shares, matches, ious, forecasts, tuple(wrong), tuple(missing), unfound)
 
 
 def average_precision(forecasts: Sequence[Forecast]) -> float:

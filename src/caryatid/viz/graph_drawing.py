@@ -6,7 +6,8 @@ ten edges through vertices, where this draws none.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Collection, Hashable, Sequence
+from dataclasses import replace
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, Support, SupportGraph
 from caryatid.viz.colours import ink_on, object_colour, object_stripes
-from caryatid.viz.pictures import DOUBT, INK, PANEL, Picture, keep_apart
+from caryatid.viz.pictures import DOUBT, INK, PANEL, WRONG, Picture, keep_apart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,7 +109,9 @@ PITCH, NODE = np.array([78.0, -110.0]), np.array([56.0, 40.0])
 """From vertex to vertex within a layer, and from layer to layer; width and height of a vertex [px]."""
 
 
-def draw_graph(graph: SupportGraph) -> Picture:
+def draw_graph(
+    graph: SupportGraph, wrong: Collection[Sequence[str]] = (), missing: Collection[Sequence[str]] = ()
+) -> Picture:
     """Draw the support graph: the table below, what it carries above it, doubt in dashes.
 
     Edges run from supporter to supported and carry their probability, the thicker the higher it is; uncertain
@@ -117,7 +120,13 @@ def draw_graph(graph: SupportGraph) -> Picture:
 
     Args:
         graph: What to draw.
+        wrong: Pairs of ids of its supports that the ground truth does not have; they are marked.
+        missing: Pairs of ids of supports that it lacks; those between its objects are drawn too.
     """
+    ids, known = {o.id for o in graph.objects}, {s.pair for s in graph.supports}
+    lacking = [Support(a, b, probability=0.0) for a, b in missing if {a, b} <= ids and (a, b) not in known]
+    graph = replace(graph, supports=(*graph.supports, *lacking))
+    marks = dict.fromkeys(map(tuple, wrong), "wrong ") | dict.fromkeys([s.pair for s in lacking], "missing")
     places, routes = arrange(graph)
     passed = [*places.values(), *chain.from_iterable(routes.values()), (0.0, 0.0)]
     span, tall = np.max(passed, axis=0) * PITCH * (1.0, -1.0) + (92.0, 76.0)
@@ -133,13 +142,14 @@ def draw_graph(graph: SupportGraph) -> Picture:
         edges.append(_from_rim_to_rim(points, support, table))
         notes.append(edges[-1][-2:].mean(axis=0))
         kind = "" if support.kind == "bottom-up" else f"{support.kind} "
-        words.append(f"{kind}{support.belief:.2f}")
+        mark = marks.get(support.pair, "")
+        words.append(mark if mark == "missing" else f"{mark}{kind}{support.belief:.2f}")
     plates = np.array([[7.4 * len(word) + 4.0, 16.0] for word in words]).reshape(-1, 2)
     plates_at = keep_apart(np.reshape(notes, (-1, 2)), plates, (width, height))
 
     def draw(axes: Axes) -> None:
         for support, points, word, place in zip(graph.supports, edges, words, plates_at, strict=True):
-            _put_edge(axes, support, points, word, place)
+            _put_edge(axes, support, points, word, place, marked=support.pair in marks)
         for item in graph.objects:
             at, half = corner + PITCH * places[item.id], NODE / 2.0
             if item.id == table:
@@ -162,12 +172,13 @@ def _from_rim_to_rim(points: Array, support: Support, table: str | None) -> Arra
     return points
 
 
-def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Array) -> None:
+def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Array, *, marked: bool) -> None:
     """An arrow that passes its points (N, 2) upright, with its note."""
     from matplotlib.patches import FancyArrowPatch
     from matplotlib.path import Path
 
-    colour = INK if support.certain else DOUBT
+    colour = WRONG if marked else INK if support.certain else DOUBT
+    solid = support.certain and support.belief > 0.0
     title = f"{support.supporter} supports {support.supported}: {support.why}".rstrip(": ")
     kind = f"edge {support.supporter} {support.supported} {'certain' if support.certain else 'uncertain'}"
     corners = [points[0]]
@@ -175,10 +186,10 @@ def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Arr
         middle = (a[1] + b[1]) / 2.0
         corners += [np.array([a[0], middle]), np.array([b[0], middle]), b]
     curve = Path(corners, [Path.MOVETO, *[Path.CURVE4] * (len(corners) - 1)])
+    width = max(1.4 if marked else 0.6, 2.4 * support.belief)
     arrow = FancyArrowPatch(
         path=curve, arrowstyle="-|>,head_length=0.5,head_width=0.22", mutation_scale=20.0, color=colour,
-        linewidth=max(0.6, 2.4 * support.belief), linestyle="-" if support.certain else (0, (3.5, 2.6)),
-        gid=f"{kind}|{title}",
+        linewidth=width, linestyle="-" if solid else (0, (3.5, 2.6)), gid=f"{kind}|{title}",
     )  # fmt: skip
     axes.add_patch(arrow)
     plate = {"facecolor": PANEL, "edgecolor": "none", "pad": 0.8}

@@ -25,8 +25,7 @@ def render_pdf(report: Report) -> bytes:
     with own_style(), PdfPages(content, metadata=metadata) as pdf:
         sheets = _Sheets(pdf, report.title)
         sheets.text(report.title, 15.0, bold=True)
-        for name, figure, note in report.cards:
-            sheets.text(f"{name}: {figure} ({note})", 9.0)
+        sheets.text(report.about, 9.0)
         for section in report.sections:
             sheets.section(section)
         sheets.finish()

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image
 
 from caryatid.config import Config, ReportConfig
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SupportGraph
+from caryatid.graph import Change, SupportGraph
 from caryatid.manipulation.dismantling import Taken
 from caryatid.sensing.views import Cloud, View
 from caryatid.simulation.camera import intrinsics, render
@@ -27,16 +28,30 @@ from caryatid.viz.tables import (
     census,
     changes,
     count_of,
+    doubts,
     object_table,
     point_table,
+    sentence,
     support_table,
     uncertain_supports,
 )
+from caryatid.viz.turntable import turntable_html
 
 if TYPE_CHECKING:
     import jinja2
 
     from caryatid.exploration import Step
+
+
+SUPPORTS = (
+    "Arrows run from supporter to supported, with the probability of the support: the higher it is, the "
+    "thicker the arrow. Dashed: uncertain; an object with a dashed rim has no known supporter."
+)
+"""Caption of a support graph."""
+WIDE = 680.0
+"""Width from which a graph cannot be read in half the page [px]: more than eight vertices side by side."""
+MOST = 6
+"""Doubts that are listed; more would bury them [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,6 +64,7 @@ class Figure:
         caption: What is to be seen in it, or empty.
         share: One divided by this is its share of the page's width.
         link: Anchor of the section it leads to, or empty.
+        page: An HTML page that stands in the picture's place where pages can be shown, or empty.
     """
 
     heading: str
@@ -56,6 +72,7 @@ class Figure:
     caption: str = ""
     share: int = 2
     link: str = ""
+    page: str = ""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -69,6 +86,7 @@ class Section:
         facts: Names and what is said under them.
         tables: Tables, one below the other.
         colour: Colour of the chip before the title, `#rrggbb`, or empty.
+        folded: On the page, only the title shows until it is clicked.
     """
 
     title: str
@@ -77,6 +95,7 @@ class Section:
     facts: Sequence[tuple[str, str]] = ()
     tables: Sequence[Table] = ()
     colour: str = ""
+    folded: bool = False
 
     @property
     def anchor(self) -> str:
@@ -90,12 +109,13 @@ class Report:
 
     Attributes:
         title: Its heading.
-        cards: Big figures of the summary: name, figure, what it is made of.
-        sections: Summary, contact sheet, the views, what was taken apart, settings.
+        about: Under which conditions, when and by what it was made.
+        sections: The answer, what is uncertain, how it went, what was taken apart, and folded: tables, the
+            views, settings.
     """
 
     title: str
-    cards: Sequence[tuple[str, str, str]]
+    about: str
     sections: Sequence[Section]
 
 
@@ -103,18 +123,20 @@ def make_report(
     title: str,
     steps: Iterable[Step],
     *,
+    about: str = "",
     settings: Mapping[str, object] | None = None,
-    scores: Sequence[Mapping[str, float]] = (),
+    scores: Sequence[Mapping[str, Any]] = (),
     strip: Sequence[Figure] = (),
     config: ReportConfig | None = None,
 ) -> Report:
-    """Describe a run; each step is drawn as it comes, and its images and clouds are not kept.
+    """Describe a run; each step is drawn as it comes, and the images and clouds of one at a time are kept.
 
     Args:
         title: Heading of the report.
         steps: What `explore` yields, or `extract` takes from a recording or a cloud; at least one.
+        about: Under which conditions, when and by what the run was made.
         settings: Names and values of the run's settings.
-        scores: F1, precision and recall after each view by name; empty where there is no ground truth.
+        scores: What a `Score` says after each view by name; empty where there is no ground truth.
         strip: Pictures of the objects being taken away, in order.
         config: Sizes of the pictures.
 
@@ -124,7 +146,7 @@ def make_report(
     width = (config or ReportConfig()).image_width
     seen: list[Step] = []
     views: list[Section] = []
-    contacts = []
+    contacts, shown, last = [], None, None
     for number, step in enumerate(steps):
         f1 = f"F1 {scores[number]['f1']:.3f}" if number < len(scores) else ""
         before = seen[-1] if seen else None
@@ -132,50 +154,91 @@ def make_report(
         if step.view is not None:
             picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
             why = "the first view" if before is None or before.decision is None else before.decision.why
+            news = "; ".join(changes(before.graph, step.graph)) or "nothing new" if before else ""
+            caption = textwrap.shorten(f"{sentence(why)} {sentence(news)}", 220, placeholder=" …")
             heading = " · ".join(filter(None, (views[-1].title, f1)))
-            contacts.append(Figure(heading, picture, _sentence(why), 3, views[-1].anchor))
+            contacts.append(Figure(heading, picture, caption, 4, views[-1].anchor))
+        if shown is None or step.changes or _number_seen(step) >= _number_seen(shown):
+            shown = step
+        last = step
         nothing = step.cloud.select(np.zeros(0, dtype=np.intp))
         seen.append(replace(step, view=None, labels=step.labels[:0], cloud=nothing, candidates=None))
-    if not seen:
+    if last is None or shown is None:
         raise ValueError("a report needs at least one view")
     if scores and len(scores) != len(seen):
         raise ValueError(f"{len(scores)} scores for {len(seen)} views")
-    sections = [Section("Summary", figures=_charts(seen, scores))]
-    if len(contacts) > 1:
-        text = "Every view with the segments found in it, and why it was taken."
-        sections.append(Section("Contact sheet", text, contacts))
-    sections += views
+    sections = [*_answer(last, shown, len(seen), scores[-1] if scores else None, width)]
+    facts = [(f"Before view {step.index + 1}", _told(change)) for step in seen for change in step.changes]
+    facts += [("Finished", sentence(last.stop))] if last.stop else []
+    pictures = [*contacts * (len(contacts) > 1), *_charts(seen, scores)]
+    sections.append(Section("How it went", figures=pictures, facts=facts))
     if strip:
         text = "Each object lifted straight up in physics, in the order found."
         sections.append(Section("Taken apart", text, strip))
+    tables = [object_table(last.graph), support_table(last.graph)]
+    sections += [Section("Objects and supports", tables=tables, folded=True), *views]
     named = ((name, str(value)) for name, value in (settings or {}).items())
-    sections.append(Section("Settings", tables=[Table.of("Source and options", ("name", "value"), named)]))
-    return Report(title, _cards(seen, scores), sections)
+    source = Table.of("Source and options", ("name", "value"), named)
+    sections.append(Section("Settings", tables=[source], folded=True))
+    return Report(title, about, sections)
 
 
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:].rstrip('.')}."
+def _number_seen(step: Step) -> int:
+    return len(np.unique(step.labels))
 
 
-def _cards(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[tuple[str, str, str]]:
-    last = steps[-1]
-    kinds = [o.shape.kind for o in last.graph.objects if o.role == "object"]
-    counts = ", ".join(count_of(kinds.count(kind), kind) for kind in sorted(set(kinds)))
-    supports, uncertain = len(last.graph.supports), uncertain_supports(last.graph)
-    seconds = [sum(step.timings.values()) for step in steps]
-    cards = [
-        ("objects", str(len(kinds)), counts or "none found"),
-        ("supports", str(supports), f"{supports - uncertain} certain, {uncertain} uncertain"),
-        ("views", str(len(steps)), last.stop or "all there were"),
-        ("per view", f"{np.mean(seconds):.2f} s", f"slowest {max(seconds):.2f} s"),
-    ]
-    if last.angle_travelled > 0.0 or last.path_travelled > 0.0:
-        path = f"around the scene; path length {last.path_travelled:.1f} m"
-        cards.append(("travelled", f"{np.rad2deg(last.angle_travelled):.0f}°", path))
-    if scores:
-        note = f"precision {scores[-1]['precision']:.3f}, recall {scores[-1]['recall']:.3f}"
-        cards.insert(0, ("F1", f"{scores[-1]['f1']:.3f}", note))
-    return cards
+def _told(change: Change) -> str:
+    return f"{change.object_id} was {change.kind}: {change.why}"
+
+
+def _answer(
+    step: Step, shown: Step, views: int, score: Mapping[str, Any] | None, width: int
+) -> Iterator[Section]:
+    """The final graph beside the view that shows most objects, in 3D, and what is uncertain.
+
+    Args:
+        step: The last step.
+        shown: The step whose view is shown.
+        views: How many there were.
+        score: What the last `Score` says by name, or None.
+        width: Of the picture [px].
+    """
+    graph, truth, facts = step.graph, score or {}, []
+    text = f"{census(graph)} after {count_of(views, 'view')}."
+    if score is not None:
+        text += f" F1 {truth['f1']:.3f}, precision {truth['precision']:.3f}, recall {truth['recall']:.3f}."
+    if "wrong" in truth:
+        errors = {
+            "wrong supports": [f"{a} → {b}" for a, b in truth["wrong"]],
+            "missing supports": [f"{a} → {b}" for a, b in truth["missing"]],
+            "objects that are not there": [o.id for o in graph.objects if o.id not in truth["matches"]],
+            "objects not found": truth["unfound"],
+        }
+        listed = "; ".join(f"{name}: {', '.join(names)}" for name, names in errors.items() if names)
+        facts.append(("Against the ground truth", sentence(listed or "nothing is wrong or missing")))
+    picture, caption = draw_graph(graph, truth.get("wrong", ()), truth.get("missing", ())), SUPPORTS
+    if truth.get("wrong") or truth.get("missing"):
+        caption += " Red: wrong or missing against the ground truth."
+    wide = picture.width > WIDE
+    supports = Figure("What supports what", picture, caption, share=1 if wide else 2)
+    azimuth = _first_azimuth(step)
+    solid = draw_cloud(step.cloud, graph, azimuth)
+    seen = Figure("The fused cloud", solid, "Every point so far, with the fitted shapes.")
+    if shown.view is not None:
+        caption = f"View {shown.index + 1} with the final shapes; pale names: not visible here."
+        seen = Figure("The objects", draw_image(shown.view, shown.labels, graph, width), caption)
+    figures = [supports, seen] if wide else [seen, supports]
+    if graph.objects:
+        caption = "Drag to turn, scroll to zoom. Arrows show through the objects; orange: uncertain."
+        page = turntable_html(graph, azimuth)
+        figures.append(Figure("In 3D" if wide else "", solid, caption, share=2 if wide else 1, page=page))
+    yield Section("Answer", text, figures if wide else figures[:2], facts)
+    told = doubts(graph)
+    text = "" if told else "Nothing: every support has a probability of 0.95 or more, and every shape fits."
+    more = [("And", f"{len(told) - MOST} more; see the tables.")] if len(told) > MOST else []
+    yield Section("What is uncertain", text, facts=told[:MOST] + more)
+    if figures[2:] and not wide:
+        yield Section("In 3D", figures=figures[2:])
 
 
 def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> list[Figure]:
@@ -192,13 +255,13 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
             "uncertain supports": [uncertain_supports(graph) for graph in graphs],
         }
         charts.append(draw_chart("Found so far", "number", found))
-    figures = [Figure("", chart) for chart in charts]
+    figures = [Figure("", chart, share=3) for chart in charts]
     if any(step.robot is not None for step in steps):
         caption = (
             "From above, y up: where the platform, or an arm's base, stood for each view, where the camera "
             "looked, and the platform's way in between."
         )
-        figures.append(Figure("Where the robot stood", draw_stands(steps), caption))
+        figures.append(Figure("Where the robot stood", draw_stands(steps), caption, 3))
     return figures
 
 
@@ -207,17 +270,22 @@ def _view(step: Step, before: Step | None, f1: str, width: int) -> Section:
     graph, decision = step.graph, step.decision
     news = "" if before is None else "; ".join(changes(before.graph, graph)) or "nothing new"
     parts = [step.name, census(graph), f1, news]
-    facts, tables = [], [object_table(graph), support_table(graph)]
+    facts, tables = [("Before this view", _told(change)) for change in step.changes], []
     if decision is not None:
         scores = (
             f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
         )
         facts.append(("Next view", f"{decision.why.rstrip('.')} ({scores})."))
         tables += [point_table(decision)] * bool(decision.points_of_interest)
-    if step.stop:
-        facts.append(("Stopped", _sentence(step.stop)))
     text = " · ".join(filter(None, parts))
-    return Section(f"View {step.index + 1}", text, _figures(step, width), facts, tables)
+    return Section(f"View {step.index + 1}", text, _figures(step, width), facts, tables, folded=True)
+
+
+def _first_azimuth(step: Step) -> float:
+    """Direction [rad] from the scene to where the first view was taken."""
+    if len(step.visited):
+        return float(np.arctan2(step.visited[0, 1], step.visited[0, 0]))
+    return sensor_azimuth(step.cloud, None if step.view is None else step.view.T_world_camera)
 
 
 def _figures(step: Step, width: int) -> list[Figure]:
@@ -231,16 +299,9 @@ def _figures(step: Step, width: int) -> list[Figure]:
         )
         picture = draw_image(view, step.labels, graph, width)
         figures.append(Figure("What the camera saw", picture, caption))
-    caption = (
-        "Arrows run from supporter to supported, with the probability of the support: the higher it is, the "
-        "thicker the arrow. Dashed arrows are uncertain; an object with a dashed rim has no known supporter."
-    )
     picture = draw_graph(graph)
-    # A graph of more than eight vertices beside each other cannot be read in half the width.
-    figures.append(Figure("What supports what", picture, caption, share=1 if picture.width > 680.0 else 2))
-    azimuth = sensor_azimuth(cloud, None if view is None else view.T_world_camera)
-    if len(step.visited):
-        azimuth = float(np.arctan2(step.visited[0, 1], step.visited[0, 0]))
+    figures.append(Figure("What supports what", picture, SUPPORTS, share=1 if picture.width > WIDE else 2))
+    azimuth = _first_azimuth(step)
     caption = (
         f"{len(cloud):,} points fused so far in their objects' colours, with the fitted shapes. Pale: the "
         "inside of a surface whose other side has not been seen."

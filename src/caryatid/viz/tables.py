@@ -144,6 +144,52 @@ def uncertain_supports(graph: SupportGraph) -> int:
     return sum(not s.certain for s in graph.supports)
 
 
+def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
+    """Say of each support and object in doubt why, and what would settle it; the least known supports first.
+
+    In doubt is a support whose probability is below 0.95, and an object that nothing is known to support,
+    whose shape fits poorly or is implausible.
+    """
+    said = []
+    for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
+        if not s.certain or s.belief < 0.95:
+            lead = f"{s.supporter} → {s.supported}, probability {s.belief:.2f}"
+            said.append((lead, f"{s.why}. {_settled_by(graph, s.supporter, s.supported)}"))
+    for item in graph.objects:
+        poor = f"the shape is {1e3 * item.residual:.1f} mm off its points on average"
+        known = item.role == "support_surface" or graph.supporters(item.id)
+        reasons = [poor] * item.poor_fit + [item.doubt] * bool(item.doubt)
+        reasons += ["nothing is known to support it"] * (not known)
+        if reasons:
+            said.append((item.id, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
+    return said
+
+
+def _settled_by(graph: SupportGraph, *ids: str) -> str:
+    """Say from where sides of objects are seen that no view has seen yet."""
+    views = []
+    for item in (graph[name] for name in ids):
+        if item.role == "support_surface" or not any(item.seen):
+            continue
+        R = item.shape.T_world_object[:3, :3]
+        outward = np.stack([-R.T, R.T], axis=1).reshape(6, 3)  # −x, +x, −y, …
+        sides = outward[~np.array(item.seen) & (outward[:, 2] > -0.5)]
+        places = [
+            "above" if z > 0.8 else f"azimuth {round(float(np.degrees(np.arctan2(y, x)))) % 360}°"
+            for x, y, z in sides
+        ]
+        if places:
+            views.append(f"{item.id} from {' and '.join(places)}")
+    if views:
+        return f"To settle it, look at {'; '.join(views)}: no view has seen that side."
+    return "Every side in reach of a camera has been seen; what is left is noise, or hidden in between."
+
+
+def sentence(text: str) -> str:
+    """Begin with a capital and end with a full stop."""
+    return f"{text[:1].upper()}{text[1:].rstrip('.')}." if text else ""
+
+
 def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
     """Say what a view changed: a line each for objects found, shaped or supported differently, and gone."""
     known, now = {} if before is None else _held(before), _held(after)

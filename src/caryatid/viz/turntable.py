@@ -1,0 +1,130 @@
+"""The shapes and supports in 3D, as a page that needs nothing else: trimesh's own, with its three.js."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from caryatid.geometry import transforms
+from caryatid.geometry.transforms import Array
+from caryatid.graph import SceneObject, Support, SupportGraph
+from caryatid.sensing.view_sphere import direction
+from caryatid.viz.colours import ink_on, object_colour, rgb
+from caryatid.viz.pictures import DOUBT, INK
+
+LETTER = 0.024
+"""Height of a name plate [m]."""
+
+
+def turntable_html(graph: SupportGraph, azimuth: float) -> str:
+    """Write a page on which the mouse turns the shapes, with arrows from supporter to supported.
+
+    Objects are translucent, so that arrows show through them. Arrows are the thicker the more probable their
+    support is; uncertain ones have another colour. Each object has its name on two opposite sides.
+
+    Args:
+        graph: The shapes and their supports, of at least one object.
+        azimuth: Direction about the vertical from which it is seen at first [rad].
+    """
+    import trimesh
+    from trimesh.viewer.notebook import scene_to_html
+
+    scene = trimesh.Scene(base_frame="file")
+    # glTF has y up.
+    scene.graph.update("world", "file", matrix=[[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+    def add(name: str, mesh: Any, visual: Any = None, T_world_mesh: Array | None = None) -> None:
+        mesh.visual = visual or mesh.visual
+        scene.add_geometry(mesh, name, name, parent_node_name="world", transform=T_world_mesh)
+
+    found = [item for item in graph.objects if item.role == "object"] or graph.objects
+    points = np.concatenate([item.shape.outline() for item in found])
+    low, high = points.min(axis=0), points.max(axis=0)
+    for item in graph.objects:
+        colour = rgb(object_colour(item.label))
+        if item.role == "support_surface":
+            # Only what is below the objects: the page turns all about the middle of what it shows.
+            x, y = high[:2] - low[:2] + 0.1
+            patch = trimesh.creation.box((x, y, 0.01))
+            top = item.centre_world[2] + float(item.shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
+            at = transforms.rigid(np.eye(3), [*((low + high) / 2.0)[:2], top - 0.005])
+            add(item.id, patch, _material(colour, 255), at)
+            continue
+        add(item.id, item.shape.mesh(), _material(colour, 150), item.shape.T_world_object)
+        for side, turn in (("front", 0.0), ("back", np.pi)):
+            add(f"name of {item.id}, {side}", *_plate(item, azimuth + turn))
+    for number, support in enumerate(graph.supports):
+        look = _material(rgb(INK if support.certain else DOUBT), 255)
+        arrow = _arrow(*support_ends(support, graph), 0.0035 * max(support.belief, 0.3))
+        if arrow is not None:
+            add(f"support {number}", arrow, look)
+    centre, reach = scene.bounds.mean(axis=0), float(np.ptp(scene.bounds, axis=0).max())
+    forward = direction(azimuth, np.deg2rad(25.0))
+    eye = centre + 1.9 * reach * np.array([forward[0], forward[2], -forward[1]])
+    scene.camera = trimesh.scene.Camera(name="camera", resolution=(1200, 460), fov=(60.0, 26.0))
+    T_file_camera = transforms.look_at(eye, centre, (0.0, 1.0, 0.0))
+    scene.camera_transform = T_file_camera @ np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z.
+    page: str = scene_to_html(scene)
+    return page
+
+
+def support_ends(support: Support, graph: SupportGraph) -> tuple[Array, Array]:
+    """Where the arrow of a support begins and ends (3,); from the table it rises, from 7 cm below it."""
+    supporter, supported = graph[support.supporter], graph[support.supported]
+    start, end, contact = supporter.centre_world, supported.centre_world, support.contact_world
+    if supporter.role == "support_surface":
+        start = np.array([*(end if contact is None else contact)[:2], start[2] - 0.07])
+    if supported.role == "support_surface":
+        end = np.array([*(start if contact is None else contact)[:2], end[2]])
+    return start, end
+
+
+def _material(colour: tuple[int, int, int], opacity: int) -> Any:
+    """A matt colour 0 … 255 of an opacity 0 … 255, a third of it without light; the page's lamp is strong."""
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    look: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    look |= {"alphaMode": "OPAQUE" if opacity == 255 else "BLEND"}
+    lit, unlit = [round(0.4 * c) for c in colour], [0.35 * c / 255.0 for c in colour]
+    return TextureVisuals(material=PBRMaterial(baseColorFactor=[*lit, opacity], emissiveFactor=unlit, **look))
+
+
+def _arrow(start: Array, end: Array, radius: float) -> Any:
+    """An arrow as a mesh, or None where it has no length."""
+    import trimesh
+
+    along = end - start
+    length = float(np.linalg.norm(along))
+    if length < 1e-6:
+        return None
+    head = min(8.0 * radius, 0.5 * length)
+    neck = end - head * along / length
+    T_world_head = trimesh.geometry.align_vectors([0.0, 0.0, 1.0], along)
+    T_world_head[:3, 3] = neck
+    tip = trimesh.creation.cone(2.7 * radius, head, sections=16, transform=T_world_head)
+    return trimesh.creation.cylinder(radius, segment=[start, neck], sections=12) + tip
+
+
+def _plate(item: SceneObject, azimuth: float) -> tuple[Any, Any, Array]:
+    """A name plate before an object, its look and its pose (4, 4); it cannot be seen from behind."""
+    import trimesh
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    colour = object_colour(item.label)
+    image = Image.new("RGB", (24 + 32 * len(item.id), 72), colour)
+    font, middle = ImageFont.load_default(52), (image.width / 2.0, 36.0)
+    ImageDraw.Draw(image).text(middle, item.id, ink_on(colour), font, anchor="mm")
+    ImageDraw.Draw(image).rectangle((0, 0, image.width - 1, 71), outline="white", width=4)
+    image = image.point(lambda value: 255.0 * (value / 255.0) ** 0.45)  # The page shows textures linearly.
+    uv = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    corners = np.column_stack([(uv - 0.5) * LETTER * (image.width / 72.0, 1.0), np.zeros(4)])
+    look = PBRMaterial(emissiveTexture=image, emissiveFactor=[1.0] * 3, baseColorFactor=[0, 0, 0, 255])
+    out, up = direction(azimuth, 0.0), np.array([0.0, 0.0, 1.0])
+    before = item.centre_world + (float(item.shape.support(out[None])[0]) + 0.001) * out
+    T_world_plate = transforms.rigid(np.column_stack([np.cross(up, out), up, out]), before)
+    plate = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    return plate, TextureVisuals(uv=uv, material=look), T_world_plate
