@@ -73,6 +73,15 @@ def test_what_somebody_put_down_is_new(segmentation, state):
     assert scene.graph[scene.changes[0].object_id].shape.kind == "sphere"
 
 
+def test_a_pose_is_not_to_blame_for_a_change_that_is_noticed(state, caplog):
+    without = state.copy()
+    without[1:4, 2] += 50.0
+    scene = model_of(views_of(without, [0.0, 120.0, 240.0]))
+    scene.update(*views_of(state, [200.0]))
+    assert kinds(scene) == [("added", f"o{k}") for k in (2, 3, 4)]
+    assert caplog.text == ""
+
+
 def test_a_world_that_stays_has_no_history(state):
     scene = Scene()
     for view in views_of(state, np.arange(0.0, 360.0, 60.0), "carmine"):

@@ -46,7 +46,7 @@ STAYS = {"serve", "view"}
 SHORT = {
     "explore": (*SMALL, "--views=2", "--no-report"),
     "demo": (*SMALL, "--views=2", "--no-report"),
-    "dismantle": (*SMALL, "--views=2"),
+    "clear": (*SMALL, "--no-report"),
     "extract": ("--no-report",),
 }
 """Few pixels, few views and no report make commands quick here."""

@@ -34,6 +34,11 @@ class Command:
                 return
         pytest.fail(f"it ended without saying {text!r}")
 
+    def kill(self):
+        """End it at once."""
+        self._process.kill()
+        self._process.communicate(timeout=60)
+
     def interrupt(self):
         """Press Ctrl-C; status, stdout and the last line of stderr."""
         os.killpg(self._process.pid, signal.SIGINT)
@@ -70,19 +75,36 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     assert len(run.record["scores"]) == len(run.views)
 
 
-@pytest.mark.parametrize("moments", [["view 2:"], ["view 2:", "done: ", "o"]], ids=["views", "lifts"])
-def test_a_dismantling_keeps_its_views_and_lifts(tmp_path, moments):
-    folder = tmp_path / "runs" / "run"
+def test_a_clearing_that_is_killed_goes_on(tmp_path):
+    words = ["clear", "tower", "--no-report", "--hands", 1, *SMALL]
+    assert run_command(*words, "--out", tmp_path / "whole", "--quiet") == 0
+    whole, folder = read_run(tmp_path / "whole"), tmp_path / "runs" / "run"
     folder.parent.mkdir()
-    command = Command("dismantle", "tower", "--out", folder, "--views", 2, "--no-early-stop", *SMALL)
-    for moment in moments:
+    for kills, moment in enumerate(["view 1:", "took", "took", "view"]):
+        command = Command(*words, "--out", folder)
         command.wait_for(moment)
+        kept = read_run(folder)
+        command.kill()
+        assert len(read_run(folder).views) >= len(kept.views) > kills, "what was said is there"
+    assert run_command(*words, "--out", folder, "--quiet") == 0
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    assert {p.relative_to(folder) for p in folder.rglob("*")} == {
+        p.relative_to(whole.folder) for p in whole.folder.rglob("*")
+    }
+    run = read_run(folder)
+    for key in ("lifts", "files", "angle_travelled", "path_travelled", "views"):
+        assert run.record[key] == whole.record[key]
+    for view, known in zip(run.views, whole.views, strict=True):
+        for name in ("graph.json", "view.json", "labels.png"):
+            assert (view.folder / name).read_bytes() == (known.folder / name).read_bytes()
+
+
+def test_an_interrupted_clearing_says_how_it_goes_on(tmp_path):
+    command = Command("clear", "tower", "--out", tmp_path / "run", *SMALL)
+    command.wait_for("view 2:")
     status, out, told = command.interrupt()
     assert (status, out) == (130, "")
-    assert "views are kept in" in told
-    record = whole(folder, 2).record["dismantling"]
-    assert len(record["steps"]) >= (moments[-1] == "o")
-    assert record["left"]
+    assert f"views are kept in {tmp_path / 'run'}; the same command goes on" in told
 
 
 def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):

@@ -15,13 +15,13 @@ from caryatid.config import Config, LiftConfig, RehearsalConfig, SupportConfig
 from caryatid.errors import InputError
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry.shapes import Uncertainty
-from caryatid.graph import Support, SupportGraph
+from caryatid.graph import Support, SupportGraph, TakeStep
 from caryatid.manipulation.dismantling import bodies_of, dismantle
-from caryatid.manipulation.order import TakeStep, plan_order
+from caryatid.manipulation.order import plan_order
 from caryatid.simulation.lifting import ASIDE
 from caryatid.simulation.truth import ground_truth
 from caryatid.simulation.world import TABLE_HEIGHT, Body, build_spec, posed, poses_of, scene_from_spec
-from caryatid.steps import read_run
+from caryatid.steps import read_run, read_steps
 from caryatid.support.relations import infer
 
 CONFIG = replace(Config(), rehearsal=RehearsalConfig(draws=2), lift=LiftConfig(watch=1.0))
@@ -200,17 +200,30 @@ class TestCommands:
         assert "run.json" in capsys.readouterr().err
         assert run_command("order", kept_run, "--hands", 3) == 2
 
-    def test_a_scene_is_taken_apart(self, scene_file, tmp_path, capsys):
-        command = ["dismantle", scene_file, "--views", 2, "--json", "--out", tmp_path / "run"]
+    def test_a_scene_is_cleared(self, scene_file, tmp_path, capsys):
+        command = ["clear", scene_file, "--json", "--out", tmp_path / "run"]
         assert run_command(*command, *SMALL, *QUICK) == 0
         document = json.loads(capsys.readouterr().out)
-        assert (document["success"], document["left"]) == (True, [])
+        assert (document["success"], document["left"], document["stop"]) == (True, [], "nothing is left")
         assert [(s["object"], s["body"], s["ok"], s["disturbed"]) for s in document["steps"]] == [
             ("o2", "can", True, []),
             ("o1", "crate", True, []),
         ]
-        assert read_run(tmp_path / "run").record["dismantling"] == document
+        run = read_run(tmp_path / "run")
+        assert "unfinished" not in run.record
+        assert len(run.views) == document["views"]
+        lifts = [step.lift and step.lift.object_id for step in read_steps(run)]
+        assert [i for i in lifts if i] == ["o2", "o1"]
+        assert [o.role for o in run.graph.objects] == ["support_surface"]
 
-    def test_a_recording_cannot_be_taken_apart(self, recording, capsys, leftovers):
-        assert run_command("dismantle", recording, "--views", 1, *QUICK, "--quiet") == 1
+    def test_to_reach_one_object_only_what_is_in_the_way_goes(self, scene_file, tmp_path, capsys):
+        for goal, taken in (("o2", ["o2"]), ("o1", ["o2", "o1"])):
+            command = ["clear", scene_file, "--goal", goal, "--json", "--out", tmp_path / goal, "--no-report"]
+            assert run_command(*command, *SMALL, *QUICK) == 0
+            document = json.loads(capsys.readouterr().out)
+            assert (document["success"], document["stop"]) == (True, f"{goal} is taken")
+            assert [step["object"] for step in document["steps"]] == taken
+
+    def test_a_recording_cannot_be_cleared(self, recording, capsys, leftovers):
+        assert run_command("clear", recording, "--views", 1, *QUICK, "--quiet") == 1
         assert "cannot be simulated" in capsys.readouterr().err

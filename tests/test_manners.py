@@ -133,7 +133,7 @@ WORKING = {
     "extract": ("{recording} --out {out}", {"run", "graph"}),
     "evaluate": ("{run} {scenes}", {"views"}),
     "order": ("{run} {quick}", {"steps", "safe", "refusal"}),
-    "dismantle": ("{scene} --views 1 --out {out} {small} {quick}", {"success", "steps", "left"}),
+    "clear": ("{scene} --views 2 --out {out} {small} {quick}", {"success", "steps", "left"}),
     "import": ("{kept}/tum --camera {kept}/tum.json --out {out}", {"recording", "views", "frames"}),
     "report": ("{run}", set()),
     "export": ("{run} --out {out}.xml", {"file", "format"}),

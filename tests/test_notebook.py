@@ -15,8 +15,8 @@ import caryatid as ct
 from caryatid.geometry.shapes import KINDS
 from caryatid.geometry.solids import Polytope, Solid
 from caryatid.geometry.transforms import look_at
-from caryatid.graph import SceneObject, Support, SupportGraph
-from caryatid.manipulation.order import Order, TakeStep
+from caryatid.graph import SceneObject, Support, SupportGraph, TakeStep
+from caryatid.manipulation.order import Order
 from caryatid.planning.decision import Decision
 from caryatid.runtime.display import Pictured
 from caryatid.sensing.views import Cloud, View

@@ -434,8 +434,8 @@ def test_views_of_noise_stay_small(make_step):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory, scene_file):
     folder = tmp_path_factory.mktemp("runs") / "run"
-    options = ("--out", folder, "--views", 2, "--quiet", *SMALL_SENSOR)
-    assert run_command("dismantle", scene_file, *options) == 0
+    options = ("--out", folder, "--quiet", *SMALL_SENSOR)
+    assert run_command("clear", scene_file, *options) == 0
     return folder
 
 

@@ -21,9 +21,8 @@ from caryatid import InputError, Scene
 from caryatid.errors import PlanningError
 from caryatid.exploration import explore
 from caryatid.geometry import transforms
-from caryatid.graph import Support, SupportGraph
+from caryatid.graph import Support, SupportGraph, TakeStep
 from caryatid.io.graph_json import graph_text
-from caryatid.manipulation.order import TakeStep
 from caryatid.sources import open_source
 from caryatid.steps import read_run
 from caryatid.viewer.drawing import BY_HAND, LAYERS, reduced

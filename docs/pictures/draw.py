@@ -40,7 +40,7 @@ from caryatid.simulation.world import box, build_spec, cylinder, scene_from_spec
 from caryatid.viz.drawings import Projection, draw_cloud, draw_image, draw_sphere
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, own_style
-from caryatid.viz.report import draw_lifts
+from caryatid.viz.report import draw_lift
 
 PICTURES = Path(__file__).parent
 TITLE = 24.0
@@ -144,7 +144,7 @@ def concepts() -> dict[str, Image.Image]:
     bodies = bodies_of(last.graph, true_scene_from_simulation(scene, ground_truth(scene)))
     taken = list(dismantle(scene, order.steps, bodies, config))
     supports = last.graph.supports
-    lifts = draw_lifts(scene, taken, last.graph, views[0].pose, config)
+    lifts = [draw_lift(scene, t, last.graph, views[0].pose, config) for t in taken if t.body is not None]
     pages: dict[str, tuple[Sequence[Titled], int, int]] = {
         "view": ([(plain(views[0]), "colour"), (plain(pale), "depth, near is light")], 480, 2),
         "parts": ([(plain(views[0], first.labels, first.graph), "the segments on the table")], 640, 1),

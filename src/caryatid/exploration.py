@@ -14,7 +14,7 @@ from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.graph import Change, SupportGraph
+from caryatid.graph import Change, SupportGraph, TakeStep
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision, Planner, PlanningState, path_cost
 from caryatid.planning.goals import settled
@@ -75,6 +75,7 @@ class Step(Pictured):
         stop: Why this is the last step, or None.
         robot: How the robot holds its camera, or None where that is not known.
         changes: What has happened to objects since the view before, seen or reported.
+        lift: What was taken away after this view, or None.
     """
 
     index: int
@@ -93,6 +94,7 @@ class Step(Pictured):
     stop: str | None
     robot: RobotPose | None = None
     changes: tuple[Change, ...] = ()
+    lift: TakeStep | None = None
 
     def __repr__(self) -> str:
         following = f"stop: {self.stop}" if self.decision is None else f"next: {self.decision.why}"
@@ -155,7 +157,7 @@ class Explorer:
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
         self._masks = masks
         self.goal = goal
-        self._until = UNTIL if until is None and goal is not None else until
+        self._until = until
         self.robot = robot
         self.step: Step | None = None
         self._camera = camera
@@ -264,7 +266,8 @@ class Explorer:
         if step.decision is None or step.candidates is None:
             return step.stop
         state = self._state(step.candidates)
-        goal, until, config = self.goal, self._until, self.scene.config.support
+        goal, config = self.goal, self.scene.config.support
+        until = UNTIL if self._until is None and goal is not None else self._until
         # Without a goal nothing asks whether a first view hides objects.
         asked = until if goal is not None or step.index > 0 else None
         if asked is not None and settled(state.graph, goal, asked, state.voxels, config):

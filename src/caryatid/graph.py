@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from caryatid.geometry.shapes import Shape, Uncertainty
 from caryatid.geometry.transforms import Array
@@ -204,6 +204,30 @@ class Change:
     object_id: str
     view: int
     why: str
+
+
+@dataclass(frozen=True, slots=True)
+class TakeStep:
+    """One object to take away.
+
+    Attributes:
+        object_id: Which.
+        hold: Ids of what the other hand holds meanwhile.
+        safe: The risk is no higher than `rehearsal.risk`.
+        risk: Probability that another object moves: the share of the rehearsals in which one did [1].
+        why: What the step goes by, for a person to read.
+    """
+
+    object_id: str
+    hold: tuple[str, ...]
+    safe: bool
+    risk: float
+    why: str
+
+    def to_json(self) -> dict[str, Any]:
+        """One entry of `steps` in what `--json` writes."""
+        known = {"object": self.object_id, "hold": list(self.hold), "safe": self.safe, "risk": self.risk}
+        return known | {"probability": 1.0 - self.risk, "why": self.why}
 
 
 def object_id(label: int) -> str:

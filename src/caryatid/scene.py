@@ -29,7 +29,7 @@ from caryatid.runtime.parallel import one_blas_thread
 from caryatid.segmentation.holes import count_holes
 from caryatid.segmentation.observation import Observation, label_image, observe
 from caryatid.segmentation.support_plane import SupportSurface, refitted
-from caryatid.segmentation.view_checks import check_camera, check_place
+from caryatid.segmentation.view_checks import check_camera, check_free, check_place
 from caryatid.sensing.registration import ViewRegistration
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
@@ -334,7 +334,13 @@ class Scene(Pictured):
         watch.lap("segment")
         observation, moved = self._registered(observation, named)
         watch.lap("register")
+        before = self.voxels
         gone, new = self._noticed(observation, named)
+        if self.surface and before and self._registration and observation.view:
+            # Where everything it shows would have changed, its pose is wrong rather.
+            explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
+            unexplained = observation.cloud.points_world[~np.isin(observation.labels, explained)]
+            check_free(source.name, unexplained, self.surface, before, self.config)
         if not named and (given or self.config.fusion.method != "sg"):
             known = self._models.objects()
             if self.config.fusion.method == "sg":  # its models have the newest view's objects alone

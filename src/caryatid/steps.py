@@ -20,7 +20,7 @@ from caryatid.config import Config
 from caryatid.config.settings import changed_settings
 from caryatid.errors import InputError
 from caryatid.exploration import RobotPose, Step
-from caryatid.graph import Change, SupportGraph
+from caryatid.graph import Change, SupportGraph, TakeStep
 from caryatid.io import images
 from caryatid.io.graph_json import graph_text, read_graph
 from caryatid.io.json_files import json_text, parse_json, read_json
@@ -52,8 +52,12 @@ class RunWriter(StagedFolder):
         folder: RUN.
         config: All settings.
         about: What run.json says of the run besides: command, source, seed, options.
+        stepwise: Put the folder in its place with the first view, and add to it view by view: whenever the
+            process is killed, the views so far are there. Where such a run was begun there and not finished,
+            go on with it.
 
     Attributes:
+        past: The run that this one goes on with, or None.
         more: What else run.json is to hold.
         files: Further files of the folder: path in it → content.
 
@@ -61,12 +65,21 @@ class RunWriter(StagedFolder):
         InputError: RUN holds something else, or cannot be written.
     """
 
-    def __init__(self, folder: str | Path, config: Config, about: Mapping[str, Any]) -> None:
-        super().__init__(folder, replaces=_own_files)
+    def __init__(
+        self, folder: str | Path, config: Config, about: Mapping[str, Any], *, stepwise: bool = False
+    ) -> None:
+        self._about = json.loads(json_text(dict(about) | {"settings": asdict(config)}))
+        self.past = _unfinished(Path(folder), self._about) if stepwise else None
+        super().__init__(folder, replaces=_own_files, durable=stepwise, goes_on=self.past is not None)
         self.more: dict[str, Any] = {}
         self.files: dict[str, bytes] = {}
-        self._about = dict(about) | {"settings": asdict(config)}
+        self._stepwise = stepwise
         self._views: list[tuple[dict[str, Any], SupportGraph, Mapping[str, Any] | None]] = []
+        if self.past is not None:
+            told = self.past.record["steps"]
+            self._views = [(t, v.graph, None) for t, v in zip(told, self.past.views, strict=True)]
+            # Of what is listed for the view that a kill prevented, nothing may be there.
+            self.written |= {name for name in self.past.record["files"] if (self._place / name).exists()}
 
     @property
     def steps(self) -> list[dict[str, Any]]:
@@ -101,19 +114,23 @@ class RunWriter(StagedFolder):
         names = ("timings", "angle_travelled", "path_travelled", "stop")
         told = {"view": step.index} | {name: getattr(step, name) for name in names}
         self._views.append((told, step.graph, score))
+        if self._stepwise:
+            self._finish({"unfinished": True} if step.decision is not None else {})
 
     def __exit__(self, kind: object = BaseException, *error: object) -> None:
         """Write the rest and put the folder in its place; after an error but Ctrl-C remove it."""
         interrupted = kind is KeyboardInterrupt and len(self._views) > 0
         try:
-            if interrupted or (kind is None and self._views):
+            if (interrupted or (kind is None and self._views)) and not self._stepwise:
                 self._finish({"interrupted": True} if interrupted else {})
         finally:
             super().__exit__()
         if interrupted:
             count = "1 view is" if len(self._views) == 1 else f"{len(self._views)} views are"
-            reason = f"{count} kept in {self.folder}; `caryatid report {self.folder}` makes the report"
-            raise KeyboardInterrupt(reason) from None
+            remedy = f"`caryatid report {self.folder}` makes the report"
+            if self._stepwise:
+                remedy = "the same command goes on"
+            raise KeyboardInterrupt(f"{count} kept in {self.folder}; {remedy}") from None
 
     def _finish(self, more: dict[str, Any]) -> None:
         """Write what a run says as a whole, and put the folder in its place."""
@@ -128,7 +145,10 @@ class RunWriter(StagedFolder):
         self.remove(_view_folder(len(self._views)))
         for path, content in ({"graph.json": graph_text(graph).encode()} | self.files).items():
             self.write(path, content)
-        self.write("run.json", json_text(document | {"files": sorted(self.written)}).encode())
+        self.files = {}
+        # A kill may leave files of the next view that nothing refers to.
+        files = self.written | (_next_files(len(self._views)) if "unfinished" in more else set())
+        self.write("run.json", json_text(document | {"files": sorted(files)}).encode())
         self.publish()
 
 
@@ -254,6 +274,25 @@ def _own_files(folder: Path) -> set[str]:
     return {"run.json", "report.html", *map(str, files)}
 
 
+def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
+    """The run that the same command with the same settings began in a folder and did not end, or None."""
+    if not is_run(folder):
+        return None
+    record = read_json(folder / "run.json")
+    return read_run(folder) if record.get("unfinished") and about.items() <= record.items() else None
+
+
+def _next_files(index: int) -> set[str]:
+    """Files that belong to a view, or may."""
+    names = ("graph.json", "labels.png", "view.json", "step.npz")
+    return {lift_file(index)} | {f"{_view_folder(index)}/{name}" for name in names}
+
+
+def lift_file(index: int) -> str:
+    """Picture of the lift after a view."""
+    return f"lifts/{index:02d}.png"
+
+
 def _view_folder(index: int) -> str:
     return f"views/{index:02d}"
 
@@ -269,6 +308,8 @@ def _summary(step: Step) -> dict[str, Any]:
     """What view.json says of the camera, the candidates and the choice of the next view."""
     record: dict[str, Any] = {key: getattr(step.view, key, None) for key in ("T_world_camera", "K")}
     record["changes"] = [asdict(change) for change in step.changes]
+    if step.lift is not None:
+        record["lift"] = step.lift.to_json()
     if step.candidates is not None:
         record["candidates"] = {"reachable": len(step.candidates), "rejected": step.candidates.rejected}
     if step.decision is not None:
@@ -309,6 +350,8 @@ def _encoded(step: Step) -> bytes:
         document["robot"] = step.robot
     if step.changes:
         document["changes"] = step.changes
+    if step.lift is not None:
+        document["lift"] = step.lift
     arrays["document"] = np.frombuffer(json.dumps(document, default=_plain).encode(), dtype=np.uint8)
     buffer = io.BytesIO()
     # Higher levels of compression take longer and save little.
@@ -352,6 +395,8 @@ def _decoded(stored: dict[str, Any]) -> Step:
         posture = Posture(**_with_arrays(stored["robot"]["posture"]))
         stored["robot"] = RobotPose(**_with_arrays(stored["robot"]) | {"posture": posture})
     stored["changes"] = tuple(Change(**change) for change in stored.get("changes", ()))
+    if "lift" in stored:
+        stored["lift"] = TakeStep(**stored["lift"] | {"hold": tuple(stored["lift"]["hold"])})
     return Step(**stored)
 
 

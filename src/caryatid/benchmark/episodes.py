@@ -21,9 +21,9 @@ from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import Score, TrueScene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
-from caryatid.graph import SupportGraph
+from caryatid.graph import SupportGraph, TakeStep
 from caryatid.manipulation.dismantling import bodies_of, dismantle
-from caryatid.manipulation.order import TakeStep, plan_order
+from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import offered
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, list_scenes, load_scene
 from caryatid.simulation.setup import make_simulation

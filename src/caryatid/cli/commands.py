@@ -36,7 +36,7 @@ COMMANDS = {
     "view": "run:View",
     "evaluate": "results:Evaluate",
     "order": "results:OrderCommand",
-    "dismantle": "run:Dismantle",
+    "clear": "run:Clear",
     "import": "results:Import",
     "report": "results:ReportCommand",
     "export": "results:Export",

@@ -165,9 +165,7 @@ class Modelling(Settings):
 
         if self.masks_from is not None and not takes_views:
             reason = "is neither scene nor per-view, and this command takes no views to give masks to"
-            raise InputError(
-                f"--masks {self.masks}", reason, "use it with explore, extract, dismantle or view"
-            )
+            raise InputError(f"--masks {self.masks}", reason, "use it with explore, extract, clear or view")
         base = base or preset(self.preset)
         identity = None if self.masks_from else self.masks
         return super().read({"fusion.method": self.fusion, "fusion.masks": identity, **(options or {})}, base)

@@ -84,6 +84,8 @@ class Output(logging.Handler):
         self.say(f"view {step.index + 1}: {census(step.graph)}{f1} ({turn(step.timings):.1f} s)")
         for line in changes(before, step.graph):
             self.say(f"  {line}")
+        if step.lift is not None:
+            self.say(f"  took {step.lift.object_id}: {step.lift.why}")
         if step.decision is not None:
             self.say(f"  next view: {step.decision.why}")
         if step.stop is not None:

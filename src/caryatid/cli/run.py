@@ -1,4 +1,4 @@
-"""`caryatid demo`, `explore`, `view`, `extract` and `dismantle`: from views to a graph, and their page."""
+"""`caryatid demo`, `explore`, `view`, `extract` and `clear`: from views to a graph, and their page."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from caryatid.config import Config
     from caryatid.evaluation.scores import TrueScene
     from caryatid.exploration import Step
+    from caryatid.graph import TakeStep
     from caryatid.io.mask_sources import MaskSource
     from caryatid.sources import Source
     from caryatid.steps import RunWriter
@@ -172,7 +173,7 @@ class View(options.ExploringCommand):
     """Show a finished run in the browser, or control there the exploration of a scene or a recording.
 
     SOURCE is one of
-      a run folder, as explore, extract and dismantle write it; it is not changed
+      a run folder, as explore, extract and clear write it; it is not changed
       an MJCF scene, the name of a built-in one, or a recording, as for explore
 
     The page is served to this machine only, loads nothing from elsewhere, and stays until Ctrl-C.
@@ -271,76 +272,113 @@ class Extract(RunCommand, options.LookingCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dismantle(Exploring):
-    """Explore a scene, find a safe order to take it apart, and try it in physics.
+class Clear(options.ExploringCommand):
+    """Clear a simulated table: look until the next lift is safe, take the object away, look again.
 
-    Objects are lifted straight up, one by one. A step fails when any other object moves by more than 2 cm
-    or 15°.
+    Objects are lifted straight up in physics, one by one. A lift does harm when any other object moves by
+    more than 2 cm or 15°. Whenever the command is killed, the same command goes on where it was.
 
     To try:
-      caryatid dismantle bridge --noise carmine
-      caryatid dismantle scene.xml --views 5 --hands 1 --out run
+      caryatid clear bridge --noise carmine
+      caryatid clear clutter --goal o3 --hands 1
+      caryatid clear scene.xml --risk 0.1 --out run
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """An MJCF scene, or the name of a built-in one."""
-    out: Annotated[Path | None, options.shown("RUN")] = None
-    """Run folder to write, its report with pictures of every lift. When left out: nothing is written."""
+    out: options.OutPath = Path("run")
+    """Run folder to write, view by view; replaces an earlier run that is finished or another."""
+    goal: Annotated[str | None, options.shown("ID")] = None
+    """Reach this object only, and take away no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
+    risk: Annotated[float | None, options.shown("P", "0.02")] = None
+    """Take only what moves another object with at most this probability."""
+    views: Annotated[options.OptionalCount, options.shown(default=100)] = None
+    """Maximum number of views, including the first."""
+    no_report: options.Flag = False
+    """Leave out report.html."""
+
+    def config(self) -> Config:
+        """All settings."""
+        from caryatid.config.settings import changed_settings, preset
+
+        own = {"active": {"max_views": 100}, "rehearsal": {"risk": 0.02}}
+        given = {"active.max_views": self.views, "rehearsal.risk": self.risk}
+        base = changed_settings(preset(self.settings.preset), own, "clear")
+        return self.settings.read(given, base, takes_views=True)
 
     def __call__(self) -> None:
+        import numpy as np
+
         from caryatid.cli.output import table
-        from caryatid.manipulation.dismantling import bodies_of, dismantle, dismantling_record
-        from caryatid.manipulation.order import Order, plan_order
+        from caryatid.exploration import Explorer
+        from caryatid.io.json_files import plain
+        from caryatid.manipulation.clearing import clear
+        from caryatid.manipulation.dismantling import SimulatedHands
         from caryatid.runtime.parallel import cores
         from caryatid.simulation.camera import SimulatedCamera
-        from caryatid.steps import RunWriter
-        from caryatid.viz.report import draw_lifts, stored_lifts
+        from caryatid.steps import RunWriter, lift_file, read_steps
+        from caryatid.viz.report import draw_lift, lift_picture
+        from caryatid.viz.tables import count_of
 
-        config, seed, taken = self.config(), self.settings.seed, []
-        order = Order((), "interrupted before an order was found")
-        kept = nullcontext() if self.out is None else RunWriter(self.out, config, _about(self))
-        with kept as writer:
-            source, steps = self.explore(config)
-            if source.truth is None or not isinstance(source.camera, SimulatedCamera):
-                remedy = "give an MJCF scene; for a run, use `caryatid order`"
-                raise InputError(self.source, "cannot be simulated", remedy)
-            scene = source.camera.scene
-            try:
-                last = _record(writer, steps, source.truth, self.output)
-                with self.output.working("rehearsing"):
-                    order = plan_order(last.graph, config, hands=self.hands, seed=seed, threads=cores())
-                for t in dismantle(scene, order.steps, bodies_of(last.graph, source.truth), config):
-                    taken.append(t)
-                    disturbed = ", ".join(t.disturbed)
-                    self.output.say(f"{t.step.object_id}: {f'{disturbed} disturbed' if disturbed else 'ok'}")
-                if writer is not None:
-                    T_world_camera = last.sphere.poses(last.visited[:1])[0]
-                    lifts = draw_lifts(scene, taken, last.graph, T_world_camera, config)
-                    writer.files |= stored_lifts(lifts)
-            finally:
-                bodies = {t.body for t in taken}
-                left = [name for name in scene.object_bodies.values() if name not in bodies]
-                record = dismantling_record(order, taken, left)
-                if writer is not None:
-                    writer.more["dismantling"] = record
-        if self.out is not None:
-            _draw_report(self.out, self.output)
-        outcome = "all taken, nothing disturbed" if record["success"] else "not without harm"
-        if left and all(t.ok for t in taken):
-            outcome = f"nothing disturbed, but {', '.join(left)} left"
+        config, seed, output = self.config(), self.settings.seed, self.output
+        with output.working("opening"):
+            masks = self.mask_source(config)
+            source = _opening(self, masks)(config)
+        camera = source.camera
+        if not isinstance(camera, SimulatedCamera):
+            remedy = "give an MJCF scene; for a run, use `caryatid order`"
+            raise InputError(self.source, "cannot be simulated", remedy)
+        known: dict[str, Any] = {"segmentation": self.segmentation, "seed": seed, "masks": masks}
+        known |= {"planner": self.chosen_planner, "goal": self.goal, "config": config}
+        explorer = Explorer(camera, source.robot, **known)
+        hands = SimulatedHands(camera.scene, config)
+        with RunWriter(self.out, config, _about(self), stepwise=True) as writer:
+            past = writer.past
+            lifts: list[dict[str, Any]] = [] if past is None else past.record["lifts"]
+            writer.more = {"lifts": lifts, "warnings": output.warnings}
+            if past is not None:
+                output.say(f"{self.source}: going on after view {len(past.views)}")
+                camera.captures = len(past.views)
+            if lifts:
+                hands.state = np.array(lifts[-1]["state"])
+                camera.scene = hands.scene
+
+            def take(step: TakeStep) -> bool:
+                graph = explorer.scene.graph
+                taken = hands.take(step, hands.bodies(graph))
+                state = plain(hands.state)  # as it comes back from the file
+                hands.state = np.array(state)
+                camera.scene = hands.scene
+                lifts.append({"view": len(writer.steps)} | taken.to_json() | {"state": state})
+                if taken.body is not None and explorer.robot is not None:
+                    drawn = draw_lift(camera.scene, taken, graph, explorer.robot.T_world_camera, config)
+                    writer.files[lift_file(len(writer.steps))] = lift_picture(drawn)
+                return taken.body is not None
+
+            known = {"hands": self.hands, "threads": cores()}
+            steps = clear(explorer, take, past=() if past is None else read_steps(past), **known)
+            last = _record(writer, steps, None, output)
+        if not self.no_report:
+            _draw_report(self.out, output)
+        harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
+        reached = any(lift["object"] == self.goal for lift in lifts) if self.goal else not hands.left
+        taken = [{name: value for name, value in lift.items() if name != "state"} for lift in lifts]
+        document = {"run": str(self.out), "success": reached and not harmed, "stop": last.stop}
+        document |= {"views": last.index + 1, "steps": taken, "left": hands.left, "warnings": output.warnings}
         rows = [
-            (str(number), t.step.object_id, t.body or "nothing there", ", ".join(t.held),
-             ", ".join(t.disturbed) or "–", t.step.why)
-            for number, t in enumerate(taken, start=1)
+            (str(number), lift["object"], lift["body"] or "nothing there", ", ".join(lift["held"]),
+             ", ".join(lift["disturbed"]) or "–", lift["why"])
+            for number, lift in enumerate(lifts, start=1)
         ]  # fmt: skip
-        columns = ("", "take", "body", "hold", "disturbed", "why")
-        shown = table(f"{source.name}: {outcome}", columns, rows)
-        self.output.result(record, shown, f"{order.refusal}\n" if order.refusal else "")
+        outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
+        title = f"{source.name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
+        shown = table(title, ("", "take", "body", "hold", "disturbed", "why"), rows)
+        output.result(document, shown)
 
 
-def _opening(command: Exploring | View, masks: MaskSource | None) -> Callable[[Config], Source]:
+def _opening(command: Exploring | View | Clear, masks: MaskSource | None) -> Callable[[Config], Source]:
     """What opens the source of a command."""
     from caryatid.sources import open_source
 
@@ -373,13 +411,14 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
         page.close()
 
 
-def _about(command: RunCommand | Dismantle) -> dict[str, Any]:
+def _about(command: RunCommand | Clear) -> dict[str, Any]:
     """What run.json says of the command."""
-    names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until")
+    names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options["preset"] = command.settings.preset
-    if isinstance(command, Exploring):
+    if isinstance(command, Exploring | Clear):
         options["planner"] = command.chosen_planner
+    if isinstance(command, Exploring):
         options["early_stop"] = not command.no_early_stop
     name, seed = type(command).__name__.lower(), command.settings.seed
     return {"command": name, "source": command.source, "seed": seed, "options": options}

@@ -22,17 +22,20 @@ leaves them behind."""
 class StagedFolder:
     """A folder in the making, to be used in a `with` block.
 
-    Everything is written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place.
-    Leaving the block without it removes what was written, and parent folders made for it.
+    Everything is written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place; what
+    is written later goes there at once, file by file. Leaving the block without `publish` removes what was
+    written, and parent folders made for it.
 
     Args:
         folder: Where the folder shall be.
         replaces: Which files of a folder that is there may be replaced, by their paths in it; one that holds
             others is left as it is. None replaces no file.
         durable: Wait until every file, and the folder itself, is on the disk.
+        goes_on: The folder is in its place already, and what is written is added to it.
 
     Attributes:
         folder: Where the folder shall be.
+        published: It is in its place.
         written: Paths of the files written so far.
 
     Raises:
@@ -45,8 +48,10 @@ class StagedFolder:
         *,
         replaces: Callable[[Path], Collection[str]] | None = None,
         durable: bool = False,
+        goes_on: bool = False,
     ) -> None:
         self.folder = Path(folder)
+        self.published = goes_on
         self._place = self.folder.resolve()
         self._replaces, self._durable = replaces, durable
         self._partial = _partial(self._place)
@@ -54,6 +59,8 @@ class StagedFolder:
         self.written: set[str] = set()
         _recover(self._place)
         self._made = [parent for parent in self._place.parents if not parent.exists()]
+        if goes_on:
+            return
         self._check_place()
         try:
             with write_errors(self.folder):
@@ -81,10 +88,13 @@ class StagedFolder:
         Raises:
             InputError: The disk is full or refuses.
         """
-        path = self._partial / name
+        path = (self._place if self.published else self._partial) / name
         with write_errors(self.folder):
             path.parent.mkdir(parents=True, exist_ok=True)
-            _write(path, content, self._durable)
+            if self.published:
+                write_file(path, content, durable=self._durable)
+            else:
+                _write(path, content, self._durable)
         self.written.add(name)
 
     def remove(self, name: str) -> None:
@@ -92,11 +102,13 @@ class StagedFolder:
         shutil.rmtree(self._partial / name, ignore_errors=True)
 
     def publish(self) -> None:
-        """Put the folder in its place, replacing an older one where that is allowed.
+        """Put the folder in its place, unless it is there; an older one is replaced where that is allowed.
 
         Raises:
             InputError: The place has been taken meanwhile, or the disk refuses.
         """
+        if self.published:
+            return
         self._check_place()
         with write_errors(self.folder):
             if self._durable:
@@ -110,6 +122,7 @@ class StagedFolder:
             except OSError:
                 self._place.rename(self._partial)
                 raise
+        self.published = True
         shutil.rmtree(self._old, ignore_errors=True)
 
     def _check_place(self) -> None:
@@ -225,8 +238,9 @@ def _partial(path: Path) -> Path:
 
 
 def _recover(place: Path) -> None:
-    """Remove what killed processes left in the making of a folder; what had given way comes back."""
+    """Remove what killed processes left in the making of a folder or in it; what had given way comes back."""
     name = re.compile(rf"{re.escape(PARTIAL + place.name)}-(\d+)-[0-9a-f]{{8}}({REPLACED})?")
+    inside = re.compile(rf"{re.escape(PARTIAL)}.+-(\d+)-[0-9a-f]{{8}}")
     with suppress(OSError):
         for path in place.parent.iterdir():
             if (found := name.fullmatch(path.name)) and not _runs(int(found[1])):
@@ -234,6 +248,9 @@ def _recover(place: Path) -> None:
                     path.rename(place)
                 else:
                     shutil.rmtree(path, ignore_errors=True)
+        for path in place.rglob(f"{PARTIAL}*"):
+            if (found := inside.fullmatch(path.name)) and not _runs(int(found[1])):
+                path.unlink()
 
 
 def _runs(process: int) -> bool:

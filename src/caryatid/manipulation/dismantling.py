@@ -1,4 +1,4 @@
-"""An order tried out in a simulated scene: what was lifted, and what it did to the rest."""
+"""Objects taken away in a simulated scene: what was lifted, and what that did to the rest."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ import numpy as np
 
 from caryatid.config import Config, EvaluationConfig
 from caryatid.evaluation.scores import TrueScene, score
+from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SupportGraph
-from caryatid.manipulation.order import Order, TakeStep
-from caryatid.simulation.lifting import Lifting
-from caryatid.simulation.world import SimulatedScene, poses_of
+from caryatid.graph import SupportGraph, TakeStep
+from caryatid.simulation.lifting import ASIDE, Lifting
+from caryatid.simulation.truth import GroundTruth
+from caryatid.simulation.world import SimulatedScene, posed, poses_of
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -27,6 +28,7 @@ class Taken:
         held: Names of the bodies that were held meanwhile.
         disturbed: Names of the bodies that were moved or turned beyond the limits.
         film: States (T, N, 7) of the scene's objects on the way; empty where nothing was lifted.
+        bodies: Body that each extracted object stood for, by id.
     """
 
     step: TakeStep
@@ -34,6 +36,7 @@ class Taken:
     held: tuple[str, ...]
     disturbed: tuple[str, ...]
     film: Array
+    bodies: Mapping[str, str]
 
     @property
     def ok(self) -> bool:
@@ -70,23 +73,55 @@ def dismantle(
     Yields:
         What came of each step.
     """
-    names = list(scene.object_bodies.values())
-    lifting = Lifting(scene.spec, names)
-    state = poses_of(scene)
-    gone: set[str] = set()
+    hands = SimulatedHands(scene, config)
     for step in steps:
-        body = bodies.get(step.object_id)
-        held = tuple(bodies[i] for i in step.hold if i in bodies and bodies[i] not in gone)
-        if body is None or body in gone:
-            yield Taken(step, None, held, (), np.zeros((0, len(names), 7)))
-            continue
-        lift = lifting.lift(state, names.index(body), config.lift, held=[names.index(h) for h in held])
-        state = lift.film[-1]
-        gone.add(body)
-        yield Taken(step, body, held, tuple(names[k] for k in np.flatnonzero(lift.disturbed)), lift.film)
+        yield hands.take(step, bodies)
 
 
-def dismantling_record(order: Order, taken: Sequence[Taken], left: Sequence[str]) -> dict[str, Any]:
-    """What came of an order whose steps were done; `left` names the bodies that nobody took."""
-    success = not left and all(t.ok for t in taken)
-    return {"success": success, **order.to_json(), "steps": [t.to_json() for t in taken], "left": list(left)}
+class SimulatedHands:
+    """Hands that take objects away in physics, one after the other.
+
+    Args:
+        scene: The scene in physics; it is not changed.
+        config: How objects are lifted, and what counts as harm.
+
+    Attributes:
+        state: State (N, 7) of the scene's objects by now; what was taken is far above.
+    """
+
+    def __init__(self, scene: SimulatedScene, config: Config) -> None:
+        self._scene, self._config = scene, config
+        self._names = list(scene.object_bodies.values())
+        self._lifting = Lifting(scene.spec, self._names)
+        self.state = poses_of(scene)
+
+    @property
+    def scene(self) -> SimulatedScene:
+        """The scene as it is by now."""
+        return posed(self._scene, self.state)
+
+    @property
+    def left(self) -> list[str]:
+        """Names of the bodies that have not been taken."""
+        return [n for n, z in zip(self._names, self.state[:, 2], strict=True) if z < ASIDE / 2.0]
+
+    def bodies(self, graph: SupportGraph) -> dict[str, str]:
+        """Body that each extracted object stands for by now, as `bodies_of`."""
+        return bodies_of(graph, true_scene_from_simulation(self.scene, GroundTruth(tuple(self.left), ())))
+
+    def take(self, step: TakeStep, bodies: Mapping[str, str]) -> Taken:
+        """Do a step, whatever comes of it.
+
+        Args:
+            step: What to take.
+            bodies: Body each extracted object stands for, by id.
+        """
+        body, left = bodies.get(step.object_id), self.left
+        held = tuple(bodies[i] for i in step.hold if bodies.get(i) in left)
+        if body not in left:
+            return Taken(step, None, held, (), np.zeros((0, len(self._names), 7)), bodies)
+        index, also = self._names.index(body), [self._names.index(h) for h in held]
+        lift = self._lifting.lift(self.state, index, self._config.lift, held=also)
+        self.state = lift.film[-1]
+        disturbed = tuple(np.array(self._names)[lift.disturbed].tolist())
+        return Taken(step, body, held, disturbed, lift.film, bodies)

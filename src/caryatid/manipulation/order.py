@@ -21,35 +21,11 @@ from numpy.typing import NDArray
 from caryatid.config import Config, RehearsalConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
-from caryatid.graph import SceneObject, SupportGraph
+from caryatid.graph import SceneObject, SupportGraph, TakeStep
 from caryatid.runtime.display import Pictured
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion, strayed
 from caryatid.support.plausibility import drawn, reconcile
-
-
-@dataclass(frozen=True, slots=True)
-class TakeStep:
-    """One object to take.
-
-    Attributes:
-        object_id: Which.
-        hold: Ids of what the other hand holds meanwhile.
-        safe: The risk is no higher than `rehearsal.risk`.
-        risk: Probability that another object moves: the share of the rehearsals in which one did [1].
-        why: What the step goes by, for a person to read.
-    """
-
-    object_id: str
-    hold: tuple[str, ...]
-    safe: bool
-    risk: float
-    why: str
-
-    def to_json(self) -> dict[str, Any]:
-        """One entry of `steps` in what `--json` writes."""
-        known = {"object": self.object_id, "hold": list(self.hold), "safe": self.safe, "risk": self.risk}
-        return known | {"probability": 1.0 - self.risk, "why": self.why}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,19 +84,48 @@ def plan_order(
             them, or no such goal.
     """
     config = config or Config()
-    rehearsal = _Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
-    if goal is not None and goal not in rehearsal.ids:
-        raise InputError(goal, "is not an object of the graph", f"there are {', '.join(rehearsal.ids)}")
+    rehearsal = _rehearsal(graph, config, goal, seed, threads)
     steps: list[TakeStep] = []
     refusal = ""
     while (left := rehearsal.left()) and (goal is None or goal in left):
-        wanted = _in_turn(graph, left) if goal is None else _on_the_way(graph, goal, left, rehearsal)
-        trial, tried = _safest(rehearsal, wanted, hands)
+        trial, tried = _next(graph, goal, hands, rehearsal)
         if trial.risk > rehearsal.accepted and not refusal:
             refusal = _refusal(trial, tried)
         steps.append(_step(graph, trial, left, config.rehearsal))
         rehearsal.take(trial)
     return Order(tuple(steps), refusal)
+
+
+def next_lift(
+    graph: SupportGraph,
+    config: Config | None = None,
+    *,
+    goal: str | None = None,
+    hands: int = 2,
+    seed: int = 0,
+    threads: int = 1,
+) -> TakeStep:
+    """Find the first step of an order; arguments and errors are those of `plan_order`."""
+    config = config or Config()
+    rehearsal = _rehearsal(graph, config, goal, seed, threads)
+    trial, _ = _next(graph, goal, hands, rehearsal)
+    return _step(graph, trial, rehearsal.left(), config.rehearsal)
+
+
+def _rehearsal(graph: SupportGraph, config: Config, goal: str | None, seed: int, threads: int) -> _Rehearsal:
+    rehearsal = _Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
+    if goal is not None and goal not in rehearsal.ids:
+        raise InputError(goal, "is not an object of the graph", f"there are {', '.join(rehearsal.ids)}")
+    return rehearsal
+
+
+def _next(
+    graph: SupportGraph, goal: str | None, hands: int, rehearsal: _Rehearsal
+) -> tuple[_Trial, list[_Trial]]:
+    """The next lift, and those tried before it."""
+    left = rehearsal.left()
+    wanted = _in_turn(graph, left) if goal is None else _on_the_way(graph, goal, left, rehearsal)
+    return _safest(rehearsal, wanted, hands)
 
 
 def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:

@@ -49,8 +49,6 @@ def check_place(
 ) -> None:
     """Refuse a view whose camera is below the table, or that shows another place than earlier views saw.
 
-    Where it shows things where they looked through there is a warning: things may have been moved.
-
     Args:
         cloud: What the view shows, registered.
         aligned: Whether registration found what it shows in earlier views.
@@ -62,17 +60,15 @@ def check_place(
         WrongViewError: Its pose cannot be right.
     """
 
-    def height(points_world: Array) -> Array:
-        return (points_world - surface.point_world) @ surface.normal_world
-
     def refused(why: str) -> WrongViewError:
         convention = "p_world = T_world_camera @ p_camera, in metres, in the frame of the first view"
         reason = f"its pose cannot be right, {why}"
         return WrongViewError(cloud.name, reason, f"check T_world_camera: {convention}")
 
     eye_world = cloud.viewpoint_world
-    if eye_world is not None and height(eye_world) <= 0.0:
-        raise refused(f"the camera would be {-height(eye_world):.2f} m below the table top")
+    height = 1.0 if eye_world is None else float((eye_world - surface.point_world) @ surface.normal_world)
+    if height <= 0.0:
+        raise refused(f"the camera would be {-height:.2f} m below the table top")
     points = cloud.points_world[:: max(1, len(cloud.points_world) // 20_000)]
     voxel = np.floor((points - voxels.origin_world) / voxels.config.size).astype(np.intp)
     within = ((voxel > 0) & (voxel < np.array(voxels.hits.shape) - 1)).all(axis=1)
@@ -83,13 +79,29 @@ def check_place(
     common = float(seen[tuple(voxel[within].T // COARSER)].mean())
     if not aligned and common < config.registration.common:
         raise refused(f"only {common:.0%} of what it shows is where earlier views saw anything")
-    over = points[within][height(points[within]) > 2.0 * config.surface.tolerance]
-    free = voxels.free_around(over)
+
+
+def check_free(
+    name: str, points_world: Array, surface: SupportSurface, voxels: VoxelMap, config: Config
+) -> None:
+    """Warn where a view shows much over the table where earlier views looked through.
+
+    Args:
+        name: Name of the view.
+        points_world: Points (N, 3) [m] of it that no change explains.
+        surface: The support surface.
+        voxels: What earlier views saw around it.
+        config: All settings.
+    """
+    points = points_world[:: max(1, len(points_world) // 20_000)]
+    over = (points - surface.point_world) @ surface.normal_world > 2.0 * config.surface.tolerance
+    over &= ((points > voxels.origin_world) & (points < voxels.end_world)).all(axis=1)
+    free = voxels.free_around(points[over])
     if free.sum() > THROUGH * len(free):
         log.warning(
             "%s: %.0f%% of what it shows over the table is where earlier views looked through; its pose is "
             "wrong, or things have been moved",
-            cloud.name, 100.0 * free.mean(),
+            name, 100.0 * free.mean(),
         )  # fmt: skip
 
 

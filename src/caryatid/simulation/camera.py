@@ -113,6 +113,7 @@ class SimulatedCamera:
 
     Attributes:
         scene: What it looks at; another state of the same scene may take its place.
+        captures: Number of views so far, which decides the noise of the next one.
 
     Raises:
         InputError: The noise model is not one of the two.
@@ -135,7 +136,7 @@ class SimulatedCamera:
         self.sensor = sensor or SensorConfig()
         self.K = intrinsics(self.sensor)
         self._seed = int((rng or np.random.default_rng(0)).integers(2**63))
-        self._captures = 0
+        self.captures = 0
         self._around = around
 
     def fork(self) -> SimulatedCamera:
@@ -158,10 +159,10 @@ class SimulatedCamera:
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
         scene = None if self._around is None else self._around(self.scene, T)
         image = render(scene or self.scene, T, self.K, self.sensor)
-        number = self._captures
+        number = self.captures
         rng = np.random.default_rng([self._seed, number])
         name = f"{self.scene.name} view {number + 1}"
-        self._captures += 1
+        self.captures += 1
         if self.noise == "none":
             depth, T_reported = image.depth, T
             normals = (image.normals_world @ T[:3, :3]).astype(np.float32)

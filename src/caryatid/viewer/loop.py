@@ -20,8 +20,9 @@ from caryatid.evaluation.scores import score
 from caryatid.exploration import Explorer, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.graph import TakeStep
 from caryatid.manipulation.dismantling import bodies_of, dismantle
-from caryatid.manipulation.order import TakeStep, plan_order
+from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import Decision
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 from caryatid.runtime.parallel import cores

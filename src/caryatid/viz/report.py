@@ -173,7 +173,7 @@ def make_report(
     pictures = [*contacts * (len(contacts) > 1), *_charts(seen, scores)]
     sections.append(Section("How it went", figures=pictures, facts=facts))
     if strip:
-        text = "Each object lifted straight up in physics, in the order found."
+        text = "Each object lifted straight up in physics, one after the other."
         sections.append(Section("Taken apart", text, strip))
     tables = [object_table(last.graph), support_table(last.graph)]
     sections += [Section("Objects and supports", tables=tables, folded=True), *views]
@@ -337,53 +337,41 @@ def _sphere_caption(step: Step) -> str:
 # Objects being taken away
 
 
-def draw_lifts(
-    scene: SimulatedScene,
-    taken: Sequence[Taken],
-    graph: SupportGraph,
-    T_world_camera: Array,
-    config: Config,
-) -> list[Figure]:
-    """Draw each lift as it looked half way up, or at its end where it did harm, in the objects' colours.
+def draw_lift(
+    scene: SimulatedScene, taken: Taken, graph: SupportGraph, T_world_camera: Array, config: Config
+) -> Figure:
+    """Draw a lift as it looked half way up, or at its end where it did harm, in the objects' colours.
 
     Args:
         scene: The scene in physics.
-        taken: The steps, done.
-        graph: The objects they took.
+        taken: The step, done; a body was lifted.
+        graph: What was known.
         T_world_camera: Where it is seen from (4, 4).
-        config: Sizes of the pictures.
+        config: Sizes of the picture.
     """
     names, K = list(scene.object_bodies.values()), intrinsics(config.sensor)
-    found = {t.body: graph[t.step.object_id] for t in taken if t.body is not None}
-    label_of = np.zeros(max(scene.object_bodies, default=0) + 1, dtype=np.int32)
+    labels = {body: graph[i].label for i, body in taken.bodies.items()}
+    label_of = np.zeros(max(scene.object_bodies) + 1, dtype=np.int32)
     for label, name in scene.object_bodies.items():
-        label_of[label] = found[name].label if name in found else 0
-    figures = []
-    for number, t in enumerate(taken, start=1):
-        if t.body is None:
-            continue
-        rising = np.flatnonzero(t.film[:, names.index(t.body), 2] < ASIDE / 2.0)
-        state = t.film[rising[(len(rising) - 1) // 2]] if t.ok else t.film[-1]
-        image = render(posed(scene, state), T_world_camera, K, config.sensor)
-        view = View(image.depth.astype(np.float32), K, rgb=image.rgb, name=f"lift {number}")
-        objects, width = SupportGraph(tuple(found.values())), config.report.image_width // 2
-        picture = draw_image(view, label_of[image.labels], objects, width)
-        held = f", {', '.join(t.step.hold)} held" if t.held else ""
-        outcome = "Nothing else moved" if t.ok else f"{', '.join(t.disturbed)} moved"
-        figures.append(Figure(f"{number}: {t.step.object_id}{held}", picture, f"{outcome}; {t.step.why}.", 3))
-    return figures
+        label_of[label] = labels.get(name, 0)
+    heights = taken.film[:, names.index(taken.body or "")][:, 2]
+    rising = np.flatnonzero(heights < ASIDE / 2.0)
+    state = taken.film[rising[(len(rising) - 1) // 2]] if taken.ok else taken.film[-1]
+    image = render(posed(scene, state), T_world_camera, K, config.sensor)
+    view = View(image.depth.astype(np.float32), K, rgb=image.rgb, name=f"lift of {taken.step.object_id}")
+    picture = draw_image(view, label_of[image.labels], graph, config.report.image_width // 2)
+    held = f", {', '.join(taken.step.hold)} held" if taken.held else ""
+    outcome = "Nothing else moved" if taken.ok else f"{', '.join(taken.disturbed)} moved"
+    return Figure(f"{taken.step.object_id}{held}", picture, f"{outcome}; {taken.step.why}.", 3)
 
 
-def stored_lifts(figures: Sequence[Figure]) -> dict[str, bytes]:
-    """The pictures of lifts as files of a run folder: `lifts/NN.png`, with headings and captions in them."""
-    return {
-        f"lifts/{number:02d}.png": picture_png(f.picture, heading=f.heading, caption=f.caption)
-        for number, f in enumerate(figures, start=1)
-    }
+def lift_picture(figure: Figure) -> bytes:
+    """The picture of a lift as a file of a run folder, with heading and caption in it."""
+    return picture_png(figure.picture, heading=figure.heading, caption=figure.caption)
 
 
 def read_lifts(folder: Path) -> list[Figure]:
-    """Read back what `stored_lifts` gave; none where there are none."""
+    """Read back what `lift_picture` gave; none where there are none."""
     figures = []
     for path in sorted((folder / "lifts").glob("*.png")):
         with Image.open(path) as image:

@@ -1,0 +1,151 @@
+"""What clearing a table by looking, taking and looking again harms, and how many views it takes.
+
+    python benchmarks/clear.py [SCENES…] --hands 1
+    python benchmarks/clear.py --suite heaps --goals 2
+
+Each scene is cleared in physics: the true objects are lifted, and what is disturbed counts. A scene is
+unharmed where no lift moved another object by more than 2 cm or 15°, and cleared where nothing is left. With
+goals, objects drawn at random are to be reached instead; the fewest lifts are those of a search on the true
+scene, breadth first, among the objects that stand in one another's way.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pandas as pd
+import tyro
+from measures import Spread, print_table, run_main
+from rich.console import Console
+
+from caryatid.benchmark.episodes import family, open_scene
+from caryatid.benchmark.suites import DENSE, HEAPED
+from caryatid.config import Config, NoiseModel, SegmentationMethod
+from caryatid.config.settings import changed_settings, read_settings
+from caryatid.exploration import Explorer
+from caryatid.geometry.transforms import Array
+from caryatid.graph import TakeStep
+from caryatid.manipulation.clearing import clear
+from caryatid.manipulation.dismantling import SimulatedHands, Taken
+from caryatid.simulation.lifting import Lifting
+from caryatid.simulation.setup import make_simulation
+from caryatid.simulation.world import SimulatedScene, poses_of
+
+
+@dataclass(frozen=True)
+class Args(Spread):
+    """Clear scenes in physics."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*HEAPED, *DENSE)
+    """Names of built-in scenes, or scene folders."""
+    hands: Literal[1, 2] = 1
+    """Hands there are."""
+    goals: int = 0
+    """Objects to reach in each scene, one by one; 0 = take everything."""
+    segmentation: SegmentationMethod = "labels"
+    """Where segments come from."""
+    noise: NoiseModel = "carmine"
+    """Noise of the simulated camera."""
+    seed: int = 0
+    """Seed of the noise and of the choice of goals."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Settings, e.g. `--set rehearsal.draws=16`."""
+
+
+def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
+    """Clear one scene, or reach each goal in it: a row for each."""
+    name, args = task
+    scene, _ = open_scene(name)
+    if not args.goals:
+        return [cleared(name, scene, args, None)]
+    rng = np.random.default_rng([args.seed, args.scenes.index(name)])
+    chosen = rng.choice(list(scene.object_bodies), min(args.goals, len(scene.object_bodies)), replace=False)
+    return [cleared(name, scene, args, label) for label in chosen.tolist()]
+
+
+def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> dict[str, Any]:
+    """Clear a scene, or reach the body with a label."""
+    base = changed_settings(Config(), {"active": {"max_views": 100}, "rehearsal": {"risk": 0.02}}, "clear")
+    config = read_settings(None, args.set, base)
+    simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
+    known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
+    explorer = Explorer(
+        simulation.camera, simulation.robot, goal=None if goal is None else f"o{goal}", **known
+    )
+    hands, done = SimulatedHands(scene, config), list[Taken]()
+
+    def take(step: TakeStep) -> bool:
+        done.append(hands.take(step, hands.bodies(explorer.scene.graph)))
+        simulation.camera.scene = hands.scene
+        return done[-1].body is not None
+
+    steps = list(clear(explorer, take, hands=args.hands))
+    lifted = [t for t in done if t.body is not None]
+    harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
+    row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}
+    row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "harm": harm, "stop": steps[-1].stop}
+    if goal is None:
+        return row | {"cleared": float(not hands.left)}
+    body = scene.object_bodies[goal]
+    row |= {"goal": f"o{goal}", "cleared": float(any(t.body == body for t in lifted))}
+    return row | {"fewest": fewest(scene, body, config) if row["cleared"] else 0}
+
+
+def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:
+    """Number of lifts that take a body, each of which disturbs nothing; 0 where there are none."""
+    names = list(scene.object_bodies.values())
+    lifting, target = Lifting(scene.spec, names), names.index(goal)
+    queue = deque[tuple[tuple[int, ...], Array]]([((), poses_of(scene))])
+    reached = set[frozenset[int]]()
+    while queue:
+        taken, state = queue.popleft()
+        wanted = [target]
+        for index in wanted:
+            lift = lifting.lift(state, index, config.lift)
+            if not lift.disturbed.any():
+                if index == target:
+                    return len(taken) + 1
+                following = frozenset((*taken, index))
+                if following not in reached and len(reached) < 200:
+                    reached.add(following)
+                    queue.append(((*taken, index), lift.film[-1]))
+            else:
+                wanted += [k for k in np.flatnonzero(lift.disturbed).tolist() if k not in wanted]
+    return 0
+
+
+def summary(rows: pd.DataFrame) -> dict[str, float]:
+    """Shares of scenes, and figures per lift."""
+    unharmed = rows["harmed"] == 0
+    found = {"runs": len(rows), "unharmed": unharmed.mean(), "cleared": rows["cleared"].mean()}
+    found |= {"both": (unharmed & (rows["cleared"] == 1.0)).mean()}
+    found |= {"lifts unharmed": 1.0 - rows["harmed"].sum() / rows["lifts"].sum()}
+    found |= {"views per lift": rows["views"].sum() / rows["lifts"].sum(), "missed": rows["missed"].sum()}
+    if "fewest" in rows:
+        known = rows[(rows["cleared"] == 1.0) & (rows["fewest"] > 0)]
+        found |= {"lifts": known["lifts"].sum(), "fewest": known["fewest"].sum()}
+        found |= {"of the fewest": known["lifts"].sum() / max(known["fewest"].sum(), 1)}
+    return found
+
+
+def main() -> int:
+    """Run the measurement."""
+    args = tyro.cli(Args)
+    rows = [row for part in args.each(measure, [(scene, args) for scene in args.scenes]) for row in part]
+    frame = pd.DataFrame(rows)
+    groups = {str(name): group for name, group in frame.groupby(frame["scene"].map(family))} | {"all": frame}
+    shown = pd.DataFrame({name: summary(group) for name, group in groups.items()})
+    console = Console(width=160)
+    print_table(shown.round(3).rename_axis("scenes").reset_index(), console)
+    for row in rows:
+        if row["harmed"] or not row["cleared"]:
+            console.print(f"{row['scene']}: {row['harm']}; {row['stop']}")
+    args.write(rows)
+    return 0
+
+
+if __name__ == "__main__":
+    run_main(main)

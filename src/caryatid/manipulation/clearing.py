@@ -1,0 +1,98 @@
+"""Look, take, look again: a table cleared one object at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+
+from caryatid.exploration import Explorer, Step
+from caryatid.graph import TakeStep
+from caryatid.manipulation.order import next_lift
+
+MISSES = 2
+"""Lifts in a row that take nothing before the loop stops [1]: the model no longer says what is there."""
+
+
+def clear(
+    explorer: Explorer,
+    take: Callable[[TakeStep], bool],
+    *,
+    hands: int = 2,
+    threads: int = 1,
+    past: Iterable[Step] = (),
+) -> Iterator[Step]:
+    """Look until the next lift is safe, do it, look again, until nothing or nothing safe is left.
+
+    A lift is safe where no other object moves with a higher probability than `config.rehearsal.risk`, as
+    `plan_order` has it. It is done once that is known as well as `until` of the explorer asks, or no view is
+    expected to show more. After each lift the robot looks again: what slid or fell is noticed there.
+
+    Args:
+        explorer: Has a camera and a robot. Its goal is the object to reach; None = all of them.
+        take: Takes an object away; whether it was there to be taken.
+        hands: 2 where another hand can hold one object, else 1.
+        threads: Number of rehearsals at a time.
+        past: Steps of a run to go on with; their views are looked at again, and nothing is taken again.
+
+    Yields:
+        A step after each view, once what it led to has been done: `lift` names what was taken.
+
+    Raises:
+        CaryatidError: A view cannot be used.
+    """
+    goal, missed = explorer.goal, 0
+    for step in past:
+        _repeat(explorer, step)
+    while explorer.step is None or explorer.step.decision is not None:
+        if explorer.step is not None:
+            explorer.go()
+        step = explorer.look()
+        lift, reason = _lift(explorer, goal, hands, threads)
+        if lift is not None:
+            missed = 0 if take(lift) else missed + 1
+            explorer.scene.removed(lift.object_id)
+            explorer.goal = goal
+            explorer.plan()
+            if lift.object_id == goal and not missed:
+                reason = f"{goal} is taken"
+            elif missed == MISSES:
+                reason = f"nothing was there to take, {MISSES} times in a row"
+        step = replace(explorer.step or step, lift=lift)
+        if reason is not None:
+            step = replace(step, candidates=None, decision=None, stop=reason)
+        explorer.step = step
+        yield step
+
+
+def _lift(
+    explorer: Explorer, goal: str | None, hands: int, threads: int
+) -> tuple[TakeStep | None, str | None]:
+    """What to take now, or None to look on; and why this is the last view, or None."""
+    scene = explorer.scene
+    ids = [o.id for o in scene.graph.objects if o.role == "object"]
+    if not ids and goal is None:
+        return None, "nothing is left"
+    lift = None
+    if goal is None or goal in ids:
+        lift = next_lift(scene.graph, scene.config, goal=goal, hands=hands, seed=scene.seed, threads=threads)
+    explorer.goal = lift.object_id if lift is not None and lift.safe else goal
+    explorer.plan()
+    reason = explorer.reason_to_stop()
+    if reason is None:
+        return None, None
+    used_up = reason if scene.views >= scene.config.active.max_views else None
+    if lift is None:
+        return None, f"{reason}; {goal} has not been found"
+    if lift.safe:
+        return lift, used_up
+    return None, used_up or f"no lift is safe: {lift.why}"
+
+
+def _repeat(explorer: Explorer, step: Step) -> None:
+    """Look once more at what a step looked at, and forget what it took."""
+    if explorer.step is not None:
+        explorer.go()
+    explorer.look(step.view)
+    if step.lift is not None:
+        explorer.scene.removed(step.lift.object_id)
+    explorer.step = step
