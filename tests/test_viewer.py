@@ -16,16 +16,18 @@ import pytest
 from conftest import SMALL, run_command
 from PIL import Image
 from scipy.spatial.transform import Rotation
+from shapely.geometry import MultiPoint, Point
 
 from caryatid import InputError, Scene
 from caryatid.errors import PlanningError
 from caryatid.exploration import explore
 from caryatid.geometry import transforms
+from caryatid.geometry.shapes import Box, Sphere
 from caryatid.graph import Support, SupportGraph, TakeStep
 from caryatid.io.graph_json import graph_text
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.viewer.drawing import BY_HAND, LAYERS, reduced
+from caryatid.viewer.drawing import BY_HAND, LAYERS, reduced, visible_points
 from caryatid.viewer.loop import LoopPage, candidate_under, taken_apart
 from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
@@ -60,12 +62,15 @@ def step(page):
     return page.steps[0]
 
 
+EYE = transforms.look_at((-1.0, -0.7, 1.3), (0.0, 0.0, 0.8))
+
+
 @pytest.fixture
 def drawn(page):
     """Draw a step and return the nodes of the scene by name."""
 
     def draw(step, **look):
-        page.drawing.show(step, [step], **look)
+        page.drawing.show(step, [step], T_world_eye=EYE, **look)
         return {node.name: node for nodes in page.drawing.nodes.values() for node in nodes}
 
     return draw
@@ -97,12 +102,16 @@ def test_only_layers_that_changed_are_sent_again(step, drawn):
     assert [name for name in first if first[name] is not again[name]] == ["/cloud/points"]
 
 
-def test_arrows_tell_direction_doubt_and_kind(step, drawn):
-    objects = step.graph
-    certain = drawn(with_supports(step, Support("o1", "o2")))
-    (arrow,) = certain["/supports/arrow 0"].points
-    np.testing.assert_allclose(arrow, [objects["o1"].centre_world, objects["o2"].centre_world], atol=1e-6)
+def test_arrows_tell_direction_doubt_and_kind(page, step, drawn):
+    certain, eye, found = drawn(with_supports(step, Support("o1", "o2"))), EYE[:3, 3], page.drawing.anchors
+    (arrow,) = certain["/supports/arrow 0"].points.astype(float)
+    on_the_way = [(at - eye) / (found[name] - eye) for at, name in zip(arrow, ("o1", "o2"), strict=True)]
+    assert np.max(on_the_way) < 1.0  # before the shapes
+    along = transforms.unit(found["o2"] - found["o1"])
+    assert (arrow[1] - arrow[0]) @ along > 0.5 * np.linalg.norm(arrow[1] - arrow[0])
     assert not {"/supports/dashes 0", "/supports/probability 0"} & certain.keys()
+    table = drawn(with_supports(step, Support("o0", "o1"), Support("o0", "o2", certain=False)))
+    assert [name for name in table if name.startswith("/supports/arrow")] == ["/supports/arrow 1"]
     doubtful = drawn(with_supports(step, Support("o1", "o2", certain=False)))
     assert len(doubtful["/supports/dashes 0"].points) > 1
     assert doubtful["/supports/probability 0"].text == "0.50"
@@ -110,8 +119,40 @@ def test_arrows_tell_direction_doubt_and_kind(step, drawn):
     assert likely["/supports/probability 0"].text == "0.83"
     widths = [nodes["/supports/arrow 0"].shaft_radius for nodes in (doubtful, likely, certain)]
     assert widths == sorted(set(widths))
-    assert "/supports/lean 0" in drawn(with_supports(step, Support("o1", "o2", "lean")))
-    assert "/supports/top-down 0" in drawn(with_supports(step, Support("o1", "o2", "top-down")))
+    for kind in ("lean", "top-down"):
+        nodes = drawn(with_supports(step, Support("o1", "o2", kind)))
+        assert nodes["/supports/probability 0"].text == f"{kind} 1.00"
+
+
+def test_names_are_on_what_can_be_seen_of_their_objects():
+    """Seen from anywhere, a name is on its object's surface, inside its outline, and nothing is before it."""
+    rng, found = np.random.default_rng(5), 0
+    for _ in range(8):
+        places = [transforms.rigid(np.eye(3), rng.uniform(-0.2, 0.2, 3)) for _ in range(6)]
+        shapes = [
+            Box(T, rng.uniform(0.05, 0.2, 3)) if k % 2 else Sphere(T, 0.06) for k, T in enumerate(places)
+        ]
+        surfaces = [shape.surface(0.004)[0] for shape in shapes]
+        owner = np.repeat(np.arange(6), [len(points) for points in surfaces])
+        eye = 1.2 * transforms.unit(rng.normal(size=3))
+        T_eye_world = transforms.invert(transforms.look_at(eye, np.zeros(3)))
+        for number, at in visible_points(np.concatenate(surfaces), owner, eye).items():
+            found += 1
+            assert abs(shapes[number].signed_distance(at[None])[0]) < 1e-3
+            way = eye + np.linspace(0.0, 1.0, 500)[:, None] * (at - eye)
+            for shape in shapes:  # in up to 1 cm, the coarseness of what is seen
+                inside = shape.signed_distance(way) < -0.012
+                assert not inside.any()
+            outline = transforms.transform(T_eye_world, shapes[number].outline())
+            x, y, z = transforms.transform(T_eye_world, at[None])[0]
+            assert (
+                MultiPoint(outline[:, :2] / outline[:, 2:])
+                .convex_hull.buffer(1e-6)
+                .covers(Point(x / z, y / z))
+            )
+        alone = visible_points(surfaces[0], np.zeros(len(surfaces[0]), dtype=int), eye)[0]
+        assert np.linalg.norm(np.cross(alone - eye, places[0][:3, 3] - eye)) < 0.02
+    assert found > 30
 
 
 def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
@@ -120,7 +161,7 @@ def test_the_sphere_is_painted_and_cameras_show_what_they_saw(step, drawn):
     assert len(np.unique(painted.colors, axis=0)) > 10
     away = np.linalg.norm(painted.points + painted.position - sphere.centre_world, axis=1)
     np.testing.assert_allclose(away, sphere.radius, rtol=1e-2)
-    assert nodes["/cameras/0"].image.shape[2] == 3
+    assert nodes["/cameras/1"].image.shape[2] == 3
     decision = replace(step.decision, why="chosen by hand")
     by_hand = replace(step, decision=decision)
     planned = tuple(nodes["/cameras/next"].color)
@@ -148,6 +189,9 @@ def test_what_is_said_of_an_object(step, settings):
     said = "o1 → o2</dt><dd>bottom-up, probability 0.50, uncertain, 1 of 1"
     assert said in describe_object(doubtful, "o1", config)
     assert "not known" in describe_object(graph, "o9", config)
+    assert "has been taken away" in describe_object(graph, "o9", config, taken=True)
+    assert "View 1 of 3" in describe_view(step, None, 3)
+    assert "finished</dt><dd>enough" in describe_view(replace(step, stop="enough"), None, 1)
     named = replace(step, name="<img src=x onerror=alert(1)>")
     assert "<img" not in describe_view(named, None, 1)
 
@@ -378,6 +422,14 @@ class Tab:
         test = f"({name!r} in (window.__viserSceneTree?.getState() ?? {{}})) === {str(there).lower()}"
         self.page.wait_for_function(test)
 
+    def wait_until(self, true):
+        """Wait until something here is true."""
+        for _ in range(600):
+            if true():
+                return
+            self.page.wait_for_timeout(100)
+        pytest.fail("waited for a minute")
+
     def wait_for_text(self, text):
         """Wait until the page says something."""
         self.page.get_by_text(text).first.wait_for()
@@ -411,8 +463,8 @@ def tab(page, browser):
     assert tab.hosts == {"127.0.0.1"}
 
 
-def click(page, point_world, tab):
-    """Click where a point of the world is in the window."""
+def pixel(page, point_world, tab):
+    """Where a point of the world is in the window [px]."""
     tab.settle()
     (client,) = page.server.get_clients().values()
     rotation = Rotation.from_quat(client.camera.wxyz, scalar_first=True).as_matrix()
@@ -421,7 +473,32 @@ def click(page, point_world, tab):
     box = tab.page.locator("canvas").first.bounding_box()
     focal = box["height"] / 2.0 / np.tan(client.camera.fov / 2.0)
     middle = box["x"] + box["width"] / 2.0, box["y"] + box["height"] / 2.0
-    tab.page.mouse.click(float(middle[0] + focal * x / z), float(middle[1] + focal * y / z))
+    return float(middle[0] + focal * x / z), float(middle[1] + focal * y / z)
+
+
+def click(page, point_world, tab):
+    """Click where a point of the world is in the window."""
+    tab.page.mouse.click(*pixel(page, point_world, tab))
+
+
+@pytest.mark.slow
+def test_the_first_sight_is_the_objects_with_their_names_on_them(page, tab):
+    page.wait()
+    tab.settle()
+    shot = np.asarray(Image.open(io.BytesIO(tab.page.screenshot())).convert("RGB"), dtype=int)
+    box = tab.page.locator("canvas").first.bounding_box()
+    corners = []
+    for item in page.steps[-1].graph.objects[1:]:
+        u, v = map(round, pixel(page, page.drawing.anchors[item.id], tab))
+        around = shot[v - 11 : v + 11, u - 16 : u + 16]
+        plate = np.abs(around - rgb(object_colour(item.label))).max(axis=-1) < 40
+        assert plate.mean() > 0.1, item.id  # the rest is letters and blur
+        corners += [pixel(page, corner, tab) for corner in item.shape.outline()]
+    low, high = np.min(corners, axis=0) - (box["x"], box["y"]), np.max(corners, axis=0) - (box["x"], box["y"])
+    room = box["width"], box["height"]
+    assert (low > 0.0).all()
+    assert (high < room).all()
+    assert ((high - low) / room).max() > 0.4
 
 
 @pytest.mark.slow
@@ -431,6 +508,9 @@ def test_a_click_on_an_object_says_what_falls_without_it(page, tab):
     tab.wait_for_text("Without o1")
     tab.wait_for_text("falls with probability")
     assert "o2" in tab.page.locator(".caryatid-cell").last.inner_text()
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    found = axe.run(tab.page, context={"include": [[".caryatid-cell"]]}).response["violations"]
+    assert [(v["id"], v["nodes"][0]["html"]) for v in found if v["impact"] in ("serious", "critical")] == []
 
 
 @pytest.mark.slow
@@ -438,32 +518,34 @@ def test_the_page_shows_the_next_view_and_goes_back(page, tab):
     first, number = tab.picture(), len(page.steps)
     assert len(np.unique(first.reshape(-1, 3), axis=0)) > 200
     tab.press("next view")
-    tab.wait_for_text(f"View {number}")
-    tab.wait_for_node(f"/cameras/{number}")
+    tab.wait_for_text(f"View {number + 1} of {number + 1}")
+    tab.wait_for_node(f"/cameras/{number + 1}")
     second = tab.picture()
     assert len(page.steps) == number + 1
     assert (np.abs(second.astype(int) - first).max(axis=-1) > 16).mean() > 0.01
 
     tab.page.get_by_role("slider").first.press("ArrowLeft")
-    tab.wait_for_text(f"View {number - 1}")
-    tab.wait_for_node(f"/cameras/{number}", there=False)
+    tab.wait_for_text(f"View {number} of {number + 1}")
+    tab.wait_for_node(f"/cameras/{number + 1}", there=False)
     assert (np.abs(tab.picture().astype(int) - second).max(axis=-1) > 16).mean() > 0.01
     tab.page.get_by_role("slider").first.press("ArrowRight")
-    tab.wait_for_node(f"/cameras/{number}")
+    tab.wait_for_node(f"/cameras/{number + 1}")
 
 
 @pytest.mark.slow
 def test_a_view_is_chosen_by_hand(page, tab):
     number, step = len(page.steps), page.steps[-1]
+    tab.page.get_by_role("checkbox", name="choose the next view by hand").click()
     client = next(iter(page.server.get_clients().values()))
+    centre, radius = step.sphere.centre_world, step.sphere.radius
+    tab.wait_until(lambda: np.linalg.norm(client.camera.position - centre) > 2.0 * radius)
     towards_eye = transforms.unit(client.camera.position - step.sphere.centre_world)
     facing = np.argmax(step.candidates.directions @ towards_eye)
     eye = step.candidates.T_world_camera[facing][:3, 3]
-    tab.page.get_by_role("checkbox", name="choose the next view by hand").click()
     click(page, eye, tab)
     tab.wait_for_text("your view is next")
     tab.press("next view")
-    tab.wait_for_node(f"/cameras/{number}")
+    tab.wait_for_node(f"/cameras/{number + 1}")
     taken = page.steps[number].view.T_world_camera
     assert page.steps[number - 1].decision.why == "chosen by hand"
     assert not np.allclose(taken, step.decision.T_world_camera)
@@ -472,7 +554,9 @@ def test_a_view_is_chosen_by_hand(page, tab):
 
 @pytest.mark.slow
 def test_everything_is_taken_away_in_a_safe_order(page, tab):
+    page.describe("o2")
     tab.press("dismantle")
-    tab.wait_for_text("a safe order; 2 of 2 taken")
+    tab.wait_for_text("finished: a safe order; 2 of 2 taken")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)
+    tab.wait_for_text("has been taken away")

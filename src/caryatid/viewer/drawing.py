@@ -10,23 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from caryatid.exploration import RobotPose, Step
+from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.graph import Support, SupportGraph
+from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
 from caryatid.viz.colours import SALIENCY_STOPS, Colour, label_colours, object_colour, rgb, scale
 from caryatid.viz.drawings import image_of
 from caryatid.viz.tables import count_of
+from caryatid.viz.turntable import name_plate, support_ends
 
-LAYERS = ("cloud", "shapes", "names", "supports", "sphere", "interest", "cameras", "robot")
-"""What can be shown and hidden."""
+LAYERS = {
+    "shapes": True, "names": True, "supports": True, "cameras": True,
+    "cloud": False, "sphere": False, "interest": False, "robot": False,
+}  # fmt: skip
+"""What can be shown and hidden, and whether it shows at first."""
 CERTAIN, UNCERTAIN = (26, 32, 40), (196, 78, 12)
 """Colours of supports; uncertain ones are dashed too."""
 EARLIER, NEXT, BY_HAND, ROBOT = (128, 136, 146), (11, 92, 148), (170, 30, 120), (120, 130, 142)
 """Colours of earlier views, the planner's choice, one by hand, and the robot."""
-ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.028}
-"""Sizes of an arrow [m]."""
+ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.02}
+"""Sizes of an arrow at 1 m from the eye [m]."""
+LETTER = 0.03
+"""Height of a name plate over its distance from the eye [1]."""
+ON_TOP = 0.85
+"""Where names and arrows are between the eye, 0, and what they belong to, 1: before whatever is near it."""
 SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
 
 
@@ -61,12 +70,18 @@ class SceneDrawing:
 
     Attributes:
         nodes: What the browser shows, by layer.
+        anchors: Where each object's name belongs (3,): a point of its surface that can be seen, by id; hidden
+            objects have none.
     """
 
     def __init__(self, server: Any, clicked: Callable[[str], None]) -> None:
         self._server, self._scene, self._clicked = server, server.scene, clicked
         self._frames = {name: self._scene.add_frame(f"/{name}", show_axes=False) for name in LAYERS}
+        for name, shown in LAYERS.items():
+            self._frames[name].visible = shown
         self._shown: dict[str, tuple[object, ...]] = {}
+        self._surface: tuple[SupportGraph, Array, NDArray[np.intp]] | None = None
+        self.anchors: dict[str, Array] = {}
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
 
     def show_layer(self, name: str, visible: bool) -> None:
@@ -78,6 +93,7 @@ class SceneDrawing:
         step: Step,
         steps: Sequence[Step],
         *,
+        T_world_eye: Array,
         chosen: str = "",
         point_size: float = 0.003,
         true_colours: bool = False,
@@ -87,6 +103,7 @@ class SceneDrawing:
         Args:
             step: What is known.
             steps: The steps so far, the newest last.
+            T_world_eye: Pose (4, 4) of the eye in the browser, OpenCV camera frame.
             chosen: Id of the object that stands out.
             point_size: Diameter of the cloud's points [m].
             true_colours: Points as the camera saw them, not in their objects' colours.
@@ -94,9 +111,8 @@ class SceneDrawing:
         decision = step.decision
         layers: dict[str, tuple[object, ...]] = {
             "cloud": (step.cloud, point_size, true_colours),
-            "shapes": (step.graph, chosen),
+            "shapes": (step.graph, chosen if any(o.id == chosen for o in step.graph.objects) else ""),
             "names": (step.graph,),
-            "supports": (step.graph,),
             "sphere": (step.sphere, step.candidates, decision),
             "interest": (step.sphere, decision),
             "cameras": (decision, *steps),
@@ -108,6 +124,33 @@ class SceneDrawing:
                     for node in self.nodes[name]:
                         node.remove()
                     self.nodes[name], self._shown[name] = getattr(self, f"_{name}")(*shown), shown
+            self.face(step.graph, T_world_eye)
+
+    def face(self, graph: SupportGraph, T_world_eye: Array) -> None:
+        """Turn names and arrows to the eye (4, 4), each before what it belongs to."""
+        eye_world, facing = T_world_eye[:3, 3], _pose(T_world_eye)["wxyz"]
+        drawn = (graph, T_world_eye.round(4).tobytes())
+        if self._shown.get("supports") == drawn:
+            return
+        if self._surface is None or self._surface[0] is not graph:
+            surfaces = [
+                item.shape.surface(float(item.shape.extents.max()) / 40.0)[0] for item in graph.objects
+            ]
+            owner = np.repeat(np.arange(len(surfaces)), [len(points) for points in surfaces])
+            self._surface = graph, np.concatenate(surfaces or [np.zeros((0, 3))]), owner
+        found = visible_points(*self._surface[1:], eye_world)
+        self.anchors = {graph.objects[k].id: point for k, point in found.items()}
+        with self._server.atomic():
+            for node in self.nodes["names"]:
+                at = self.anchors.get(node.name.removeprefix("/names/"))
+                node.visible = at is not None
+                if at is not None:
+                    node.wxyz, node.position = facing, _nearer(eye_world, at)
+                    node.scale = LETTER * ON_TOP * float(np.linalg.norm(at - eye_world))
+            for node in self.nodes["supports"]:
+                node.remove()
+            self.nodes["supports"] = self._supports(graph, eye_world)
+        self._shown["supports"] = drawn
 
     def _points(self, name: str, points: Array, colours: NDArray[np.uint8], size: float) -> Any:
         """Points (N, 3); they are sent as half floats, and so counted from their middle."""
@@ -125,12 +168,12 @@ class SceneDrawing:
         return [self._points("/cloud/points", cloud.points_world, colours, size)]
 
     def _shapes(self, graph: SupportGraph, chosen: str) -> list[Any]:
-        """Shapes one sees through, so that points and arrows show, and their edges."""
+        """Shapes and their edges; where one is chosen, the others are faint."""
         nodes, outlines, colours = [], [np.zeros((0, 2, 3))], [np.zeros((0, 2, 3), dtype=np.uint8)]
         for item in graph.objects:
             mesh, T_world_object = item.shape.mesh(), item.shape.T_world_object
             colour = rgb(object_colour(item.label))
-            opacity = 0.16 if item.role == "support_surface" else 0.7 if item.id == chosen else 0.36
+            opacity = 1.0 if chosen in (item.id, "") else 0.3
             body = self._scene.add_mesh_simple(
                 f"/shapes/{item.id}", mesh.vertices, mesh.faces, color=colour, opacity=opacity, side="double",
                 flat_shading=item.shape.kind == "box", cast_shadow=False, receive_shadow=False,
@@ -145,12 +188,18 @@ class SceneDrawing:
         return [*nodes, *self._lines("/shapes/outlines", edges, paint, **SCREEN)]
 
     def _names(self, graph: SupportGraph) -> list[Any]:
-        up = np.array([[0.0, 0.0, 1.0]])
-        return [
-            self._label(f"/names/{o.id}", o.id, o.centre_world + up[0] * float(o.shape.support(up)[0]))
-            for o in graph.objects
-            if o.role != "support_surface"
-        ]
+        nodes = []
+        for item in graph.objects:
+            if item.role == "support_surface":
+                continue
+            plate = np.asarray(name_plate(item))
+            width = plate.shape[1] / plate.shape[0]
+            node = self._scene.add_image(
+                f"/names/{item.id}", plate, width, 1.0, cast_shadow=False, format="png"
+            )
+            node.on_click(lambda _, name=item.id: self._clicked(name))
+            nodes.append(node)
+        return nodes
 
     def _label(self, name: str, text: str, at: Array) -> Any:
         look: dict[str, Any] = {"anchor": "bottom-center", "font_screen_scale": 0.85}
@@ -160,35 +209,44 @@ class SceneDrawing:
         """Line segments (N, 2, 3), if there are any."""
         return [self._scene.add_line_segments(name, ends, colours, **look)] if len(ends) else []
 
-    def _arrow(self, name: str, start: Array, end: Array, colour: Colour, share: float = 1.0) -> Any:
-        """An arrow whose shaft has this share of the usual width."""
-        look = ARROW | {"shaft_radius": share * ARROW["shaft_radius"]}
+    def _arrow(
+        self, name: str, start: Array, end: Array, colour: Colour, share: float = 1.0, size: float = 1.0
+    ) -> Any:
+        """An arrow of a size, whose shaft has this share of the usual width."""
+        look = {part: size * length for part, length in ARROW.items()}
+        look["shaft_radius"] *= share
         return self._scene.add_arrows(name, np.array([[start, end]]), colour, **look)
 
-    def _supports(self, graph: SupportGraph) -> list[Any]:
-        """Arrows from supporter to supported; a ball stands for leaning, a cube for weight from above."""
+    def _supports(self, graph: SupportGraph, eye_world: Array) -> list[Any]:
+        """Arrows from name to name, on top of the shapes; not where the table certainly supports."""
         nodes: list[Any] = []
         for number, support in enumerate(graph.supports):
-            start, end = _ends(support, graph)
-            neck, length = start, float(np.linalg.norm(end - start))
+            if graph[support.supporter].role == "support_surface" and support.certain:
+                continue
+            start, end = (
+                _nearer(eye_world, self.anchors.get(name, end))
+                for name, end in zip(support.pair, support_ends(support, graph), strict=True)
+            )
+            along, size = end - start, float(np.linalg.norm(end - eye_world))
+            length = float(np.linalg.norm(along))
             if length < 1e-6:
                 continue
+            gap = min(0.6 * LETTER * size, 0.3 * length) / length  # Names stay readable.
+            start, end, middle = start + gap * along, end - gap * along, (start + end) / 2.0
             colour, share = CERTAIN if support.certain else UNCERTAIN, max(support.belief, 0.3)
+            neck = start
             if not support.certain:
-                neck = end - min(2.0 * ARROW["head_length"], 0.5 * length) * (end - start) / length
+                neck = end - min(2.0 * size * ARROW["head_length"] / length, 0.5) * (end - start)
                 count = max(2, round(float(np.linalg.norm(neck - start)) / 0.016))
                 dashes = np.linspace(start, neck, 2 * count).reshape(-1, 2, 3)
-                nodes += self._lines(f"/supports/dashes {number}", dashes, UNCERTAIN, thickness=0.007 * share)
-            nodes.append(self._arrow(f"/supports/arrow {number}", neck, end, colour, share))
-            if support.belief < 0.995:
-                text, at = f"{support.belief:.2f}", (start + end) / 2.0
-                nodes.append(self._label(f"/supports/probability {number}", text, at))
-            name = f"/supports/{support.kind} {number}"
-            look: dict[str, Any] = {"color": colour, "position": (start + end) / 2.0}
-            if support.kind == "lean":
-                nodes.append(self._scene.add_icosphere(name, radius=0.011, **look))
-            elif support.kind == "top-down":
-                nodes.append(self._scene.add_box(name, dimensions=(0.019, 0.019, 0.019), **look))
+                nodes += self._lines(
+                    f"/supports/dashes {number}", dashes, UNCERTAIN, thickness=0.007 * size * share
+                )
+            nodes.append(self._arrow(f"/supports/arrow {number}", neck, end, colour, share, size))
+            kind = "" if support.kind == "bottom-up" else f"{support.kind} "
+            if kind or support.belief < 0.995:
+                text = f"{kind}{support.belief:.2f}"
+                nodes.append(self._label(f"/supports/probability {number}", text, middle))
         return nodes
 
     def _sphere(self, sphere: ViewSphere, candidates: Any, decision: Any) -> list[Any]:
@@ -229,11 +287,11 @@ class SceneDrawing:
             if view.T_world_camera is not None:
                 newest = number == steps[-1].index
                 look = {"image": image_of(view), "format": "jpeg", "variant": "wireframe"}
-                look |= {"scale": 0.135, "color": CERTAIN} if newest else {"scale": 0.09, "color": EARLIER}
-                nodes += self._camera(str(number), view, view.T_world_camera, **look)
+                look |= {"scale": 0.06, "color": CERTAIN} if newest else {"scale": 0.04, "color": EARLIER}
+                nodes += self._camera(str(number + 1), view, view.T_world_camera, **look)
         if views and decision is not None:
             colour = BY_HAND if decision.why == "chosen by hand" else NEXT
-            look = {"variant": "filled", "scale": 0.09, "color": colour}
+            look = {"variant": "filled", "scale": 0.05, "color": colour}
             nodes += self._camera("next", views[-1][1], decision.T_world_camera, **look)
         return nodes
 
@@ -263,15 +321,44 @@ class SceneDrawing:
         ]
 
 
-def _ends(support: Support, graph: SupportGraph) -> tuple[Array, Array]:
-    """Where an arrow begins and ends; from the table it rises, from 7 cm below, to its supported object."""
-    supporter, supported = graph[support.supporter], graph[support.supported]
-    start, end, contact = supporter.centre_world, supported.centre_world, support.contact_world
-    if supporter.role == "support_surface":
-        start = np.array([*(end if contact is None else contact)[:2], start[2] - 0.07])
-    if supported.role == "support_surface":
-        end = np.array([*(start if contact is None else contact)[:2], end[2]])
-    return start, end
+def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Array) -> dict[int, Array]:
+    """Find for each object the point of its surface that is amid what can be seen of it.
+
+    Points are put into a coarse image with the least depth in each pixel; a point is seen where none is more
+    than a centimetre nearer in its pixel and those around.
+
+    Args:
+        points_world: Points (N, 3) of all surfaces.
+        owner: Number (N,) of the object of each.
+        eye_world: Where it is looked from (3,) [m].
+
+    Returns:
+        A point (3,) by the object's number; objects of which nothing is seen have none.
+    """
+    from scipy.ndimage import minimum_filter
+
+    if len(points_world) == 0:
+        return {}
+    T_world_eye = transforms.look_at(eye_world, points_world.mean(axis=0))
+    x, y, z = transforms.transform(transforms.invert(T_world_eye), points_world).T
+    before = np.flatnonzero(z > 1e-3)
+    at = np.stack([x[before], y[before]], axis=1) / z[before, None]
+    pixels = ((at - at.min(axis=0)) / max(float(np.ptp(at, axis=0).max()), 1e-9) * 120.0).astype(int)
+    depth = np.full((121, 121), np.inf)
+    np.minimum.at(depth, tuple(pixels.T), z[before])
+    seen = z[before] <= minimum_filter(depth, size=3)[tuple(pixels.T)] + 0.01
+    found = {}
+    for number in np.unique(owner[before[seen]]):
+        own = seen & (owner[before] == number)
+        amid = np.argmin(np.linalg.norm(at[own] - np.median(at[own], axis=0), axis=1))
+        found[int(number)] = points_world[before[own][amid]]
+    return found
+
+
+def _nearer(eye_world: Array, point_world: Array) -> Array:
+    """A point on the way from the eye, near what it hides."""
+    nearer: Array = eye_world + ON_TOP * (point_world - eye_world)
+    return nearer
 
 
 def _pose(T_world: Array) -> dict[str, Any]:

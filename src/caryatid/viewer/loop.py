@@ -178,12 +178,12 @@ class LoopPage(Page):
                 said = done
                 self.say(said)
             time.sleep(0.12)  # Each picture of a lift stands for so long [s].
-        return f"{order.refusal or 'a safe order'}; {said}"
+        return f"finished: {order.refusal or 'a safe order'}; {said}"
 
     def start(self) -> None:
         """Take the first view, or the next, in the page's own thread."""
         self._running.clear()
-        self._do("taking a view", self.turn)
+        self._do("taking a view", lambda: _finished(self.turn()))
 
     def wait(self) -> None:
         """Wait until all that has been asked for is done and drawn."""
@@ -258,12 +258,20 @@ class LoopPage(Page):
         while self._running.is_set():
             said = self.turn()
             if said is not None:
-                return said
+                return _finished(said)
         return "paused"
 
     def _listen(self, wanted: bool) -> None:
         scene = self.server.scene
         scene.remove_click_callback("all")
+        self._boxes["sphere"].value = wanted
+        self.drawing.show_layer("sphere", wanted)
+        if wanted and self.steps:
+            sphere = self.steps[-1].sphere
+            for client in self.server.get_clients().values():  # Back to where the whole sphere is in sight.
+                away = transforms.unit(np.array(client.camera.position) - sphere.centre_world)
+                client.camera.position = sphere.centre_world + 2.7 * sphere.radius * away
+                client.camera.look_at = sphere.centre_world
         if wanted:
             scene.on_click()(self._pointed)
 
@@ -276,6 +284,10 @@ class LoopPage(Page):
         index = candidate_under(origin, direction, step.sphere, step.candidates, np.deg2rad(6.0))
         if index is not None:
             self._do("choosing", lambda: self.choose(index))
+
+
+def _finished(reason: str | None) -> str | None:
+    return reason and f"finished: {reason}"
 
 
 def candidate_under(

@@ -18,17 +18,21 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from caryatid.config import SupportConfig
 from caryatid.errors import InputError, missing_extra, needs_extra
 from caryatid.exploration import Step
+from caryatid.geometry import transforms
 from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
+from caryatid.sensing.view_sphere import direction
 from caryatid.support.relations import predict_removal
 from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene
 from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
 from caryatid.viz.drawings import draw_chart, draw_layers
-from caryatid.viz.notebook import cell_html, draw_cell
+from caryatid.viz.graph_drawing import draw_graph
+from caryatid.viz.notebook import cell_html
 from caryatid.viz.report import Figure, Section
 from caryatid.viz.tables import census, object_table, support_table
 
@@ -81,7 +85,9 @@ class Page:
         self._charted: list[float | None] = []
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
+        self._T_world_eye = transforms.look_at((-1.0, 0.0, 1.0), (0.0, 0.0, 0.0))
         self._build()
+        self.server.on_client_connect(self._follow)
 
     def say(self, text: str) -> None:
         """Say something at the top of the page, in place of what was said before."""
@@ -151,12 +157,13 @@ class Page:
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=NEXT)
         self.server.scene.set_up_direction("+z")
         self._notice = gui.add_html("", order=-20, visible=False)
-        self._slider = gui.add_slider("view", 0, 1, 1, 0, disabled=True, hint="Go back to an earlier view")
-        self._slider.on_update(lambda _: self.go_to(int(self._slider.value)))
+        self._slider = gui.add_slider("view", 1, 2, 1, 1, disabled=True, hint="Go back to an earlier view")
+        self._slider.on_update(lambda _: self.go_to(int(self._slider.value) - 1))
         self._told = gui.add_html("")
-        with gui.add_folder("show", expand_by_default=False, order=90):
-            for name in LAYERS:
-                box = gui.add_checkbox(name, True)
+        self._boxes: dict[str, Any] = {}
+        with gui.add_folder("show", order=90):
+            for name, shown in LAYERS.items():
+                box = self._boxes[name] = gui.add_checkbox(name, shown)
                 box.on_update(lambda event, name=name: self.drawing.show_layer(name, event.target.value))
             self._true_colours = gui.add_checkbox("colours of the camera", False)
             self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 3.0)
@@ -181,15 +188,28 @@ class Page:
             gui.main_panel.dock_right()
 
     def _look_at(self, step: Step) -> None:
-        """Have the eye begin over the shoulder of the first camera, or before the middle of what is there."""
+        """Have the eye begin before the objects, over the shoulder of the first camera."""
         x, y = step.visited[0][:2] if len(step.visited) else (-1.0, 0.0)
-        backward = np.array([x - 0.5 * y, y + 0.5 * x, 0.0])
-        backward /= max(float(np.linalg.norm(backward)), 1e-9)
-        distance = 1.7 if self._small else 3.2  # The table only, or all cameras in sight [m].
+        azimuth = float(np.arctan2(y + 0.5 * x, x - 0.5 * y))
+        outlines = [item.shape.outline() for item in step.graph.objects if item.role == "object"]
+        points = np.concatenate(outlines or [step.sphere.centre_world[None]])
+        low, high = points.min(axis=0), points.max(axis=0)
+        centre, reach = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, 0.15)
         camera = self.server.initial_camera
-        camera.look_at = step.sphere.centre_world
-        camera.position = step.sphere.centre_world + distance * (backward + [0.0, 0.0, 0.7])
+        camera.look_at = centre
         camera.fov = 0.72  # Narrow, so that what is near does not hide what is far [rad].
+        camera.position = centre + 3.2 * reach * direction(azimuth, 0.55)  # 3.2 radii away, all fits in.
+        self._T_world_eye = transforms.look_at(camera.position, centre)
+
+    def _follow(self, client: Any) -> None:
+        """Turn names and arrows to a client's eye, wherever it goes."""
+
+        def moved(camera: Any) -> None:
+            rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
+            self._T_world_eye = transforms.rigid(rotation, camera.position)
+            self.redraw()
+
+        client.camera.on_update(moved)
 
     def _draw(self) -> None:
         steps, scores, chosen = self.steps[: self._shown + 1], [*self.scores], self._chosen
@@ -197,18 +217,18 @@ class Page:
             return
         step, f1 = steps[-1], scores[self._shown]
         if self._staged is not None:
-            step, f1 = self._staged, scores[-1]
+            step, f1 = self._staged, None
         look = {"point_size": self._size.value / 1000.0, "true_colours": self._true_colours.value}
-        self.drawing.show(step, steps, chosen=chosen, **look)
+        self.drawing.show(step, steps, T_world_eye=self._T_world_eye, chosen=chosen, **look)
         last = len(self.steps) - 1
-        self._slider.max = max(last, 1)
+        self._slider.max = max(last + 1, 2)
         self._slider.disabled = last == 0
-        self._slider.value = self._shown
-        self._told.content = describe_view(step, f1, last)
+        self._slider.value = self._shown + 1
+        self._told.content = describe_view(step, f1, last + 1)
         graph = step.graph
         if graph is not self._graph_drawn:
             self._graph_drawn = graph
-            self._graph.content = draw_cell(graph)
+            self._graph.content = cell_html(Section("", figures=[Figure("", draw_graph(graph))]))
         if scores != self._charted and any(f1 is not None for f1 in scores):
             self._charted = scores
             chart = draw_chart(
@@ -217,7 +237,8 @@ class Page:
             self._chart.content = cell_html(Section("", figures=[Figure("", chart)]))
         if chosen:
             with self.working:
-                self._about.content = describe_object(graph, chosen, self._support)
+                known = any(o.id == chosen for o in steps[-1].graph.objects)
+                self._about.content = describe_object(graph, chosen, self._support, taken=known)
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
@@ -242,26 +263,23 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
 # What is said beside the scene
 
 
-def describe_view(step: Step, f1: float | None, last: int) -> str:
-    """Say what a view brought, and where to look next."""
-    decision = step.decision
-    facts = [("known", census(step.graph)), ("points", f"{len(step.cloud):,}")]
-    if f1 is not None:
-        facts.append(("F1", f"{f1:.3f}"))
-    if decision is not None:
-        figures = f"saliency {decision.saliency:.2f} − cost {decision.cost:.2f} = {decision.score:.2f}"
-        facts += [("next", decision.why), ("score", figures)]
+def describe_view(step: Step, f1: float | None, count: int) -> str:
+    """Say what is known after a view, of so many, and where to look next."""
+    facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
+    if step.decision is not None:
+        facts.append(("next", step.decision.why))
     if step.stop is not None:
-        facts.append(("done", step.stop))
-    return cell_html(Section(f"View {step.index}", f"of {last} · {step.name}", facts=facts))
+        facts.append(("finished", step.stop))
+    facts += [(change.kind, f"{change.object_id}: {change.why}") for change in step.changes]
+    return cell_html(Section(f"View {step.index + 1} of {count}", census(step.graph), facts=facts))
 
 
 def _describe_signs() -> str:
     """Say what the signs in the scene mean."""
     signs = {
-        "Arrow": "supporter → supported, thicker where more probable; dashed where uncertain",
+        "Arrow": "supporter → supported, thicker where more probable; dashed where uncertain. "
+        "From the table only where uncertain",
         "Number on an arrow": "the probability of the support, where it is less than 1",
-        "Ball, cube on an arrow": "it leans; weight from above. Neither: supported from below",
         "Dots on the sphere": "where the robot can bring its camera, coloured by saliency",
         "Fine grey dots": "where it cannot",
         "Balls with rays": "points of interest, and from where they are seen best",
@@ -273,22 +291,27 @@ def _describe_signs() -> str:
     return cell_html(Section("Key", facts=[*signs.items()], figures=[Figure("", picture, caption)]))
 
 
-def describe_object(graph: SupportGraph, object_id: str, config: SupportConfig) -> str:
-    """Say what an object is, how it is known, its edges, and what falls without it."""
+def describe_object(
+    graph: SupportGraph, object_id: str, config: SupportConfig, *, taken: bool = False
+) -> str:
+    """Say what an object is, how it is known, its edges, and what falls without it; or that it is taken."""
     item = next((o for o in graph.objects if o.id == object_id), None)
     if item is None:
-        return cell_html(Section(object_id, "is not known after this view"))
-    table = object_table(graph)
-    (row,) = (row for row in table.rows if row[0].text == object_id)
-    facts = [(name, entry.text) for name, entry in zip(table.columns, row, strict=True)][2:]
-    if item.role == "object":
-        effects = predict_removal(graph, object_id, config)
-        falls = [f"{e.object_id} falls with probability {e.probability:.2f}: {e.why}" for e in effects]
-        facts += [(f"Without {object_id}", text) for text in falls or ["nothing falls"]]
+        return cell_html(
+            Section(object_id, "has been taken away" if taken else "is not known after this view")
+        )
+    facts = []
     for supporter, supported, kind, likely, found, why in support_table(graph).rows:
         if object_id in (supporter.text, supported.text):
             evidence = f"{kind.text}, probability {likely.text}, {found.text}; {why.text}"
             facts.append((f"{supporter.text} → {supported.text}", evidence))
+    if item.role == "object":
+        effects = predict_removal(graph, object_id, config)
+        falls = [f"{e.object_id} falls with probability {e.probability:.2f}: {e.why}" for e in effects]
+        facts += [(f"Without {object_id}", text) for text in falls or ["nothing falls"]]
+    table = object_table(graph)
+    (row,) = (row for row in table.rows if row[0].text == object_id)
+    facts += [(name, e.text) for name, e in zip(table.columns, row, strict=True) if e.text][2:]
     return cell_html(Section(item.id, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 

@@ -61,7 +61,7 @@ def _cell_of(shown: object) -> Section:
         case Step(view=view, graph=graph):
             images = [] if view is None else [_image(view, shown.labels, graph, "segments and fitted shapes")]
             travelled = f"{np.degrees(shown.angle_travelled):.0f}° and {shown.path_travelled:.1f} m travelled"
-            cell = _graph_cell(f"View {shown.index}", f"{census(graph)}; {travelled}", graph, *images)
+            cell = _graph_cell(f"View {shown.index + 1}", f"{census(graph)}; {travelled}", graph, *images)
             following = ("stopped", f"{shown.stop}")
             if shown.decision is not None:
                 following = ("next", shown.decision.why)
