@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
 from caryatid.config import FitConfig
 from caryatid.fitting.least_squares import CONVERGED, NOISE_FLOOR, levenberg_marquardt, normal_equations
@@ -15,6 +15,7 @@ from caryatid.geometry.points import quantile
 from caryatid.geometry.shapes import Primitives, Shape, Uncertainty
 from caryatid.geometry.signed_distance import in_frame, signed_distances
 from caryatid.geometry.transforms import Array, rigid
+from caryatid.runtime.parallel import kernel
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
 """Which sides -x, +x, -y, +y, -z, +z of an object points bear out."""
@@ -56,10 +57,7 @@ def close_hidden_faces(
     refined = np.concatenate([R, [kept[0] + R @ ((high - low) / 2.0), kept[1] + (low + high) / 2.0]])
     levenberg_marquardt(kind, refined, points, config.steps, config.min_extent, 0.0, CONVERGED)
     closed, unsure, information = np.concatenate([R, kept]), np.zeros((3, 2)), np.empty((9, 9))
-    sigma, residual, inliers = _close(
-        kind, refined, hidden, points, config.threshold, config.min_points, config.min_extent,
-        config.max_extent, config.correlated, config.rim**2, closed, unsure,
-    )  # fmt: skip
+    sigma, residual, inliers = _close(kind, refined, hidden, points, config, closed, unsure)
     normal_equations(kind, refined, points, 2.5 * sigma, information, np.empty(9))
     information *= len(points) / (config.correlated * sigma**2)
     uncertainty = deviations(kind, unsure, information, config)
@@ -67,11 +65,10 @@ def close_hidden_faces(
     return found, residual, inliers, uncertainty
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _close(  # type: ignore[no-untyped-def]
-    kind, refined, hidden, points, threshold, min_points, min_extent, max_extent, correlated, rim, shape,
-    unsure,
-):  # fmt: skip
+def _close(
+    kind: int, refined: Array, hidden: NDArray[np.bool_], points: Array, config: FitConfig, shape: Array,
+    unsure: Array,
+) -> tuple[float, float, float]:  # fmt: skip
     """Put each hidden side (3, 2) of a refined shape (5, 3) where points (N, 3) end, or back where it was.
 
     The shape (5, 3) as it was is replaced by the closed one, unless that is too long; the variances (3, 2)
@@ -82,28 +79,28 @@ def _close(  # type: ignore[no-untyped-def]
     """
     R, middle, half = refined[:3], refined[3].copy(), refined[4]
     distance = np.abs(signed_distances(kind, R, middle, half, points))
-    near = distance[distance < threshold]
-    sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) > 0 else threshold
+    near = distance[distance < config.threshold]
+    sigma = max(1.4826 * quantile(near, 0.5), NOISE_FLOOR) if len(near) > 0 else config.threshold
     own, before, closed = in_frame(R, middle, points), in_frame(R, middle, shape[3:4])[0], half.copy()
     for axis in range(3):
         ends = [-half[axis], half[axis]]
-        for side, sign in enumerate((-1.0, 1.0)):
-            if hidden[axis, side]:
-                end, variance = _end(kind, half, own, axis, sign, sigma, min_points, correlated, rim)
-                if variance == np.inf:
-                    end, variance = shape[4, axis], max_extent**2 / 12.0
-                    if kind == BOX or axis == 2:
-                        end += sign * before[axis]
-                ends[side], unsure[axis, side] = sign * end, variance
-        short = max(min_extent - (ends[1] - ends[0]), 0.0)
+        for side in np.flatnonzero(hidden[axis]):
+            sign = 2.0 * side - 1.0
+            end, variance = _end(kind, half, own, axis, sign, sigma, config)
+            if variance == np.inf:
+                end, variance = shape[4, axis], config.max_extent**2 / 12.0
+                if kind == BOX or axis == 2:
+                    end += sign * before[axis]
+            ends[side], unsure[axis, side] = sign * end, variance
+        short = max(config.min_extent - (ends[1] - ends[0]), 0.0)
         low, high = (ends[0], ends[1] + short) if hidden[axis, 1] else (ends[0] - short, ends[1])
         closed[axis] = (high - low) / 2.0
-        for a in range(3):
-            middle[a] += R[a, axis] * (high + low) / 2.0
-    if 2.0 * closed.max() <= max_extent and len(near) > 0:
+        middle += R[:, axis] * (high + low) / 2.0
+    if 2.0 * closed.max() <= config.max_extent and len(near) > 0:
         shape[:3], shape[3], shape[4] = R, middle, closed
     distance = np.abs(signed_distances(kind, shape[:3], shape[3], shape[4], points))
-    return sigma, np.minimum(distance, threshold).mean(), (distance < threshold).sum() / len(points)
+    inliers = np.count_nonzero(distance < config.threshold) / len(points)
+    return sigma, float(np.minimum(distance, config.threshold).mean()), inliers
 
 
 def deviations(kind: int, unsure: Array, information: Array, config: FitConfig) -> Uncertainty:
@@ -135,8 +132,9 @@ def deviations(kind: int, unsure: Array, information: Array, config: FitConfig) 
     )
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
-def _end(kind, half, own, axis, sign, sigma, min_points, correlated, rim):  # type: ignore[no-untyped-def]
+def _end(
+    kind: int, half: Array, own: Array, axis: int, sign: float, sigma: float, config: FitConfig
+) -> tuple[float, float]:
     """Where points (N, 3) beside one side end along its direction [m], and its variance; infinite if few do.
 
     Points of a cylinder's ends tell where its mantle is, those of a box's other faces where a face is.
@@ -151,17 +149,17 @@ def _end(kind, half, own, axis, sign, sigma, min_points, correlated, rim):  # ty
         off = np.abs(own[:, 2]) - half[2] if growing else reach - half[0]
         along = reach if growing else along
     found = along[np.abs(off) < 3.0 * sigma]
-    if len(found) < min_points:
+    if len(found) < config.min_points:
         return 0.0, np.inf
     start = quantile(found, 1.0 - TRIM)
     span = start if growing else start - quantile(found, TRIM)
     window = max(4.0 * sigma, 0.1 * span)
     close = found[found > start - window - 12.0 * sigma]
     end, deviation = likeliest_end(close, start, sigma, window, growing)
-    return end, deviation * deviation * correlated + rim
+    return end, deviation * deviation * config.correlated + config.rim**2
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def likeliest_end(coordinates, start, sigma, window, growing):  # type: ignore[no-untyped-def]
     """Upper end [m] of points (N,) whose density is even up to it, and its standard deviation [m].
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile, solve_positive
-from caryatid.geometry.signed_distance import gradient, local, signed_distances
+from caryatid.geometry.signed_distance import copy, gradient, local, signed_distances
+from caryatid.runtime.parallel import inner, kernel
 
 RIDGE = 1e-3 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
 """Added to the diagonal, times the damping, so that what no point determines stays where it is."""
@@ -18,7 +18,7 @@ CONVERGED = 1e-4
 """Least squares end with a step that lowers the cost by less than this share; the rest is far below noise."""
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converged):  # type: ignore[no-untyped-def]
     """Minimise the Geman–McClure cost of signed distances of points (N, 3) to a shape.
 
@@ -56,7 +56,7 @@ def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converge
             trial_cost = _cost(distance, scale, shrink, trial, columns[:size])
             if trial_cost < cost:
                 improved = True
-                shape[:] = trial
+                copy(trial, shape)
                 break
             damping *= 6.0
         if not improved:
@@ -66,7 +66,7 @@ def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converge
             break
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def normal_equations(kind, shape, points, scale, H, g):  # type: ignore[no-untyped-def]
     """Write Gauss–Newton matrix (9, 9) and gradient (9,) of the mean Geman–McClure cost over points (N, 3).
 
@@ -74,8 +74,11 @@ def normal_equations(kind, shape, points, scale, H, g):  # type: ignore[no-untyp
     x and y share the radius (column 6, half height in column 8), of a sphere all three (column 6). A point at
     a distance of `scale` [m] weighs a quarter.
     """
-    J = np.empty(9)
-    H[:], g[:], J[:] = 0.0, 0.0, 0.0
+    J = np.zeros(9)
+    for a in range(9):
+        g[a] = 0.0
+        for b in range(9):
+            H[a, b] = 0.0
     R, centre, share = shape[:3], shape[3], 1.0 / len(points)
     hx, hy, hz = shape[4]
     for i in range(len(points)):
@@ -101,13 +104,13 @@ def normal_equations(kind, shape, points, scale, H, g):  # type: ignore[no-untyp
             H[b, a] = H[a, b]
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _stepped(kind, shape, step, columns, min_extent, trial):  # type: ignore[no-untyped-def]
     """Write the shape after a step in its own frame, shortened to 3 cm and 0.3 rad, no extent too short."""
     longest = 1.0
     for a in range(len(step)):
         longest = max(longest, abs(step[a]) / (0.3 if 3 <= a < 6 else 0.03))
-    trial[:] = shape
+    copy(shape, trial)
     turned, moved, grown = trial[:3], trial[3], trial[4]
     for a in range(6, len(step)):
         grown[columns[a] - 6] = max(grown[columns[a] - 6] + step[a] / longest, min_extent / 2.0)
@@ -130,7 +133,7 @@ def _stepped(kind, shape, step, columns, min_extent, trial):  # type: ignore[no-
         turned[i, 2] = cosine * w + sine * (u * y - v * x) + along * z
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _cost(distance, scale, shrink, shape, columns):  # type: ignore[no-untyped-def]
     """The Geman–McClure cost of distances (N,), and the pull on the half extents, each once."""
     total = sizes = 0.0

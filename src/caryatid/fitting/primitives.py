@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from caryatid.config import FitConfig
 from caryatid.errors import InputError, check_type
@@ -16,8 +15,9 @@ from caryatid.fitting.search import TRIM, search
 from caryatid.geometry import BOX, CYLINDER, SPHERE, transforms
 from caryatid.geometry.points import quantile
 from caryatid.geometry.shapes import KINDS, Primitives, Shape, Uncertainty
-from caryatid.geometry.signed_distance import gradient, in_frame, sample_surface
+from caryatid.geometry.signed_distance import copy, gradient, in_frame, sample_surface
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import inner, kernel
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 FREE_WEIGHT = 0.01
@@ -148,7 +148,7 @@ def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]
     return inside, free
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _count_free(kind, T, half, states, origin, size):  # type: ignore[no-untyped-def]
     """Count the cubes of a grid in a shape, and those whose centres lie in free voxels."""
     inside = free = 0
@@ -227,7 +227,7 @@ def _ranked(
     return sorted(fits, key=lambda f: f.cost), points
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     kinds, points, normals, every, samples, steps, threshold, max_radius, max_extent, min_extent,
     normal_weight, min_points, shapes, score, seen,
@@ -275,7 +275,7 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
                 # Kinds are compared once least squares on all the points have nothing left to gain. By now
                 # they gain a thousandth a step, so kinds that cost twice as much as the best cannot catch up.
                 first, last, used = polish + 1, polish + 2, points
-                shapes[k, first] = shapes[k, best[k]]
+                copy(shapes[k, best[k]], shapes[k, first])
             elif turn == 3 and not within[k]:
                 best[k] = -1
             # A small pull on the extents keeps sides that hold no points near; the last fit has none.
@@ -296,7 +296,7 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     return best
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  # type: ignore[no-untyped-def]
     """Find the sides that points bear out, draw the others in to where the points end, and score the shape.
 
@@ -338,7 +338,7 @@ def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  #
     return away / count, turned / count, inliers / count
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _draw_in(kind, shape, own, near, min_extent, seen):  # type: ignore[no-untyped-def]
     """Move sides that are not seen inwards to where the near points end; all points move with the centre."""
     R, centre, half = shape[:3], shape[3], shape[4]
@@ -358,18 +358,23 @@ def _draw_in(kind, shape, own, near, min_extent, seen):  # type: ignore[no-untyp
             own[i, a] -= shift[a]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _bare_share(kind, R, centre, half, seen, points):  # type: ignore[no-untyped-def]
     """Share of the seen sides' area that has no point near it: a side that was seen should be seen whole.
 
     The shape has axes R (3, 3), a centre (3,) and half extents (3,) [m]; points are (N, 3).
     """
     own = in_frame(R, centre, points)
-    places, outward = sample_surface(kind, np.eye(3), np.zeros(3), half, BARE_SPACING)
+    axes = np.zeros((3, 3))
+    axes[0, 0] = axes[1, 1] = axes[2, 2] = 1.0
+    places, outward = sample_surface(kind, axes, np.zeros(3), half, BARE_SPACING)
     samples = bare = last = 0
     for k in range(len(places)):
         # A round side is the part of the surface whose outward normal is nearest to the side's direction.
-        axis = np.argmax(np.abs(outward[k]))
+        axis = 0
+        for a in range(1, 3):
+            if abs(outward[k, a]) > abs(outward[k, axis]):
+                axis = a
         if not seen[2 * axis + (outward[k, axis] > 0.0)]:
             continue
         samples += 1

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from caryatid.geometry import BOX, CYLINDER, SPHERE
 from caryatid.geometry.points import quantile, select
 from caryatid.geometry.signed_distance import gradient, local
+from caryatid.runtime.parallel import inner, kernel
 
 TRIM = 0.005
 """Share of the points beyond each end of an extent that count as noise [1]."""
@@ -15,7 +15,7 @@ LEAST_EXTENT, LEAST_RADIUS = 1e-4, 1e-3
 """Extents of hypotheses are no shorter [m], points on one plane have none across it; no radius is smaller."""
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def search(  # type: ignore[no-untyped-def]
     kind, points, normals, samples, keep, threshold, max_radius, max_extent, min_extent, shapes
 ):
@@ -41,8 +41,10 @@ def search(  # type: ignore[no-untyped-def]
                 while place > 0 and cost[place] < cost[place - 1]:
                     place -= 1
                     cost[place], cost[place + 1] = cost[place + 1], cost[place]
-                    better = shapes[place + 1].copy()
-                    shapes[place + 1], shapes[place] = shapes[place], better
+                    for i in range(5):
+                        for j in range(3):
+                            better = shapes[place + 1, i, j]
+                            shapes[place + 1, i, j], shapes[place, i, j] = shapes[place, i, j], better
                 found = min(found + 1, keep)
                 if place == 0:
                     most_inliers = inliers
@@ -56,7 +58,7 @@ def search(  # type: ignore[no-untyped-def]
     return found + _of_one_face(kind, points, normals, min_extent, max_radius, max_extent, shapes[found])
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _of_one_face(kind, points, normals, min_extent, max_radius, max_extent, shape):  # type: ignore[no-untyped-def]
     """Make a box or a cylinder for points of one face: their main normal, and what holds them along it.
 
@@ -104,7 +106,7 @@ def _of_one_face(kind, points, normals, min_extent, max_radius, max_extent, shap
     return LEAST_RADIUS < half[0] <= max_radius and 2.0 * half[2] <= max_extent
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _msac(kind, shape, points, threshold, limit):  # type: ignore[no-untyped-def]
     """Sum of truncated squared distances in units of the threshold, and how many points lie within it.
 
@@ -125,7 +127,7 @@ def _msac(kind, shape, points, threshold, limit):  # type: ignore[no-untyped-def
     return total, inliers
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shape):  # type: ignore[no-untyped-def]
     """Make a shape of two oriented points; what they leave open is as long as all points reach.
 
@@ -174,7 +176,7 @@ def _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shape):  # 
     return kind != CYLINDER or 2.0 * half[2] <= max_extent
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _set_axes(R, ux, uy, uz, x, y, z, column):  # type: ignore[no-untyped-def]
     """Set right-handed axes (3, 3): z, a unit vector across it as x or y (column 0 or 1), and the third."""
     R[0, column], R[1, column], R[2, column] = ux, uy, uz
@@ -185,13 +187,13 @@ def _set_axes(R, ux, uy, uz, x, y, z, column):  # type: ignore[no-untyped-def]
     R[2, 1 - column] = sign * (x * uy - y * ux)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _turned(R, c, s):  # type: ignore[no-untyped-def]
     """The direction between the first two axes by cosine and sine."""
     return c * R[0, 0] + s * R[0, 1], c * R[1, 0] + s * R[1, 1], c * R[2, 0] + s * R[2, 1]
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _range(points, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Least and greatest coordinate [m] of points (N, 3) along a direction, a share at each end left out."""
     along = np.empty(len(points))
@@ -201,7 +203,7 @@ def _range(points, dx, dy, dz):  # type: ignore[no-untyped-def]
     return select(along, beyond), select(along, len(points) - 1 - beyond)
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _main_normal(normals):  # type: ignore[no-untyped-def]
     """The direction most normals (N, 3) agree on, their mean, and which do (N,)."""
     count, agreed = len(normals), np.cos(np.radians(25.0))
@@ -222,12 +224,12 @@ def _main_normal(normals):  # type: ignore[no-untyped-def]
     return (u / length, v / length, w / length), agree
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _cosine(normals, i, j):  # type: ignore[no-untyped-def]
     return normals[i, 0] * normals[j, 0] + normals[i, 1] * normals[j, 1] + normals[i, 2] * normals[j, 2]
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _across(points, x, y, z):  # type: ignore[no-untyped-def]
     """A direction across an axis that turns with the points: to the first one well off their middle."""
     count = len(points)

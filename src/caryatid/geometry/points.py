@@ -6,10 +6,10 @@ NumPy's `solve`, `sort` and `median` do the same; called in a kernel they take t
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import kernel
 
 
 def transform(T_a_b: Array, which: NDArray[np.intp], points_b: Array) -> Array:
@@ -22,7 +22,7 @@ def rotate(T_a_b: Array, which: NDArray[np.intp], vectors_b: Array) -> Array:
     return _transformed(np.ascontiguousarray(T_a_b), which, np.ascontiguousarray(vectors_b), 0.0)
 
 
-@njit(cache=True)
+@kernel
 def _transformed(T, which, points, last):  # type: ignore[no-untyped-def]
     """Transform homogeneous points with this last coordinate."""
     moved = np.empty((len(points), 3))
@@ -71,7 +71,7 @@ def _numbered(points: Array, groups: NDArray[np.int32], edges: Array) -> tuple[N
     return voxel, _number(points, groups, np.asarray(edges, dtype=np.float64), table, cells, voxel)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _most_central(points, voxel, means, sizes, least, nearest):  # type: ignore[no-untyped-def]
     for i in range(len(points)):
         k = voxel[i]
@@ -91,7 +91,7 @@ def _most_central(points, voxel, means, sizes, least, nearest):  # type: ignore[
                 least[k], nearest[k] = distance, i
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _number(points, groups, edges, table, cells, voxel):  # type: ignore[no-untyped-def]
     """Number voxels by a hash table with linear probing; neighbours in the image are often in one voxel."""
     mask = len(table) - 1
@@ -116,19 +116,19 @@ def _number(points, groups, edges, table, cells, voxel):  # type: ignore[no-unty
     return count
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _same(cell, x, y, z, group):  # type: ignore[no-untyped-def]
     return cell[0] == x and cell[1] == y and cell[2] == z and cell[3] == group
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _mixed(x, y, z, group):  # type: ignore[no-untyped-def]
     """A hash of four integers: a sum with odd factors, its upper bits folded into the lower (Fibonacci)."""
     h = (x * 0x9E3779B1 + y * 0x85EBCA77 + z * 0xC2B2AE3D + group * 0x27D4EB2F) * 0x9E3779B97F4A7C1
     return (h ^ (h >> 29)) & 0x7FFFFFFF
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def solve_positive(A: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
     """Solution x (N,) of A x = b for a symmetric positive definite A (N, N), by Cholesky's factors.
 
@@ -155,7 +155,7 @@ def solve_positive(A: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
     return x
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def select(numbers: NDArray[np.float64], rank: int) -> float:
     """The number that comes at this rank among numbers (N,) in ascending order, counted from 0.
 
@@ -182,7 +182,7 @@ def select(numbers: NDArray[np.float64], rank: int) -> float:
     return numbers[rank]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def quantile(numbers: NDArray[np.float64], share: float) -> float:
     """Quantile of numbers (N,), between two of them in proportion; they are put in another order."""
     place = share * (len(numbers) - 1)

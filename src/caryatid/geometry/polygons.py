@@ -7,13 +7,13 @@ nothing. shapely's geometry is the reference the tests compare all this with.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def hull(points: NDArray[np.float64]) -> Array:
     """Convex hull of points laid onto the ground (N, 2) or (N, 3)."""
     p, count = points[:, :2].copy(), len(points)
@@ -45,7 +45,7 @@ def hull(points: NDArray[np.float64]) -> Array:
     return corners[: size - 1 if size > 1 else size]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
     """Common area (K, 2) of two convex polygons (N, 2) and (M, 2): one cut along each edge of the other."""
     now, cut = np.empty((2 * (len(a) + len(b)), 2)), np.empty((2 * (len(a) + len(b)), 2))
@@ -73,7 +73,7 @@ def intersection(a: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
     return now[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def area(polygon: NDArray[np.float64]) -> float:
     """Area [m²] of a polygon (N, 2) [m]."""
     total = 0.0
@@ -82,7 +82,7 @@ def area(polygon: NDArray[np.float64]) -> float:
     return total / 2.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple[float, float, float, bool]:
     """Distance [m] of a point to a polygon's (N, 2) border, the point nearest there, and if it is inside.
 
@@ -106,7 +106,7 @@ def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple
     return least, near_x, near_y, inside
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cap(
     corners: NDArray[np.float64], edges: NDArray[np.int64], direction: NDArray[np.float64], depth: float
 ) -> Array:
@@ -142,7 +142,7 @@ def cap(
     return hull(kept[:count])
 
 
-@njit(cache=True)
+@kernel
 def _turn(p: NDArray[np.float64], a: int, b: int, x: float, y: float) -> float:
     """Twice the area [m²] of the triangle from p[a] over p[b] to a point; positive counter-clockwise."""
     return (p[b, 0] - p[a, 0]) * (y - p[a, 1]) - (p[b, 1] - p[a, 1]) * (x - p[a, 0])

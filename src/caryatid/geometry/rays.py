@@ -7,8 +7,9 @@ at the end. `traverse` finds all its voxels at once.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from caryatid.runtime.parallel import inner, kernel
 
 Grid = NDArray[np.uint8]
 """One byte a voxel, indexed [x, y, z]."""
@@ -21,13 +22,13 @@ BATCH = 8
 """Slabs worked on together; a ray takes up a whole number of batches [1]."""
 
 
-@njit(cache=True)
+@kernel
 def room(shape: Voxel) -> NDArray[np.int32]:
     """Make room (3, M) for the voxels of any ray through a grid: what `traverse` writes to."""
     return np.empty((3, max(shape) + BATCH), dtype=np.int32)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def traverse(
     found: NDArray[np.int32], shape: Voxel, start: Triple, ray: Triple, t_from: float, t_to: float
 ) -> int:
@@ -63,7 +64,7 @@ def traverse(
     return _slabs(found, (nz, nx, ny), (1.0, ny * nz, nz), (z, x, y), (dz, dx, dy), per_z, t_from, t_to)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"}, inline="always")
+@kernel(fastmath={"contract"}, inline="always")
 def _clip(start, ray, count, t_from, t_to):  # type: ignore[no-untyped-def]
     """Cut a ray to the grid along one axis: t per voxel, begin and end; nothing where the end is no later."""
     if ray == 0.0:
@@ -73,7 +74,7 @@ def _clip(start, ray, count, t_from, t_to):  # type: ignore[no-untyped-def]
     return per_voxel, max(t_from, min(near, far)), min(t_to, max(near, far))
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@inner(fastmath={"contract"})
 def _slabs(found, counts, strides, start, ray, per_voxel, t_from, t_to):  # type: ignore[no-untyped-def]
     """Do as `traverse` does, the axes turned so that the ray goes along the first most."""
     x, y, z = start

@@ -7,15 +7,23 @@ extents (3,) along the axes [m].
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from caryatid.geometry import CYLINDER, SPHERE
+from caryatid.runtime.parallel import inner, kernel
 
 GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 """Angle by which one point of a ball is turned against the last [rad]."""
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
+def copy(shape, target):  # type: ignore[no-untyped-def]
+    """Copy axes, centre and half extents (5, 3); an assignment of slices takes seconds to compile."""
+    for i in range(5):
+        for j in range(3):
+            target[i, j] = shape[i, j]
+
+
+@kernel(inline="always")
 def local(R, centre, points, i):  # type: ignore[no-untyped-def]
     """Coordinates in the object's frame of one of the points (N, 3)."""
     u, v, w = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
@@ -25,7 +33,7 @@ def local(R, centre, points, i):  # type: ignore[no-untyped-def]
     return x, y, z
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
     """Coordinates (N, 3) of points (N, 3) in a frame with axes R (3, 3) at an origin (3,)."""
     own = np.empty((len(points), 3))
@@ -34,7 +42,7 @@ def in_frame(R, origin, points):  # type: ignore[no-untyped-def]
     return own
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def signed_distances(kind, R, centre, half, points):  # type: ignore[no-untyped-def]
     """Distances (N,) [m] of points (N, 3) to a shape's surface, negative inside."""
     distance = np.empty(len(points))
@@ -45,7 +53,7 @@ def signed_distances(kind, R, centre, half, points):  # type: ignore[no-untyped-
     return distance
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def distances_and_gradients(kind, R, centre, half, points):  # type: ignore[no-untyped-def]
     """Signed distances (N,) [m] of points (N, 3), and their gradients (N, 3) in the object's frame."""
     distance = np.empty(len(points))
@@ -57,7 +65,7 @@ def distances_and_gradients(kind, R, centre, half, points):  # type: ignore[no-u
     return distance, gradients
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
     """Signed distance [m] of one point in the object's frame, and its gradient (3) there."""
     if kind == SPHERE:
@@ -88,22 +96,22 @@ def gradient(kind, x, y, z, hx, hy, hz):  # type: ignore[no-untyped-def]
     return qz, 0.0, 0.0, np.sign(z)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sample_surface(kind, R, centre, half, spacing):  # type: ignore[no-untyped-def]
     """Points (N, 3) [m] about `spacing` metres apart all over a surface, and outward normals (N, 3)."""
     # A box has the most points of all shapes with its extents.
     i, j, k = _cells(half[0], spacing), _cells(half[1], spacing), _cells(half[2], spacing)
-    most, count = 2 * (i * j + j * k + k * i), 0
+    most, count = 2 * (i * j + j * k + k * i), np.intp(0)  # `_face` would be compiled for a literal, too.
     points, normals = np.empty((most, 3)), np.empty((most, 3))
     if kind == SPHERE:
         count = _ball(points, normals, half[0], spacing)
     elif kind == CYLINDER:
         count = _mantle(points, normals, half[0], half[2], spacing)
         for face in range(5, 3, -1):
-            count = _face(points, normals, count, half, face, spacing, True)
+            count = _face(kind, points, normals, count, half, face, spacing)
     else:
         for face in range(6):
-            count = _face(points, normals, count, half, face, spacing, False)
+            count = _face(kind, points, normals, count, half, face, spacing)
     for n in range(count):
         x, y, z = points[n]
         u, v, w = normals[n]
@@ -114,15 +122,15 @@ def sample_surface(kind, R, centre, half, spacing):  # type: ignore[no-untyped-d
     return points[:count], normals[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _cells(half, spacing):  # type: ignore[no-untyped-def]
     """How many equal cells cover [−half, half]."""
     return max(2, int(np.ceil(2.0 * half / spacing)))
 
 
-@njit(cache=True, error_model="numpy")
-def _face(points, normals, start, half, face, spacing, disc):  # type: ignore[no-untyped-def]
-    """Write the points of face −x, +x, −y, …, or of the disc within it, and return the row after the last."""
+@inner
+def _face(kind, points, normals, start, half, face, spacing):  # type: ignore[no-untyped-def]
+    """Write the points of face −x, +x, −y, …, of a cylinder a disc, and return the row after the last."""
     axis, sign = face // 2, 2.0 * (face % 2) - 1.0
     n, u, v = start, (axis + 1) % 3, (axis + 2) % 3
     along_u, along_v = _cells(half[u], spacing), _cells(half[v], spacing)
@@ -130,7 +138,7 @@ def _face(points, normals, start, half, face, spacing, disc):  # type: ignore[no
         x = half[u] * (2.0 * (i + 0.5) / along_u - 1.0)
         for j in range(along_v):
             y = half[v] * (2.0 * (j + 0.5) / along_v - 1.0)
-            if disc and x * x + y * y > half[u] * half[u]:
+            if kind == CYLINDER and x * x + y * y > half[u] * half[u]:
                 continue
             normals[n, axis], normals[n, u], normals[n, v] = sign, 0.0, 0.0
             points[n, axis], points[n, u], points[n, v] = sign * half[axis], x, y
@@ -138,7 +146,7 @@ def _face(points, normals, start, half, face, spacing, disc):  # type: ignore[no
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _mantle(points, normals, radius, half_height, spacing):  # type: ignore[no-untyped-def]
     """Write the points of a cylinder's mantle and return how many they are."""
     n, around = 0, max(8, int(np.rint(2.0 * np.pi * radius / spacing)))
@@ -154,7 +162,7 @@ def _mantle(points, normals, radius, half_height, spacing):  # type: ignore[no-u
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _ball(points, normals, radius, spacing):  # type: ignore[no-untyped-def]
     """Write the points of a ball and return how many they are."""
     count = max(20, int(np.rint(4.0 * np.pi * (radius / spacing) ** 2)))

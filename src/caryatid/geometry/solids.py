@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Shape
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import kernel
 
 LEAST_VOLUME = 1e-9
 """What is smaller is flat, and no part [m³]; a cubic millimetre."""
@@ -287,7 +287,7 @@ def _spread(polytope: Polytope, spacing: float) -> tuple[Array, Array]:
     return a[face] + u * (b - a)[face] + v * (c - a)[face], polytope.faces[face, :3]
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _distances(points, faces, ends):  # type: ignore[no-untyped-def]
     """Distances (N,) [m] of points (N, 3) to the nearest of several parts, by the planes (F, 4) of each."""
     found = np.empty(len(points))

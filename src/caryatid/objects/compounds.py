@@ -12,7 +12,6 @@ from itertools import product
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import ExplanationConfig
@@ -20,6 +19,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import UP, Array
+from caryatid.runtime.parallel import kernel
 from caryatid.sensing.voxel_map import VoxelMap
 
 Index = NDArray[np.intp]
@@ -389,7 +389,7 @@ def shape_costs(
     return costs
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _point_costs(kind, T, half, points, normals, noise, normal_weight, outlier):  # type: ignore[no-untyped-def]
     costs, hx, hy, hz = np.empty(len(points)), half[0], half[1], half[2]
     centre, origin = T[:3, 3], np.zeros(3)

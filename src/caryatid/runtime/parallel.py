@@ -11,18 +11,23 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import numba
 import numpy as np
-from numba import types
+from numba import njit, types
 from numba.core.caching import FunctionCache
 from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
+
+kernel = partial(njit, cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
+"""Decorator of kernels: kept on disk, run without Python's lock, not compiled for calls from C."""
+inner = partial(kernel, no_cpython_wrapper=True)
+"""Decorator of kernels that only kernels call."""
 
 SHARES = 16
 """Shares into which threads divide points, pixels or hypotheses [1]: enough for usual numbers of cores."""
@@ -107,7 +112,6 @@ _kept: dict[tuple[Any, ...], Any] = {}
 def _compiled(work: Any, data: tuple[Any, ...]) -> Any:
     layout = (work, type(data), *map(_layout, data))
     if layout not in _kept:
-        work.targetoptions |= {"nogil": True, "no_cpython_wrapper": False}
         _kept[layout] = work.compile((types.int64, numba.typeof(data)))
     return _kept[layout]
 

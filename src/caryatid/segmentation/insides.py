@@ -106,7 +106,7 @@ def _outside(inner: Mask, image: Labels, possible: Mask, reach: int) -> int:
 
 def _hull_of(own: Mask) -> Mask:
     """The convex hull of places in an image (H, W)."""
-    corners = hull(np.argwhere(own).astype(np.float64))
+    corners = hull(np.argwhere(own).astype(np.float64, order="C"))
     row, column = np.ogrid[: own.shape[0], : own.shape[1]]
     inside = np.ones(own.shape, dtype=np.bool_)
     for (y, x), (down, right) in zip(corners, np.roll(corners, -1, axis=0) - corners, strict=True):

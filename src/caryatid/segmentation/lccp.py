@@ -6,13 +6,13 @@ import heapq
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from caryatid.config import SegmentationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
+from caryatid.runtime.parallel import kernel
 from caryatid.sensing.clouds import thin
 
 Index = NDArray[np.intp]
@@ -37,7 +37,7 @@ def grid_edges(
     return _find_pairs(number, points, normals, planes, ways, edge_jump)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _find_pairs(number, points, normals, planes, ways, edge_jump):  # type: ignore[no-untyped-def]
     """The pairs that `grid_edges` returns; the first four ways lead to neighbours, the others across gaps."""
     height, width = number.shape
@@ -117,7 +117,7 @@ def convex_parts(
     return number_by_appearance(np.where(large[part + 1], part, -1))
 
 
-@njit(cache=True)
+@kernel
 def _spread_seeds(points, normals, edges, start, seeds, surfel, crease):  # type: ignore[no-untyped-def]
     """For each node (N,), the number of the seed (S,) nearest along the edges (E, 2), −1 = none.
 
@@ -189,7 +189,7 @@ def _border_attraction(
     return np.clip(np.minimum(bend, step), -2.0, 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _merge_all(count, node, total, length):  # type: ignore[no-untyped-def]
     """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import CloudConfig, Config, SegmentationMethod
 from caryatid.errors import InputError, NoSurfaceError, PerceptionError
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import UP, Array
+from caryatid.runtime.parallel import kernel
 from caryatid.segmentation.segments import segment, segment_cloud
 from caryatid.segmentation.support_plane import SupportSurface, find_support_surface
 from caryatid.sensing.clouds import oriented_points
@@ -139,7 +139,7 @@ def _with_whole_masks(view: View, jump: float) -> View:
     return replace(view, labels=whole.reshape(labels.shape))
 
 
-@njit(cache=True)
+@kernel
 def _bodies(labels, inverse_depth, jump):  # type: ignore[no-untyped-def]
     """The first pixel (H, W), counted by rows, of the surface of one label (H, W) that each pixel is on.
 

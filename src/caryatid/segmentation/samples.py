@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import CloudConfig, SegmentationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import SHARES, on_threads
+from caryatid.runtime.parallel import SHARES, inner, kernel, on_threads
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.clouds import slope_limit
 from caryatid.sensing.views import View
@@ -110,7 +109,7 @@ def take_samples(
     return Samples(grid, places, points, normals, height, depth, rgb, K)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-def]
     """Planes 1/z = c + a·du + b·dv (N, 3) [1/m, 1/m per px] of the surface around pixels, up to its creases.
 
@@ -140,7 +139,7 @@ def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-
     return planes
 
 
-@njit(cache=True, error_model="numpy", no_cpython_wrapper=True)
+@inner
 def _refit(image, row, column, radius, tolerance, slope, least, spread, plane):  # type: ignore[no-untyped-def]
     """Fit a plane (3,) to the readings of a window that lie near it, and say if they determine one.
 

@@ -7,7 +7,6 @@ from functools import partial
 from itertools import combinations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
@@ -16,7 +15,7 @@ from caryatid.config import CloudConfig, FitConfig, SegmentationConfig
 from caryatid.fitting.primitives import Fit, candidates
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import on_threads
+from caryatid.runtime.parallel import kernel, on_threads
 from caryatid.segmentation.insides import MEETING, merge_insides
 from caryatid.segmentation.lccp import convex_parts, grid_edges, number_by_appearance, wide_parts
 from caryatid.segmentation.samples import Samples, take_samples
@@ -116,7 +115,7 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
     return labels
 
 
-@njit(cache=True)
+@kernel
 def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-untyped-def]
     """Bring labels (H, W) to waiting pixels (N,), ascending, no depth step from a labelled neighbour.
 
@@ -323,7 +322,7 @@ def _explained(shape: Shape, samples: Samples, own: Mask) -> float:
     return float(((np.abs(distance) < 0.006) & (cosine > 0.7)).mean())
 
 
-@njit(cache=True)
+@kernel
 def _count_gaps(labels, inverse_depth, jump, longest, votes):  # type: ignore[no-untyped-def]
     """Add one for each row on which one part ends, another begins, and all between lies nearer.
 

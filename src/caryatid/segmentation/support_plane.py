@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -16,7 +15,7 @@ from caryatid.geometry import transforms
 from caryatid.geometry.polygons import hull
 from caryatid.geometry.shapes import Box
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import SHARES, for_each
+from caryatid.runtime.parallel import SHARES, for_each, kernel
 from caryatid.sensing.views import View
 
 Mask = NDArray[np.bool_]
@@ -293,7 +292,7 @@ def _basis(normal: Array) -> Array:
     return np.stack([x, np.cross(normal, x)])
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _score_planes(share, data):  # type: ignore[no-untyped-def]
     """Score a share of the planes (4, B), n·p = offset: 1 − (distance/tolerance)² for each point that agrees.
 
@@ -315,7 +314,7 @@ def _score_planes(share, data):  # type: ignore[no-untyped-def]
             gains[k] -= penalty if signed < -3.0 * tolerance else 0.0
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _is_over(planes, x, y, z, low, high):  # type: ignore[no-untyped-def]
     """Whether a point lies between two heights over the first plane, and on the inner side of the others."""
     over = low < planes[0, 0] * x + planes[0, 1] * y + planes[0, 2] * z + planes[0, 3] < high
@@ -326,7 +325,7 @@ def _is_over(planes, x, y, z, low, high):  # type: ignore[no-untyped-def]
     return over
 
 
-@njit(cache=True)
+@kernel
 def _points_over(points, planes, low, high):  # type: ignore[no-untyped-def]
     over = np.empty(len(points), np.bool_)
     for i in range(len(points)):
@@ -334,7 +333,7 @@ def _points_over(points, planes, low, high):  # type: ignore[no-untyped-def]
     return over
 
 
-@njit(cache=True)
+@kernel
 def _pixels_over(depth, x, y, planes, low, high):  # type: ignore[no-untyped-def]
     over = np.zeros(depth.shape, np.bool_)
     for row in range(len(y)):

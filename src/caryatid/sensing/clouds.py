@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -11,7 +10,7 @@ from caryatid.config import CloudConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.points import most_central
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import SHARES, for_each
+from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
 from caryatid.sensing.views import View
 
 Image = NDArray[np.float32]
@@ -100,7 +99,7 @@ def local_planes(inverse_depth: Image, radius: int, edge_jump: float, max_slope:
     return planes[:3]
 
 
-@njit(cache=True)
+@kernel
 def _find_planes(share, data):  # type: ignore[no-untyped-def]
     """Write a, b, c and the variance about them of every 16th row; zeros stay where readings are few."""
     padded, radius, edge_jump, max_slope, sums, planes = data
@@ -129,12 +128,12 @@ def _find_planes(share, data):  # type: ignore[no-untyped-def]
         _solve(own, sums, enough, a, b, c, d)
 
 
-@njit(cache=True)
+@inner
 def _part(image, row, first, count):  # type: ignore[no-untyped-def]
     return image[row, first : first + count]
 
 
-@njit(cache=True)
+@inner
 def _add_corners(own, a, b, c, d, du, dv, share, allowed, sums):  # type: ignore[no-untyped-def]
     """Add the readings at (∓dv, ∓du) of each pixel to n, Σdu, Σdv, Σdu², Σdu·dv, Σdv², Σw, Σw·du, Σw·dv, Σw².
 
@@ -160,7 +159,7 @@ def _add_corners(own, a, b, c, d, du, dv, share, allowed, sums):  # type: ignore
         sums[8, i] += dv * ((wc + wd) - (wa + wb))
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _solve(own, sums, enough, a, b, c, variance):  # type: ignore[no-untyped-def]
     """The least-squares planes of windows with enough readings that do not lie on a line."""
     for i in range(len(own)):
@@ -183,7 +182,7 @@ def _solve(own, sums, enough, a, b, c, variance):  # type: ignore[no-untyped-def
         variance[i] = max(squares, ZERO) / max(n - np.float32(3.0), np.float32(1.0)) if known else ZERO
 
 
-@njit(cache=True)
+@kernel
 def _steadier(pixels, image, planes, radius, limit, trusted):  # type: ignore[no-untyped-def]
     """The planes (3, N) of unsteady pixels: each of the steadiest window next to it, or its own."""
     height, width = image.shape
@@ -209,7 +208,7 @@ def _steadier(pixels, image, planes, radius, limit, trusted):  # type: ignore[no
     return found
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _orient(share, data):  # type: ignore[no-untyped-def]
     """Write the points (N, 3) [m] and normals (N, 3) of a share of these pixels, in the world."""
     pixels, planes, K, T, points, normals = data

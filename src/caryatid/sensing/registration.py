@@ -11,14 +11,13 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import RegistrationConfig
 from caryatid.geometry import transforms
 from caryatid.geometry.points import solve_positive
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import on_threads
+from caryatid.runtime.parallel import inner, kernel, on_threads
 from caryatid.sensing.surfels import MIN_COSINE, even_sample, surfels_of
 from caryatid.sensing.views import Cloud
 
@@ -369,14 +368,14 @@ def twist_transform(twist: Array, pivot_world: Array) -> Array:
     return T
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def _bucket(label, x, y, z):  # type: ignore[no-untyped-def]
     """Number of the bucket of a label and a cell, all integers."""
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791) ^ (label * 50331653)
     return (mixed ^ (mixed >> 15)) & (BUCKETS - 1)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _find_correspondences(samples, patches, starts, T, T_other, T_back, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
     """Look for the patch of another view that is nearest in place and direction, and linearise the distance.
 
@@ -409,7 +408,7 @@ def _find_correspondences(samples, patches, starts, T, T_other, T_back, pivot, e
     return rows
 
 
-@njit(cache=True, error_model="numpy")
+@inner
 def _partner(patches, starts, edge, reach, point, normal, label):  # type: ignore[no-untyped-def]
     """Number of the patch nearest in place and direction, or −1."""
     x, y, z = point
@@ -452,7 +451,7 @@ def _partner(patches, starts, edge, reach, point, normal, label):  # type: ignor
     return found
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@kernel(inline="always")
 def _moved(T, x, y, z, last):  # type: ignore[no-untyped-def]
     """A point (last 1) or a direction (last 0) moved by a rigid transform (4, 4)."""
     return (
@@ -462,7 +461,7 @@ def _moved(T, x, y, z, last):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
     """Sum up the robust normal equations of rows (N, 8) after a step (6,) of the moving view.
 
@@ -491,7 +490,7 @@ def _normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
     return sums
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _step_down(rows, twist, information, independent, outlier, steps, settled):  # type: ignore[no-untyped-def]
     """Move a view by Gauss–Newton on the robust distances and its pose as reported; partners stay the same.
 

@@ -8,13 +8,12 @@ never the same surface.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from caryatid.config import RegistrationConfig
 from caryatid.geometry.points import quantile
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import SHARES, on_threads
+from caryatid.runtime.parallel import SHARES, kernel, on_threads
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
 MIN_COSINE = 0.9
@@ -95,7 +94,7 @@ def _gathered(
     return voxels[is_first], kinds[is_first], totals
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@kernel
 def _gather(points, normals, labels, spacing, spacing_far):  # type: ignore[no-untyped-def]
     """Do as `_gathered` does with a part of the readings, patches in the order of their first readings."""
     counted, size = 0, 64

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from caryatid.config import VoxelConfig
@@ -24,7 +23,7 @@ from caryatid.geometry.rays import room, traverse
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.signed_distance import gradient, local
 from caryatid.geometry.transforms import Array
-from caryatid.runtime.parallel import SHARES, for_each
+from caryatid.runtime.parallel import SHARES, for_each, inner, kernel
 from caryatid.sensing.views import View
 
 UNKNOWN, FREE, OCCUPIED = 0, 1, 2
@@ -301,7 +300,7 @@ def _log_odds(config: VoxelConfig) -> Array:
     return np.arange(256) * hit + np.arange(256)[:, None] * miss
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _mark_rays(share, data):  # type: ignore[no-untyped-def]
     """Mark the voxels that the rays of a share of the image's tiles pass, and those in which they end.
 
@@ -334,7 +333,7 @@ def _mark_rays(share, data):  # type: ignore[no-untyped-def]
                     hits[i, j, k] = 1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@inner(fastmath={"contract"})
 def _ray(depth_image, K, R, u, v):  # type: ignore[no-untyped-def]
     """Vector (3) [m] in the world from the camera to a pixel's reading, its length and its depth."""
     z = float(depth_image[v, u])
@@ -347,7 +346,7 @@ def _ray(depth_image, K, R, u, v):  # type: ignore[no-untyped-def]
     return ray, np.sqrt(x * x + y * y + z * z), z
 
 
-@njit(cache=True)
+@kernel
 def _count_marks(share, data):  # type: ignore[no-untyped-def]
     """Turn the marks in a share of the map into counts, at most 255; no ray passes where one ends."""
     hits, passes, new_hits, new_passes = data
@@ -361,7 +360,7 @@ def _count_marks(share, data):  # type: ignore[no-untyped-def]
         new_passes[n] = passes[n] + np.uint8((passed > hit) & (passes[n] < 255))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _fill_layer(i, data):  # type: ignore[no-untyped-def]
     """Mark the voxels of one layer of a grid whose centres are inside a shape, within low ≤ index < high."""
     kinds, R, centres, half, low, high, grid, origin, size = data
@@ -379,7 +378,7 @@ def _fill_layer(i, data):  # type: ignore[no-untyped-def]
                     grid[i, j, k] = 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _show(share, data):  # type: ignore[no-untyped-def]
     """Write the worth of a share of the work: each piece is one point and 128 of the cameras."""
     occluders, worth = data[0], data[-1]
@@ -392,7 +391,7 @@ def _show(share, data):  # type: ignore[no-untyped-def]
         _hide(data, found, p, first, end)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@inner(fastmath={"contract"})
 def _face(data, p, first, end):  # type: ignore[no-untyped-def]
     """Write what each camera shows of one point for the first time, where nothing is in between."""
     _, _, _, points, normals, befores, weights, eyes, axes, _, cone, worths = data
@@ -409,7 +408,7 @@ def _face(data, p, first, end):  # type: ignore[no-untyped-def]
         worth[n] = weight * new if new > 0.0 and along >= cone * distance else 0.0
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract"})
+@inner(fastmath={"contract"})
 def _hide(data, found, p, first, end):  # type: ignore[no-untyped-def]
     """Set to nought what cameras would show of one point but for what is in between."""
     occluders, origin, per_metre, points, _, _, _, eyes, _, clearance, _, worths = data

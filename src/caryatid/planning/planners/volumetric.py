@@ -25,7 +25,6 @@ from __future__ import annotations
 from functools import cache, partial
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import distance_transform_edt
 
 from caryatid.config import ActiveVisionConfig
@@ -35,7 +34,7 @@ from caryatid.planning.candidates import Looks
 from caryatid.planning.decision import Decision, PlanningState, check_candidates, decide, path_cost
 from caryatid.planning.expected_visibility import space_above
 from caryatid.planning.planners import VOLUMETRIC
-from caryatid.runtime.parallel import for_each
+from caryatid.runtime.parallel import for_each, inner, kernel
 from caryatid.sensing.voxel_map import OCCUPIED, UNKNOWN, VoxelMap
 
 PROXIMITY = 0.1
@@ -134,7 +133,7 @@ def ray_information(voxels: VoxelMap, T_world_camera: Array, rays_camera: Array)
     return gathered
 
 
-@njit(cache=True)
+@kernel
 def _gather(c, data):  # type: ignore[no-untyped-def]
     """Sum what the rays of one camera gather."""
     states, layers, T_world_camera, rays, origin, size, gathered = data
@@ -151,7 +150,7 @@ def _gather(c, data):  # type: ignore[no-untyped-def]
         _gather_ray(states.reshape(-1), layers.reshape(-1, 3), found, slabs, gathered[c])
 
 
-@njit(cache=True)
+@inner
 def _gather_ray(states, layers, found, slabs, gathered):  # type: ignore[no-untyped-def]
     """Add what one ray gathers up to the first occupied voxel to `gathered` (5,)."""
     visible, run, before = 1.0, 0.0, np.uint32(np.iinfo(np.uint32).max)
