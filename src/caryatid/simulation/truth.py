@@ -14,6 +14,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import Kind
 from caryatid.io.json_files import json_text, parse_json, read_json
 from caryatid.io.staging import write_file
+from caryatid.runtime.parallel import on_threads
 from caryatid.simulation.world import SimulatedScene, body_poses, state_of, strayed
 
 _REMEDY = 'write {"vertices": […], "edges": [{"supporter", "supported", "kind"}, …]}'
@@ -67,15 +68,19 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
     config = config or PhysicsConfig()
     names = {0: scene.table, **scene.object_bodies}
     forces = mean_contact_forces(scene)
-    falling = {a: displaced_without(scene, a, config) for a in {a for a, _ in forces} - {0}}
     gravity = np.linalg.norm(scene.model.opt.gravity)
     weights = {a: scene.model.body_subtreemass[scene.body_id(a)] * gravity for a in names}
-    kinds: dict[tuple[int, int], Kind] = {}
-    for (a, b), force in forces.items():
-        if b != 0 and force[2] > config.force_share * weights[b]:
-            kinds[a, b] = "bottom-up"
-        elif a != 0 and b in falling[a]:
+    share = config.force_share
+    held = {(a, b) for (a, b), force in forces.items() if b != 0 and force[2] > share * weights[b]}
+    kinds: dict[tuple[int, int], Kind] = dict.fromkeys(held, "bottom-up")
+    others = [(a, b) for a, b in forces if a != 0 != b and (a, b) not in held]
+    labels = sorted({a for a, _ in others})
+    moved = on_threads(lambda k: displaced_without(scene, labels[k], config), len(labels))
+    falling = dict(zip(labels, moved, strict=True))
+    for a, b in others:
+        if b in falling[a]:
             # A force nearer to the horizontal than 30° leans, a steeper one that points down presses.
+            force = forces[a, b]
             steep = -force[2] > np.sin(np.deg2rad(30.0)) * np.linalg.norm(force)
             kinds[a, b] = "top-down" if steep else "lean"
     edges = [TrueEdge(names[a], names[b], kinds[a, b]) for a, b in sorted(kinds)]
