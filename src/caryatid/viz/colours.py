@@ -70,9 +70,11 @@ def striped_colours(labels: NDArray[np.int32], u: Array, v: Array, pitch: float)
         pitch: From stripe to stripe along a row or column [px]; the stripe takes a third of it.
     """
     stripe = np.zeros(labels.shape, dtype=np.bool_)
-    for label in np.unique(labels):
-        for direction in object_stripes(int(label)):
-            stripe |= (labels == label) & ((u + direction * v) % pitch < pitch / 3.0)
+    found = np.flatnonzero(np.bincount(labels.ravel()))
+    for direction in set().union(*(object_stripes(int(label)) for label in found)):
+        striped = np.zeros(int(labels.max(initial=0)) + 1, dtype=np.bool_)
+        striped[[label for label in found if direction in object_stripes(int(label))]] = True
+        stripe |= striped[labels] & ((u + direction * v) % pitch < pitch / 3.0)
     colour = label_colours(labels).astype(np.float64)
     return np.where(stripe[..., None], (255.0 + colour) / 2.0, colour)
 
