@@ -69,10 +69,10 @@ def missing_extra(extra: str, library: str, source: str | PathLike[str]) -> Inpu
 
 @contextmanager
 def needs_extra(extra: str, source: str | PathLike[str]) -> Iterator[None]:
-    """Say which extra to install where an import in the block does not find its library.
+    """Name the extra to install if an import in the block fails.
 
     Raises:
-        InputError: In place of the ModuleNotFoundError.
+        InputError: Instead of the ModuleNotFoundError.
     """
     try:
         yield

@@ -30,9 +30,11 @@ from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Camera, Cloud, View
 
 UNTIL = 0.95
-"""Probability from which what moves without the goal counts as known [1], where none is given."""
+"""Default probability at which the effects of removing the goal count as known [1]."""
 ATTEMPTS = 20
-"""Refusals by the robot in one step before the loop stops [1]; a coarse map errs about every tenth view."""
+"""Refusals by the robot in one step before the loop stops [1]; a coarse map is wrong about every tenth
+view.
+"""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -43,7 +45,7 @@ class RobotPose:
         posture: Pose of the platform, or of an arm's base, and gaze.
         T_world_camera: Camera pose (4, 4).
         footprint: Radius of the platform [m].
-        arm: Whether it is an arm; then the platform is what it stands on.
+        arm: Whether it is an arm; the platform is then its base.
     """
 
     posture: Posture
@@ -57,25 +59,25 @@ class Step(Pictured):
     """One turn of the loop.
 
     Attributes:
-        index: Number of the view, 0 is the first.
+        index: Number of the view, from 0.
         name: Name of the view or cloud.
-        view: The view, or None where a cloud was given. Its pose is the one the camera reported; where it
-            reported none, or there is no robot, it is the one found by registration.
+        view: The view, or None for a cloud. Its pose is the one the camera reported; without one, or without
+            a robot, it is the one found by registration.
         labels: Label image (H, W) of the view, or labels (N,) of a cloud.
         graph: The fused graph after this view.
         cloud: All points so far, thinned, with labels.
         sphere: The view sphere of the robot.
         visited: Unit directions (V, 3) of the views so far from the sphere's centre.
-        candidates: The views that could be reached next, or None where the loop stops.
-        decision: The next view, or None where the loop stops.
+        candidates: The views that could be reached next, or None if the loop stops.
+        decision: The next view, or None if the loop stops.
         timings: Seconds of each stage.
         angle_travelled: Sum of the angles between consecutive views at the sphere's centre [rad].
         path_travelled: Path length of the robot [m]: of a platform over the floor, of an arm's hand. Without
             a robot, of the camera.
         stop: Why this is the last step, or None.
-        robot: How the robot holds its camera, or None where that is not known.
-        changes: What has happened to objects since the view before, seen or reported.
-        lift: What was taken away after this view, or None.
+        robot: How the robot holds its camera, or None if unknown.
+        changes: Changes of objects since the previous view, seen or reported.
+        lift: The object removed after this view, or None.
     """
 
     index: int
@@ -108,26 +110,27 @@ class Explorer:
     Between any two calls the planner may be replaced (`use_planner`) or another view chosen (`choose`).
 
     Args:
-        camera: Gives views, or None where they are handed to `look`.
-        robot: Stands where the first view is taken, or None where nothing is planned.
-        planner: Chooses the next view, or its name.
+        camera: Takes the views; None if they are passed to `look`.
+        robot: Stands where the first view is taken; None if nothing is planned.
+        planner: Planner of the next view, or its name.
         config: Settings of all stages.
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
-        masks: Gives views their masks, or None to take them as they come.
-        goal: Id of an object that is to be taken away: what that depends on decides where planner `support`
-            looks, and when to stop. It may be one that no view has shown yet.
-        until: Probability [1], above 0.5, from which a support counts as known, or with a goal whether an
-            object moves; once all are, looking further does not pay. None = 0.95 with a goal, else never.
+        masks: Source of masks, or None to use those of the views.
+        goal: Id of an object to remove. Planner `support` then looks at what its removal depends on, and the
+            loop stops when that is known. No view need have shown it yet.
+        until: Probability [1], above 0.5, at which a support counts as known, or with a goal whether an
+            object moves. The loop stops when all are known. None = 0.95 with a goal, otherwise never.
 
     Attributes:
-        scene: What is known so far.
+        scene: The scene model.
         robot: The robot.
-        goal: Id of the object that is to be taken away, or None.
+        goal: Id of the object to remove, or None.
         step: The newest step, or None before the first view.
 
     Raises:
-        InputError: There is no such planner, masks are given and not to be used, or `until` is out of range.
+        InputError: There is no such planner, masks are given but would not be used, or `until` is out of
+            range.
     """
 
     def __init__(
@@ -164,7 +167,7 @@ class Explorer:
         self.use_planner(planner)
 
     def use_planner(self, planner: Planner | str) -> None:
-        """Let another planner, or the one of this name, choose from now on.
+        """Use another planner, or the one of this name, from now on.
 
         Raises:
             InputError: There is no such planner.
@@ -175,7 +178,7 @@ class Explorer:
         """Take a view where the robot stands and update the scene with it.
 
         Args:
-            given: The view, or a cloud with z up, in place of one of the camera.
+            given: A view, or a cloud with z up, instead of one from the camera.
 
         Returns:
             The new step, without candidates and decision.
@@ -188,7 +191,7 @@ class Explorer:
         return step
 
     def looks(self, given: View | Cloud | None = None) -> Iterator[Step]:
-        """Look, and yield the steps of the views that the scene kept until now before the new one's.
+        """Look, and yield the steps of the views kept so far, then that of the new one.
 
         Args:
             given: As of `look`.
@@ -206,7 +209,7 @@ class Explorer:
             yield self.step
 
     def _step(self, source: View | Cloud, captured: float) -> Step:
-        """The step of a view that has just become part of the scene; capturing it took some time [s]."""
+        """The step of a view that has just become part of the scene, with its capture time [s]."""
         scene, robot, before = self.scene, self.robot, self.step
         assert scene.sphere is not None
         assert scene.labels is not None
@@ -233,10 +236,10 @@ class Explorer:
         )  # fmt: skip
 
     def plan(self) -> Step:
-        """Choose the next view. Where the robot, looking closer, refuses one, plan again among the others.
+        """Choose the next view. If the robot refuses one in its closer check, plan again among the others.
 
         Returns:
-            The newest step, with candidates and decision; where no view can be reached, with why in `stop`.
+            The newest step, with candidates and decision; if no view can be reached, `stop` says why.
 
         Raises:
             PlanningError: Nothing has been seen yet, or there is no robot.
@@ -257,7 +260,7 @@ class Explorer:
         return self.step
 
     def reason_to_stop(self) -> str | None:
-        """Say why looking further may not pay, after `plan`; None where it may.
+        """After `plan`, say why another view may not pay, or None.
 
         Raises:
             PlanningError: Nothing has been seen yet.
@@ -268,7 +271,7 @@ class Explorer:
         state = self._state(step.candidates)
         goal, config = self.goal, self.scene.config.support
         until = UNTIL if self._until is None and goal is not None else self._until
-        # Without a goal nothing asks whether a first view hides objects.
+        # Without a goal, nothing checks whether the first view hides objects.
         asked = until if goal is not None or step.index > 0 else None
         if asked is not None and settled(state.graph, goal, asked, state.voxels, config):
             what = "every support" if goal is None else f"what moves without {goal}"
@@ -276,10 +279,10 @@ class Explorer:
         return reason_to_stop(state, self.scene.changed, self._planner, step.decision)
 
     def choose(self, chosen: Decision | int) -> Step:
-        """Take another view in place of the planner's choice.
+        """Choose another view instead of the planner's.
 
         Args:
-            chosen: A decision, or which of the newest step's candidates: then with the planner's figures.
+            chosen: A decision, or the index of one of the newest step's candidates.
 
         Returns:
             The newest step, with this decision and the way there.
@@ -336,7 +339,7 @@ class Explorer:
 
     def _moving(self) -> Robot:
         if self.robot is None:
-            raise PlanningError("there is no robot to go anywhere")
+            raise PlanningError("there is no robot to move")
         return self.robot
 
     def _newest(self) -> Step:
@@ -361,13 +364,13 @@ def explore(
     """Look around until no view is expected to show more than its path costs, or the views are used up.
 
     Args:
-        camera: Gives views.
+        camera: Takes the views.
         robot: Stands where the first view is taken.
-        planner: Chooses the next view, or its name.
+        planner: Planner of the next view, or its name.
         config: Settings of all stages; `config.active.max_views` limits the views.
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
-        masks: Gives views their masks, or None to take them as they come.
+        masks: Source of masks, or None to use those of the views.
         goal: As of `Explorer`.
         until: As of `Explorer`.
         early_stop: Stop before the views are used up, as `config.active.stop` and `until` say.
@@ -398,12 +401,12 @@ def explore(
 
 
 def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decision: Decision) -> str | None:
-    """Say why looking further may not pay; None where it may.
+    """Say why another view may not pay, or None.
 
     Args:
-        state: What the planner looked at.
+        state: The state that the planner used.
         changed: Whether the newest view changed the graph.
-        planner: Chose the next view.
+        planner: The planner that chose the next view.
         decision: Its choice.
     """
     views = len(state.visited)
@@ -434,13 +437,13 @@ def next_best_view(
     """Choose where to look next (Algorithm 2).
 
     Args:
-        scene: What is known, of at least one view.
-        robot: Says which views it can reach; None where `candidates` are given.
+        scene: Scene model of at least one view.
+        robot: Robot that has to reach the view; None if `candidates` are given.
         visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
             current one last; None = those of the scene, or where the robot is if they have no poses.
         candidates: Camera poses (N, 4, 4) to choose from; None = those the robot reaches.
         path_length: Path length (N,) [m] to each of these poses; None = straight lines.
-        planner: Chooses among them, or its name.
+        planner: Planner, or its name.
 
     Returns:
         The decision: `T_world_camera` is the view, `index` its place among the candidates, `waypoints` the
@@ -480,7 +483,7 @@ def given_candidates(
     """Check camera poses that a robot whose camera is at a pose (4, 4) can reach.
 
     Raises:
-        InputError: They are not poses (N, 4, 4), or path lengths (N,) [m] are not as many or negative.
+        InputError: They are not poses (N, 4, 4), or path lengths (N,) [m] differ in number or are negative.
     """
     try:
         named = enumerate(np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4))
@@ -501,7 +504,7 @@ def given_candidates(
 def _decide(
     state: PlanningState, robot: Robot | None, planner: Planner, seed: int
 ) -> tuple[Decision, Candidates]:
-    """Return the decision and the candidates it was taken among: without those the robot refused."""
+    """Return the decision, and the candidates without those the robot refused."""
     rng = np.random.default_rng([seed, len(state.visited)])
     why = ""
     for _ in range(ATTEMPTS):

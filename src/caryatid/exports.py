@@ -30,14 +30,14 @@ ENDINGS: Final[dict[str, ExportFormat]] = {
     ".dot": "dot",
     ".gv": "dot",
 }
-"""How a file's name ends → its format."""
+"""File suffix → format."""
 
 
 def format_of(path: Path, wanted: ExportFormat | None = None) -> ExportFormat:
-    """The format a file's name ends in.
+    """The format of a file by its suffix.
 
     Raises:
-        InputError: It ends in none, or in another one than is wanted.
+        InputError: The suffix is unknown, or not that of the wanted format.
     """
     found = ENDINGS.get(path.suffix.lower())
     if found is None or wanted not in (None, found):
@@ -56,8 +56,8 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
         config: Density, friction and how fine meshes are.
 
     Raises:
-        InputError: The name ends in no format, there is nothing to export, the format does not take a name of
-            an object, or the file cannot be written.
+        InputError: The suffix is unknown, there is nothing to export, the format rejects the name of an
+            object, or the file cannot be written.
     """
     path, config = Path(path), config or ExportConfig()
     chosen = format_of(path)
@@ -78,7 +78,7 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
 
 
 def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
-    """The static body `table`, and a free body for each object, called as its id: a scene to explore, too.
+    """The static body `table`, and a free body per object, named by its id: a scene to explore.
 
     Fitted shapes may overlap or hover by millimetres: objects settle by about as much when it is simulated.
     """
@@ -105,7 +105,7 @@ def _mjcf(graph: SupportGraph, config: ExportConfig) -> str:
 
 
 def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
-    """A link for each object, called as its id, fixed to the link `world`; parts of a solid as boxes."""
+    """A link per object, named by its id, fixed to the link `world`; parts of a solid as boxes."""
     robot = Element("robot", name="caryatid")
     SubElement(robot, "link", name="world")
     for item in graph.objects:
@@ -142,7 +142,7 @@ def _urdf(graph: SupportGraph, config: ExportConfig) -> str:
 
 
 def _boxes(shape: Shape) -> Sequence[tuple[Array, Shape]]:
-    """What URDF can say of a shape: itself, or the least box around each part, with poses (4, 4) in it."""
+    """A shape for URDF: itself, or the smallest box around each part, with poses (4, 4) in it."""
     if not isinstance(shape, Solid):
         return [(np.eye(4), shape)]
     import trimesh
@@ -160,7 +160,7 @@ def _pose(T: Array) -> dict[str, str]:
     from scipy.spatial.transform import Rotation
 
     with warnings.catch_warnings():
-        # Straight up or down there are many roll-pitch-yaw angles; SciPy warns and takes one.
+        # Straight up or down, many roll-pitch-yaw angles fit; SciPy warns and takes one.
         warnings.simplefilter("ignore", UserWarning)
         angles = Rotation.from_matrix(T[:3, :3]).as_euler("xyz")
     return {"xyz": _numbers(*T[:3, 3]), "rpy": _numbers(*angles)}
@@ -177,7 +177,7 @@ def _numbers(*values: float) -> str:
 
 
 def _gltf(graph: SupportGraph, config: ExportConfig, *, binary: bool) -> bytes:
-    """Under the node `z_up` a node for each object, called as its id, in the report's colour.
+    """The node `z_up`, and under it a node per object, named by its id, in the report's colour.
 
     Shape, size and role are in each mesh's extras.
     """
@@ -223,7 +223,7 @@ def _graphml(graph: SupportGraph) -> str:
 
 
 def to_dot(graph: SupportGraph) -> str:
-    """Write the support graph as DOT, to be drawn as the report draws it: the table below, doubt in dashes.
+    """Write the support graph as DOT, drawn as in the report: the table below, uncertain supports dashed.
 
     Args:
         graph: The graph.

@@ -1,4 +1,4 @@
-"""The support graph: objects with their shapes, and who supports whom, certain and uncertain."""
+"""The support graph: objects with their shapes, and which supports which, certain or uncertain."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class SceneObject(Pictured):
         label: Its number in label images.
         shape: The fitted primitive, in the world frame. The support surface is a thin box.
         role: `object` or `support_surface`.
-        occurrences: In how many views it was extracted.
-        opportunities: In how many views it could have been.
+        occurrences: Number of views in which it was extracted.
+        opportunities: Number of views in which it could have been extracted.
         residual: Mean absolute distance of its points to the shape [m].
         poor_fit: None of the three shapes explains its points within the configured error.
-        seen: Which sides (-x, +x, -y, +y, -z, +z along the object's axes) points bear out.
+        seen: Which sides (-x, +x, -y, +y, -z, +z along the object's axes) points confirm.
         why: How the shape came about, for a person to read.
-        uncertainty: How far off the shape may be, where that is known.
-        doubt: What is physically implausible about it, for a person to read; empty where nothing is.
+        uncertainty: Uncertainty of the shape, if known.
+        doubt: What is physically implausible about it, for a person to read; empty if nothing is.
         probability: Probability that its true shape agrees with `shape` by an IoU of 0.5 [1], or None.
     """
 
@@ -73,7 +73,7 @@ class Support:
         kind: `bottom-up` from below, `lean` from the side, `top-down` by weight from above.
         certain: False where it was added because an object looked unstable or leans.
         occurrences: How many times it was extracted and matched: #occ(e) of eq. 2.
-        opportunities: How many times both its ends were extracted, so that it could have been.
+        opportunities: How many times both its ends were extracted.
         contact_world: Centre (3,) [m] of the contact patch, or None.
         normal_world: Normal (3,) of the separating plane, from supporter to supported, or None.
         why: Which test put it there, with figures.
@@ -98,7 +98,7 @@ class Support:
 
     @property
     def belief(self) -> float:
-        """Its probability [1]; where that is not known, 1 if it is certain and 0.5 if it is not."""
+        """Its probability [1]; if unknown, 1 if it is certain and 0.5 if it is not."""
         if self.probability is None:
             return 1.0 if self.certain else 0.5
         return self.probability
@@ -168,7 +168,7 @@ class SupportGraph(Pictured):
 
 @dataclass(frozen=True, slots=True)
 class Stability:
-    """What the support polygon of an object says.
+    """Stability of an object by its support polygon.
 
     Attributes:
         ratio: Support area ratio r_s in [0, 1], eq. 1.
@@ -195,9 +195,9 @@ class Change:
 
     Attributes:
         kind: `removed`, `moved` to where `object_id` is now, or `added` where nothing was.
-        object_id: Of the object; one that was removed and is found again keeps its id.
-        view: Number of the view before which it happened, 0 the first.
-        why: What says so, with figures.
+        object_id: Id of the object; one that was removed and is found again keeps it.
+        view: Number of the view before which it happened, from 0.
+        why: The evidence, with figures.
     """
 
     kind: ChangeKind
@@ -208,14 +208,14 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class TakeStep:
-    """One object to take away.
+    """One object to remove.
 
     Attributes:
-        object_id: Which.
-        hold: Ids of what the other hand holds meanwhile.
+        object_id: Its id.
+        hold: Ids of the objects that the other hand holds meanwhile.
         safe: The risk is no higher than `rehearsal.risk`.
         risk: Probability that another object moves: the share of the rehearsals in which one did [1].
-        why: What the step goes by, for a person to read.
+        why: The reason for the step, for a person to read.
     """
 
     object_id: str
@@ -225,7 +225,7 @@ class TakeStep:
     why: str
 
     def to_json(self) -> dict[str, Any]:
-        """One entry of `steps` in what `--json` writes."""
+        """One entry of `steps` in the output of `--json`."""
         known = {"object": self.object_id, "hold": list(self.hold), "safe": self.safe, "risk": self.risk}
         return known | {"probability": 1.0 - self.risk, "why": self.why}
 

@@ -1,4 +1,4 @@
-"""What is known so far: the objects of a scene, who supports whom, and the space around them."""
+"""The scene model: objects, supports, and the space around them."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ LEFT_OUT = "%s; the view is left out"
 class Scene(Pictured):
     """The scene model of section III, updated view by view.
 
-    The first one after installation takes some seconds to come: kernels are compiled.
+    The first one after installation takes longer, because kernels are compiled.
 
     Args:
         config: All stages' settings.
-        segmentation: `labels` demands them of every view, `auto` ignores them, None takes them where given.
+        segmentation: `labels` requires them in every view, `auto` ignores them, None uses them where given.
         seed: Seed of every random choice; the same seed and views give the same model.
 
     Attributes:
@@ -68,7 +68,7 @@ class Scene(Pictured):
         sphere: The view sphere around the table top, or None before that view.
         T_world_camera: Pose (4, 4) of the newest view after registration, or None for a cloud.
         T_world_cameras: Poses (4, 4) of all views so far, each as it was when the view was new.
-        views: How many views the model is made of.
+        views: Number of views in the model.
         waiting: Views kept until a later one shows the support surface.
         changed: Whether the newest view changed the graph.
         timings: Seconds the stages of the newest update took.
@@ -112,7 +112,7 @@ class Scene(Pictured):
 
     @property
     def changes(self) -> tuple[Change, ...]:
-        """What has happened to objects since the first view, in this order."""
+        """Changes of objects since the first view, in order."""
         return self._detector.history
 
     @property
@@ -125,7 +125,7 @@ class Scene(Pictured):
         return f"Scene(views={self.views}, vertices={vertices}, edges={edges})"
 
     def explain(self, supporter: str, supported: str) -> str:
-        """Say why one object is, or is not, taken to support another; with figures.
+        """Say why one object supports another, or why not, with figures.
 
         Args:
             supporter: Id of an object, such as `o1`.
@@ -134,7 +134,7 @@ class Scene(Pictured):
         return explain(self.graph, supporter, supported, self.config.support)
 
     def predict_removal(self, object_id: str) -> tuple[Effect, ...]:
-        """Say which objects move when one is taken away, how likely and why.
+        """Say which objects move when one is removed, how likely, and why.
 
         Args:
             object_id: Id of an object, such as `o3`.
@@ -145,21 +145,21 @@ class Scene(Pictured):
         return predict_removal(self.graph, object_id, self.config.support)
 
     def show(self) -> Any:
-        """Open the viewer on what is known: a page in the browser, which a notebook shows in place.
+        """Open the viewer: a page in the browser, which a notebook shows in its cell.
 
         Returns:
-            A handle with the page's `url`; `update(scene)` adds what is known by then, `close()` ends it.
+            A handle with the page's `url`; `update(scene)` adds the scene's current state, `close()` ends it.
 
         Raises:
-            InputError: viser is not installed, which comes with the extra `view`; or no port is free.
+            InputError: viser, which the extra `view` brings, is not installed; or no port is free.
         """
         return call("viewer", self)
 
     def copy(self) -> Scene:
-        """Return a scene that knows the same; what one of the two learns, the other does not.
+        """Return an independent copy.
 
-        Both go on alike: the same views give the same graphs. What no update changes in place is shared, so
-        a copy costs next to nothing.
+        Both continue alike: the same views give the same graphs. Data that no update changes in place is
+        shared, so a copy costs almost nothing.
         """
         other = copy.copy(self)
         other._models = self._models.copy()
@@ -168,7 +168,7 @@ class Scene(Pictured):
         return other
 
     def removed(self, object_id: str) -> SupportGraph:
-        """Say that an object was taken away; what is known of it is dropped, and where it was is unknown.
+        """Report that an object was removed; the model forgets it, and its old place is unknown.
 
         Args:
             object_id: Id of an object, such as `o3`.
@@ -184,7 +184,7 @@ class Scene(Pictured):
         return self.graph
 
     def moved(self, object_id: str, T: Array) -> SupportGraph:
-        """Say that an object was moved: its points and its shape move along, its supports are found again.
+        """Report that an object was moved; its points and shape move along, and its supports are found again.
 
         Args:
             object_id: Id of an object, such as `o3`.
@@ -201,10 +201,10 @@ class Scene(Pictured):
         return self.graph
 
     def added(self, shape: Shape) -> str:
-        """Say that an object was put somewhere.
+        """Report that an object was added.
 
         Args:
-            shape: What it is and where, in the world frame.
+            shape: Its shape and pose, in the world frame.
 
         Returns:
             Id of the new object.
@@ -232,7 +232,7 @@ class Scene(Pictured):
         raise InputError(object_id, "is not an object of the graph", f"there are {known or 'none'}")
 
     def _forget(self, o: SceneObject, T: Array | None = None) -> None:
-        """Drop what is known of an object, or let its points and shape move by T; its supports go with it."""
+        """Forget an object, or move its points and shape by T; its supports are dropped."""
         label = self._label_of(o.id)
         points = np.zeros((0, 3)) if label is None else self._models.points.of(label).points_world
         if self.voxels is not None:
@@ -248,14 +248,14 @@ class Scene(Pictured):
         self._shown = tuple(ids - {o.id} for ids in self._shown)
 
     def _label_of(self, object_id: str) -> int | None:
-        """Label by which models know an object of the graph; None where they do not."""
+        """Label of an object of the graph in the models, or None."""
         for label, known in self._ids.items():
             if known == object_id:
                 return label
         return None if self.config.fusion.method == "sg" else int(object_id[1:])
 
     def _reported(self, kind: ChangeKind, object_id: str) -> None:
-        """Note what the robot did, and read the graph again."""
+        """Record what the robot did, and derive the graph again."""
         assert self.surface is not None
         assert self.voxels is not None
         self._detector.history += (Change(kind, object_id, self.views, "reported"),)
@@ -268,13 +268,13 @@ class Scene(Pictured):
         self._set_graph(newest)
 
     def update(self, source: View | Cloud) -> SupportGraph:
-        """Take in one view, or one cloud with z up, and return the fused graph.
+        """Add one view, or one cloud with z up, and return the fused graph.
 
-        A view with a pose that shows no support surface, before any did, is kept with a warning. The first
-        one that shows it is preceded by those kept.
+        A view with a pose that shows no support surface is kept with a warning, until a view shows one. Kept
+        views are then added first.
 
         Raises:
-            InputError: Labels are demanded and missing, or a later view has no pose.
+            InputError: Required labels are missing, or a later view has no pose.
             WrongViewError: The camera or its pose cannot be right; nothing has changed.
             PerceptionError: There are no readings; or no support surface, and no pose.
         """
@@ -289,7 +289,7 @@ class Scene(Pictured):
         return self.graph
 
     def updates(self, source: View | Cloud) -> Iterator[View | Cloud]:
-        """Take in one view or cloud, after the views kept; yields each once it is part of the model.
+        """Add one view or cloud, after the views kept; yields each when it is part of the model.
 
         Raises:
             NoSurfaceError: There is no support surface. A view with a pose is kept all the same.
@@ -379,7 +379,7 @@ class Scene(Pictured):
         return self.config.fusion.matching == "points" and self.config.fusion.masks == "scene"
 
     def _check_identity(self, observation: Observation, name: str) -> None:
-        """Warn where most masks lie on objects that earlier masks gave other numbers."""
+        """Warn if most masks lie on objects that had other numbers in earlier masks."""
         wrong, shown = self._models.mislabelled(observation)
         if 2 * wrong > shown:
             log.warning(
@@ -389,7 +389,7 @@ class Scene(Pictured):
             )  # fmt: skip
 
     def _say_thinned(self, source: View, used: View) -> None:
-        """Say once that some pixels of large images are enough."""
+        """Report once that only some pixels of large images are used."""
         (height, width), (rows, columns) = source.depth.shape, used.depth.shape
         if not self.views and rows < height:
             log.info(
@@ -398,7 +398,7 @@ class Scene(Pictured):
             )  # fmt: skip
 
     def _check_holes(self, view: View, surface: SupportSurface) -> None:
-        """Warn where something as large as an object may be that has no depth."""
+        """Warn of regions without depth that are as large as an object."""
         holes = count_holes(view, surface, self.config.segmentation)
         if holes:
             log.warning(
@@ -408,7 +408,7 @@ class Scene(Pictured):
             )  # fmt: skip
 
     def _check_found(self, observation: Observation, name: str, masks: bool) -> None:
-        """Warn where there are readings over the support surface, but no object."""
+        """Warn if there are readings above the support surface but no object."""
         if set(observation.shown) <= {0, SUPPORT_LABEL}:
             low, high = self.config.segmentation.clearance, self.config.surface.storey
             over = observation.surface.over(observation.cloud.points_world, low, high, 0.0)
@@ -419,10 +419,10 @@ class Scene(Pictured):
                 log.warning("%s: no object among %d points over the table; %s", name, over.sum(), remedy)
 
     def _registered(self, observation: Observation, named: bool) -> tuple[Observation, set[int]]:
-        """Lay the view onto the earlier ones and move those by what it shows of them.
+        """Register the view to the earlier ones, and move those by what it shows.
 
         Returns:
-            The observation, moved, and the labels of the objects some of whose points moved.
+            The observation, moved, and the labels of the objects with moved points.
 
         Raises:
             WrongViewError: Its pose cannot be right; nothing has changed.
@@ -457,7 +457,7 @@ class Scene(Pictured):
         return known if fused is None else fused
 
     def _bounds(self, observation: Observation) -> tuple[SupportSurface, VoxelMap]:
-        """Enter the view into the map; return what bounds hidden extents: of this view alone with `sg`."""
+        """Add the view to the map; return the limits of hidden extents (`sg`: of this view alone)."""
         if self.sphere is None or self.voxels is None:
             centre = observation.surface.point_world
             self.sphere = ViewSphere.around(centre, self.config.active)
@@ -475,7 +475,7 @@ class Scene(Pictured):
     def _fitted(
         self, observation: Observation, shown: set[int], voxels: VoxelMap, given: bool, named: bool
     ) -> Observation:
-        """Fit what this view changed; automatic segments are divided and united as the shapes suggest."""
+        """Fit the objects this view changed; split and merge automatic segments as the shapes suggest."""
         if self.config.fusion.method == "sg":
             self._models.fit_newest(set(observation.shown) - {0, SUPPORT_LABEL}, voxels)
             return observation
@@ -491,7 +491,7 @@ class Scene(Pictured):
         return self._renamed(observation, given_up)
 
     def _renamed(self, observation: Observation, given_up: Mapping[int, int]) -> Observation:
-        """Let objects have other labels, now and in the graphs so far: old → new."""
+        """Relabel objects, now and in the graphs so far: old → new."""
         if given_up and self.config.fusion.matching == "points":
             names = {object_id(old): object_id(new) for old, new in given_up.items()}
             self._graphs = tuple(renamed(graph, names) for graph in self._graphs)
@@ -499,7 +499,7 @@ class Scene(Pictured):
         return observation.relabelled(dict(given_up))
 
     def _noticed(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
-        """Find what is not as it was, and drop it before anything is added to it.
+        """Find objects that changed, and forget them before anything is added.
 
         Returns:
             Ids of the objects that are not where they were, and labels of the segments that are where space
@@ -553,7 +553,7 @@ class Scene(Pictured):
         return self._renamed(observation, found), {found.get(k, k): why for k, why in new.items()}
 
     def _inferred(self, surface: SupportSurface, voxels: VoxelMap) -> SupportGraph:
-        """The support graph of the objects as they are known now."""
+        """The support graph of the current objects."""
         fitted = self._models.objects()
         if self.config.completion.enabled:
             fitted = complete(fitted, surface, voxels, self.config.completion)
@@ -573,7 +573,7 @@ class Scene(Pictured):
         return observation
 
     def _set_graph(self, newest: SupportGraph) -> None:
-        """Read the fused graph off all graphs; the newest one, with fused ids, says what is stable."""
+        """Derive the fused graph from all graphs; stability is that of the newest one, with fused ids."""
         fused = fused_graph(self._graphs, self.config.fusion, shown=self._shown)
         ids = {o.id for o in fused.objects}
         stability = {i: verdict for i, verdict in newest.stability.items() if i in ids}
@@ -582,7 +582,7 @@ class Scene(Pictured):
 
 
 class Stopwatch:
-    """Measures where the time of one turn of the loop goes, stage by stage.
+    """Measures the time of each stage of a step.
 
     Attributes:
         laps: Stage → seconds it took.

@@ -1,7 +1,7 @@
 """Sessions over HTTP, for robot software that lives elsewhere: `caryatid serve`.
 
-One thread works on the sessions, one request after the other. A view takes all cores in compiled loops, and
-not every threading layer of numba may be entered by two threads at once: more threads would gain nothing.
+One thread works on the sessions, one request after the other. A view uses all cores in compiled loops, and
+not every threading layer of numba allows two threads at once, so more threads would gain nothing.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ STATUS: dict[type[Exception], int] = {
     OSError: 503,
     MemoryError: 503,
 }
-"""Statuses of errors; of all others 422: what was given cannot be used."""
+"""Status of each error; 422, the input cannot be used, for all others."""
 
 PATIENCE = 30.0
 """Time that a request's body may take to arrive [s]: 16 MB at half a megabyte per second."""
@@ -69,7 +69,7 @@ SessionName = Annotated[Name, PathParameter(description="Name of the session")]
 
 
 class Document(BaseModel):
-    """A JSON object of these keys and no others."""
+    """A JSON object with these keys only."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -81,7 +81,7 @@ class Problem(Document):
 
 
 class SessionOptions(Document):
-    """What a session is begun with."""
+    """Options of a new session."""
 
     name: Name = Field(description="Its name")
     segmentation: SegmentationMethod | None = Field(
@@ -118,7 +118,9 @@ class NewView(Document):
         None, description="Grey PNG, or .npy (H, W) of whole numbers: the object of each pixel, 0 = nothing"
     )
     number: int | None = Field(
-        None, ge=0, description="Number it is to have, 0 the first; a view that is there is not added again"
+        None,
+        ge=0,
+        description="Expected number of the view, from 0; a view that is already there is not added again",
     )
 
     def capture(self) -> Capture:
@@ -130,9 +132,9 @@ class NewView(Document):
 
 
 class ViewAnswer(Document):
-    """What came of a view."""
+    """Result of adding a view."""
 
-    view: int = Field(description="Its number, 0 the first")
+    view: int = Field(description="Number of the view, from 0")
     changed: bool = Field(description="Whether it changed the graph")
     note: str | None = Field(description="That the view waits for one that shows the table top, or null")
     graph: dict[str, Any] = Field(description="graph.json")
@@ -146,31 +148,31 @@ class UndoAnswer(Document):
 
 
 class Gaze(Document):
-    """Where the head looks, against the platform [rad]."""
+    """Where the head looks, relative to the platform [rad]."""
 
     yaw: float = Field(description="To the left")
     pitch: float = Field(description="Upwards")
 
 
 class Waypoint(Document):
-    """How the robot stands on its way."""
+    """Posture of the robot on its way."""
 
     platform: list[float] = Field(description="x, y, yaw [m, m, rad]")
     camera_height: float = Field(description="Over the floor [m]")
     gaze: Gaze = Field(description="How the head turns")
-    joints: list[float] | None = Field(description="Joint positions of an arm, or null where not known")
+    joints: list[float] | None = Field(description="Joint positions of an arm, or null if unknown")
 
 
 class NextAnswer(Document):
     """Where to look next."""
 
-    view: int = Field(description="Number it would have, 0 the first")
+    view: int = Field(description="Number of the next view, from 0")
     T_world_camera: list[list[float]] = Field(description="Pose [m], OpenCV camera frame, world z up")
-    candidate: int = Field(description="Which of the candidates it is")
+    candidate: int = Field(description="Index among the candidates")
     platform: list[float] | None = Field(description="x, y, yaw [m, rad]; null with candidates")
     camera_height: float | None = Field(description="Over the floor [m]; null with candidates")
     gaze: Gaze | None = Field(description="How the head turns; null with candidates")
-    joints: list[float] | None = Field(description="Joint positions of an arm, or null where not known")
+    joints: list[float] | None = Field(description="Joint positions of an arm, or null if unknown")
     waypoints: list[Waypoint] = Field(
         description="The way there, from where the robot is; straight in between; empty with candidates"
     )
@@ -178,16 +180,16 @@ class NextAnswer(Document):
     cost: float = Field(description="Cost h of the path, eq. 3")
     score: float = Field(description="c = s − h, eq. 3")
     why: str = Field(description="One sentence for a person to read")
-    stop: str | None = Field(description="Why looking on may not pay, or null")
+    stop: str | None = Field(description="Why another view may not pay, or null")
 
 
 class SessionPool:
-    """The sessions in one folder. Of its methods only `do` is called by others than the thread of the pool.
+    """The sessions in one folder. Threads other than the pool's own call only `do`.
 
     Args:
         folder: Holds the sessions, each in a folder of its name.
         config: Settings of new sessions.
-        open_sessions: Maximum number kept open; of more, the one used longest ago is closed.
+        open_sessions: Maximum number kept open; beyond it, the least recently used one is closed.
         waiting: Maximum number of requests waiting, including the one in work.
     """
 
@@ -203,12 +205,12 @@ class SessionPool:
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="sessions")
 
     async def __aexit__(self, *error: object) -> None:
-        """Finish what is waiting, and close the sessions."""
+        """Finish the waiting requests, and close the sessions."""
         self._worker.shutdown()
         self._close_all_but(0)
 
     async def do(self, work: Callable[[], Any]) -> Any:
-        """Run some work on the sessions, in the thread of the pool, after everything that is waiting already.
+        """Run work on the sessions in the pool's thread, after all work that is waiting.
 
         Raises:
             FullError: Too many requests are waiting.
@@ -240,7 +242,7 @@ class SessionPool:
         return self._opened(name, Session.begin(self.folder / name, config, **options))
 
     def session(self, name: str) -> Session:
-        """Return a session, opened from disk where it is not open.
+        """Return a session, opened from disk if needed.
 
         Raises:
             MissingError: There is none of that name.
@@ -269,7 +271,7 @@ class SessionPool:
             )
 
     def _opened(self, name: str, session: Session) -> Session:
-        """Keep a session open, as the one used last."""
+        """Keep a session open as the most recently used one."""
         self._open[name] = session
         self._close_all_but(self._max_open)
         return session
@@ -294,8 +296,8 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
 
     Args:
         pool: The sessions; started and stopped with the application.
-        token: What requests have to bear; None = only this machine's own may come, and need none.
-        max_request: Size of a request at the most [bytes].
+        token: Token that requests need; None = only this machine may connect, without one.
+        max_request: Maximum size of a request [bytes].
         host: Address it listens at.
     """
     app = FastAPI(
@@ -311,7 +313,7 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
     )
     app.add_middleware(Gate, token=token)
     if token is None:
-        # Pages from elsewhere that a browser here shows are refused: they name another host.
+        # Refuse pages from elsewhere that a browser on this machine shows: they name another host.
         local = ["127.0.0.1", "localhost", "[::1]", host]
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=local)
     for kind in (CaryatidError, RequestValidationError, OSError, MemoryError):
@@ -322,7 +324,7 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
 
 def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     def queued(work: Callable[..., Any]) -> Callable[..., Any]:
-        """Do the work of a page in the thread of the pool."""
+        """Handle a request in the pool's thread."""
 
         @wraps(work)
         async def answer(**given: Any) -> Any:
@@ -354,13 +356,13 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.get("/sessions/{name}", response_model=SessionAnswer)
     @queued
     def describe_session(name: SessionName) -> Any:
-        """Say what a session is, and how many views it has."""
+        """Describe a session, with its number of views."""
         return described(name, pool.session(name))
 
     @app.post("/sessions/{name}/views", status_code=201, response_model=ViewAnswer)
     @queued
     def add_view(name: SessionName, given: NewView) -> Any:
-        """Take in a view; when this answers, it is on the disk and stays."""
+        """Add a view; when this answers, the view is on disk."""
         return pool.add(name, given.capture(), given.number).to_json()
 
     @app.delete("/sessions/{name}/views/last", response_model=UndoAnswer)
@@ -373,28 +375,28 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.get("/sessions/{name}/graph")
     @queued
     def tell_graph(name: SessionName) -> dict[str, Any]:
-        """Say what is known: graph.json."""
+        """Return the support graph, graph.json."""
         return graph_to_json(pool.session(name).graph)
 
     @app.get("/sessions/{name}/next", response_model=NextAnswer)
     @queued
     def tell_next(name: SessionName) -> Any:
-        """Say where to look next, for the robot the session was begun with."""
+        """Choose the next view for the session's robot."""
         return pool.session(name).next().to_json()
 
     @app.post("/sessions/{name}/next", response_model=NextAnswer)
     @queued
     def choose_next(name: SessionName, given: Reachable) -> Any:
-        """Choose where to look next among the views that your robot reaches."""
+        """Choose the next view among those that your robot reaches."""
         return pool.session(name).next(given.T_world_camera, given.path_length).to_json()
 
 
 class Gate:
-    """Before anything of a request is read: its token, and how long its body may take.
+    """Checks the token and limits the time of the body, before a request is read.
 
     Args:
-        app: What is behind it.
-        token: What requests have to bear; None = nothing.
+        app: The application behind it.
+        token: Token that requests need, or None.
     """
 
     def __init__(self, app: ASGIApp, token: str | None) -> None:
@@ -424,7 +426,7 @@ class Gate:
 
 
 class PatientProtocol(H11Protocol):
-    """HTTP whose keep-alive time also holds for the headers of a request: halves do not stay for ever."""
+    """HTTP whose keep-alive time also limits the headers of a request, so that half requests end."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin to wait for the first request."""
@@ -433,7 +435,7 @@ class PatientProtocol(H11Protocol):
         self.timeout_keep_alive_task = self.loop.call_later(wait, close)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes; the waiting ends with a whole request, which uvicorn's own ends with any byte."""
+        """Receive bytes; the timer stops at a whole request, while uvicorn's own stops at any byte."""
         self.conn.receive_data(data)
         self.handle_events()
 
@@ -463,23 +465,23 @@ def _check_limits(own: Config, asked: Config) -> None:
 
 
 async def _refuse(folder: Path, request: Request, error: Exception) -> Response:
-    """Say what does not fit in one sentence, and neither what was sent nor where sessions are kept."""
+    """Say in one sentence what does not fit, without the data sent or the place of the sessions."""
     status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 422)
     text = in_one_line(error)
     if isinstance(error, RequestValidationError):
         first = error.errors()[0]
         text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    # Names that were sent may hold halves of characters, which no answer can.
+    # Names in a request may hold half characters, which no answer can.
     text = text.replace(f"{folder}/", "").replace(str(folder), "its folder")
     detail = " ".join(text.encode("utf-8", "replace").decode().splitlines())
     return JSONResponse({"detail": detail}, status, {"Retry-After": "1"} if status == 503 else None)
 
 
 def check_token(host: str, token: str | None) -> None:
-    """Refuse to serve others than this machine without a token.
+    """Refuse to serve other machines without a token.
 
     Raises:
-        InputError: There is none, or it is too short to keep anybody out.
+        InputError: There is none, or it is too short to be safe.
     """
     if token is not None and len(token) < 16:
         raise InputError("--token", "has fewer than 16 characters", "give a longer one that nobody can guess")
@@ -493,7 +495,7 @@ def check_token(host: str, token: str | None) -> None:
 
 
 def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM, at any free port for 0; what has been asked by then is answered.
+    """Serve until Ctrl-C or SIGTERM, and answer all earlier requests; port 0 = any free one.
 
     `listening` is called with the address.
 
@@ -512,14 +514,14 @@ def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], N
             http=PatientProtocol,
             log_level="warning",
             access_log=False,
-            limit_concurrency=64,  # with the size of a request this bounds what is held in memory
+            limit_concurrency=64,  # with the size of a request, this limits the memory in use
         )
     )
 
     def stop(number: int, frame: object) -> None:
         server.should_exit = True
 
-    # The server hears signals itself as soon as it runs, and hands them on once it has stopped.
+    # The server handles signals itself while it runs, and passes them on when it has stopped.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
     listening(f"http://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}")

@@ -1,4 +1,4 @@
-"""What SOURCE is: a scene to simulate, a recording to play back, or a cloud."""
+"""Sources: a scene to simulate, a recording to play back, or a cloud."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class Source:
 
     Attributes:
         name: Short name.
-        camera: Gives its views.
+        camera: Takes its views.
         robot: Stands at the first view.
-        truth: What is really there, where known.
+        truth: The ground truth, if known.
     """
 
     name: str
@@ -78,19 +78,19 @@ def open_source(
     """Open an MJCF file or folder, the name of a built-in scene, or a recording.
 
     Args:
-        source: What the user gave.
+        source: Name, file or folder.
         config: All settings.
         noise: Noise of the simulated camera.
         segmentation: Which segmentation to use.
         seed: Seed of the noise.
         robot: Name of the simulated robot.
-        masks: Gives views their masks, or None to take them as they come.
-        ignore: Mask of what to ignore in a recording, as `without_ignored` takes it, or None.
+        masks: Source of masks, or None to use those of the views.
+        ignore: Mask of pixels to ignore in a recording, as for `without_ignored`, or None.
         level: Turn the world of a recording so that the table is level, for poses whose z is not up.
 
     Raises:
-        InputError: It is none of them, or broken, or lacks the labels that are demanded; or there is no such
-            robot, a robot is given for a recording, or a mask of what to ignore for a simulation.
+        InputError: It is none of them, is broken, or lacks required labels; or there is no such robot, a
+            robot is given for a recording, or an ignore mask for a simulation.
         PlanningError: The robot reaches no view of the table.
     """
     if is_cloud(source):
@@ -151,13 +151,12 @@ def open_recording(
 ) -> Dataset:
     """Open a dataset and decode every frame once, so that a broken one is reported before any work is done.
 
-    Of a video a few sharp frames are chosen. Where a source gives the masks, those of the dataset do not
-    count. What a mask says to ignore is not in the views. With `level` the world is turned so that the table
-    is level.
+    From a video, a few sharp frames are chosen. A mask source replaces the masks of the dataset. Ignored
+    pixels are left out. With `level`, the world is turned so that the table is level.
 
     Raises:
-        InputError: It or the mask is broken, it has no labels where they are demanded, a segment too small
-            for a shape, or no table to level the world by.
+        InputError: It or the mask is broken, required labels are missing, a segment is too small for a
+            shape, or no table shows what is level.
     """
     recording = open_dataset(folder, config.recording)
     if recording.is_video:
@@ -195,21 +194,20 @@ def extract(
     ignore: Path | None = None,
     level: bool = False,
 ) -> Iterator[Step]:
-    """Open a recording or a cloud; returns the steps of looking at all it holds.
+    """Open a recording or a cloud; returns the steps of all its views.
 
     Args:
-        source: What the user gave.
+        source: Name, file or folder.
         config: All settings.
         segmentation: Which segmentation to use.
         seed: Seed of every random choice.
         label_divisor: For a cloud whose labels number parts of objects: object = label // this.
-        masks: Gives views their masks, or None to take them as they come.
-        ignore: Mask of what to ignore in a recording, as `without_ignored` takes it, or None.
+        masks: Source of masks, or None to use those of the views.
+        ignore: Mask of pixels to ignore in a recording, as for `without_ignored`, or None.
         level: Turn the world of a recording so that the table is level, for poses whose z is not up.
 
     Raises:
-        InputError: It is neither, or broken, or has no labels where they are demanded; or masks are to be
-            given to a cloud.
+        InputError: It is neither, is broken, or lacks required labels; or masks are given for a cloud.
         PerceptionError: A cloud shows no support surface.
     """
     explorer = Explorer(config=config, segmentation=segmentation, seed=seed, masks=masks)
@@ -232,12 +230,12 @@ def extract(
 
 
 def _seen(frame: Frame, ignore: Path, max_pixels: int) -> View:
-    """The view of a frame, without what a mask says to ignore."""
+    """The view of a frame, without the pixels to ignore."""
     return without_ignored(frame.load(), ignore, max_pixels)
 
 
 def _look_at_all(explorer: Explorer, recording: Dataset) -> Iterator[Step]:
-    """The steps of all views, or the error of the last where none shows a support surface."""
+    """The steps of all views, or the error of the last if none shows a support surface."""
     for left, frame in zip(range(len(recording))[::-1], recording.frames, strict=True):
         try:
             yield from explorer.looks(frame.load())

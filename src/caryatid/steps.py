@@ -34,7 +34,7 @@ from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 FORMAT: Final = "caryatid/run"
 AGAIN: Final = "run caryatid again"
-"""What to do where a file of a run is broken."""
+"""Remedy for a broken file of a run."""
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 """Packages whose versions run.json records."""
 PARTS = {"cloud": Cloud, "sphere": ViewSphere, "view": View, "candidates": Candidates, "decision": Decision}
@@ -42,23 +42,21 @@ PARTS = {"cloud": Cloud, "sphere": ViewSphere, "view": View, "candidates": Candi
 
 
 class RunWriter(StagedFolder):
-    """Writes a run folder step by step, in a `with` block at whose end the folder is put in its place.
+    """Writes a run folder step by step in a `with` block; the folder appears at the end of the block.
 
-    Ctrl-C ends the block too: the views so far are kept. Any other error leaves nothing behind. A run folder
-    already there is replaced at the end of the block and not before; a folder that holds anything else, be it
-    beside a run, is never touched.
+    Ctrl-C ends the block too and keeps the views so far. Any other error leaves nothing behind. An earlier
+    run folder is replaced only at the end of the block. A folder with any other file is never touched.
 
     Args:
         folder: RUN.
         config: All settings.
-        about: What run.json says of the run besides: command, source, seed, options.
-        stepwise: Put the folder in its place with the first view, and add to it view by view: whenever the
-            process is killed, the views so far are there. Where such a run was begun there and not finished,
-            go on with it.
+        about: Further entries of run.json: command, source, seed, options.
+        stepwise: Publish the folder with the first view and add to it view by view, so that a kill keeps the
+            views so far. An unfinished run of this kind is continued.
 
     Attributes:
-        past: The run that this one goes on with, or None.
-        more: What else run.json is to hold.
+        past: The run that this one continues, or None.
+        more: More entries of run.json.
         files: Further files of the folder: path in it → content.
 
     Raises:
@@ -83,20 +81,20 @@ class RunWriter(StagedFolder):
 
     @property
     def steps(self) -> list[dict[str, Any]]:
-        """What run.json says of each view: its number, its timings [s], angle and path so far."""
+        """Entries of run.json for each view: its number, its timings [s], angle and path so far."""
         return [step for step, _, _ in self._views]
 
     def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
         """Write the next view.
 
-        Points and normals of the cloud are rounded to float32; all else comes back as it was.
+        Points and normals of the cloud are rounded to float32; everything else is read back unchanged.
 
         Args:
             step: The step of this view.
-            score: What run.json says of its score, where the truth is known.
+            score: Its score for run.json, if the ground truth is known.
 
         Raises:
-            InputError: Labels leave 16 bits, or the disk is full or refuses.
+            InputError: Labels exceed 16 bits, or the disk cannot be written.
         """
         number = len(self._views)
         labels, folder = step.labels, _view_folder(number)
@@ -118,7 +116,7 @@ class RunWriter(StagedFolder):
             self._finish({"unfinished": True} if step.decision is not None else {})
 
     def __exit__(self, kind: object = BaseException, *error: object) -> None:
-        """Write the rest and put the folder in its place; after an error but Ctrl-C remove it."""
+        """Write the rest and publish the folder; after an error other than Ctrl-C, remove it."""
         interrupted = kind is KeyboardInterrupt and len(self._views) > 0
         try:
             if (interrupted or (kind is None and self._views)) and not self._stepwise:
@@ -129,11 +127,11 @@ class RunWriter(StagedFolder):
             count = "1 view is" if len(self._views) == 1 else f"{len(self._views)} views are"
             remedy = f"`caryatid report {self.folder}` makes the report"
             if self._stepwise:
-                remedy = "the same command goes on"
+                remedy = "the same command continues"
             raise KeyboardInterrupt(f"{count} kept in {self.folder}; {remedy}") from None
 
     def _finish(self, more: dict[str, Any]) -> None:
-        """Write what a run says as a whole, and put the folder in its place."""
+        """Write the files of the whole run, and publish the folder."""
         last, graph, _ = self._views[-1]
         document = {"format": FORMAT, "version": 2, "views": len(self._views)} | self._about
         document["date"] = datetime.now(UTC).isoformat(timespec="seconds")
@@ -157,7 +155,7 @@ class RunView:
     """One view of a run.
 
     Attributes:
-        name: The view's name; a recording's frame is found again by it.
+        name: The view's name, which identifies a recording's frame.
         graph: The fused graph after this view.
         record: All of view.json.
         folder: Its folder, `views/NN`.
@@ -216,7 +214,7 @@ class _ViewFile:
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read a run folder; label images are loaded when asked for.
+    """Read a run folder; label images are loaded on demand.
 
     Raises:
         InputError: It is not a run folder, or a file in it is missing or broken.
@@ -247,7 +245,7 @@ def read_steps(run: Run) -> Iterator[Step]:
 
 
 def read_config(run: Run) -> Config:
-    """Return the settings a run was made with; settings that no longer exist are passed over.
+    """Return the settings a run was made with; settings that no longer exist are ignored.
 
     Raises:
         InputError: The settings are not valid.
@@ -264,7 +262,7 @@ def is_run(folder: Path) -> bool:
 
 
 def _own_files(folder: Path) -> set[str]:
-    """Files of a run folder that may be replaced: what run.json says was written, and what is made of it."""
+    """Files of a run folder that may be replaced: those that run.json lists, and those made from them."""
     if not is_run(folder):
         return set()
     files = read_json(folder / "run.json").get("files")
@@ -275,7 +273,7 @@ def _own_files(folder: Path) -> set[str]:
 
 
 def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
-    """The run that the same command with the same settings began in a folder and did not end, or None."""
+    """The unfinished run of the same command and settings in a folder, or None."""
     if not is_run(folder):
         return None
     record = read_json(folder / "run.json")
@@ -283,7 +281,7 @@ def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
 
 
 def _next_files(index: int) -> set[str]:
-    """Files that belong to a view, or may."""
+    """Possible files of a view."""
     names = ("graph.json", "labels.png", "view.json", "step.npz")
     return {lift_file(index)} | {f"{_view_folder(index)}/{name}" for name in names}
 
@@ -305,7 +303,7 @@ def _read_view(folder: Path) -> RunView:
 
 
 def _summary(step: Step) -> dict[str, Any]:
-    """What view.json says of the camera, the candidates and the choice of the next view."""
+    """Entries of view.json about the camera, the candidates and the choice of the next view."""
     record: dict[str, Any] = {key: getattr(step.view, key, None) for key in ("T_world_camera", "K")}
     record["changes"] = [asdict(change) for change in step.changes]
     if step.lift is not None:
@@ -328,7 +326,7 @@ def _summary(step: Step) -> dict[str, Any]:
 
 
 def _encoded(step: Step) -> bytes:
-    """Content of step.npz: arrays are members named `part.field`, all else is in the member `document`."""
+    """Content of step.npz: arrays are members named `part.field`, the rest is in the member `document`."""
     arrays: dict[str, NDArray[Any]] = {"labels": step.labels, "visited": step.visited}
     names = ("index", "name", "timings", "angle_travelled", "path_travelled", "stop")
     document: dict[str, Any] = {name: getattr(step, name) for name in names}
@@ -376,7 +374,7 @@ def _read_step(folder: Path) -> Step:
 
 
 def _decoded(stored: dict[str, Any]) -> Step:
-    """The step of its graph and all that step.npz holds."""
+    """The step with its graph and the content of step.npz."""
     for name in ("cloud.points", "cloud.normals"):
         stored[name] = stored[name].astype(np.float64)
     if "view.depth" in stored:
@@ -401,12 +399,12 @@ def _decoded(stored: dict[str, Any]) -> Step:
 
 
 def _names(part: str, kind: Any) -> dict[str, str]:
-    """Keys of what a part holds, and the fields they come from."""
+    """Keys of a part in step.npz, and their fields."""
     return {f"{part}.{f.name.removesuffix('_world')}": f.name for f in fields(kind) if f.init}
 
 
 def _plain(value: Any) -> Any:
-    """What JSON does not know: arrays, NumPy's scalars and dataclasses."""
+    """Convert what JSON does not know: arrays, NumPy's scalars and dataclasses."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else asdict(value)
 
 

@@ -1,1 +1,1 @@
-"""The benchmark: ways to look at clutter compared over scenes, sensors and seeds, stored and drawn."""
+"""The benchmark: methods compared over scenes, sensors and seeds, stored and drawn."""

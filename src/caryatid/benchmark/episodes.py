@@ -1,4 +1,4 @@
-"""One episode: a scene is explored and every view scored; and what scenes there are to explore."""
+"""One episode: a scene is explored and every view scored; and the choice of scenes."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ from caryatid.simulation.setup import make_simulation
 from caryatid.simulation.world import SimulatedScene, poses_of
 
 OrderName = Literal["", "one hand", "two hands", "highest first", "random", "true graph"]
-"""How objects are ordered for removal; with the empty name nothing is removed."""
+"""Orders of removal; the empty name removes nothing."""
 ORDERS: tuple[OrderName, ...] = tuple(name for name in get_args(OrderName) if name)
 REMOVAL_VIEWS = (1, 3, 5, 10)
-"""Views after which a scene is taken apart, by what is known then."""
+"""Views after which a scene is taken apart, from the scene model at the time."""
 
 Row = dict[str, Any]
 """What was measured after one view: `view` (from 1), `MEASURES`, `counts`, and `forecasts` of its `Score`."""
@@ -58,7 +58,7 @@ class Episode:
         scene: Name of a built-in scene, or a scene folder.
         content: Digest of a scene folder's files; empty for a built-in scene.
         fusion: What is fused.
-        planner: Who chooses the views.
+        planner: Planner of the views.
         plugin: Digest of the package that offers the planner; empty for built-in planners.
         segmentation: Where segments come from.
         noise: Noise of the camera.
@@ -66,7 +66,7 @@ class Episode:
         settings: Changes of these, `stage.name=value`.
         views: Number of views, including the first.
         seed: Seed of the noise and of every choice.
-        order: How the objects are ordered for removal; empty where nothing is removed.
+        order: Order of removal; empty if nothing is removed.
     """
 
     scene: str
@@ -90,16 +90,16 @@ class Episode:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What an episode gave: one row per view, or none and the error in one line."""
+    """Result of an episode: one row per view, or none and the error in one line."""
 
     rows: tuple[Row, ...]
     error: str | None = None
 
 
 def run_episode(episode: Episode) -> Outcome:
-    """Run an episode; whatever goes wrong is part of the outcome.
+    """Run an episode; any error is part of the outcome.
 
-    Views that can no longer be reached repeat the last row: the graph stays as it is.
+    Unreachable views repeat the last row, because the graph does not change.
     """
     try:
         return Outcome(tuple(_rows(episode)))
@@ -175,7 +175,7 @@ def family(scene: str) -> str:
 
 @lru_cache(maxsize=8)
 def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene]:
-    """Load a scene and its ground truth; kept, as the episodes of a scene are run one after the other.
+    """Load a scene and its ground truth; cached, because the episodes of a scene run one after the other.
 
     Raises:
         InputError: It cannot be loaded, or its files have another digest than `content`.
@@ -189,7 +189,7 @@ def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene
 def _take_apart(
     scene: SimulatedScene, graph: SupportGraph, truth: TrueScene, order: OrderName, config: Config, seed: int
 ) -> dict[str, float]:
-    """Whether taking a scene apart harms nothing; what was not extracted goes last, the highest first."""
+    """Whether taking a scene apart harms nothing; unextracted objects go last, the highest first."""
     bodies = bodies_of(graph, truth)
     objects = [o for o in graph.objects if o.role == "object"]
     if objects and order in ("one hand", "two hands"):
@@ -210,7 +210,7 @@ def _take_apart(
 
 
 def figures_of(found: Score, graph: SupportGraph, true: int) -> Row:
-    """Scores of a graph, and numbers of true objects, of extracted ones and of those that are both."""
+    """Scores of a graph, and the numbers of true, extracted and matched objects."""
     scores = {name: getattr(found, name) for name in SCORES}
     return scores | {"objects": true, "returned": len(graph.objects) - 1, "matched": len(found.ious)}
 
@@ -240,7 +240,7 @@ def _rows(episode: Episode) -> list[Row]:
 
 
 def _by_graph(ids: Sequence[str], edges: frozenset[tuple[str, str]], bodies: Mapping[str, str]) -> list[str]:
-    """Ids (the highest first) reordered so that what supports nothing that is left goes first."""
+    """Ids (the highest first) reordered so that objects without remaining loads go first."""
     left, done = list(ids), []
     while left:
         carrying = {i for i in left for k in left if (bodies.get(i), bodies.get(k)) in edges}

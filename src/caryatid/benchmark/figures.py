@@ -1,4 +1,4 @@
-"""The benchmark's figures, drawn of a suite's summary: the same bytes every time."""
+"""The benchmark's figures, drawn from a suite's summary: the same bytes every time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#e69f00", "#56b4e9")
-"""Of Okabe and Ito, told apart with any kind of colour vision; without their yellow, too pale for a line."""
+"""Colours of Okabe and Ito, distinct for any colour vision; without their yellow, too pale for a line."""
 MARKERS, DASHES = "os^DvPX", ("-", "--", ":")
 STYLE = {
     "font.size": 9.0, "axes.spines.right": False, "axes.spines.top": False, "axes.axisbelow": True,
@@ -30,7 +30,7 @@ Curves = dict[str, "pd.DataFrame"]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Figure:
-    """A figure: name of its file without an ending, what is to be seen in it, and what draws it."""
+    """A figure: name of its file without a suffix, its caption, and the function that draws it."""
 
     name: str
     caption: str
@@ -38,7 +38,7 @@ class Figure:
     plot: Callable[[Any], None]
 
     def save(self, path: Path) -> None:
-        """Write it as the ending says, SVG or PNG, with nothing of who drew it when."""
+        """Write it as SVG or PNG, by the suffix, without author and date."""
         from matplotlib import style
         from matplotlib.figure import Figure as Drawing
 
@@ -54,9 +54,9 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
 
     Args:
         group: Its rows of a suite's summary.
-        measure: What is drawn, say `f1`.
-        heading: What the axis says of it.
-        reference: Method differences are from.
+        measure: The quantity, such as `f1`.
+        heading: Label of the axis.
+        reference: Reference method of the differences.
     """
     family = group["family"].iloc[0]
     scenes = f"{family} scenes".strip()
@@ -163,5 +163,5 @@ def _reliability(curves: dict[int, pd.DataFrame], numbers: dict[int, pd.DataFram
 
 
 def _interval(curve: pd.DataFrame) -> Any:
-    """How far the interval reaches below and above each value (2, N)."""
+    """Extent of the interval below and above each value (2, N)."""
     return np.abs([curve["value"] - curve["low"], curve["high"] - curve["value"]])

@@ -71,12 +71,12 @@ def run_on_cluster(
     Args:
         episodes: What to run.
         address: Of the scheduler.
-        tell: Is given a line when there is nobody to work.
+        tell: Receives a line if there are no workers.
         patience: How long the scheduler may take to answer [s].
 
     Raises:
         InputError: No scheduler answers.
-        CaryatidError: It is gone, or a worker has other code.
+        CaryatidError: The scheduler is gone, or a worker has other code.
     """
     code = fingerprint()
     with connect(address, patience) as client:
@@ -103,7 +103,7 @@ def connect(address: str, patience: float = 10.0) -> Client:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are reported here
 
     async def greet() -> None:
-        """Fail soon where a client would go on trying."""
+        """Fail soon, while a client would keep trying."""
         secrets = Security().get_connection_args("client")
         connection = open_connection(address, patience, **secrets)
         await (await asyncio.wait_for(connection, patience)).close()
@@ -130,7 +130,7 @@ def run_on_worker(episode: Episode, code: str) -> Outcome:
         code: Fingerprint the worker's code must have.
 
     Raises:
-        CaryatidError: It has another, or another package that offers the planner.
+        CaryatidError: The worker has other code, or another package that offers the planner.
     """
     from numba import set_num_threads
 
@@ -172,7 +172,7 @@ def _other_code(found: str) -> CaryatidError:
 
 
 def _end_with_parent() -> None:
-    """End this process as soon as the one that started it is gone, however that ended."""
+    """End this process as soon as its parent is gone, for any reason."""
     parent = parent_process()
 
     def follow() -> None:
@@ -185,7 +185,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back while processes are started; they never get it, so that they leave quietly.
+    """Hold Ctrl-C back while processes are started; they never receive it, so they end quietly.
 
     The mask is what the processes inherit. It does not hold Ctrl-C back here, where another thread may take
     it and half-started processes would be left behind: the handler does. Where Ctrl-C is ignored, as in the

@@ -1,4 +1,4 @@
-"""What a suite's episodes say: means over scenes with intervals, paired differences, path to a threshold.
+"""Statistics of a suite: means over scenes with intervals, paired differences, path to a threshold.
 
 Scenes are what is sampled: the seeds of a scene are averaged first, and the percentile bootstrap (Efron and
 Tibshirani 1993, chapter 13) draws scenes. A failed episode is counted, and is in no mean. An episode that
@@ -32,7 +32,7 @@ COLUMNS = ("condition", "family", "method", "quantity", "at", "value", "low", "h
 CURVE = ["f1", "path"]
 
 Statistic = tuple[str, float, float, float, float]
-"""Quantity, where it is taken, its value and the ends of its interval (NaN where there is none)."""
+"""Quantity, its place, its value and the ends of its interval (NaN if there is none)."""
 
 
 def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | None = None) -> pd.DataFrame:
@@ -41,8 +41,8 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
     Args:
         table: A row per view and failed episode, as `ResultStore.table` returns it.
         reference: Method the others are compared with.
-        gap: Two methods, such as random choice and the oracle; `gap` is how much of their gap in F1 each
-            other method closes.
+        gap: Two methods, such as random choice and the oracle; `gap` is the share of their gap in F1 that
+            each other method closes.
 
     Returns:
         One row per figure with the columns `COLUMNS`. Quantities: every measure (`at`: view), `MEASURE
@@ -98,8 +98,7 @@ def bootstrap(frames: Sequence[pd.DataFrame], figures: Callable[..., Array]) -> 
 
     Args:
         frames: By scene and seed, with the same number C of columns each; what all of them have counts.
-        figures: Makes figures (..., F) of the frames' means (..., C); infinite where a threshold is not
-            reached.
+        figures: Makes figures (..., F) of the frames' means (..., C); infinite if a threshold is not reached.
 
     Returns:
         Value, lower and upper end of each figure (F, 3); no ends (NaN) for a single scene, no figures for
@@ -116,7 +115,7 @@ def bootstrap(frames: Sequence[pd.DataFrame], figures: Callable[..., Array]) -> 
             return np.stack([value, np.full_like(value, np.nan), np.full_like(value, np.nan)], axis=1)
         drawn = np.random.default_rng((0, size)).multinomial(size, np.full(size, 1.0 / size), RESAMPLES)
         means = np.tensordot(drawn / size, scenes, 1)
-        # Sorted and picked, not interpolated: a path that ends nowhere is infinite.
+        # Sorted and picked, not interpolated, because a missing path is infinite.
         resampled = np.sort(figures(*np.moveaxis(means, 1, 0)), axis=0)
     tail = round((1.0 - CONFIDENCE) / 2.0 * (RESAMPLES - 1))
     return np.stack([value, resampled[tail], resampled[-1 - tail]], axis=1)
@@ -190,12 +189,12 @@ def _against(own: pd.DataFrame, other: pd.DataFrame) -> Iterator[Statistic]:
     difference = bootstrap([own, other], lambda ours, theirs: ours - theirs)
     yield from _named([(f"{name} difference", at) for name, at in own.columns], difference)
     found = bootstrap([frame[name] for frame in (own, other) for name in CURVE], ratios)
-    # Where the other method is not there either its path is infinite, and the ratio 0.
+    # If the other method does not reach it either, its path is infinite, and the ratio 0.
     yield from (row for row in _by_threshold("path ratio", found) if 0.0 < row[2] < np.inf)
 
 
 def _calibration(episodes: pd.DataFrame) -> Iterator[Statistic]:
-    """How good the probabilities of a method's supports are."""
+    """Quality of the probabilities of a method's supports."""
     if episodes.empty:
         return
     rows = episodes.set_index(["scene", "seed", "view"])["forecasts"].map(_sums)
@@ -224,7 +223,7 @@ def _calibration(episodes: pd.DataFrame) -> Iterator[Statistic]:
 
 
 def _sums(forecasts: Sequence[Sequence[float]]) -> Array:
-    """How many are missing; of the others both squared errors, and number, probability, truth by bin."""
+    """Number of missing supports; both squared errors of the others, and their sums by bin."""
     table = np.array(forecasts, dtype=np.float64).reshape(-1, 3)
     said, by_certain, true = table[table[:, 0] > 0.0].T
     bins = np.minimum(BINS * said, BINS - 1).astype(int)

@@ -1,4 +1,4 @@
-"""Results on disk: one JSON line per finished episode, appended and synced; and which code made them."""
+"""Results on disk: one JSON line per finished episode, appended and synced; and the code that made them."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class _First:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """A line that says what a suite consists of."""
+    """A line with the members of a suite."""
 
     suite: str
     members: list[Member]
@@ -56,7 +56,7 @@ class _Plan:
 
 @dataclass(frozen=True, slots=True)
 class _Done:
-    """A line that says what came of an episode."""
+    """A line with the result of an episode."""
 
     key: str
     rows: tuple[dict[str, int | float | list[list[float | bool]] | None], ...]
@@ -64,15 +64,15 @@ class _Done:
 
 
 class ResultStore:
-    """What was asked for and what is done. A line is either whole or, torn by a kill, ignored.
+    """Planned and finished episodes. A line is either whole or, torn by a kill, ignored.
 
     Args:
         path: File of JSON lines; created by a writer.
         fingerprint: Of the code that adds episodes; None only reads. There is one writer at a time.
-        about: Further facts on code and machine, kept where the file is new.
+        about: Further facts about code and machine, kept if the file is new.
 
     Raises:
-        InputError: The file is missing or no result file, other code made it, or another run is under way.
+        InputError: The file is missing or not a result file, other code made it, or another run is under way.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class ResultStore:
         self._lock.release()
 
     def plan(self, suite: str, members: Sequence[Member], *, retry: bool = False) -> list[Episode]:
-        """Record what a suite consists of, in place of an earlier plan.
+        """Record the members of a suite, instead of an earlier plan.
 
         Args:
             suite: Its name.
@@ -124,13 +124,13 @@ class ResultStore:
         return [episode for key, episode in wanted.items() if key not in known]
 
     def add(self, episode: Episode, outcome: Outcome) -> None:
-        """Append what an episode gave; a success that is there already stays."""
+        """Append the result of an episode; an earlier success stays."""
         key = self._key(episode)
         self._append({"key": key, "episode": asdict(episode), "rows": outcome.rows, "error": outcome.error})
         self._keep(key, outcome)
 
     def table(self, suite: str) -> pd.DataFrame:
-        """What is done of a suite: a row per view, in its order; a failed episode has one row with its error.
+        """Finished episodes of a suite: a row per view, in order; one row with the error if it failed.
 
         Raises:
             InputError: pandas is not installed.
@@ -158,7 +158,7 @@ class ResultStore:
             self.outcomes[key] = outcome
 
     def _open(self) -> None:
-        """Let nobody else write, and open the file for it."""
+        """Lock the file against other writers, and open it."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._lock.acquire()
@@ -191,7 +191,7 @@ class ResultStore:
             self._file.truncate(len(whole))
 
     def _begin(self, about: dict[str, str]) -> None:
-        """Write the first line, or refuse to add to what other code made."""
+        """Write the first line, or refuse to add to results of other code."""
         if not self.about:
             self._append({"about": about})
             self.about = about
@@ -222,7 +222,7 @@ def import_pandas() -> Any:
 
 
 def collect_provenance() -> dict[str, str]:
-    """Which code on which machine: version, commit, libraries, processor; nothing of who ran it or where."""
+    """Code and machine: version, commit, libraries, processor; nothing about the user or place."""
     package = Path(__file__).parents[1]
     tracked = _git(package, "ls-files", "__init__.py")
     processors = Path("/proc/cpuinfo")
@@ -250,7 +250,7 @@ def describe_provenance(about: Mapping[str, str]) -> str:
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    """What git says; nothing where there is no git or it refuses."""
+    """Output of git; empty without git or on failure."""
     try:
         return subprocess.run(
             ["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=30.0, check=True

@@ -1,4 +1,4 @@
-"""Named suites: which methods meet which scenes, under which conditions, how often."""
+"""Named suites: methods, scenes, conditions and repetitions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from caryatid.planning.planners import VOLUMETRIC
 
 
 def _generated(kind: str, smallest: int, largest: int, seed: int, count: int) -> tuple[str, ...]:
-    """Names of generated scenes from a seed on, their sizes going round from the smallest to the largest."""
+    """Names of generated scenes from a seed on, with sizes that cycle from the smallest to the largest."""
     return tuple(f"{kind}-{smallest + i % (largest - smallest + 1)}-{seed + i}" for i in range(count))
 
 
@@ -33,7 +33,7 @@ DENSE = _generated("dense", 10, 25, 301, 32)
 MIXED = (*DESIGNED, *PILES[2::2], *DENSE[:8])
 """Some of each."""
 LABELS = "labels, Carmine noise"
-"""The condition under which methods are compared where no other is said."""
+"""The default condition."""
 
 Changes = Mapping[str, Mapping[str, Any]]
 """Label of a method or condition → fields of its episodes that differ from the defaults."""
@@ -45,14 +45,14 @@ class Suite:
 
     Attributes:
         name: Its name on the command line.
-        what: What it shows, in one sentence.
-        methods: What is compared: a line of a figure each.
+        what: Its purpose, in one sentence.
+        methods: The methods, each a line of a figure.
         scenes: Names of built-in scenes, or scene folders.
-        conditions: What the camera gives; figures are drawn for each.
+        conditions: Conditions of the camera and segments; figures are drawn for each.
         seeds: Seeds 0…n−1.
-        views: Views an episode, including the first.
-        reference: Method the others are compared with; None for the first.
-        gap: Two methods, such as random choice and the oracle: how much of their gap each other one closes.
+        views: Views per episode, including the first.
+        reference: Method with which the others are compared; None for the first.
+        gap: Two methods, such as random choice and the oracle, whose gap the others close in part.
     """
 
     name: str
@@ -93,14 +93,14 @@ def change_suite(
     seeds: int | None = None,
     views: int | None = None,
 ) -> Suite:
-    """Return a suite with other methods, conditions, settings or scenes; what is not given stays.
+    """Return a suite with other methods, conditions, settings or scenes; the rest stays.
 
     Args:
-        suite: What is changed.
-        planners: Take the place of its methods, each with the default fusion.
-        fusions: How each of its planners fuses; methods that differ in their fusion alone become one.
-        segmentations: Take the place of its conditions, together with every noise.
-        noises: Of the camera.
+        suite: The suite.
+        planners: Replace its methods, each with the default fusion.
+        fusions: Fusions of each of its planners; methods that differ only in their fusion become one.
+        segmentations: Replace its conditions, together with every noise.
+        noises: Noise models of the camera.
         preset: Settings to start from in all episodes.
         settings: Changed in all episodes, `STAGE.NAME=VALUE`; a method's own go before.
         scenes: Built-in names, scene folders and folders of them.
@@ -108,8 +108,8 @@ def change_suite(
         views: Views of every episode.
 
     Raises:
-        InputError: A setting does not exist, its value is not valid, or an option changes it; or a scene is
-            not there.
+        InputError: A setting does not exist, its value is not valid, or an option changes it; or a scene
+            does not exist.
     """
     methods, conditions = suite.methods, suite.conditions
     if planners:
@@ -149,7 +149,7 @@ def change_suite(
 
 
 def _name(method: Mapping[str, Any]) -> str:
-    """What a method is, its fusion aside."""
+    """A method without its fusion."""
     order = (method["order"],) if "order" in method else ()
     return ", ".join((method.get("planner", "support"), *method.get("settings", ()), *order))
 
@@ -163,9 +163,9 @@ _FIG5: Changes = {
 }
 _PLANNERS = ("support", "attention", "paper", "random", "ring", "farthest", *VOLUMETRIC, "oracle")
 _FREE: dict[str, Any] = {"label": "{}, w = 0", "settings": ("active.path_cost=none",)}
-"""Volumetric planners that do not mind the way."""
+"""Volumetric planners without a path cost."""
 _GIVEN = {"settings": ("registration.enabled=false",)}
-"""Views whose poses are taken as they come."""
+"""Views with poses as reported."""
 _BOTH = {
     "eq. 2 with 2π": "active.saliency=paper",
     "point at midpoint": "active.edge_point=midpoint",
@@ -195,8 +195,8 @@ _DEPARTURES = {
     "matched by points": ("fusion.matching=points",),
     "edges kept by share": ("fusion.keep_share=0.5",),
 }
-"""What the default settings do otherwise than the paper, one at a time."""
-_TOP_DOWN: Changes = {  # only the paper's rule asks for the ratio
+"""The departures of the default settings from the paper, one at a time."""
+_TOP_DOWN: Changes = {  # only the paper's rule uses the ratio
     f"top-down by r_s,min {ratio:g}": {
         "settings": ("support.stability=area", f"support.min_area_ratio={ratio:g}")
     }
@@ -208,7 +208,7 @@ _NOISE: Changes = {
         "settings": (f"noise.axial=[{factor * _CONSTANT:.6g}, {factor * _SLOPE:.6g}, {_START:g}]",)
     }
     for factor in (0.0, 1.0, 2.0, 4.0)
-} | {  # poses of views that are off by so much (σ)
+} | {  # poses of views with these errors (σ)
     f"registration {cm:g} cm, {degrees:g}°": {
         "settings": (f"noise.translation={cm / 100.0:g}", f"noise.rotation={degrees:g}")
     }

@@ -71,7 +71,7 @@ def _interrupted(error: BaseException | None) -> bool:
 def run_from_shell() -> NoReturn:
     """Run the command line of the shell and end the process with its exit status.
 
-    SIGTERM and the end of the terminal are as Ctrl-C. What goes to a closed stdout or stderr is dropped.
+    SIGTERM and the end of the terminal act like Ctrl-C. Output to a closed stdout or stderr is dropped.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name) or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
@@ -83,7 +83,7 @@ def run_from_shell() -> NoReturn:
             signal.signal(number, signal.default_int_handler)
     status = main()
     if status == INTERRUPTED:
-        # Threads and libraries take their time to end; whoever pressed Ctrl-C does not wait for them.
+        # Threads and libraries take time to end; do not make the user wait for them.
         sys.stderr.flush()
         os._exit(status)
     sys.exit(status)

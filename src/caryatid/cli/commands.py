@@ -1,4 +1,4 @@
-"""All commands by name, and the one that the command line asks for; the two that only print text."""
+"""All commands by name, the reading of the command line, and the commands that only print text."""
 
 from __future__ import annotations
 

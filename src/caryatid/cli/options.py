@@ -154,12 +154,12 @@ class Modelling(Settings):
         """The configuration, as `Settings.read` returns it, with the options here.
 
         Args:
-            options: As there.
-            base: As there.
-            takes_views: Whether the command takes views, to which a model or folder may give masks.
+            options: As for `Settings.read`.
+            base: As for `Settings.read`.
+            takes_views: Whether the command takes views, whose masks may come from a model or folder.
 
         Raises:
-            InputError: As there; or masks are to be given and the command takes no views.
+            InputError: As for `Settings.read`; or masks are given and the command takes no views.
         """
         from caryatid.config.settings import preset
 
@@ -201,10 +201,10 @@ class LookingCommand(Command):
     """Use the masks or labels of the views, or segment automatically."""
     ignore: Annotated[Path | None, shown("MASK.png")] = None
     """Mask of the robot's own arm, or of anything else fixed to the camera: a grey PNG, whose pixels other
-    than 0 are ignored in every view; for a recording also a folder of one NAME.png a view."""
+    than 0 are ignored in every view; for a recording also a folder with one NAME.png per view."""
 
     def mask_source(self, config: Config) -> MaskSource | None:
-        """What gives views their masks, or None.
+        """The source of masks, or None.
 
         Raises:
             InputError: The model or folder is missing or broken, or its masks would not be used.
@@ -231,7 +231,7 @@ class PlanningCommand(LookingCommand):
 
     @property
     def chosen_planner(self) -> str:
-        """The planner, where none is given that of the preset."""
+        """The planner; by default that of the preset."""
         return self.planner or ("paper" if self.settings.preset == "paper" else "support")
 
 

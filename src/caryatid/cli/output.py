@@ -77,7 +77,7 @@ class Output(logging.Handler):
         sys.stdout.flush()
 
     def step(self, step: Step, before: SupportGraph | None, score: Score | None) -> None:
-        """Print what a view changed, its score where the ground truth is known, and what comes next."""
+        """Print what a view changed, its score if the ground truth is known, and what comes next."""
         from caryatid.viz.tables import census, changes
 
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
@@ -94,7 +94,7 @@ class Output(logging.Handler):
 
 @contextmanager
 def kept(what: str) -> Iterator[None]:
-    """Let Ctrl-C say what is kept."""
+    """Make Ctrl-C say what is kept."""
     try:
         yield
     except KeyboardInterrupt:

@@ -33,15 +33,15 @@ class Import(options.Command):
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Scene folder to write, in the BOP format; must be new or empty."""
     depth: Topic = None
-    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. When left out: topics are listed."""
+    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. Without it, the topics are listed."""
     info: Topic = None
     """Camera of the depth images (CameraInfo)."""
     rgb: Topic = None
     """Colour images that depth is registered to; they also show how sharp a frame is."""
     tf: Annotated[str | None, options.shown("FRAME")] = None
-    """World frame, level with z up, such as map or base_link. When left out: one frame without a pose."""
+    """World frame, level with z up, such as map or base_link. Without it, one frame without a pose."""
     camera: Annotated[Path | None, options.shown("FILE.json")] = None
-    """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. When left out: as published."""
+    """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. Without it, as published."""
     level: options.Flag = False
     """Rotate the world so that the table is level, for poses whose z is not up; most views must show it."""
     views: Annotated[options.OptionalCount, options.default_of("recording.max_views")] = None
@@ -104,11 +104,11 @@ class Evaluate(options.Command):
 
 @dataclass(frozen=True, kw_only=True)
 class OrderCommand(options.Command):
-    """Find a safe order to take everything away, or to reach one object.
+    """Find a safe order in which to remove everything, or to reach one object.
 
-    Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others as likely.
-    The share of rehearsals in which nothing else moves is the probability given with it.
-    If no order is safe, the output gives the least risky one and names the objects in each other's way.
+    Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others equally
+    likely. The share of rehearsals in which nothing else moves is the probability given with it. If no order
+    is safe, the output gives the least risky one and names the objects in each other's way.
 
     To try:
       caryatid order run
@@ -120,7 +120,7 @@ class OrderCommand(options.Command):
     run: options.RunPath
     """Run folder."""
     goal: Annotated[str | None, options.shown("ID")] = None
-    """Reach this object only, and take away no more than necessary."""
+    """Reach this object only, and remove no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
     risk: Annotated[float | None, options.shown("P", "0")] = None
@@ -208,8 +208,8 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
         The files that were written.
 
     Raises:
-        InputError: It is not a run, a file in it is broken, or a file cannot be written; an older report.html
-            is left as it was.
+        InputError: It is not a run, a file in it is broken, or a file cannot be written; an older
+            report.html does not change.
     """
     from caryatid.io.staging import write_file
     from caryatid.steps import read_config, read_run, read_steps

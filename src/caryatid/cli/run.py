@@ -46,7 +46,7 @@ class RunCommand(options.Command):
     """Print the time of each stage at the end; with --json as part of the document."""
 
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
-        """Open the source; returns its name, what is really there, and the steps of the run."""
+        """Open the source; returns its name, its ground truth, and the steps of the run."""
         raise NotImplementedError
 
     def conditions(self) -> str:
@@ -60,7 +60,7 @@ class RunCommand(options.Command):
         return f"{text}, noise: {getattr(self, 'noise', 'none')}" if simulated else text
 
     def run(self, config: Config, page: PageProcess | None = None) -> None:
-        """Keep all steps, write the report and print what came of the run."""
+        """Keep all steps, write the report and print the result."""
         from caryatid.cli.output import profile
         from caryatid.io.graph_json import graph_to_json
         from caryatid.steps import RunWriter
@@ -93,7 +93,7 @@ class Exploring(options.ExploringCommand):
     """Continue to the maximum number of views; otherwise stop when no view is worth its path."""
 
     def explore(self, config: Config, **options: Any) -> tuple[Source, Iterator[Step]]:
-        """Open the source; returns it and the steps of its exploration, with these options of `explore`."""
+        """Open the source; returns it and the steps of `explore` with these options."""
         from caryatid.evaluation.oracle import planner_for
         from caryatid.exploration import explore
 
@@ -127,9 +127,11 @@ class Explore(RunCommand, Exploring):
     source: options.SourceName
     """Scene or recording."""
     goal: Annotated[str | None, options.shown("ID")] = None
-    """Look only at what matters for taking this object away, and stop when it is known what that moves."""
+    """Look only at what matters for removing this object, and stop when it is known what its removal
+    moves.
+    """
     until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
-    """Stop when every support is known with this probability, or with --goal what moves and what does not."""
+    """Stop when every support is known with this probability, or with --goal, what moves and what stays."""
     view: options.Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
 
@@ -170,7 +172,7 @@ class Demo(RunCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class View(options.ExploringCommand):
-    """Show a finished run in the browser, or control there the exploration of a scene or a recording.
+    """Show a finished run in the browser, or control the exploration of a scene or recording there.
 
     SOURCE is one of
       a run folder, as explore, extract and clear write it; it is not changed
@@ -187,7 +189,9 @@ class View(options.ExploringCommand):
     source: options.SourceName
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at; at any but 127.0.0.1, other machines can connect without a password."""
+    """Address to listen at; with any but 127.0.0.1, other machines can connect if they know the page's full
+    address.
+    """
     port: options.Port = PORT
     """Port to listen at, or else the next free one; 0 = any free one."""
     no_browser: options.Flag = False
@@ -273,10 +277,10 @@ class Extract(RunCommand, options.LookingCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Clear(options.ExploringCommand):
-    """Clear a simulated table: look until the next lift is safe, take the object away, look again.
+    """Clear a simulated table: look until the next lift is safe, remove the object, look again.
 
     Objects are lifted straight up in physics, one by one. A lift does harm when any other object moves by
-    more than 2 cm or 15°. Whenever the command is killed, the same command goes on where it was.
+    more than 2 cm or 15°. After a kill, the same command continues.
 
     To try:
       caryatid clear bridge --noise carmine
@@ -287,13 +291,13 @@ class Clear(options.ExploringCommand):
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """An MJCF scene, or the name of a built-in one."""
     out: options.OutPath = Path("run")
-    """Run folder to write, view by view; replaces an earlier run that is finished or another."""
+    """Run folder to write, view by view; replaces an earlier run, unless this command continues it."""
     goal: Annotated[str | None, options.shown("ID")] = None
-    """Reach this object only, and take away no more than necessary."""
+    """Reach this object only, and remove no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
     risk: Annotated[float | None, options.shown("P", "0.02")] = None
-    """Take only what moves another object with at most this probability."""
+    """Remove only objects that move another one with at most this probability."""
     views: Annotated[options.OptionalCount, options.shown(default=100)] = None
     """Maximum number of views, including the first."""
     no_report: options.Flag = False
@@ -379,7 +383,7 @@ class Clear(options.ExploringCommand):
 
 
 def _opening(command: Exploring | View | Clear, masks: MaskSource | None) -> Callable[[Config], Source]:
-    """What opens the source of a command."""
+    """A function that opens the source of a command."""
     from caryatid.sources import open_source
 
     options: dict[str, Any] = {"noise": command.noise, "robot": command.robot, "masks": masks}
@@ -412,7 +416,7 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
 
 
 def _about(command: RunCommand | Clear) -> dict[str, Any]:
-    """What run.json says of the command."""
+    """Entries of run.json about the command."""
     names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options["preset"] = command.settings.preset
@@ -453,7 +457,7 @@ def _record(
 
 
 def _draw_report(folder: Path, output: Output) -> None:
-    """Draw the report of a run that is in its place already."""
+    """Draw the report of a finished run folder."""
     from caryatid.cli.output import kept
     from caryatid.cli.results import write_report
 

@@ -67,12 +67,13 @@ class CloudConfig:
     """A larger depth step between neighbours separates two surfaces [m]; at 1 m, growing with z²."""
     max_slope: NotNegative = 0.004
     """Change of inverse depth within one surface beyond edge_jump [1/m per px]; a tilt of 80° at 2.7 m with
-    f = 525 px. In coarser images more by as much as the pixels are larger."""
+    f = 525 px. Grows with the size of the pixels in coarser images."""
     voxel: Positive = 0.005
     """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
     depth: Count = 5
-    """Points kept in a voxel once more than twice as many views have shown it [1]; their mean errs by less
-    than half the noise of one."""
+    """Points kept in a voxel once more than twice as many views have shown it [1]; their mean has less than
+    half the noise of one.
+    """
     neighbours: Count = 16
     """Neighbours from which a normal of an unorganised cloud is estimated [1]."""
 
@@ -90,7 +91,7 @@ class SurfaceConfig:
     gap: Positive = 0.3
     """Parts of one plane further apart than this are two surfaces [m]; shadows of objects are narrower."""
     min_area: NotNegative = 0.05
-    """Seen area a table has at least [m²]; more than most objects' tops."""
+    """Minimum visible area of a table [m²]; more than most objects' tops."""
     storey: NotNegative = 0.6
     """A plane that has a table this far above it is the floor [m]; lower ones are tops of objects."""
     min_points: Count = 200
@@ -108,7 +109,7 @@ class RegistrationConfig:
     enabled: bool = True
     """Whether poses are refined."""
     translation: Positive = 0.01
-    """Expected error of a reported position, per axis [m]; the worst that is usual, twice the usual."""
+    """Expected error of a reported position, per axis [m]; about twice the usual error."""
     rotation: Positive = 0.5
     """Expected error of a reported orientation, per axis, about the camera [deg]."""
     noise: Positive = 0.001
@@ -124,14 +125,15 @@ class RegistrationConfig:
     min_points: Count = 100
     """Minimum number of matches that determine a pose [1]."""
     kept: Count = 12
-    """Views that later ones are laid onto and that move with them [1]; 30° apart on a full turn."""
+    """Views to which later ones are registered, and which move with them [1]; 30° apart on a full turn."""
     max_translation: NotNegative = 0.1
     """A longer move is refused [m]."""
     max_rotation: Angle = 5.0
     """A larger turn is refused [deg]."""
     common: Share = 0.25
-    """Share of what a view that cannot be registered shows around the table that must lie where earlier views
-    saw something [1]; of right poses a third does, even from the other side, of wrong ones a fifth."""
+    """Minimum share of what an unregistered view shows around the table that lies where earlier views saw
+    something [1]; with right poses a third does, even from the other side, with wrong ones a fifth.
+    """
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -147,21 +149,27 @@ class SegmentationConfig:
     surfel: Positive = 0.015
     """Size of the patches whose edges are judged convex or concave [m]; four times the noise at 1.5 m."""
     crease: NotNegative = 4.0
-    """What a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at edges."""
+    """Length that a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at
+    edges.
+    """
     step: NotNegative = 0.0035
-    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]; 2σ evened out."""
+    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]; 2σ after
+    smoothing.
+    """
     reach: Positive = 0.012
     """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
     concavity: Angle = 15.0
-    """Angle between normals beyond which a concave edge parts two surfaces [deg]; LCCP's 10 and noise."""
+    """Angle between normals beyond which a concave edge separates two surfaces [deg]; LCCP's 10, plus
+    noise.
+    """
     rise: NotNegative = 0.01
     """Height over the tangent plane of another place of a segment from which the pair is concave [m]."""
     min_size: Count = 40
     """Minimum number of samples of a segment [points]."""
     min_width: NotNegative = 0.02
-    """A segment narrower than this beside a larger one belongs to it [m]; creases are rounded so far."""
+    """A segment narrower than this beside a larger one belongs to it [m]; creases are rounded by as much."""
     merge_gap: NotNegative = 0.25
-    """Segments are merged across something nearer that hides up to this much between them [m]."""
+    """Segments are merged across a nearer object that hides up to this much between them [m]."""
     clearance: NotNegative = 0.008
     """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
     max_height: Positive = 0.6
@@ -247,7 +255,7 @@ class ExplanationConfig:
     normal_weight: NotNegative = 4.0
     """Cost of a normal turned by 90° [nats]; normals, blurred over edges, are good to 30°."""
     reading: Positive = 0.0002
-    """Surface whose points err alike [m²]; half of the 2 cm square a registration error shows in."""
+    """Area whose points share one error [m²]; half of the 2 cm square a registration error shows in."""
     border: NotNegative = 4.0
     """Cost of a point with only the other object around it, on a surface without crease [nats]."""
     free_cost: NotNegative = 0.5
@@ -255,7 +263,7 @@ class ExplanationConfig:
     usual: NotNegative = 0.9
     """Mean cost of the points around a point that is still well explained [nats]; 9 in 10 true shapes."""
     spacing: Positive = 0.008
-    """Spacing the points are thinned to [m]; a third of the patch that errs alike."""
+    """Spacing the points are thinned to [m]; a third of the patch that shares one error."""
     reach: Positive = 0.03
     """Objects further apart are never merged [m]; the width of an occluder's shadow."""
 
@@ -267,7 +275,9 @@ class CompletionConfig:
     enabled: bool = True
     """Whether unseen sides are extended."""
     max_tilt: Angle = 30.0
-    """An unseen side that faces down within this angle may be extended [deg]; what rests on a face does."""
+    """An unseen side that faces down within this angle may be extended [deg]; sides that rest on something
+    face down.
+    """
     step: Positive = 0.01
     """Step of the extension [m]; a voxel."""
     overlap: NotNegative = 0.004
@@ -311,16 +321,18 @@ class SupportConfig:
     overhang: NotNegative = 0.003
     """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
     stability: Literal["area", "balance"] = "balance"
-    """An object is unstable by r_s of eq. 1 over its contact points, and all that rests on it may hold it
-    (`area`, the paper's); or also by its centre of mass, and only what weighs against its tipping does."""
+    """With `area`, the paper's, an object is unstable by r_s of eq. 1 over its contact points, and
+    everything on it may hold it; with `balance` also by its centre of mass, and only what weighs against its
+    tipping does.
+    """
     draws: Count = 12
     """Scenes drawn by the fits' uncertainty, for probabilities [1]: a share is right to 0.14 near a half."""
     force_share: Share = 0.03
-    """Share of its weight [1] from which an object is held by another one in a draw, as in the truth."""
+    """Minimum share of an object's weight [1] that a supporter carries in a draw, as in the ground truth."""
     at_rest: Share = 0.05
     """Acceleration below which an object is at rest in a draw [g]: it closes a gap of 2 mm at most."""
     unexplained: Share = 0.1
-    """Weight of a draw for an object that does not rest in it [1]: how often what nobody saw holds one."""
+    """Weight of a draw for an object that does not rest in it [1]: how often something unseen holds one."""
     friction: Lengths = (0.4, 1.0)
     """Sliding friction of each object is drawn from this range [1]: wood on cardboard to rubber on glass."""
     density: Lengths = (300.0, 1200.0)
@@ -343,7 +355,7 @@ class FusionConfig:
     masks: MaskIdentity = "scene"
     """The number of a mask names an object in all views (`scene`), or a segment of one view (`per-view`)."""
     max_distance: NotNegative = 0.05
-    """Centres further apart are two objects [m], beside half the smaller object's size."""
+    """Centres further apart are two objects [m], plus half the smaller object's size."""
     max_angle: Angle = 20.0
     """Axes further apart are two orientations [deg], up to the shape's symmetry."""
     max_ratio: Factor = 1.6
@@ -373,9 +385,9 @@ class VoxelConfig:
     margin: NotNegative = 0.01
     """Length before a reading that a ray does not clear [m]; depth noise within it carves no surface."""
     hit: Likelihood = 0.7
-    """Occupancy one view with a reading in a voxel speaks for [1]; the usual sensor model."""
+    """Occupancy that one view with a reading in a voxel implies [1]; the usual sensor model."""
     miss: Likelihood = 0.4
-    """Occupancy one view that looks through a voxel speaks for [1]; the usual sensor model."""
+    """Occupancy that one view that looks through a voxel implies [1]; the usual sensor model."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -401,10 +413,13 @@ class ActiveVisionConfig:
     inhibition: NotNegative = 1.0
     """Depth of the negative bump at every visited view [1]; 0 is no inhibition of return."""
     path_cost: Literal["angle", "path", "none"] = "path"
-    """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path halves it."""
+    """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path length halves
+    the distance travelled.
+    """
     stop: Literal["gain", "unchanged"] = "gain"
-    """Looking ends where no view is expected to show more than its path costs: where c = s − h of planner
-    `support` is at most 0 everywhere. Or, as in the paper, after a view that does not modify the graph."""
+    """The loop ends when no view is expected to show more than its path costs: when c = s − h of planner
+    `support` is at most 0 everywhere. Or, as in the paper, after a view that does not modify the graph.
+    """
     max_views: Count = 10
     """Maximum number of views, including the first; the paper's."""
     look_directions: Count = 1200
@@ -426,7 +441,7 @@ class RobotConfig:
     pitch: Annotated[tuple[Elevation, Elevation], AfterValidator(_rising)] = (-60.0, 20.0)
     """Head pitch, down to up [deg]."""
     yaw: Annotated[tuple[Azimuth, Azimuth], AfterValidator(_rising)] = (-80.0, 80.0)
-    """Head yaw against the platform [deg]."""
+    """Head yaw relative to the platform [deg]."""
     camera_forward: NotNegative = 0.1
     """Distance of the camera in front of the platform's centre [m]."""
     cell: Positive = 0.05
@@ -448,8 +463,9 @@ class ArmConfig:
     base_yaw: Azimuth = 0.0
     """Where the x axis of its base points, from the world's x towards y [deg]; 0 is over the table."""
     radius: Lengths = (0.4, 1.0)
-    """Smallest and largest view sphere tried [m]: nearer, the camera meets what is on the table, and the hand
-    of a common arm gets no farther. Equal ends fix the radius."""
+    """Smallest and largest view sphere tried [m]: nearer, the camera meets objects on the table; farther, a
+    common arm does not reach. Equal values fix the radius.
+    """
     radius_views: Count = 400
     """Views tried on each sphere to choose among the spheres [1]; about 10° apart."""
     sphere_points: Count = 4000
@@ -461,7 +477,7 @@ class ArmConfig:
     cell: Positive = 0.08
     """Edge of a cell of a sampled map [m]; finer ones need more samples, by the third power."""
     view_directions: Count = 150
-    """Viewing directions a sampled map tells apart [1]; about 16° apart."""
+    """Viewing directions that a sampled map distinguishes [1]; about 16° apart."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -491,7 +507,7 @@ class NoiseConfig:
     disparity_step: Positive = 0.00285
     """Depth is quantised in equal steps of 1/z [1/m]: 1/8 px of disparity, f = 580 px, baseline 75 mm."""
     grazing: Angle = 80.0
-    """No return where the surface is turned away by more than this [deg]."""
+    """No return if the surface is turned away by more than this [deg]."""
     range: Lengths = (0.35, 3.0)
     """Nearest and farthest reading [m]."""
     edge_jump: NotNegative = 0.03
@@ -507,15 +523,15 @@ class PhysicsConfig:
     """Settling a simulated scene and deriving ground-truth support from physics, method notes section 4."""
 
     rest_window: Positive = 0.25
-    """Time over which an object must stay where it is to be at rest [s]."""
+    """Time for which an object must stay in place to be at rest [s]."""
     rest_distance: Positive = 0.001
-    """Movement within the window that still is rest [m]; soft contacts creep up to 3 mm/s."""
+    """Movement within the window that still counts as rest [m]; soft contacts creep up to 3 mm/s."""
     rest_angle: Angle = 1.0
-    """Rotation within the window that still is rest [deg]."""
+    """Rotation within the window that still counts as rest [deg]."""
     settle_time: NotNegative = 6.0
     """Maximum time to settle [s]; then a scene is used as it is, at rest or not."""
     force_share: NotNegative = 0.03
-    """Least upward part of a contact force on an object that supports it, as a share of its weight [1]."""
+    """Minimum upward part of a contact force that supports an object, as a share of its weight [1]."""
     removal_time: Positive = 1.0
     """How long the others are observed after an object is removed [s]."""
     moved: NotNegative = 0.01
@@ -568,26 +584,30 @@ class RecordingConfig:
     max_views: Count = 30
     """Maximum number of views [1]; those farthest apart are kept. A table is known after 5 to 10."""
     min_distance: Positive = 0.10
-    """A view is another one when its camera has moved by this from all others [m] …"""
+    """A view is new if its camera has moved by this from all others [m] …"""
     min_angle: Annotated[float, Field(gt=0, le=180)] = 10.0
     """… or has turned by this [deg]; from 10 cm or 10° on, sides of objects come into sight."""
     sharp_window: NotNegative = 0.5
     """A frame's sharpness is compared with that of frames within this [s]; they show nearly the same."""
     sharp_share: Share = 0.7
-    """Least sharpness, as a share of the sharpest within the window [1]; a camera at rest varies by 10 %."""
+    """Minimum sharpness, as a share of the sharpest within the window [1]; a camera at rest varies by 10
+    %.
+    """
     colour_gap: NotNegative = 0.02
     """Colour belongs to a depth image when it was taken within this [s]; just over half of 1/30 s."""
     pose_gap: Positive = 0.2
     """Maximum time between two poses that are interpolated [s]; robots send 10 a second."""
     min_readings: Likelihood = 0.1
-    """Least share of pixels with a depth reading [1]; a camera held too near, or at the sky, has fewer."""
+    """Minimum share of pixels with a depth reading [1]; a camera too near, or pointed at the sky, has
+    fewer.
+    """
     far: Annotated[float, Field(gt=0, le=65)] = 10.0
     """Readings farther away than this are left out [m]; beyond what RGB-D cameras measure."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class ExportConfig:
-    """What other programs need and a scene model does not hold."""
+    """Data that other programs need and a scene model lacks."""
 
     density: Positive = 600.0
     """Density of objects [kg/m³]; that of the simulated scenes, wood or a filled carton."""
@@ -606,7 +626,7 @@ class SessionConfig:
     max_sessions: Count = 1000
     """Maximum number of sessions of a service [1]; a folder of each stays until it is removed by hand."""
     min_free: NotNegative = 1e9
-    """A service takes nothing new where the disk has less left [bytes]; others write there too."""
+    """Free disk space below which a service accepts nothing new [bytes]; other programs write there too."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -628,8 +648,9 @@ class RehearsalConfig:
     """Lifts simulated on the extracted shapes before they are done."""
 
     draws: Count = 8
-    """Scenes that a lift is rehearsed in [1]: the shapes as extracted, and others as likely by their
-    uncertainty; a risk of a third shows in one of eight with 96 %."""
+    """Scenes that a lift is rehearsed in [1]: the shapes as extracted, and others equally likely given their
+    uncertainty; a risk of a third shows in one of eight with 96 %.
+    """
     risk: Share = 0.0
     """Probability of moving another object up to which a lift is safe [1]: no rehearsal shows any."""
     max_objects: Count = 300

@@ -1,7 +1,8 @@
-"""The planner that knows the truth: what any planner that thinks one view ahead could reach at best.
+"""The planner that knows the ground truth, an upper bound for planners that think one view ahead.
 
-It tries candidates in simulation, each on a copy of what is known, and takes the one after which the score is
-in fact highest. Nobody else may see what it sees: it is not among `caryatid.planning.planners.BUILT_IN`.
+It tries candidates in simulation, each on a copy of the scene model, and chooses the one with the highest
+score afterwards. No other planner may use the ground truth, so it is not among
+`caryatid.planning.planners.BUILT_IN`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
 
 
 class _WatchedCamera:
-    """A camera that remembers pose (4, 4) and view of each capture that nobody has asked about yet."""
+    """A camera that remembers pose (4, 4) and view of each capture since the last query."""
 
     def __init__(self, camera: SimulatedCamera) -> None:
         self.taken: list[tuple[Array, View]] = []
@@ -39,26 +40,26 @@ class _WatchedCamera:
 
 
 class OraclePlanner:
-    """Takes the candidate that raises F1, vertices and edges together, most.
+    """Chooses the candidate that raises F1, vertices and edges together, most.
 
-    Of equal ones it takes that which shows most true surface no earlier view has shown, then the shorter way,
-    then the first. True surface is counted in cells as large as the map's voxels, object by object: those in
-    which a ray of a camera without noise meets the object. The views tried are spread evenly over the
-    candidates, away from the views so far; the one the default planner would choose is tried too, so that no
-    step of that planner can be better.
+    Among equal ones it chooses the one that shows most true surface for the first time, then the shorter
+    path, then the first. True surface is counted in cells as large as the map's voxels, object by object:
+    cells in which a ray of a camera without noise meets the object. The views tried are spread evenly over
+    the candidates, away from the views so far; the one the default planner would choose is tried too, so
+    that no step of that planner can be better.
 
-    It is good for one exploration. Its predictions are exact: it knows the noise the next view will have, and
-    explores with the same configuration, segmentation and seed.
+    It serves one exploration. Its predictions are exact: it knows the noise of the next view, and explores
+    with the same configuration, segmentation and seed.
 
     Args:
-        camera: Looks at the scene. `camera` below is to be explored with in its place.
-        truth: What is really there.
+        camera: Camera of the scene. Explore with the attribute `camera` instead.
+        truth: The ground truth.
         config: All settings of the exploration.
-        segmentation: That of the exploration.
-        seed: That of the exploration.
+        segmentation: Segmentation of the exploration.
+        seed: Seed of the exploration.
 
     Attributes:
-        camera: The camera to hand to `explore`.
+        camera: The camera to pass to `explore`.
     """
 
     def __init__(
@@ -80,11 +81,11 @@ class OraclePlanner:
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose the candidate after which F1 is highest.
 
-        The decision's saliency is the F1 that will be reached.
+        The decision's saliency is the resulting F1.
 
         Raises:
             PlanningError: There is no candidate.
-            InputError: The exploration is not the one this planner was made for.
+            InputError: The exploration is not the one for which this planner was made.
         """
         check_candidates(state)
         self._catch_up(state)
@@ -92,7 +93,7 @@ class OraclePlanner:
         tried = spread_out(candidates.directions, state.visited, self._config.oracle.candidates)
         tried = np.union1d(tried, SupportPlanner().plan(state, rng).index)
         unseen = np.array([self._unseen_surface(candidates.T_world_camera[i]) for i in tried])
-        # Best tie first: then the first of the highest F1 is the one to take, and nothing beats F1 = 1.
+        # Best tie first: then the first of the highest F1 is chosen, and nothing beats F1 = 1.
         order = np.lexsort((tried, candidates.path_length[tried], -unseen))
         best, reached = int(order[0]), -1.0
         equal = 1e-9  # scores are ratios of small whole numbers
@@ -110,7 +111,7 @@ class OraclePlanner:
         return Decision(candidates.T_world_camera[index], index, reached, cost, reached - cost, why)
 
     def _catch_up(self, state: PlanningState) -> None:
-        """Learn what the exploration has seen since the last decision."""
+        """Update with the views since the last decision."""
         for T_world_camera, view in self.camera.taken:
             self._scene.update(view)
             self._shown = np.union1d(self._shown, self._surface(T_world_camera))
@@ -124,7 +125,7 @@ class OraclePlanner:
             )
 
     def _f1_after(self, T_world_camera: Array) -> float:
-        """F1 of the fused graph after a view from there, or -1 where that view cannot be used."""
+        """F1 of the fused graph after a view from there, or -1 if that view cannot be used."""
         scene = self._scene.copy()
         try:
             graph = scene.update(self._simulated.fork().capture(T_world_camera))
@@ -136,12 +137,12 @@ class OraclePlanner:
         return score(graph, self._truth, config=self._config.evaluation).f1
 
     def _unseen_surface(self, T_world_camera: Array) -> int:
-        """Cells of true surface that come into sight from there."""
+        """Cells of true surface that become visible from there."""
         cells = self._surface(T_world_camera)
         return len(cells) - int(np.isin(cells, self._shown, assume_unique=True).sum())
 
     def _surface(self, T_world_camera: Array) -> NDArray[np.int64]:
-        """Cells (N,) of the objects' true surface seen from there, each a number of object and place."""
+        """Cells (N,) of the objects' true surface seen from there, each a number for object and place."""
         config, camera = self._config.oracle, self._simulated
         K = np.diag([1.0 / config.stride, 1.0 / config.stride, 1.0]) @ camera.K
         width, height = camera.sensor.width // config.stride, camera.sensor.height // config.stride
@@ -169,7 +170,7 @@ def planner_for(
     segmentation: SegmentationMethod | None,
     seed: int,
 ) -> tuple[Planner, Camera]:
-    """Make a planner by its name, `oracle` too where the truth is known, and the camera to explore with.
+    """Make a planner by its name, also `oracle` if the truth is known, and the camera to explore with.
 
     Raises:
         InputError: There is no such planner, or it is the oracle and nothing is simulated.
@@ -181,15 +182,15 @@ def planner_for(
 
 
 def spread_out(directions: Array, visited: Array, count: int) -> NDArray[np.intp]:
-    """Pick directions one by one, each as far from the visited and the picked ones as can be.
+    """Pick directions one by one, each as far as possible from the visited and the picked ones.
 
     Args:
         directions: Unit vectors (N, 3) to pick from.
         visited: Unit vectors (V, 3), V ≥ 1.
-        count: How many to pick; fewer where there are not so many.
+        count: Maximum number to pick.
 
     Returns:
-        Indices (M,), M = min(count, N), each once; of equally far ones the first.
+        Indices (M,), M = min(count, N), each once; the first of equally far ones.
     """
     nearness = (directions @ visited.T).max(axis=1)
     picked = []

@@ -25,7 +25,7 @@ TABLE: Final = "table"
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueObject:
-    """A solid whose inside can be asked for.
+    """A solid with a test for its inside.
 
     Attributes:
         name: Body name, or `object<obj_id>`.
@@ -40,14 +40,14 @@ class TrueObject:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class TrueScene:
-    """A support graph over solids: the truth, or any graph to compare with it.
+    """A support graph over solids: the ground truth, or a graph to compare with it.
 
     Attributes:
         vertices: Names, the table's too.
         edges: Directed pairs (supporter, supported) of names.
         objects: The solids of the vertices that are objects; a vertex without one is never found.
         table: Name of the vertex that is the support surface, or None.
-        table_top: Height of its top [m], or None where it has none.
+        table_top: Height of its top [m], or None without a table.
     """
 
     vertices: tuple[str, ...]
@@ -58,11 +58,11 @@ class TrueScene:
 
 
 class Forecast(NamedTuple):
-    """What a graph says of a support, and whether it is true.
+    """The probability of a support in a graph, and whether it is true.
 
     Attributes:
-        probability: That of the support; 0 if the graph does not have it [1].
-        by_certain: The same said by `certain` alone: 1, and 0.5 if uncertain [1].
+        probability: Probability of the support; 0 if the graph lacks it [1].
+        by_certain: The same by `certain` alone: 1, and 0.5 if uncertain [1].
         true: It is in the truth.
     """
 
@@ -73,9 +73,9 @@ class Forecast(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """How a graph compares with the truth.
+    """Scores of a graph against the ground truth.
 
-    A ratio whose denominator is 0 is 1 where there was nothing to find either, and 0 otherwise.
+    A ratio with denominator 0 is 1 if there was nothing to find either, and 0 otherwise.
 
     Attributes:
         precision: Eq. 4, vertices and edges together [1].
@@ -85,17 +85,17 @@ class Score:
         edge_recall: Edges alone [1].
         vertex_precision: Vertices alone, the table included [1].
         vertex_recall: Vertices alone [1].
-        mean_iou: Mean IoU of the matched objects, the table left out; 0 where none is matched [1].
+        mean_iou: Mean IoU of the matched objects without the table; 0 if none is matched [1].
         brier: Brier score of the forecasts: their mean squared error; 0 is perfect [1].
-        average_precision: Area under precision over recall of the forecasts as the least probability that
-            counts falls from 1; 1 is perfect [1].
-        matches: Extracted vertex to the true vertex it is.
+        average_precision: Area under precision over recall of the forecasts as the probability threshold
+            falls from 1; 1 is perfect [1].
+        matches: Extracted vertex → its true vertex.
         ious: IoU of each matched object [1].
-        forecasts: Of each support in the graph with both ends matched, and of each true one between matched
-            vertices that the graph lacks, with probability 0. What is neither is not listed. Supports of
-            vertices that are not matched say nothing of probabilities; they count in precision and recall.
+        forecasts: Those of each support in the graph with both ends matched, and, with probability 0, of
+            each true one between matched vertices that the graph lacks. Supports of unmatched vertices say
+            nothing about probabilities; they count in precision and recall.
         wrong: Extracted supports that are not in the truth.
-        missing: True supports that were not extracted; ends that are matched have their extracted names.
+        missing: True supports that were not extracted; matched ends have their extracted names.
         unfound: True vertices that are not matched.
     """
 
@@ -127,7 +127,7 @@ class Score:
         return _harmonic_mean(self.edge_precision, self.edge_recall)
 
     def to_json(self) -> dict[str, float]:
-        """What `caryatid evaluate --json` writes of a view."""
+        """Entry of a view in `caryatid evaluate --json`."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.type == "float"}
 
 
@@ -139,14 +139,14 @@ def score(
 ) -> Score:
     """Score a graph of fitted shapes, or a scene of solids, against true solids; the truth itself scores 1.
 
-    Every edge of the graph counts, the uncertain ones too: a guess that is wrong costs precision. An edge is
+    Every edge of the graph counts, also uncertain ones: a wrong guess costs precision. An edge is
     true when both its ends are matched and the directed pair is in the truth, whatever its kind.
 
     Args:
         found: The extracted graph, in the world frame of the truth.
         truth: The true scene.
-        rng: Draws the points volumes are measured with; None draws the same ones every time.
-        config: Least IoU, tolerance of the table's height, points a pair.
+        rng: Draws the points that measure volumes; None draws the same ones every time.
+        config: Minimum IoU, tolerance of the table's height, points per pair.
     """
     config = config or EvaluationConfig()
     edges = _said(found)
@@ -171,16 +171,16 @@ def score_masks(
 ) -> Score:
     """Score a graph by pixels, for real frames, where there are no true shapes.
 
-    An object is a true one when its pixels and a true mask are paired one-to-one at the least IoU; the table
-    when graph and truth both have one. Over several frames the pixels of all are pooled.
+    An object is true if a one-to-one assignment pairs its pixels with a true mask at the minimum IoU; the
+    table if graph and truth both have one. Over several frames the pixels of all are pooled.
 
     Args:
         graph: The extracted graph.
         labels: Label images (H, W), k = the object with label k, one for each frame.
         true_labels: The true ones (H, W), k = the vertex `object<k>`.
-        vertices: True vertices, the table's name among them where there is one.
+        vertices: True vertices, including the table's name if there is one.
         edges: True directed pairs of names.
-        config: Least IoU.
+        config: Minimum IoU.
 
     Raises:
         InputError: Images differ in number or size.
@@ -199,7 +199,7 @@ def score_masks(
 
 
 def _said(found: SupportGraph | TrueScene) -> dict[tuple[str, str], tuple[float, float]]:
-    """Probability of each edge, and what `certain` alone says of it; a scene of solids is sure of all."""
+    """Probability of each edge, and that by `certain` alone; all are certain in a scene of solids."""
     if isinstance(found, TrueScene):
         return dict.fromkeys(found.edges, (1.0, 1.0))
     return {s.pair: (s.belief, 1.0 if s.certain else 0.5) for s in found.supports}
@@ -208,7 +208,7 @@ def _said(found: SupportGraph | TrueScene) -> dict[tuple[str, str], tuple[float,
 def _matched(
     iou: Array, found: Sequence[str], true: Sequence[str], min_iou: float
 ) -> tuple[dict[str, str], dict[str, float]]:
-    """Which found name (F) is which true one (T) by IoUs (F, T), one-to-one; and the IoU of each."""
+    """One-to-one match of found (F) to true names (T) by IoUs (F, T); and the IoU of each."""
     pairs = assign(iou, min_iou)
     return {found[i]: true[j] for i, j in pairs}, {found[i]: float(iou[i, j]) for i, j in pairs}
 
@@ -221,7 +221,7 @@ def _score_matches(
     matches: dict[str, str],
     ious: dict[str, float],
 ) -> Score:
-    """All scores once it is known which extracted vertex is which true one, one-to-one."""
+    """All scores, given the one-to-one match of extracted and true vertices."""
     named = {(matches.get(a, ""), matches.get(b, "")): said for (a, b), said in found_edges.items()}
     judged = {pair: Forecast(*said, pair in edges) for pair, said in named.items() if all(pair)}
     v, e = len(matches), sum(forecast.true for forecast in judged.values())
@@ -244,15 +244,15 @@ def _score_matches(
 
 
 def average_precision(forecasts: Sequence[Forecast]) -> float:
-    """Sum of precision times gain in recall, as the least probability that counts falls from 1 to above 0.
+    """Sum of precision times gain in recall, as the probability threshold falls from 1 to above 0.
 
-    Equal probabilities are one step. A support that has probability 0 is never found.
+    Equal probabilities are one step. A support with probability 0 is never found.
 
     Args:
-        forecasts: What is said of supports.
+        forecasts: The forecasts of supports.
 
     Returns:
-        In [0, 1]; 1 where there is nothing to find and nothing is said, 0 where only false ones are.
+        In [0, 1]; 1 if there is nothing to find and nothing found, 0 if only false ones are found.
     """
     said, _, true = np.array(forecasts, dtype=np.float64).reshape(-1, 3).T
     order = np.argsort(-said, kind="stable")[: np.count_nonzero(said)]
@@ -266,7 +266,7 @@ def average_precision(forecasts: Sequence[Forecast]) -> float:
 def _volume_ious(
     found: Sequence[TrueObject], true: Sequence[TrueObject], samples: int, rng: np.random.Generator
 ) -> Array:
-    """Intersection over union (F, T) of solids by Monte Carlo; 10,000 points a pair: σ = 0.01 at worst."""
+    """Intersection over union (F, T) of solids by Monte Carlo; 10,000 points per pair: σ = 0.01 at worst."""
     iou = np.zeros((len(found), len(true)))
     for i, a in enumerate(found):
         for j, b in enumerate(true):
@@ -314,13 +314,13 @@ def mask_ious(
 
 
 def assign(iou: Array, min_iou: float) -> list[tuple[int, int]]:
-    """Pair rows with columns of IoUs (F, T) for the largest sum (Hungarian); drop pairs below the least."""
+    """Pair rows with columns of IoUs (F, T) for the largest sum (Hungarian); drop pairs below the minimum."""
     rows, columns = linear_sum_assignment(iou, maximize=True)
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if iou[i, j] >= min_iou]
 
 
 def as_scene(graph: SupportGraph) -> TrueScene:
-    """Take a graph of fitted shapes as a scene of solids, vertices named by their ids."""
+    """Convert a graph of fitted shapes to a scene of solids, with vertices named by their ids."""
     surface = graph.support_surface
     return TrueScene(
         vertices=tuple(o.id for o in graph.objects),
@@ -343,7 +343,7 @@ def _top_height(shape: Shape) -> float:
 
 def _solid(name: str, shape: Shape) -> TrueObject:
     if len(shape.parts) > 1:
-        # Hollow things count with their inside, here as in the truth.
+        # Hollow objects count with their inside, here as in the ground truth.
         corners = shape.outline()
         return TrueObject(
             name, partial(in_hull, corners), np.stack([corners.min(axis=0), corners.max(axis=0)])
@@ -358,7 +358,7 @@ def _solid(name: str, shape: Shape) -> TrueObject:
 
 
 def _ratios(right: int, claimed: int, true: int) -> tuple[float, float]:
-    """Precision and recall of some that are right, of those claimed and those that are true."""
+    """Precision and recall from the numbers of right, claimed and true items."""
     nothing = 1.0 if claimed == true == 0 else 0.0
     return right / claimed if claimed else nothing, right / true if true else nothing
 

@@ -1,4 +1,4 @@
-"""What a run is scored against: a simulated scene or a recording, each with its gt.json."""
+"""Ground truth of a run: a simulated scene or a recording, each with its gt.json."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
 
     Args:
         scene: The scene.
-        truth: What gt.json holds; None = read it beside the scene's file, or ask physics where there is none.
+        truth: Content of gt.json; None = read it beside the scene's file, or derive it from physics without
+            one.
 
     Raises:
         InputError: The truth names a body the scene does not have.
@@ -50,13 +51,13 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
 def evaluate_run(
     run_folder: str | Path, truth: str | Path | None = None, config: EvaluationConfig | None = None
 ) -> tuple[Score, ...]:
-    """Score every view of a run, in their order: what `caryatid evaluate RUN [GT]` does.
+    """Score every view of a run, in order, as `caryatid evaluate RUN [GT]` does.
 
     Args:
         run_folder: A run.
         truth: Name of a built-in scene, an MJCF file or scene folder, with `gt.json` beside it or else scored
             against physics; or a recording with masks and `gt.json`. None = the run's own source.
-        config: Least IoU, tolerance of the table's height, points a pair.
+        config: Minimum IoU, tolerance of the table's height, points per pair.
 
     Raises:
         InputError: The run or the truth is missing or broken, or they do not fit each other.

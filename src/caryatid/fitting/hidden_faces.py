@@ -1,4 +1,4 @@
-"""The last step of fits: seen sides where their points lie, others where points beside them end; how sure."""
+"""The last step of fits: where seen and hidden sides lie, and how uncertain they are."""
 
 from __future__ import annotations
 
@@ -18,39 +18,40 @@ from caryatid.geometry.transforms import Array, rigid
 from caryatid.runtime.parallel import kernel
 
 Seen = tuple[bool, bool, bool, bool, bool, bool]
-"""Which sides -x, +x, -y, +y, -z, +z of an object points bear out."""
+"""Which sides -x, +x, -y, +y, -z, +z of an object points confirm."""
 
 
 def close_hidden_faces(
     shape: Shape, seen: Seen, points: Array, config: FitConfig
 ) -> tuple[Shape, float, float, Uncertainty]:
-    """Refine a fitted shape without the pulls that the search for it needs, and say how sure it is.
+    """Refine a fitted shape without the pulls that its search needs, and estimate its uncertainty.
 
-    The sides that points bear out are refined by least squares alone, the others out of the way: neither the
-    pull on the extents nor points beyond a rim shift them. Then each unseen side is put where the points on
+    The sides that points confirm are refined by least squares alone, with the others out of the way: neither
+    the pull on the extents nor points beyond a rim shift them. Then each unseen side is put where the points
+    on
     the faces beside it end: at the likeliest end of an even density blurred by the fit's own noise, which
     neither a trimmed share nor the spread of the noise biases. A side without such points stays.
 
     Args:
         shape: The shape.
-        seen: The sides that points bear out.
+        seen: The sides that points confirm.
         points: Its points (N, 3) [m], all finite.
         config: Limits and thresholds.
 
     Returns:
         The shape, the mean distance of its points truncated at the threshold [m], the share of them within
-        it, and how far off the shape may be.
+        it, and the uncertainty of the shape.
     """
     # Of 3 mm of noise, four points sharing an error, 3500 points leave 0.1 mm on a side: far less than the
     # error of registration.
     points = points[np.linspace(0, len(points) - 1, min(len(points), 3500)).astype(np.intp)]
     origin = points.mean(axis=0)
     kind, R, centre, half = Primitives.of([shape]).row(0)
-    # Where no step of least squares was better yet, a shape may still be thinner than it may be.
+    # If no step of least squares was better yet, a shape may still be below the shortest extent.
     points, kept = points - origin, np.stack([centre - origin, np.maximum(half, config.min_extent / 2.0)])
     hidden = ~np.array(seen).reshape(3, 2) & (kind != SPHERE)
     if kind == CYLINDER:
-        # Any part of the mantle tells where all of it is.
+        # Any part of the mantle determines all of it.
         hidden[:2] = hidden[:2].all()
     # Unseen sides are moved out of the way, beyond all noise.
     low, high = 0.05 * hidden.T
@@ -108,7 +109,7 @@ def deviations(kind: int, unsure: Array, information: Array, config: FitConfig) 
 
     Args:
         kind: Code of the shape.
-        unsure: Variance (3, 2) [m²] of the lower and upper sides that no point bears out, 0 of the others.
+        unsure: Variance (3, 2) [m²] of the lower and upper sides that no point confirms, 0 for the others.
         information: Inverse covariance (9, 9), unseen sides out of the way; rows and columns as of
             `least_squares.normal_equations`.
         config: The longest extent, and the error of registration.
@@ -135,9 +136,9 @@ def deviations(kind: int, unsure: Array, information: Array, config: FitConfig) 
 def _end(
     kind: int, half: Array, own: Array, axis: int, sign: float, sigma: float, config: FitConfig
 ) -> tuple[float, float]:
-    """Where points (N, 3) beside one side end along its direction [m], and its variance; infinite if few do.
+    """Where points (N, 3) beside one side end along its direction [m], and the variance; infinite if few do.
 
-    Points of a cylinder's ends tell where its mantle is, those of a box's other faces where a face is.
+    Points on a cylinder's ends show where its mantle is, those on a box's other faces where a face is.
     """
     growing = kind == CYLINDER and axis < 2
     along = sign * own[:, axis]

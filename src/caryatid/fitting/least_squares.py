@@ -10,20 +10,21 @@ from caryatid.geometry.signed_distance import copy, gradient, local, signed_dist
 from caryatid.runtime.parallel import inner, kernel
 
 RIDGE = 1e-3 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 0.01, 0.01, 0.01])
-"""Added to the diagonal, times the damping, so that what no point determines stays where it is."""
+"""Added to the diagonal, times the damping, so that parameters that no point determines stay in place."""
 NOISE_FLOOR = 0.001
-"""Least standard deviation the weights assume [m]: what smoothed points of several views err by. With less,
-faces that hold few of the points would be outliers of the others."""
+"""Minimum standard deviation that the weights assume [m]: the error of smoothed points of several views.
+With less, faces with few of the points would be outliers of the others.
+"""
 CONVERGED = 1e-4
-"""Least squares end with a step that lowers the cost by less than this share; the rest is far below noise."""
+"""Least squares stop at a step that lowers the cost by less than this share; the rest is far below noise."""
 
 
 @kernel
 def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converged):  # type: ignore[no-untyped-def]
     """Minimise the Geman–McClure cost of signed distances of points (N, 3) to a shape.
 
-    The shape (5, 3) is replaced by the one of the least cost. There is a least extent [m] and a pull `shrink`
-    on the extents [m]; the last step lowers the cost by no more than the share `converged`.
+    The shape (5, 3) is replaced by the one of the lowest cost. There is a minimum extent [m] and a pull
+    `shrink` on the extents [m]; the last step lowers the cost by no more than the share `converged`.
     """
     columns, size = np.empty(9, np.intp), 0
     for a in range(9):
@@ -38,7 +39,7 @@ def levenberg_marquardt(kind, shape, points, steps, min_extent, shrink, converge
     for _ in range(steps):
         for i in range(len(points)):
             absolute[i] = abs(distance[i])
-        # What is further off than 2.5 robust standard deviations loses most of its weight.
+        # Points further off than 2.5 robust standard deviations lose most of their weight.
         scale = 2.5 * max(1.4826 * quantile(absolute, 0.5), NOISE_FLOOR)
         normal_equations(kind, shape, points, scale, H_all, g_all)
         cost = _cost(distance, scale, shrink, shape, columns[:size])

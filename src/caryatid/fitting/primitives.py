@@ -21,9 +21,9 @@ from caryatid.runtime.parallel import inner, kernel
 from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 FREE_WEIGHT = 0.01
-"""Cost of a shape whose whole inside was seen free [m]; a share of it in proportion."""
+"""Cost of a shape whose whole inside was seen free [m]; in proportion for a share of it."""
 BARE_SPACING = 0.008
-"""Spacing of the samples that look for points near a side [m]; a point within twice that is near one."""
+"""Spacing of the samples on a side that count points near it [m]; a point within twice that is near one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -34,10 +34,10 @@ class Fit:
         shape: In the points' frame.
         residual: Mean absolute distance of the points to the surface, truncated at the threshold [m].
         inliers: Share of the points within the threshold [1].
-        seen: Which sides (-x, +x, -y, +y, -z, +z of the object) points bear out.
-        cost: What model choice compares [m].
+        seen: Which sides (-x, +x, -y, +y, -z, +z of the object) points confirm.
+        cost: The cost that model choice compares [m].
         poor: No shape explains the points within the configured residual.
-        uncertainty: How far off it may be; of the fit that was chosen only.
+        uncertainty: Its uncertainty, for the chosen fit only.
     """
 
     shape: Shape
@@ -78,7 +78,7 @@ def fit(
         normals: Unit normals (N, 3) towards the sensor.
         config: Limits and thresholds.
         rng: Source of the samples.
-        space: What has been seen free, where points are in the world frame: shapes do not fill it.
+        space: Space seen free, for points in the world frame; shapes do not fill it.
 
     Raises:
         InputError: Points and normals differ in shape, or an argument is of another type.
@@ -97,7 +97,7 @@ def fit(
     for f in fits:
         if f.cost >= least:
             break
-        # A shape pays for what it fills of the space seen free, too.
+        # A shape also pays for the free space that it fills.
         priced = _with_bare(f, judged_by)
         total = priced.cost
         if space is not None:
@@ -115,29 +115,29 @@ def fit(
 def candidates(
     points: Array, normals: Array, *, config: FitConfig, rng: np.random.Generator, whole: bool = True
 ) -> list[Fit]:
-    """Return the best fit of each shape that could be fitted, least cost first; none where points are few.
+    """Return the best fit of each shape that could be fitted, lowest cost first; none if points are few.
 
     Args:
         points: (N, 3) [m], in any frame.
         normals: Unit normals (N, 3) towards the sensor.
         config: Limits and thresholds.
         rng: Source of the samples.
-        whole: Whether sides that should have been seen whole cost where they are bare.
+        whole: Whether bare parts of sides that should have been seen whole cost.
     """
     fits, judged_by = _ranked(*_finite(points, normals), config, rng)
     return sorted((_with_bare(f, judged_by) for f in fits), key=lambda f: f.cost) if whole else fits
 
 
 def free_inside(shape: Shape, voxels: VoxelMap, inset: float) -> tuple[int, int]:
-    """Of the space well inside a shape, how much there is and how much was seen free [voxels].
+    """The space well inside a shape: all of it, and how much was seen free [voxels].
 
     Args:
         shape: In the world frame.
-        voxels: What has been seen.
+        voxels: The voxel map.
         inset: How far inside the surface to begin [m]; a surface voxel may be half free.
 
     Returns:
-        Cubes of a voxel's size in all, none where the shape is too thin, and those in voxels seen free.
+        Number of cubes of a voxel's size, 0 if the shape is too thin, and of those in voxels seen free.
     """
     half = shape.extents / 2.0 - inset
     if half.min() <= 0.0:
@@ -196,13 +196,13 @@ def _with_bare(f: Fit, points: Array) -> Fit:
 def _ranked(
     points: Array, normals: Array, config: FitConfig, rng: np.random.Generator
 ) -> tuple[list[Fit], Array]:
-    """The best fit of each shape, least cost first, and the points (N, 3) that they are judged by."""
+    """The best fit of each shape, lowest cost first, and the points (N, 3) by which they are scored."""
     if len(points) < config.min_points:
         return [], points
     count = min(len(points), config.max_points)
     every = max(1, count // config.search_points)
     if every > 1 or count < len(points):
-        # Shuffled: points come row by row, and every so many of a row would leave out whole columns.
+        # Shuffled: points come row by row, and every n-th of a row would leave out whole columns.
         drawn = rng.choice(len(points), count, replace=False)
         points, normals = points[drawn], normals[drawn]
     origin = points.mean(axis=0)
@@ -232,18 +232,18 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     kinds, points, normals, every, samples, steps, threshold, max_radius, max_extent, min_extent,
     normal_weight, min_points, shapes, score, seen,
 ):  # fmt: skip
-    """Fit each kind of shape: search among every so many of the points, least squares, score by all of them.
+    """Fit each kind of shape: search among every n-th point, least squares, score by all points.
 
     Args:
         kinds: Codes (K,).
         points: (N, 3) [m], about the origin.
         normals: Unit normals (N, 3).
-        every: Every so many of the points are searched.
+        every: Every n-th point is searched.
         samples: Pairs (K, B, 2) of those points that hypotheses are made from; then settings as configured.
         shapes: S of each kind (K, S, 5, 3); written to, and so are the rest. All but two of them are
             hypotheses from the search, one is of a single face, one the last refinement of the best.
         score: Cost [m], infinite at first, mean distance [m] and share of inliers (K, S, 3).
-        seen: Which sides points bear out (K, S, 6).
+        seen: Which sides points confirm (K, S, 6).
 
     Returns:
         Which of its shapes is the best of each kind (K,); −1 = none.
@@ -251,7 +251,7 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
     some, facing, polish = points[::every].copy(), normals[::every].copy(), shapes.shape[1] - 2
     best, found = np.zeros(len(kinds), np.intp), np.zeros(len(kinds), np.intp)
     within = np.zeros(len(kinds), np.bool_)
-    least_seen = max(min_points / 3.0, 0.02 * len(points))  # Points that bear out a side.
+    least_seen = max(min_points / 3.0, 0.02 * len(points))  # Points that confirm a side.
     for turn in range(4):
         least = np.inf
         for k in range(len(kinds)):
@@ -272,13 +272,13 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
                 # halve what it found, and twice the best may still win.
                 first, last = 1, found[k]
             elif turn == 2 and within[k] and score[k, best[k], 0] <= 2.0 * least:
-                # Kinds are compared once least squares on all the points have nothing left to gain. By now
+                # Kinds are compared when least squares on all the points gain nothing more. By now
                 # they gain a thousandth a step, so kinds that cost twice as much as the best cannot catch up.
                 first, last, used = polish + 1, polish + 2, points
                 copy(shapes[k, best[k]], shapes[k, first])
             elif turn == 3 and not within[k]:
                 best[k] = -1
-            # A small pull on the extents keeps sides that hold no points near; the last fit has none.
+            # A small pull on the extents keeps sides without points near; the last fit has none.
             for row in range(first, last):
                 shape, converged = shapes[k, row], CONVERGED if turn == 2 else 10.0 * CONVERGED
                 levenberg_marquardt(kinds[k], shape, used, steps, min_extent, 2e-5, converged)
@@ -298,14 +298,14 @@ def _best_of_each(  # type: ignore[no-untyped-def]  # noqa: D417
 
 @kernel(inline="always")
 def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  # type: ignore[no-untyped-def]
-    """Find the sides that points bear out, draw the others in to where the points end, and score the shape.
+    """Find the sides that points confirm, draw the others in to where the points end, and score the shape.
 
     Points and unit normals are (N, 3); those nearer than the threshold [m] are the shape's, and a side needs
     at least `least` of them. The shape (5, 3) changes, down to a least extent [m]; `seen` (6,) is written to:
     whether the sides -x, +x, -y, +y, -z, +z are.
 
     Returns:
-        Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, 1 at the most;
+        Mean distance, truncated at the threshold [m]; mean of 1 − the cosine between normals, at most 1;
         share of the points within the threshold.
     """
     own, facing = in_frame(shape[:3], shape[3], points), in_frame(shape[:3], np.zeros(3), normals)
@@ -319,7 +319,7 @@ def _judge(kind, shape, points, normals, threshold, least, min_extent, seen):  #
         count += 1
         if gx * facing[i, 0] + gy * facing[i, 1] + gz * facing[i, 2] > 0.5:
             for axis, g in enumerate((gx, gy, gz)):
-                # A point bears out the side that its own gradient follows within 45°.
+                # A point confirms the side whose direction its gradient follows within 45°.
                 counts[2 * axis + (g > 0.0)] += abs(g) > 0.7
     for side in range(6):
         seen[side] = counts[side] >= least
@@ -360,7 +360,7 @@ def _draw_in(kind, shape, own, near, min_extent, seen):  # type: ignore[no-untyp
 
 @kernel
 def _bare_share(kind, R, centre, half, seen, points):  # type: ignore[no-untyped-def]
-    """Share of the seen sides' area that has no point near it: a side that was seen should be seen whole.
+    """Share of the seen sides' area without a point near it: a side that was seen should be seen whole.
 
     The shape has axes R (3, 3), a centre (3,) and half extents (3,) [m]; points are (N, 3).
     """

@@ -10,9 +10,9 @@ from caryatid.geometry.signed_distance import gradient, local
 from caryatid.runtime.parallel import inner, kernel
 
 TRIM = 0.005
-"""Share of the points beyond each end of an extent that count as noise [1]."""
+"""Share of the points beyond each end of an extent that counts as noise [1]."""
 LEAST_EXTENT, LEAST_RADIUS = 1e-4, 1e-3
-"""Extents of hypotheses are no shorter [m], points on one plane have none across it; no radius is smaller."""
+"""Minimum extent and radius of hypotheses [m]; points on one plane have none across it."""
 
 
 @kernel(inline="always")
@@ -26,7 +26,7 @@ def search(  # type: ignore[no-untyped-def]
     shape for points of one face behind them.
 
     Returns:
-        How many there are; none where nothing is within the limits.
+        Number of hypotheses; 0 if none is within the limits.
     """
     count, cost = len(points), np.full(keep + 1, np.inf)
     most_inliers = found = 0
@@ -60,10 +60,10 @@ def search(  # type: ignore[no-untyped-def]
 
 @inner
 def _of_one_face(kind, points, normals, min_extent, max_radius, max_extent, shape):  # type: ignore[no-untyped-def]
-    """Make a box or a cylinder for points of one face: their main normal, and what holds them along it.
+    """Make a box or a cylinder for points of one face, along their main normal.
 
-    A box has the least rectangle around them, a cylinder the circle that reaches as far. Returns whether it
-    is within the limits.
+    A box has the smallest rectangle around them, a cylinder the circle that reaches as far. Returns whether
+    it is within the limits.
     """
     R, centre, half = shape[:3], shape[3], shape[4]
     (x, y, z), on_face = _main_normal(normals)
@@ -129,7 +129,7 @@ def _msac(kind, shape, points, threshold, limit):  # type: ignore[no-untyped-def
 
 @inner
 def _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shape):  # type: ignore[no-untyped-def]
-    """Make a shape of two oriented points; what they leave open is as long as all points reach.
+    """Make a shape from two oriented points; extents they leave open are as long as all points reach.
 
     A box has adjacent faces through them; a cylinder has them on its mantle, its axis where the lines along
     their normals come closest; so does the centre of a sphere. Returns whether it is within the limits.
@@ -158,7 +158,7 @@ def _hypothesis(kind, points, normals, i, j, max_radius, max_extent, shape):  # 
     x, y, z = x / sine, y / sine, z / sine
     gx, gy, gz = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
     tx, ty, tz = bx - ax, by - ay, bz - az
-    # The turn of the normals is across the axis, so the gap along it adds nothing.
+    # Normals turn across the axis, so the gap along it adds nothing.
     radius = (gx * tx + gy * ty + gz * tz) / max(tx * tx + ty * ty + tz * tz, 1e-12)
     if not LEAST_RADIUS < radius <= max_radius:
         return False
@@ -195,7 +195,7 @@ def _turned(R, c, s):  # type: ignore[no-untyped-def]
 
 @inner
 def _range(points, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Least and greatest coordinate [m] of points (N, 3) along a direction, a share at each end left out."""
+    """Lowest and highest coordinate [m] of points (N, 3) along a direction, without a share at each end."""
     along = np.empty(len(points))
     for i in range(len(points)):
         along[i] = points[i, 0] * dx + points[i, 1] * dy + points[i, 2] * dz
@@ -249,7 +249,7 @@ def _across(points, x, y, z):  # type: ignore[no-untyped-def]
                 return u / reach, v / reach, w / reach
         if farthest < 1e-6:
             break
-    # Points on the axis leave it open: across the world axis that is least along it.
+    # Points on the axis leave it open: then across the world axis least aligned with it.
     u, v, w = 0.0, 0.0, 1.0
     if abs(x) <= abs(y) and abs(x) <= abs(z):
         u, v, w = 1.0, 0.0, 0.0

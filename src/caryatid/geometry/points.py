@@ -35,7 +35,7 @@ def _transformed(T, which, points, last):  # type: ignore[no-untyped-def]
 
 
 def most_central(points: Array, groups: NDArray[np.int32], edges: Array) -> NDArray[np.intp]:
-    """Of the points of each group in each voxel, the one nearest to their mean; of two as near, the first.
+    """For each group and voxel, the point nearest to the mean of its points; of two equally near, the first.
 
     Args:
         points: (N, 3) [m].
@@ -54,7 +54,7 @@ def most_central(points: Array, groups: NDArray[np.int32], edges: Array) -> NDAr
 
 
 def last_in_voxels(points: Array, edge: float, depth: int) -> NDArray[np.intp]:
-    """Of the points (N, 3) [m] in each voxel of this edge length [m] the last `depth`; indices, ascending."""
+    """The last `depth` points (N, 3) [m] in each voxel of this edge length [m]; ascending indices."""
     points = np.ascontiguousarray(points)
     voxel, count = _numbered(points, np.zeros(len(points), dtype=np.int32), np.array([edge]))
     backwards = voxel[::-1]
@@ -132,7 +132,7 @@ def _mixed(x, y, z, group):  # type: ignore[no-untyped-def]
 def solve_positive(A: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
     """Solution x (N,) of A x = b for a symmetric positive definite A (N, N), by Cholesky's factors.
 
-    They overwrite A. Where A is not positive definite x has NaN.
+    They overwrite A. If A is not positive definite, x has NaN.
     """
     size = len(b)
     x = np.empty(size)
@@ -157,10 +157,10 @@ def solve_positive(A: NDArray[np.float64], b: NDArray[np.float64]) -> Array:
 
 @kernel
 def select(numbers: NDArray[np.float64], rank: int) -> float:
-    """The number that comes at this rank among numbers (N,) in ascending order, counted from 0.
+    """The number at this rank, from 0, among numbers (N,) in ascending order.
 
-    The numbers are put in another order: those before the rank are not greater, those after it not less.
-    Where some are not comparable, it is any of them.
+    The numbers are reordered: those before the rank are not greater, those after it not less. If some are
+    not comparable, it is any of them.
     """
     left, right = 0, len(numbers) - 1
     while left < right:
@@ -184,7 +184,7 @@ def select(numbers: NDArray[np.float64], rank: int) -> float:
 
 @kernel
 def quantile(numbers: NDArray[np.float64], share: float) -> float:
-    """Quantile of numbers (N,), between two of them in proportion; they are put in another order."""
+    """Quantile of numbers (N,), interpolated between two of them; they are reordered."""
     place = share * (len(numbers) - 1)
     rank = int(place)
     below = select(numbers, rank)

@@ -1,7 +1,7 @@
 """Compiled convex polygons in the ground plane: hulls, common areas, and the parts of solids that touch.
 
 A polygon is an array (M, 2) [m] of its corners, counter-clockwise; two are a line, one is a point, none is
-nothing. shapely's geometry is the reference the tests compare all this with.
+nothing. The tests compare with shapely.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from caryatid.runtime.parallel import kernel
 
 @kernel
 def hull(points: NDArray[np.float64]) -> Array:
-    """Convex hull of points laid onto the ground (N, 2) or (N, 3)."""
+    """Convex hull of points (N, 2) or (N, 3) projected to the ground."""
     p, count = points[:, :2].copy(), len(points)
     gap = count // 2
     while gap > 0:
@@ -30,7 +30,7 @@ def hull(points: NDArray[np.float64]) -> Array:
     corners = np.empty((2 * count + 1, 2))
     size, first = 0, 0
     for k in range(2 * count):
-        # There along the lower side, and back along the upper one.
+        # Forth along the lower side, and back along the upper one.
         i = k if k < count else 2 * count - 1 - k
         if k == count:
             first = size - 1
@@ -41,7 +41,7 @@ def hull(points: NDArray[np.float64]) -> Array:
             size -= 1
         corners[size, 0], corners[size, 1] = x, y
         size += 1
-    # The way back ends where the way there began.
+    # The way back ends where the way forth began.
     return corners[: size - 1 if size > 1 else size]
 
 
@@ -84,9 +84,9 @@ def area(polygon: NDArray[np.float64]) -> float:
 
 @kernel
 def nearest_on_border(polygon: NDArray[np.float64], x: float, y: float) -> tuple[float, float, float, bool]:
-    """Distance [m] of a point to a polygon's (N, 2) border, the point nearest there, and if it is inside.
+    """Distance [m] of a point to a polygon's (N, 2) border, the nearest point there, and if it is inside.
 
-    Nothing is inside a line or a point; what lies on the border of an area is.
+    Nothing is inside a line or a point; a point on the border of an area is inside.
     """
     least, near_x, near_y = np.inf, x, y
     inside = len(polygon) > 2

@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from caryatid.runtime.parallel import inner, kernel
 
 Grid = NDArray[np.uint8]
-"""One byte a voxel, indexed [x, y, z]."""
+"""One byte per voxel, indexed [x, y, z]."""
 Triple = tuple[float, float, float]
-"""One number an axis."""
+"""One number per axis."""
 Voxel = tuple[int, int, int]
 """Index of a voxel."""
 
 BATCH = 8
-"""Slabs worked on together; a ray takes up a whole number of batches [1]."""
+"""Slabs per batch; a ray uses a whole number of batches [1]."""
 
 
 @kernel
 def room(shape: Voxel) -> NDArray[np.int32]:
-    """Make room (3, M) for the voxels of any ray through a grid: what `traverse` writes to."""
+    """Make room (3, M) for the voxels of any ray through a grid, which `traverse` fills."""
     return np.empty((3, max(shape) + BATCH), dtype=np.int32)
 
 
@@ -34,8 +34,8 @@ def traverse(
 ) -> int:
     """Find the voxels a ray traverses, slab by slab along the axis it goes along most.
 
-    Within a slab it meets no more than three voxels: where it enters, where it leaves, and where it crosses
-    over if both other axes change. All slabs are worked alike, without a branch, so several at a time.
+    Within a slab it meets at most three voxels: where it enters, where it leaves, and where it crosses over
+    if both other axes change. All slabs are treated alike, without a branch, so several run at a time.
 
     Args:
         found: Flat indices (3, M), written to: the voxels of each slab, which may be the same; see `room`.
@@ -46,7 +46,7 @@ def traverse(
         t_to: Where it ends.
 
     Returns:
-        How many slabs it crosses.
+        Number of slabs it crosses.
     """
     x, y, z = start
     dx, dy, dz = ray
@@ -66,7 +66,7 @@ def traverse(
 
 @kernel(fastmath={"contract"}, inline="always")
 def _clip(start, ray, count, t_from, t_to):  # type: ignore[no-untyped-def]
-    """Cut a ray to the grid along one axis: t per voxel, begin and end; nothing where the end is no later."""
+    """Clip a ray to the grid along one axis: t per voxel, begin and end; nothing if the end is not later."""
     if ray == 0.0:
         return np.inf, t_from, t_to if 0.0 <= start < count else t_from
     per_voxel = 1.0 / ray
@@ -76,7 +76,7 @@ def _clip(start, ray, count, t_from, t_to):  # type: ignore[no-untyped-def]
 
 @inner(fastmath={"contract"})
 def _slabs(found, counts, strides, start, ray, per_voxel, t_from, t_to):  # type: ignore[no-untyped-def]
-    """Do as `traverse` does, the axes turned so that the ray goes along the first most."""
+    """Like `traverse`, with the axes turned so that the ray goes along the first most."""
     x, y, z = start
     dx, dy, dz = ray
     last_x, last_y, last_z = counts[0] - 1.0, counts[1] - 1.0, counts[2] - 1.0

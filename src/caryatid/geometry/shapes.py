@@ -1,6 +1,6 @@
-"""Box, Cylinder and Sphere: a pose and named sizes, with what geometry asks of them; many shapes as arrays.
+"""Box, Cylinder and Sphere: a pose and named sizes, with their geometry; many shapes as arrays.
 
-A new kind of shape derives from `Shape`; from then on `from_size` knows it by its name.
+A new kind of shape derives from `Shape`; `from_size` then knows it by its name.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ KINDS: dict[str, type[Shape]] = {}
 class Shape(Pictured):
     """A convex form whose pose is at its centre: a frozen dataclass of `T_world_object` and named sizes.
 
-    A kind has to give its `kind`, `extents` and `from_extents`, and an `outline` that spans it. Everything
-    else follows; what compiled kernels, MuJoCo or URDF do not know by its `code` is the box around it there.
-    One that is not convex is the union of its convex `parts`.
+    A kind has to define `kind`, `extents` and `from_extents`, and an `outline` that spans it. Everything
+    else follows. Compiled kernels, MuJoCo and URDF use the box around a shape whose `code` they do not know.
+    A shape that is not convex is the union of its convex `parts`.
 
     Attributes:
         kind: Name of the kind, as in graph.json.
-        code: What the compiled kernels take it for.
-        ties: Which of the extents along x, y, z are one number: equal entries are.
+        code: Its kind for the compiled kernels.
+        ties: Extents along x, y, z with equal entries here are one number.
         parameters: Numbers that determine the shape.
-        fill: Share of the box around it that it fills [1]; None: as its mesh does.
+        fill: Share of the box around it that it fills [1]; None = that of its mesh.
         spread: Mean square of its points' coordinates along x, y, z, per squared extent [1].
         T_world_object: Pose (4, 4) of the centre.
     """
@@ -66,7 +66,7 @@ class Shape(Pictured):
     @classmethod
     @abstractmethod
     def from_extents(cls, T_world_object: Array, extents: Array) -> Self:
-        """Build the shape with a pose (4, 4) and full extents (3,) [m]; of tied ones the first counts."""
+        """Build the shape with a pose (4, 4) and full extents (3,) [m]; the first of tied ones counts."""
 
     @abstractmethod
     def outline(self) -> Array:
@@ -78,7 +78,7 @@ class Shape(Pictured):
 
     @property
     def parts(self) -> tuple[Shape, ...]:
-        """Convex shapes whose union it is: itself alone where it is convex."""
+        """Convex shapes whose union it is; itself alone if it is convex."""
         return (self,)
 
     @property
@@ -387,7 +387,7 @@ class Uncertainty:
 
 
 class Primitives(NamedTuple):
-    """N shapes in the world frame, as the compiled kernels take them.
+    """N shapes in the world frame, for the compiled kernels.
 
     Attributes:
         kinds: Codes (N,).

@@ -12,7 +12,7 @@ from caryatid.geometry import CYLINDER, SPHERE
 from caryatid.runtime.parallel import inner, kernel
 
 GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
-"""Angle by which one point of a ball is turned against the last [rad]."""
+"""Angle by which one point of a ball is turned relative to the last [rad]."""
 
 
 @kernel(inline="always")
@@ -124,7 +124,7 @@ def sample_surface(kind, R, centre, half, spacing):  # type: ignore[no-untyped-d
 
 @inner
 def _cells(half, spacing):  # type: ignore[no-untyped-def]
-    """How many equal cells cover [−half, half]."""
+    """Number of equal cells that cover [−half, half]."""
     return max(2, int(np.ceil(2.0 * half / spacing)))
 
 

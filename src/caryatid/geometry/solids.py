@@ -1,4 +1,4 @@
-"""Solid: a shape of any form, as the convex parts that make it up."""
+"""Solid: a shape of any form, made of convex parts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel
 
 LEAST_VOLUME = 1e-9
-"""What is smaller is flat, and no part [m³]; a cubic millimetre."""
+"""Anything smaller is flat and not a part [m³]; a cubic millimetre."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -39,7 +39,7 @@ class Polytope:
 
     @classmethod
     def around(cls, points: Array) -> Polytope | None:
-        """The hull of points (N, 3) [m], or None where they have no volume."""
+        """The hull of points (N, 3) [m], or None if they have no volume."""
         try:
             hull = ConvexHull(points)
         except (QhullError, ValueError):
@@ -83,7 +83,7 @@ class Polytope:
 
 @dataclass(frozen=True, eq=False, slots=True, repr=False)
 class Solid(Shape):
-    """The union of convex parts: what is not a box, no cylinder and no ball, and what is hollow.
+    """The union of convex parts: anything that is not a box, a cylinder or a ball, and anything hollow.
 
     Its axes are the world's where it was first seen; its centre is that of the box around it.
 
@@ -143,7 +143,7 @@ class Solid(Shape):
 
     @property
     def volume(self) -> float:
-        """Volume [m³]; where parts overlap it counts as often."""
+        """Volume [m³]; where parts overlap, each counts."""
         return float(sum(p.volume for p in self.polytopes))
 
     @property
@@ -154,29 +154,29 @@ class Solid(Shape):
         return transforms.transform(self.T_world_object, (weights @ middles / weights.sum())[None])[0]
 
     def resized(self, T_world_object: Array, extents: Array) -> Solid:
-        """The same form with another pose (4, 4), as long (3,) [m] along its axes."""
+        """The same form with another pose (4, 4) and other lengths (3,) [m] along its axes."""
         scale = extents / self.extents
         if np.allclose(scale, 1.0, atol=1e-9):
             return replace(self, T_world_object=T_world_object)
         return Solid.from_size(T_world_object, {"parts": [p.vertices * scale for p in self.polytopes]})
 
     def lowest(self, direction: Array, depth: float) -> NDArray[np.bool_]:
-        """Which corners of its outline (N,) lie within a depth [m] of the last one along a direction (3,)."""
+        """Which corners of its outline (N,) lie within a depth [m] of its end along a direction (3,)."""
         reach = np.concatenate([p.vertices for p in self.polytopes]) @ direction
         return np.asarray(reach >= reach.max() - depth)
 
     def lengthened(self, direction: Array, depth: float, length: float) -> Solid:
-        """The solid with the corners within a depth [m] of the last one along a direction moved on, or back.
+        """The solid with the corners within a depth [m] of its end along a direction moved on, or back.
 
         Args:
             direction: Unit vector (3,) in the solid's frame.
             depth: Of the corners that move [m].
-            length: How far they go [m]; a negative one takes them back.
+            length: How far they move [m]; backwards if negative.
         """
         moving = np.split(self.lowest(direction, depth), np.cumsum([len(p.vertices) for p in self.polytopes]))
         moved = []
         for part, own in zip(self.polytopes, moving, strict=False):
-            # What moves on leaves a prism behind.
+            # A face that moves on leaves a prism behind.
             stays = part.vertices[~own] if length < 0.0 else part.vertices
             longer = Polytope.around(np.concatenate([stays, part.vertices[own] + length * direction]))
             moved.append(part if longer is None or not own.any() else longer)
@@ -204,7 +204,7 @@ class Solid(Shape):
         local, outward = np.concatenate(points), np.concatenate(normals)
         inside = np.zeros(len(local), dtype=np.bool_)
         for number, part in enumerate(self.polytopes):
-            # Where two parts touch there is no surface, to a tenth of a millimetre.
+            # Parts that touch, to a tenth of a millimetre, have no surface there.
             depth = (local @ part.faces[:, :3].T + part.faces[:, 3]).max(axis=1)
             inside |= (depth < 1e-4) & (owner != number)
         R = self.T_world_object[:3, :3]
@@ -219,14 +219,15 @@ class Solid(Shape):
         )
 
     def _edges(self, eye: Array | None) -> Array:
-        """Those of the whole: none where parts touch or overlap."""
+        """Edges of the whole: none where parts touch or overlap."""
         import trimesh
 
         ends = Shape._edges(self, eye)
         middle, around = ends.mean(axis=1), trimesh.creation.icosphere(subdivisions=2).vertices
         nearby = (middle[:, None] + 2e-3 * around).reshape(-1, 3)
         filled = Solid(np.eye(4), self.polytopes).signed_distance(nearby).reshape(len(ends), -1) < 0.0
-        # Half of what is around a point on a flat face is filled, a quarter around one on a box's edge.
+        # Half of the space around a point on a flat face is filled, a quarter of that around one on a box's
+        # edge.
         share = filled.mean(axis=1)
         kept = (np.abs(share - 0.5) > 0.1) & (share < 0.9)
         if eye is not None:  # across the line of sight
@@ -247,14 +248,14 @@ def in_hull(corners: Array, points: Array) -> NDArray[np.bool_]:
 
 
 def hollowed(part: Polytope, cavity: Sequence[tuple[Array, float]]) -> list[Polytope]:
-    """What is left of a part without a convex cavity, in convex pieces that do not overlap.
+    """The rest of a part without a convex cavity, in convex pieces that do not overlap.
 
     Args:
         part: The part.
-        cavity: Its planes, unit normal (3,) into the cavity and offset [m]: in it is what lies before all.
+        cavity: Its planes, unit normal (3,) into the cavity and offset [m]: the points before all of them.
 
     Returns:
-        The pieces; the part itself where the cavity does not reach it.
+        The pieces; the part itself if the cavity does not reach it.
     """
     pieces, rest = [], part
     for normal, offset in cavity:

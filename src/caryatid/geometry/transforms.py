@@ -14,7 +14,9 @@ Array = NDArray[np.float64]
 UP: Array = np.array([0.0, 0.0, 1.0])
 """The world's vertical (3,)."""
 FARTHEST = 1e6
-"""Largest coordinate of a translation [m]: beyond it float64 leaves no nanometre, and units are wrong."""
+"""Largest coordinate of a translation [m]: beyond it, float64 does not resolve a nanometre, and units are
+wrong.
+"""
 RIGID_TOLERANCE = 1e-4
 """How far RᵀR may be from the identity (per entry, no unit) before a matrix is refused as a rotation."""
 
@@ -159,7 +161,7 @@ def level_world(normal: ArrayLike, point: ArrayLike) -> Array:
     """`T_world_camera` (4, 4) for a frame without a pose, from the support plane seen by the camera.
 
     World z is the plane's normal, the world's origin is the plane's point below the camera, and world x
-    is the camera's viewing direction laid into the plane.
+    is the camera's viewing direction projected to the plane.
 
     Args:
         normal: Unit normal (3,) of the plane in the camera frame, pointing up.

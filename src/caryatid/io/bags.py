@@ -1,4 +1,4 @@
-"""Bags of ROS 1 and ROS 2 (sqlite3 and MCAP): depth, its camera, colour of its time, and camera poses."""
+"""Bags of ROS 1 and ROS 2 (sqlite3 and MCAP): depth, its camera, simultaneous colour, and camera poses."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from caryatid.io.video import SECOND, TimedCamera, TimedImage, TransformTree, is
 from caryatid.sensing.views import check_intrinsics
 
 SUFFIXES: Final = (".bag", ".mcap", ".db3")
-"""Endings of files that are bags; a folder with a metadata.yaml is one too."""
+"""Suffixes of bags; a folder with a metadata.yaml is one too."""
 COMPRESSED: Final = "sensor_msgs/msg/CompressedImage"
 TYPES: Final[Mapping[str, tuple[str, ...]]] = {
     "images": ("sensor_msgs/msg/Image", COMPRESSED),
     "cameras": ("sensor_msgs/msg/CameraInfo",),
     "transforms": ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"),
 }
-"""What is read → types of its messages."""
+"""Kind of data → types of its messages."""
 DEPTH_ENCODINGS: Final[Mapping[str, str]] = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encodings of depth → type of a pixel: whole millimetres, or metres."""
 COLOUR_ENCODINGS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = {
@@ -42,7 +42,7 @@ COLOUR_ENCODINGS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = {
 }
 """Encodings of colour → number of channels, and those that are red, green and blue."""
 _CONFIG_HEADER: Final = struct.Struct("<iff")
-"""What comes before a compressed depth image: its format, and two parameters of inverse depth."""
+"""Header of a compressed depth image: its format, and two parameters of inverse depth."""
 
 
 def recognises(path: Path) -> bool:
@@ -98,7 +98,7 @@ class _Bag:
         if path.is_file() and path.stat().st_size == 0:
             raise InputError(path, "the bag is empty", "record it again")
         with _damage(path):
-            # Before ROS 2 Iron sqlite3 bags did not say how messages are laid out; those read here are alike.
+            # Before ROS 2 Iron, sqlite3 bags did not store message definitions; those read here are alike.
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
             self._reader.open()
         weakref.finalize(self, self._reader.close)
@@ -192,12 +192,12 @@ def _frame(name: str) -> str:
 
 
 def _stamp(header: Any, received: int) -> int:
-    """The header's time [ns], or when it was received where that is 0."""
+    """The header's time [ns], or the time of receipt if that is 0."""
     return int(header.stamp.sec * SECOND + header.stamp.nanosec) or received
 
 
 def _depth(message: Any, source: str, max_pixels: int) -> NDArray[np.float32]:
-    """Depth (H, W) [m] of an image message, compressed or not; 0 where it is NaN, infinite or negative."""
+    """Depth (H, W) [m] of an image message, compressed or not; 0 for NaN, infinite or negative values."""
     if message.__msgtype__ == COMPRESSED:
         depth = _compressed_depth(message, source, max_pixels)
     else:
@@ -252,7 +252,7 @@ def _pixels(message: Any, kind: str, channels: int, source: str) -> NDArray[Any]
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Turn whatever the library raises on bytes no program wrote into one sentence."""
+    """Turn any exception of the library on damaged data into one sentence."""
     try:
         yield
     except CaryatidError:

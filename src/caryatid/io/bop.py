@@ -22,7 +22,7 @@ from caryatid.io.staging import StagedFolder
 from caryatid.sensing.views import SUPPORT_LABEL, View, check_intrinsics
 
 COLOUR_ENDINGS: Final = (".png", ".jpg", ".jpeg")
-"""Files of colour images; the first that exists counts."""
+"""Files of colour images; the first existing one counts."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,7 +61,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
 def read_recording(folder: str | Path, config: RecordingConfig | None = None) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
-    Cameras, poses and the table of masks are checked here, images when a view is asked for. A rotation that
+    Cameras, poses and the table of masks are checked here, images when a view is loaded. A rotation that
     has drifted from orthonormal by less than 0.02 is replaced by the nearest rotation.
 
     Args:
@@ -70,8 +70,8 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
 
     Raises:
         InputError: A table is missing or broken, a camera or pose is not valid, a mask names no object,
-            several frames have no poses, or there is no frame. Loading a frame raises it where an image is
-            missing, broken, of another size or mode, or where masks overlap.
+            several frames have no poses, or there is no frame. Loading a frame raises it if an image is
+            missing, broken, or of another size or mode, or if masks overlap.
     """
     check_type("folder", folder, (str, Path), "give a scene folder of the BOP format")
     folder = find_sample(folder)
@@ -99,9 +99,9 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
 
 
 def write_recording(folder: str | Path, views: Iterable[View]) -> None:
-    """Write views as a BOP scene folder, whole or not at all; `read_recording` gives them back.
+    """Write views as a BOP scene folder, whole or not at all; `read_recording` reads them back.
 
-    Depth is counted in units of 0.1 mm, which 16 bits take to 6.5 m; where a view reaches farther, in 0.2 mm,
+    Depth is stored in units of 0.1 mm, enough for 6.5 m in 16 bits; if a view reaches farther, in 0.2 mm,
     0.4 mm and so on.
 
     Args:
@@ -116,10 +116,10 @@ def write_recording(folder: str | Path, views: Iterable[View]) -> None:
 
 
 def write_views(folder: StagedFolder, views: Iterable[View]) -> None:
-    """Write views into a folder in the making, as `write_recording` does, and publish it.
+    """Write views into a staged folder, as `write_recording` does, and publish it.
 
     Raises:
-        InputError: No views, the folder's place is taken, or the disk is full or refuses.
+        InputError: No views, the folder's place is taken, or the disk cannot be written.
     """
     cameras: dict[str, Any] = {}
     objects: dict[str, Any] = {}
@@ -198,7 +198,7 @@ def _pose(camera: _Camera, name: str) -> Array | None:
         missing = "cam_R_w2c" if camera.cam_R_w2c is None else "cam_t_w2c"
         raise InputError(name, f"the key '{missing}' is missing", "add it")
     R = camera.cam_R_w2c.reshape(3, 3)
-    # Trackers that multiply up single precision drift by 5e-4 in 1000 frames; scaled matrices are far beyond.
+    # Trackers in single precision drift by 5e-4 in 1000 frames; scaled matrices are far beyond.
     if np.linalg.det(R) > 0.0 and np.allclose(R.T @ R, np.eye(3), atol=0.02):
         left, _, right = np.linalg.svd(R)
         R = left @ right

@@ -23,21 +23,21 @@ from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import View
 
 BUILT_IN: Final = ("bop", "tum", "bags")
-"""Modules of `caryatid.io` that are formats, in the order they are tried."""
+"""Modules of `caryatid.io` that are formats, in the order in which they are tried."""
 ENTRY_POINTS: Final = "caryatid.datasets"
 """Group under which other packages offer formats."""
 NO_COLOUR: Final = "no colour image of that time"
 NO_POSE: Final = "no pose"
-"""Why a frame of a video does not become a view."""
+"""Reasons why a frame of a video does not become a view."""
 
 
 SAMPLES: Final = Path(__file__).parents[1] / "samples"
-"""Folder of what comes with the package."""
+"""Folder of the samples in the package."""
 DESCRIPTIONS: Final = {
     "sample-recording": "eight views of the simulated scene clutter, with noise, masks and ground truth",
     "sample-cloud": "points of the same scene from all sides, with normals and labels",
 }
-"""What each sample in there is."""
+"""Description of each sample."""
 
 
 def find_sample(source: str | Path) -> Path:
@@ -52,10 +52,10 @@ class Frame:
     Attributes:
         name: Name of the view it becomes.
         number: Its number in the dataset.
-        load: Decodes it. Raises `caryatid.io.images.BrokenImageError` where other frames may be whole, and
-            another `InputError` where it does not fit the dataset.
-        T_world_camera: Camera pose (4, 4), or None where it is not known.
-        time: When it was taken [ns]; 0 where that does not matter.
+        load: Decodes it. Raises `caryatid.io.images.BrokenImageError` if other frames may be whole, and
+            another `InputError` if it does not fit the dataset.
+        T_world_camera: Camera pose (4, 4), or None if unknown.
+        time: Time of the image [ns]; 0 if that does not matter.
         has_labels: Whether its view has labels.
     """
 
@@ -80,14 +80,14 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Dataset(Sequence[View]):
-    """A sequence of frames; as a sequence, of their views, which are decoded when asked for and not kept.
+    """A sequence of views, decoded on access from its frames and not kept.
 
     Attributes:
         path: File or folder.
         frames: The frames, in order.
-        skipped: How many others cannot become views, by reason.
-        notes: What a person should know.
-        is_video: Whether neighbouring frames show nearly the same, so that a few of them should be chosen.
+        skipped: Number of others that cannot become views, by reason.
+        notes: Notes for the user.
+        is_video: Whether neighbouring frames show nearly the same, so a few of them should be chosen.
     """
 
     path: Path
@@ -131,10 +131,10 @@ class Dataset(Sequence[View]):
 
 @dataclass(frozen=True, slots=True)
 class OpenOptions:
-    """What a format may need to know.
+    """Options of formats.
 
     Attributes:
-        depth: Topic of a bag's depth images, registered to the colour where there is one.
+        depth: Topic of a bag's depth images, registered to colour if there is any.
         info: Topic of the depth images' camera.
         rgb: Topic of colour images, or None.
         world: Frame of a bag to be the world: level, z up; None without poses.
@@ -161,9 +161,9 @@ def open_dataset(
     """Open a dataset of any known format.
 
     Args:
-        path: BOP scene folder, TUM RGB-D folder, bag, `sample-recording`, or what another package recognises.
+        path: BOP scene folder, TUM RGB-D folder, bag, `sample-recording`, or a format of another package.
         config: Limits of time and range.
-        options: What the format may need to know.
+        options: Options of the format.
 
     Raises:
         InputError: It does not exist, has an unknown format, or is damaged.

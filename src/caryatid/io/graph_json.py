@@ -1,4 +1,4 @@
-"""graph.json: the support graph as other programs read it."""
+"""graph.json: the support graph for other programs."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class _Support:
 
 @dataclass(frozen=True)
 class _Stability:
-    """An entry of `stability`; JSON has no infinity, so an overhang without end is null."""
+    """An entry of `stability`; JSON has no infinity, so an infinite overhang is null."""
 
     ratio: float
     overhang: float | None
@@ -136,7 +136,7 @@ def graph_text(graph: SupportGraph) -> str:
 
 
 def graph_from_json(document: Mapping[str, Any], source: str | Path) -> SupportGraph:
-    """Read a graph from the document of graph.json; keys that are not known are ignored.
+    """Read a graph from the document of graph.json; unknown keys are ignored.
 
     Args:
         document: The parsed JSON object.
@@ -180,7 +180,7 @@ def read_graph(path: str | Path) -> SupportGraph:
         path: The file.
 
     Raises:
-        InputError: The file is missing, broken or no graph; see `graph_from_json`.
+        InputError: The file is missing, broken or not a graph; see `graph_from_json`.
     """
     return graph_from_json(read_json(Path(path)), Path(path))
 

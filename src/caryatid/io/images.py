@@ -20,11 +20,11 @@ DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
 MAX_PIXELS: Final = RecordingConfig().max_pixels
-"""Maximum number of pixels of an image where no settings are given."""
+"""Maximum number of pixels of an image without settings."""
 _BAD_BYTES: Final = (SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error)
-"""What Pillow raises on a broken image, …"""
+"""Exceptions of Pillow for a broken image, …"""
 _TOO_LARGE: Final = (Image.DecompressionBombError, Image.DecompressionBombWarning)
-"""… and on one that says it is larger than any camera's."""
+"""… and for one that claims to be larger than any camera's."""
 
 
 class BrokenImageError(InputError):
@@ -64,17 +64,17 @@ def decode_image(
     what: str = "",
     max_pixels: int = MAX_PIXELS,
 ) -> NDArray[Any]:
-    """Decode a PNG or JPEG: (H, W), or (H, W, 3) where colour is allowed; grey then has three equal channels.
+    """Decode a PNG or JPEG: (H, W), or (H, W, 3) if colour is allowed; grey then has three equal channels.
 
     Args:
         image: A file, or its content.
         name: What to call content in errors.
         modes: Pillow modes allowed; None allows all.
-        what: What the image ought to be, for the error where the mode is another.
+        what: What the image ought to be, for the error about another mode.
         max_pixels: Maximum number of pixels; a larger image is not decoded.
 
     Raises:
-        InputError: It is missing or broken, larger, or not such an image.
+        InputError: It is missing, broken, too large, or of another mode.
     """
     source, remedy = image if isinstance(image, Path) else name, "copy or record the file again"
     try:
@@ -83,7 +83,7 @@ def decode_image(
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with _open(content) as whole:
                 if whole.format == "PNG":
-                    whole.verify()  # decoding passes over a wrong checksum or a missing end
+                    whole.verify()  # decoding ignores a wrong checksum or a missing end
             with _open(content) as opened:
                 width, height = opened.size
                 if modes is not None and opened.mode not in modes:
@@ -105,7 +105,7 @@ def decode_image(
 
 
 def read_mask(image: Path | bytes, name: str = "", max_pixels: int = MAX_PIXELS) -> NDArray[np.bool_]:
-    """Read where a grey PNG (H, W), a file or its content, is not 0.
+    """Read the pixels (H, W) of a grey PNG, a file or its content, that are not 0.
 
     Raises:
         InputError: As `decode_image`.
@@ -123,7 +123,7 @@ def read_npy(array: Path | bytes, name: str = "") -> NDArray[Any]:
     try:
         content = array.read_bytes() if isinstance(array, Path) else array
         return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
-    except Exception as error:  # NumPy reads the header as Python: a damaged one raises almost anything
+    except Exception as error:  # NumPy reads the header as Python, so a damaged one raises almost anything
         reason = f"is not a valid .npy ({' '.join(str(error).split())})"
         raise InputError(source, reason, "save it with numpy.save") from None
 

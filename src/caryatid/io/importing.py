@@ -1,4 +1,4 @@
-"""A robot's recording becomes a recording of a few good views, a scene folder of the BOP format."""
+"""Import of a robot's log: a recording of a few good views, as a scene folder in the BOP format."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from caryatid.sensing.views import View
 BROKEN: Final = "broken"
 DARK: Final = "hardly any depth"
 SPARE: Final = "more than are wanted"
-"""Why a frame does not become a view."""
+"""Reasons why a frame does not become a view."""
 _REMEDIES: Final[Mapping[str, str]] = {
     NO_COLOUR: "leave colour out, or allow more with --set recording.colour_gap=SECONDS",
     NO_POSE: "record its poses all the time, or allow more with --set recording.pose_gap=SECONDS",
     DARK: "allow less with --set recording.min_readings=SHARE",
 }
-"""What to do where no frame is usable for one reason."""
+"""Remedies if no frame is usable, by reason."""
 _UP: Final = np.array([0.0, 0.0, 1.0])
 
 
@@ -51,9 +51,9 @@ def import_recording(
     Args:
         source: A bag, a TUM RGB-D folder, or another dataset that `open_dataset` recognises.
         out: Folder to write; must not exist, or be empty. It appears whole or not at all.
-        options: What to take from a bag, and the camera of a TUM RGB-D folder.
+        options: Topics of a bag, and the camera of a TUM RGB-D folder.
         level: Turn the world so that the table is level: for poses whose z axis does not point up.
-        config: What is sharp, what is different, and how many views there may be; and how a table is found.
+        config: When frames are sharp and different, maximum number of views, and how a table is found.
 
     Returns:
         The source with the frames that became views.
@@ -73,7 +73,7 @@ def import_recording(
 
 
 def levelled(dataset: Dataset, config: Config) -> Dataset:
-    """Turn the world of a dataset so that the table is level; without poses there is none to turn.
+    """Turn the world of a dataset so that the table is level; without poses, nothing changes.
 
     Args:
         dataset: The frames.
@@ -99,10 +99,10 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
 
     Args:
         dataset: The frames.
-        config: What is sharp, what is another viewpoint, and how many frames are wanted.
+        config: When frames are sharp and viewpoints different, and the maximum number of frames.
 
     Returns:
-        The dataset with the chosen frames, in the order of time; the others are counted among the skipped.
+        The dataset with the chosen frames, in the order of time; the others count as skipped.
 
     Raises:
         InputError: No frame can become a view.
@@ -141,19 +141,19 @@ def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
 def choose_views(
     times: Array, sharpness: Array, T_world_camera: Array | None, config: RecordingConfig
 ) -> tuple[list[int], dict[str, int]]:
-    """Choose frames that are sharp for their time and seen from viewpoints apart from each other.
+    """Choose frames that are sharp for their time and have different viewpoints.
 
-    Through time, the sharpest frame of the next moments that is seen from elsewhere than all chosen ones is
-    chosen. Of more than are wanted those stay that are farthest from each other.
+    In the order of time, the sharpest frame of the next moments is chosen whose viewpoint differs from all
+    chosen ones. If there are too many, those farthest from each other stay.
 
     Args:
-        times: When frames were taken (N,) [s], rising; N > 0.
-        sharpness: How sharp they are (N,); only ratios count.
-        T_world_camera: Their poses (N, 4, 4), or None where poses are not known: a single frame is chosen.
-        config: What is sharp, and how far apart viewpoints are.
+        times: Times of the frames (N,) [s], rising; N > 0.
+        sharpness: Their sharpness (N,); only ratios count.
+        T_world_camera: Their poses (N, 4, 4); None if unknown: then a single frame is chosen.
+        config: When frames are sharp, and how far apart viewpoints are.
 
     Returns:
-        Indices of the chosen frames in the order of time, and how many others there are by reason.
+        Indices of the chosen frames in the order of time, and the number of others by reason.
     """
     if T_world_camera is None:
         return [int(np.argmax(sharpness))], dict(+Counter({SPARE: len(times) - 1}))
@@ -174,15 +174,15 @@ def choose_views(
 
 
 def reasons(skipped: Mapping[str, int]) -> str:
-    """How many were skipped, by reason, the most frequent one first."""
+    """Number of skipped frames by reason, the most frequent one first."""
     return ", ".join(f"{count} {reason}" for reason, count in Counter(skipped).most_common())
 
 
 def _level_rotation(dataset: Dataset, config: Config) -> Array:
     """Find the smallest turn of the world about its origin (4, 4) that makes the table of a dataset level.
 
-    Each view says where up is as if it had no pose, by the largest plane that faces its camera and has the
-    rest of the scene in front of it. Of these directions the one counts that is nearest to all the others.
+    Each view votes for the up direction as if it had no pose, by the largest plane that faces its camera and
+    has the rest of the scene in front of it. The direction nearest to all the others wins.
     """
     rng, found = np.random.default_rng(0), []
     for view in dataset:
@@ -220,14 +220,14 @@ def _most_around(times: Array, values: Array, window: float) -> Array:
 
 
 def _apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:
-    """How far poses (N, 4, 4) are from another one (4, 4), in units of what makes a view another one (N,)."""
+    """Distance (N,) of poses (N, 4, 4) from another one (4, 4), in units of the smallest new view."""
     distance = np.linalg.norm(T_world_camera[:, :3, 3] - T_world_other[:3, 3], axis=1)
     turns = Rotation.from_matrix(T_world_other[:3, :3].T @ T_world_camera[:, :3, :3])
     return np.maximum(distance / config.min_distance, np.degrees(turns.magnitude()) / config.min_angle)
 
 
 def _farthest(T_world_camera: Array, config: RecordingConfig) -> list[int]:
-    """Indices of as many poses as are wanted: the first, then always the one farthest from those before."""
+    """Indices of the wanted number of poses: the first, then always the one farthest from those before."""
     kept = [0]
     gap = _apart(T_world_camera, T_world_camera[0], config)
     while len(kept) < min(config.max_views, len(T_world_camera)):

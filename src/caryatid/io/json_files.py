@@ -20,9 +20,9 @@ from caryatid.io.staging import read_errors
 T = TypeVar("T")
 
 LARGEST: Final = 2.0**63
-"""No number of a file is larger, in no unit: its square is finite, and it is a whole number of 64 bits."""
+"""Largest number in a file, in any unit: its square is finite, and it fits in 64 bits."""
 DECIMALS: Final = 9
-"""Decimals floats are written with: a nanometre, far below the sensor's noise, far above rounding errors."""
+"""Decimals of floats in files: a nanometre, far below the sensor's noise, far above rounding errors."""
 
 
 class Numbers:
@@ -54,7 +54,7 @@ class Numbers:
         """Turn nested lists into an array (...) of this shape.
 
         Raises:
-            ValueError: They have another shape, hold something else than finite numbers, or are not rigid.
+            ValueError: They have another shape, hold anything but finite numbers, or are not rigid.
         """
         try:
             array = np.array(value)
@@ -104,10 +104,10 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
 
     Args:
         path: The file.
-        remedy: What the user can do where it is missing or broken.
+        remedy: What the user can do if it is missing or broken.
 
     Raises:
-        InputError: The file is missing, unreadable, no JSON, holds NaN or infinity, or is not an object.
+        InputError: The file is missing, unreadable, not JSON, holds NaN or infinity, or is not an object.
     """
     with read_errors(path, remedy):
         content = path.read_bytes()
@@ -121,7 +121,7 @@ def read_json(path: Path, remedy: str = "write the file again") -> dict[str, Any
 
 
 def json_text(document: Mapping[str, Any]) -> str:
-    """Write a document as JSON text: keys in the order given, floats rounded to `DECIMALS`, no negative zero.
+    """Write a document as JSON text: keys in their order, floats rounded to `DECIMALS`, no negative zero.
 
     NumPy scalars and arrays become numbers and lists, dataclasses objects.
 
@@ -132,7 +132,7 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 
 def plain(value: Any) -> Any:
-    """Turn NumPy values, tuples, paths and dataclasses into what JSON knows, floats rounded to `DECIMALS`."""
+    """Turn NumPy values, tuples, paths and dataclasses into JSON types, with floats rounded to `DECIMALS`."""
     match value:
         case Mapping():
             return {str(key): plain(item) for key, item in value.items()}
@@ -165,7 +165,7 @@ def _largest(value: Any) -> float:
 
 
 def _sentence(error: Any) -> str:
-    """One sentence of what pydantic found first."""
+    """The first error of pydantic in one sentence."""
     *above, last = error["loc"] or ("it",)
     where = f"{'.'.join(map(str, above))}: " if above else ""
     if error["type"] == "missing":

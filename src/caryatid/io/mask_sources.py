@@ -1,4 +1,4 @@
-"""Masks that another program wrote, or that a learned segmenter gives; and masks of what to ignore."""
+"""Masks from another program or a learned segmenter, and masks of pixels to ignore."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from caryatid.sensing.masks import labels_from_masks
 from caryatid.sensing.views import SUPPORT_LABEL, View
 
 MaskSource = Callable[[View], View]
-"""Gives a view the masks of its objects, as segments of that view alone."""
+"""Adds masks of its objects to a view, as segments of that view alone."""
 
 ONNX: Final = "onnx:"
-"""What a mask source begins with that goes on with the file of a model."""
+"""Prefix of a mask source that continues with the file of a model."""
 
 
 def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
-    """Return what gives views their masks.
+    """Return the source of masks.
 
     Args:
         name: `onnx:FILE`, a model; or a folder of masks.
         config: All stages' settings.
-        seed: Seed of the segments a model may take as prompts.
+        seed: Seed of the segments that a model may use as prompts.
 
     Raises:
         InputError: There is no such file or folder, the model is not one of instance masks, or onnxruntime is
@@ -48,7 +48,7 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
 
 
 def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
-    """Return a view with the masks of a file named as it is: a label image `NAME.png`, or `NAME.npy`.
+    """Return a view with the masks of the file of its name: a label image `NAME.png`, or `NAME.npy`.
 
     Args:
         folder: Holds the files.
@@ -75,7 +75,7 @@ def without_ignored(view: View, ignore: Path, max_pixels: int) -> View:
 
     Args:
         view: The view.
-        ignore: A grey PNG for every view of a camera, or a folder of one for each: NAME.png, as there.
+        ignore: A grey PNG for all views of a camera, or a folder with one NAME.png per view.
         max_pixels: Maximum number of pixels of the mask.
 
     Raises:
@@ -88,13 +88,13 @@ def without_ignored(view: View, ignore: Path, max_pixels: int) -> View:
 class OnnxMasks:
     """A class-agnostic instance segmenter as an ONNX model, run on the CPU.
 
-    Inputs are float32 and told apart by name. Where H and W are fixed, images are resized.
+    Inputs are float32 and have names. If H and W are fixed, images are resized.
 
     * `image` (1, 3, H, W): RGB in [0, 1].
     * `xyz` (1, 3, H, W), optional: points in the camera frame [m], 0 where there is no reading.
     * `boxes` (N, 4), optional: x, y of two corners [px] around our own automatic segments, as prompts.
 
-    Outputs are `masks` and, optionally, `scores` (N,). Masks are (N, H, W), with any axes of length 1 beside:
+    Outputs are `masks` and, optionally, `scores` (N,). Masks are (N, H, W), with any extra axes of length 1:
     boolean, scores in [0, 1], or logits, which are above 0 in the mask.
 
     Args:
@@ -103,7 +103,7 @@ class OnnxMasks:
         seed: Their seed.
 
     Raises:
-        InputError: There is no such file, its inputs or outputs are others, or onnxruntime is not installed.
+        InputError: There is no such file, it has other inputs or outputs, or onnxruntime is not installed.
     """
 
     def __init__(self, path: Path, config: Config, seed: int = 0) -> None:
@@ -130,10 +130,10 @@ class OnnxMasks:
         self._size: tuple[int, int] | None = (height, width) if fixed else None
 
     def __call__(self, view: View) -> View:
-        """Return the view with the masks the model gives it.
+        """Return the view with the masks of the model.
 
         Raises:
-            InputError: It has no colour, or the model fails or gives something else than masks.
+            InputError: It has no colour, or the model fails or does not return masks.
         """
         if view.rgb is None:
             raise InputError(view.name, "has no colour image, which the model needs", "record colour")

@@ -1,4 +1,4 @@
-"""Clouds from PCD and PLY files: finite points with normals, labels and colours where the file has them."""
+"""Clouds from PCD and PLY files: finite points with normals, labels and colours if the file has them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StoredCloud:
         normals: (N, 3) as stored, or None.
         labels: Object number of each point (N,), 0 = nothing, or None.
         rgb: (N, 3) uint8, or None.
-        viewpoint: Where the sensor was (3,) [m]; the origin where the file does not say.
+        viewpoint: Where the sensor was (3,) [m]; the origin if the file does not say.
         name: The file.
     """
 
@@ -51,7 +51,7 @@ class StoredCloud:
         return np.isfinite(self.points).all(axis=1) & (self.points != self.viewpoint).any(axis=1)
 
     def spread(self, values: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Give every stored point (N,) the value of its reading (M,); 0 where there was no reading."""
+        """Give every stored point (N,) the value of its reading (M,); 0 without a reading."""
         kept = self.kept
         result = np.zeros(len(kept), dtype=np.int32)
         result[kept] = values
@@ -60,8 +60,8 @@ class StoredCloud:
     def to_cloud(self, config: CloudConfig) -> Cloud:
         """Keep the readings and give them normals.
 
-        Stored normals are taken as they are, scaled to length 1; where the file has none, or not for every
-        reading, all are estimated from neighbours and point to the viewpoint.
+        Stored normals are used, scaled to length 1. If the file has none, or not for every reading, all are
+        estimated from neighbours and point to the viewpoint.
 
         Args:
             config: Neighbours a normal is estimated from.
@@ -93,8 +93,8 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
             the parts of objects, as mOSD does with object = label // 10, need 10.
 
     Raises:
-        InputError: The file is missing, of another kind, broken, its header lies, it holds no readings, or
-            its labels are not object numbers.
+        InputError: The file is missing, of another kind or broken, its header is wrong, it holds no
+            readings, or its labels are not object numbers.
     """
     path = find_sample(path)
     parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
@@ -119,7 +119,7 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
 
 
 def _parse_pcd(content: bytes) -> tuple[Columns, Array]:
-    """The fields and the viewpoint (3,). Whatever is wrong is a ValueError, or what pypcd4 raises."""
+    """The fields and the viewpoint (3,). Errors are a ValueError, or an exception of pypcd4."""
     from pypcd4.pypcd4 import MetaData, PointCloud
 
     end = re.search(rb"^DATA\b[^\n]*\n", content[:65536], re.MULTILINE)
@@ -183,7 +183,7 @@ def _reason(error: Exception) -> str:
 
 
 def _triple(columns: Columns, *choices: str) -> Array | None:
-    """The first three fields that are all there, as (N, 3)."""
+    """The first three fields that all exist, as (N, 3)."""
     for names in map(str.split, choices):
         if columns.keys() >= set(names):
             return np.stack([columns[name].astype(np.float64) for name in names], axis=-1)

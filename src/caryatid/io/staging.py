@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all: written beside their place, renamed when done."""
+"""Files and folders that appear whole or not at all: written beside their final place, renamed when done."""
 
 from __future__ import annotations
 
@@ -15,31 +15,32 @@ from typing import Self
 from caryatid.errors import InputError
 
 PARTIAL, REPLACED = ".partial-", "-replaced"
-"""Beginning of the names of files and folders in the making, and end of those that give way; a killed process
-leaves them behind."""
+"""Prefix of staged files and folders, and suffix of those being replaced; a killed process leaves them
+behind.
+"""
 
 
 class StagedFolder:
-    """A folder in the making, to be used in a `with` block.
+    """A staged folder, to be used in a `with` block.
 
     Everything is written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place; what
     is written later goes there at once, file by file. Leaving the block without `publish` removes what was
     written, and parent folders made for it.
 
     Args:
-        folder: Where the folder shall be.
-        replaces: Which files of a folder that is there may be replaced, by their paths in it; one that holds
-            others is left as it is. None replaces no file.
-        durable: Wait until every file, and the folder itself, is on the disk.
+        folder: The folder's final place.
+        replaces: Which files of an existing folder may be replaced, by their paths in it; a folder with
+            others does not change. None replaces no file.
+        durable: Wait until every file, and the folder itself, is on disk.
         goes_on: The folder is in its place already, and what is written is added to it.
 
     Attributes:
-        folder: Where the folder shall be.
+        folder: The folder's final place.
         published: It is in its place.
         written: Paths of the files written so far.
 
     Raises:
-        InputError: The place is taken by something that may not be replaced, or cannot be written.
+        InputError: The place holds something that may not be replaced, or cannot be written.
     """
 
     def __init__(
@@ -73,7 +74,7 @@ class StagedFolder:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Remove what is not published, and put back what it was to replace."""
+        """Remove an unpublished folder, and restore the one it was to replace."""
         with suppress(OSError):
             if self._old.exists() and not self._place.exists():
                 self._old.rename(self._place)
@@ -86,7 +87,7 @@ class StagedFolder:
         """Write one file, `name` relative to the folder.
 
         Raises:
-            InputError: The disk is full or refuses.
+            InputError: The disk cannot be written.
         """
         path = (self._place if self.published else self._partial) / name
         with write_errors(self.folder):
@@ -98,14 +99,14 @@ class StagedFolder:
         self.written.add(name)
 
     def remove(self, name: str) -> None:
-        """Remove a subfolder, `name` relative to the folder, if it is there."""
+        """Remove a subfolder, `name` relative to the folder, if it exists."""
         shutil.rmtree(self._partial / name, ignore_errors=True)
 
     def publish(self) -> None:
-        """Put the folder in its place, unless it is there; an older one is replaced where that is allowed.
+        """Publish the folder, unless it is published; an older one is replaced if that is allowed.
 
         Raises:
-            InputError: The place has been taken meanwhile, or the disk refuses.
+            InputError: The place has been taken meanwhile, or cannot be written.
         """
         if self.published:
             return
@@ -147,10 +148,10 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
     Args:
         path: The file.
         content: Its bytes.
-        durable: Wait until it is on the disk.
+        durable: Wait until it is on disk.
 
     Raises:
-        InputError: It is a folder, or the disk is full or refuses; nothing is left behind.
+        InputError: It is a folder, or the disk cannot be written; nothing is left behind.
     """
     if path.is_dir():
         raise InputError(path, "is a folder", "give a file")
@@ -166,10 +167,10 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder in one step; once this returns it will not come back.
+    """Remove a folder in one step; after this returns, it cannot reappear.
 
     Raises:
-        InputError: The disk refuses.
+        InputError: The disk cannot be written.
     """
     partial = _partial(folder)
     with write_errors(folder):
@@ -179,7 +180,7 @@ def remove_folder(folder: Path) -> None:
 
 
 def clear_partials(folder: Path) -> None:
-    """Remove what killed processes left in the making; for the only writer of the folder."""
+    """Remove the staged files of killed processes; for the only writer of the folder."""
     for path in folder.glob(f"{PARTIAL}*"):
         with suppress(OSError):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -194,7 +195,7 @@ def read_errors(path: Path, remedy: str) -> Iterator[None]:
         remedy: What the user can do about it.
 
     Raises:
-        InputError: In place of the OSError.
+        InputError: Instead of the OSError.
     """
     try:
         yield
@@ -209,7 +210,7 @@ def write_errors(path: Path) -> Iterator[None]:
     """Turn an OSError while writing into one sentence with the path, the reason and the remedy.
 
     Raises:
-        InputError: In place of the OSError.
+        InputError: Instead of the OSError.
     """
     try:
         yield
@@ -223,7 +224,7 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on the disk, where the system can."""
+    """Wait until a file, or the names in a folder, are on disk, if the system supports it."""
     if os.name == "nt":
         return
     handle = os.open(path, os.O_RDONLY)
@@ -238,7 +239,7 @@ def _partial(path: Path) -> Path:
 
 
 def _recover(place: Path) -> None:
-    """Remove what killed processes left in the making of a folder or in it; what had given way comes back."""
+    """Remove staged files of killed processes; restore a folder that was being replaced."""
     name = re.compile(rf"{re.escape(PARTIAL + place.name)}-(\d+)-[0-9a-f]{{8}}({REPLACED})?")
     inside = re.compile(rf"{re.escape(PARTIAL)}.+-(\d+)-[0-9a-f]{{8}}")
     with suppress(OSError):
@@ -254,7 +255,7 @@ def _recover(place: Path) -> None:
 
 
 def _runs(process: int) -> bool:
-    """Whether a process may still run: unless it is known not to."""
+    """Whether a process may still run; false only if it certainly does not."""
     try:
         if os.name == "posix":
             os.kill(process, 0)

@@ -1,4 +1,4 @@
-"""Folders of the TUM RGB-D benchmark: depth.txt, rgb.txt, groundtruth.txt and the images they name."""
+"""Folders of the TUM RGB-D benchmark: depth.txt, rgb.txt, groundtruth.txt and the images they list."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PUBLISHED: Final[Mapping[str, tuple[float, float, float, float]]] = {
     "freiburg2": (520.9, 521.0, 325.1, 249.7),
     "freiburg3": (535.4, 539.2, 320.1, 247.6),
 }
-"""fx, fy, cx, cy [px] that the data set publishes for its three cameras, of 640×480 pixels."""
+"""Published fx, fy, cx, cy [px] of the data set's three cameras of 640×480 pixels."""
 _WORLD, _CAMERA = "world", "camera"
 
 
@@ -55,7 +55,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
         options: The camera.
 
     Raises:
-        InputError: A list is missing or broken, or the camera is not known.
+        InputError: A list is missing or broken, or the camera is unknown.
     """
     if options != OpenOptions(camera_file=options.camera_file):
         remedy = f"{path} is a TUM RGB-D folder; leave them out"
@@ -110,7 +110,7 @@ def _read_list(path: Path, read: Callable[[Path], NDArray[Any]]) -> list[TimedIm
 
 
 def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
-    """Rows of a list: a time, here in ns, and the other columns."""
+    """Rows of a list: a time, in ns here, and the other columns."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

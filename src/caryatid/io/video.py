@@ -1,4 +1,4 @@
-"""Depth images that follow each other in time, each with the colour, camera and pose of its moment."""
+"""Depth images in the order of time, each with the colour, camera and pose of its moment."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from caryatid.io.datasets import NO_COLOUR, NO_POSE, Dataset, Frame
 from caryatid.sensing.views import View
 
 SECOND = 1_000_000_000
-"""Nanoseconds of a second: times are whole nanoseconds, which floats cannot hold since 1970."""
+"""Nanoseconds per second: times are whole nanoseconds since 1970, which floats cannot hold."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class TimedImage:
         name: What to call it.
         time: When it was taken [ns].
         frame: Frame of its camera.
-        decode: Gives depth (H, W) [m], or colour (H, W, 3). Raises `InputError` where that cannot be done.
+        decode: Returns depth (H, W) [m], or colour (H, W, 3). Raises `InputError` on failure.
     """
 
     name: str
@@ -54,7 +54,7 @@ class TimedCamera:
         time: When [ns].
         frame: Its frame.
         K: Pinhole matrix (3, 3) [px].
-        size: Width and height of its images [px], or None where any will do.
+        size: Width and height of its images [px], or None for any size.
     """
 
     name: str
@@ -83,12 +83,12 @@ def make_video(
         depths: Depth images; they are numbered in this order.
         colours: Colour images, or None to leave colour out.
         cameras: Cameras of the depth images, at least one.
-        pose_at: Pose (4, 4) of a frame at a time [ns], or None where it is not known. None leaves poses out.
-        config: How far apart in time depth and colour may be, and what is too far away.
-        notes: What a person should know.
+        pose_at: Pose (4, 4) of a frame at a time [ns], or None if unknown. None leaves poses out.
+        config: Maximum time between depth and colour, and maximum depth.
+        notes: Notes for the user.
 
     Returns:
-        The frames that have all that is wanted in the order of time, and how many have not.
+        The complete frames in the order of time, and the number of others by reason.
     """
     frames, skipped = [], Counter[str]()
     by_time = attrgetter("time")
@@ -114,7 +114,7 @@ def make_video(
 
 
 def _nearest(items: Sequence[Timed], time: int) -> Timed | None:
-    """The item nearest to a time, of two as near the earlier one; None where there is none."""
+    """The item nearest to a time, the earlier of two equally near; None if there is none."""
     after = bisect_left(items, time, key=attrgetter("time"))
     around = items[max(after - 1, 0) : after + 1]
     return min(around, key=lambda item: abs(item.time - time), default=None)
@@ -153,7 +153,7 @@ def _described(size: tuple[int, ...], frame: str) -> str:
 class _Link:
     """Where one frame was over time: times [ns], parents, and poses as translation and quaternion, w last.
 
-    As compact as robots that send for hours need it.
+    Compact, because robots may send for hours.
     """
 
     times: array[int] = field(default_factory=lambda: array("q"))
@@ -162,17 +162,17 @@ class _Link:
 
     @cached_property
     def in_order(self) -> tuple[NDArray[np.int64], list[str], Array]:
-        """Times that rise, with parents and poses (N, 7); of those at the same time the last one counts."""
+        """Rising times, with parents and poses (N, 7); the last of equal times counts."""
         times, last = np.unique(np.array(self.times)[::-1], return_index=True)
         order = len(self.times) - 1 - last
         return times, [self.parents[i] for i in order], np.array(self.numbers).reshape(-1, 7)[order]
 
 
 class TransformTree:
-    """Poses of frames in their parent frames, asked for between any two frames at any time.
+    """Poses of frames in their parent frames, for queries between any two frames at any time.
 
     Args:
-        max_gap: Poses further apart in time than this are not interpolated across [s].
+        max_gap: Maximum time between two interpolated poses [s].
     """
 
     def __init__(self, max_gap: float) -> None:
@@ -188,7 +188,7 @@ class TransformTree:
         return sorted({*self._links, *self._fixed} | parents)
 
     def add(self, parent: str, child: str, time: int, pose: Sequence[float], *, fixed: bool = False) -> None:
-        """Take in one pose, before any is asked for; of two at the same time the later one counts.
+        """Add one pose, before the first query; of two at the same time, the later one counts.
 
         Args:
             parent: Frame the pose is given in.
@@ -213,7 +213,7 @@ class TransformTree:
         Between two poses the rotation is interpolated along the shortest arc and the translation linearly.
 
         Returns:
-            None where the frames are not connected, or a link has no pose around that time.
+            None if the frames are not connected, or a link has no pose around that time.
         """
         T_up_source = dict(self._upwards(source, time))
         for frame, T_frame_target in self._upwards(target, time):
@@ -222,7 +222,7 @@ class TransformTree:
         return None
 
     def _upwards(self, frame: str, time: int) -> Iterator[tuple[str, Array]]:
-        """The frame and those above it, each with the pose of `frame` in it, as far as is known."""
+        """The frame and those above it, each with the pose of `frame` in it, as far as known."""
         T_up_frame = np.eye(4)
         met: set[str] = set()
         while frame not in met:
@@ -235,7 +235,7 @@ class TransformTree:
             T_up_frame = T_parent_child @ T_up_frame
 
     def _step(self, child: str, time: int) -> tuple[str, Array] | None:
-        """Parent of a frame and its pose in it at a time, or None where that is not known."""
+        """Parent of a frame and its pose in it at a time, or None if unknown."""
         if child not in self._links:
             return self._fixed.get(child)
         times, parents, poses = self._links[child].in_order

@@ -1,1 +1,1 @@
-"""What happens when objects are taken away, and in which order that is safe."""
+"""Removal of objects: effects, and a safe order."""

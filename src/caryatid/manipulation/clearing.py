@@ -1,4 +1,4 @@
-"""Look, take, look again: a table cleared one object at a time."""
+"""Clearing: look, remove one object, look again."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from caryatid.graph import TakeStep
 from caryatid.manipulation.order import next_lift
 
 MISSES = 2
-"""Lifts in a row that take nothing before the loop stops [1]: the model no longer says what is there."""
+"""Maximum number of lifts in a row that remove nothing [1]: the model is then wrong."""
 
 
 def clear(
@@ -21,21 +21,21 @@ def clear(
     threads: int = 1,
     past: Iterable[Step] = (),
 ) -> Iterator[Step]:
-    """Look until the next lift is safe, do it, look again, until nothing or nothing safe is left.
+    """Look until the next lift is safe, lift, look again, until nothing or nothing safe is left.
 
-    A lift is safe where no other object moves with a higher probability than `config.rehearsal.risk`, as
-    `plan_order` has it. It is done once that is known as well as `until` of the explorer asks, or no view is
-    expected to show more. After each lift the robot looks again: what slid or fell is noticed there.
+    A lift is safe if no other object moves with a higher probability than `config.rehearsal.risk`, as in
+    `plan_order`. It is done when that is known with the explorer's `until`, or when no view is expected to
+    show more. After each lift the robot looks again, which shows objects that slid or fell.
 
     Args:
         explorer: Has a camera and a robot. Its goal is the object to reach; None = all of them.
-        take: Takes an object away; whether it was there to be taken.
-        hands: 2 where another hand can hold one object, else 1.
+        take: Removes an object; returns whether it was there.
+        hands: 2 if another hand can hold one object, else 1.
         threads: Number of rehearsals at a time.
-        past: Steps of a run to go on with; their views are looked at again, and nothing is taken again.
+        past: Steps of a run to continue; their views are used again, and nothing is removed again.
 
     Yields:
-        A step after each view, once what it led to has been done: `lift` names what was taken.
+        A step after each view and its lift; `lift` names the removed object.
 
     Raises:
         CaryatidError: A view cannot be used.
@@ -67,7 +67,7 @@ def clear(
 def _lift(
     explorer: Explorer, goal: str | None, hands: int, threads: int
 ) -> tuple[TakeStep | None, str | None]:
-    """What to take now, or None to look on; and why this is the last view, or None."""
+    """The object to remove now, or None to look again; and why this is the last view, or None."""
     scene = explorer.scene
     ids = [o.id for o in scene.graph.objects if o.role == "object"]
     if not ids and goal is None:
@@ -89,7 +89,7 @@ def _lift(
 
 
 def _repeat(explorer: Explorer, step: Step) -> None:
-    """Look once more at what a step looked at, and forget what it took."""
+    """Repeat a step's view, and remove the object of its lift."""
     if explorer.step is not None:
         explorer.go()
     explorer.look(step.view)

@@ -1,4 +1,4 @@
-"""Objects taken away in a simulated scene: what was lifted, and what that did to the rest."""
+"""Removal in a simulated scene: what was lifted, and what it disturbed."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ class Taken:
     """One step of an order, done.
 
     Attributes:
-        step: What was asked for.
-        body: Name of the body that was lifted; None where there is none at the extracted object's place.
+        step: The step of the order.
+        body: Name of the lifted body; None if there is none at the extracted object's place.
         held: Names of the bodies that were held meanwhile.
         disturbed: Names of the bodies that were moved or turned beyond the limits.
-        film: States (T, N, 7) of the scene's objects on the way; empty where nothing was lifted.
+        film: States (T, N, 7) of the scene's objects on the way; empty if nothing was lifted.
         bodies: Body that each extracted object stood for, by id.
     """
 
@@ -44,15 +44,15 @@ class Taken:
         return not self.disturbed
 
     def to_json(self) -> dict[str, Any]:
-        """One entry of `steps` in what `--json` writes."""
+        """One entry of `steps` in the output of `--json`."""
         done = {"body": self.body, "held": list(self.held), "ok": self.ok, "disturbed": list(self.disturbed)}
         return self.step.to_json() | done
 
 
 def bodies_of(graph: SupportGraph, truth: TrueScene) -> dict[str, str]:
-    """Body each extracted object stands for, by id: what a hand that reaches for it would take hold of.
+    """Body that each extracted object represents, by id: the one that a hand would grasp.
 
-    It is the one it overlaps most; one that overlaps by less than 0.01 (IoU) stands for none.
+    It is the one it overlaps most; an object with an overlap below 0.01 (IoU) represents none.
     """
     found = score(graph, truth, np.random.default_rng(0), replace(EvaluationConfig(), min_iou=0.01))
     table = graph.support_surface
@@ -62,16 +62,16 @@ def bodies_of(graph: SupportGraph, truth: TrueScene) -> dict[str, str]:
 def dismantle(
     scene: SimulatedScene, steps: Sequence[TakeStep], bodies: Mapping[str, str], config: Config
 ) -> Iterator[Taken]:
-    """Do the steps of an order one after the other, whatever comes of them.
+    """Carry out the steps of an order one after the other, even if some fail.
 
     Args:
         scene: The scene in physics; it is not changed.
-        steps: What to take.
-        bodies: Body each extracted object stands for, by id.
+        steps: The steps of the order.
+        bodies: Body that each extracted object represents, by id.
         config: How objects are lifted, and what counts as harm.
 
     Yields:
-        What came of each step.
+        The result of each step.
     """
     hands = SimulatedHands(scene, config)
     for step in steps:
@@ -79,14 +79,14 @@ def dismantle(
 
 
 class SimulatedHands:
-    """Hands that take objects away in physics, one after the other.
+    """Hands that remove objects in physics, one after the other.
 
     Args:
         scene: The scene in physics; it is not changed.
         config: How objects are lifted, and what counts as harm.
 
     Attributes:
-        state: State (N, 7) of the scene's objects by now; what was taken is far above.
+        state: Current state (N, 7) of the scene's objects; removed ones are far above.
     """
 
     def __init__(self, scene: SimulatedScene, config: Config) -> None:
@@ -97,7 +97,7 @@ class SimulatedHands:
 
     @property
     def scene(self) -> SimulatedScene:
-        """The scene as it is by now."""
+        """The scene in its current state."""
         return posed(self._scene, self.state)
 
     @property
@@ -106,15 +106,15 @@ class SimulatedHands:
         return [n for n, z in zip(self._names, self.state[:, 2], strict=True) if z < ASIDE / 2.0]
 
     def bodies(self, graph: SupportGraph) -> dict[str, str]:
-        """Body that each extracted object stands for by now, as `bodies_of`."""
+        """Body that each extracted object represents now, as `bodies_of`."""
         return bodies_of(graph, true_scene_from_simulation(self.scene, GroundTruth(tuple(self.left), ())))
 
     def take(self, step: TakeStep, bodies: Mapping[str, str]) -> Taken:
-        """Do a step, whatever comes of it.
+        """Carry out a step, even if it disturbs others.
 
         Args:
             step: What to take.
-            bodies: Body each extracted object stands for, by id.
+            bodies: Body that each extracted object represents, by id.
         """
         body, left = bodies.get(step.object_id), self.left
         held = tuple(bodies[i] for i in step.hold if bodies.get(i) in left)

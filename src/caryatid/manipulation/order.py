@@ -1,9 +1,9 @@
-"""A safe order to take objects away: each step rehearsed in physics before it is chosen.
+"""A safe order of removal: each step is rehearsed in physics before it is chosen.
 
-What has been extracted is not at rest in physics to the millimetre, and friction and weights are not known.
-So a lift is rehearsed in several scenes, drawn by the shapes' uncertainty, each of which is let come to rest
-first. An object that does not, though the real one was seen at rest, is wrongly shaped or rests on what was
-not seen: there it is held, and the support graph alone says what it needs.
+Extracted shapes are not exactly at rest in physics, and friction and weights are unknown. So a lift is
+rehearsed in several scenes, drawn from the shapes' uncertainty, each of which first comes to rest. An object
+that does not, although the real one was seen at rest, has a wrong shape or rests on something unseen. It is
+held there, and the support graph alone says what it needs.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from caryatid.support.plausibility import drawn, reconcile
 
 @dataclass(frozen=True, slots=True)
 class Order(Pictured):
-    """An order to take objects away.
+    """An order of removal.
 
     Attributes:
-        steps: What to take, one after the other.
-        refusal: Why there is no safe order, naming what stands in whose way; empty where there is one.
+        steps: The objects to remove, one after the other.
+        refusal: Why there is no safe order, and which objects block each other; empty if there is one.
     """
 
     steps: tuple[TakeStep, ...]
@@ -42,7 +42,7 @@ class Order(Pictured):
 
     @property
     def safe(self) -> bool:
-        """Every step is."""
+        """Whether every step is safe."""
         return not self.refusal
 
     def __repr__(self) -> str:
@@ -64,24 +64,24 @@ def plan_order(
     seed: int = 0,
     threads: int = 1,
 ) -> Order:
-    """Find a safe order to take everything away, or to get at one object.
+    """Find a safe order in which to remove everything, or to reach one object.
 
-    Greedy: of what is left that object is taken whose lift disturbs another one with no higher probability
-    than `rehearsal.risk`, one that supports nothing before one that does, higher ones first. Where there is
-    none, the other hand holds what would be disturbed most. Where that does not help either, the least risky
-    lift is taken, and the order is not safe.
+    Greedy: the next object is one whose lift disturbs another one with a probability of at most
+    `rehearsal.risk`; objects that support nothing come first, and higher ones before lower ones. If there is
+    none, the other hand holds the object that would be disturbed most. If that does not help either, the
+    least risky lift is chosen, and the order is not safe.
 
     Args:
-        graph: What has been extracted.
+        graph: The extracted graph.
         config: How lifts go, and how they are rehearsed.
-        goal: Id of the object to get at; only what has to be taken before it is.
-        hands: 2 where another hand can hold one object, else 1.
+        goal: Id of the object to reach; only objects that must go first are removed.
+        hands: 2 if another hand can hold one object, else 1.
         seed: Seed of the rehearsals.
-        threads: How many of them run at a time.
+        threads: Number of rehearsals at a time.
 
     Raises:
-        InputError: There is no support surface, no object to take, more than `rehearsal.max_objects` of
-            them, or no such goal.
+        InputError: There is no support surface, no object, more than `rehearsal.max_objects` of them, or no
+            such goal.
     """
     config = config or Config()
     rehearsal = _rehearsal(graph, config, goal, seed, threads)
@@ -129,14 +129,14 @@ def _next(
 
 
 def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:
-    """What is left, what supports nothing of it first, and of these the highest."""
+    """The remaining objects; those that support nothing come first, the highest of them foremost."""
     carrying = {s.supporter for s in graph.supports if s.supported in left}
     height = {o.id: float(o.centre_world[2]) for o in graph.objects}
     return sorted(left, key=lambda i: (i in carrying, -height[i], i))
 
 
 def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: _Rehearsal) -> list[str]:
-    """The goal if it can be lifted; else what its lift disturbs, and what theirs do, the nearest first."""
+    """The goal if it can be lifted; otherwise the objects its lift disturbs, and so on, the nearest first."""
     found = [goal]
     for object_id in found:
         trial = rehearsal.try_lift(object_id)
@@ -147,7 +147,7 @@ def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: 
 
 
 def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_Trial, list[_Trial]]:
-    """The first lift that is safe, with one hand before two; else the least risky; and those tried before."""
+    """The first safe lift, with one hand before two, or else the least risky; and those tried before."""
     tried: list[_Trial] = []
     for object_id in wanted:
         trial = rehearsal.try_lift(object_id)
@@ -177,7 +177,7 @@ def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], config: Rehea
 
 
 def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
-    """Say which objects stand in one another's way."""
+    """Say which objects block each other."""
     blocked = nx.DiGraph((t.object_id, i) for t in tried for i in t.harmed)
     try:
         edges = nx.find_cycle(blocked, trial.object_id)
@@ -189,7 +189,7 @@ def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Trial:
-    """A lift rehearsed in every drawn scene: probability that others are disturbed, and that of each."""
+    """A lift rehearsed in every drawn scene: probability that others are disturbed, in all and each."""
 
     object_id: str
     hold: tuple[str, ...]
@@ -199,7 +199,7 @@ class _Trial:
 
 
 class _Rehearsal:
-    """Scenes in which to try lifts, and where their objects are once some have been taken."""
+    """Scenes in which to try lifts, with the states of their objects after each removal."""
 
     def __init__(
         self, graph: SupportGraph, config: Config, rng: np.random.Generator, *, threads: int = 1
@@ -221,16 +221,16 @@ class _Rehearsal:
         specs = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
         settled = self._each(lambda k: _settled(specs[k], self.ids, config))
         self._liftings: list[Lifting] = [lifting for lifting, _, _ in settled]
-        # Of D scenes with N objects: which do not stay where they were seen (D, N), and all states (D, N, 7).
+        # For D scenes with N objects: which do not stay in place (D, N), and all states (D, N, 7).
         self._restless = np.stack([restless for _, restless, _ in settled])
         self._states = np.stack([state for _, _, state in settled])
 
     def left(self) -> list[str]:
-        """Ids of the objects that have not been taken yet."""
+        """Ids of the objects that have not been removed yet."""
         return [i for i, height in zip(self.ids, self._states[0, :, 2], strict=True) if height < ASIDE / 2.0]
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> _Trial:
-        """Lift an object in every scene, others being held; nothing changes, and it is done only once."""
+        """Lift an object in every scene while others are held; cached, and nothing changes."""
         asked = (object_id, *sorted(hold))
         if asked not in self._trials:
             index, held = self.ids.index(object_id), {self.ids.index(i) for i in hold}
@@ -241,7 +241,7 @@ class _Rehearsal:
                 return self._liftings[k].lift(state, index, how, held=held | also, to_the_end=False)
 
             lifts = self._each(lift)
-            # What is held in a scene, because it does not stay there, moves if it loses a support it has.
+            # An object held in a scene because it does not stay there moves if it loses a support.
             free = set(self.left()) - set(hold)
             supports = [self._graph.support(object_id, i) if i in free else None for i in self.ids]
             loses = np.array([0.0 if s is None else s.belief for s in supports])
@@ -253,7 +253,7 @@ class _Rehearsal:
         return self._trials[asked]
 
     def take(self, trial: _Trial) -> None:
-        """Go on without an object whose lift was tried: where others moved, they are put back."""
+        """Continue without an object whose lift was tried; others that moved are put back."""
         index = self.ids.index(trial.object_id)
         self._trials.clear()
         moved = np.array([lift.disturbed.any() for lift in trial.lifts])
@@ -269,7 +269,7 @@ class _Rehearsal:
 
 
 def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
-    """A `mujoco.MjSpec` of the extracted shapes, or of others as likely for a number above 0."""
+    """A `mujoco.MjSpec` of the extracted shapes or, for a number above 0, of others as likely."""
     objects = list(graph.objects)
     if number > 0:
         objects = [drawn(o, rng, config.plausibility) for o in objects]
@@ -280,7 +280,7 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
     if number == 0:
         frictions[:], densities[:] = np.mean(settings.friction), np.mean(settings.density)
     spec = empty_spec("rehearsal")
-    # Twice MuJoCo's own time step, which the implicit integrator bears, for half the time.
+    # Twice MuJoCo's default time step, which the implicit integrator allows, for half the time.
     spec.option.timestep = 0.004
     for o, friction, density in zip(objects, frictions, densities, strict=True):
         if o.role == "support_surface":
@@ -291,9 +291,9 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
 
 
 def _add_table(spec: Any, table: SceneObject) -> None:
-    """The table, 10 cm larger on each side than what was seen of it.
+    """The table, 10 cm larger on each side than its seen part.
 
-    It is slippery: contacts take the larger friction of two, and it is not to hide how slippery objects are.
+    It is slippery: contacts use the larger friction of two, and it must not hide how slippery objects are.
     """
     T, extents = table.shape.T_world_object, table.shape.extents
     up = int(np.argmax(np.abs(T[2, :3])))
@@ -303,7 +303,7 @@ def _add_table(spec: Any, table: SceneObject) -> None:
 
 
 def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[Lifting, NDArray[np.bool_], Array]:
-    """Let a scene come to rest: what moves too far is put back and held, until nothing else does.
+    """Let a scene come to rest: objects that move too far are put back and held, until no others do.
 
     Returns:
         The scene, which objects (N,) had to be held, and the state (N, 7) of all.

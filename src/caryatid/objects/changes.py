@@ -15,15 +15,19 @@ from caryatid.graph import Change, ChangeKind, SceneObject
 from caryatid.sensing.views import View
 
 BEYOND = 0.02
-"""How far behind a point a reading contradicts it [m] at 1.5 m, and times z²: 2σ of pose and depth."""
+"""Distance behind a point at which a reading contradicts it [m], at 1.5 m and growing with z²: 2σ of pose
+and depth.
+"""
 ASIDE = 0.01
-"""How far aside of a point readings are looked at [m]: 2σ of registration; rims are seen past otherwise."""
+"""Distance beside a point within which readings count [m]: 2σ of registration; otherwise views look past
+rims.
+"""
 CELL = 0.02
-"""Edge of the cells in which points count once [m]: what is nearer errs alike."""
+"""Edge of the cells in which points count once [m]: nearer points share their errors."""
 ERRS = 0.2
-"""Share of the cells of an object up to which errors contradict them though it stayed where it was [1]."""
+"""Share of an object's cells up to which errors contradict them although it stayed in place [1]."""
 TINY = 1e-300
-"""What probabilities are cut at [1]: their logarithm stays finite."""
+"""Minimum probability [1], so that logarithms stay finite."""
 ODDS = 7.0
 """Log-odds against a change, before anything is seen: one in a thousand objects changes between two views."""
 ALIKE = 0.2
@@ -44,7 +48,7 @@ class ChangeDetector:
         self._fresh: frozenset[int] = frozenset()
 
     def copy(self) -> ChangeDetector:
-        """Return a detector that knows the same and goes on by itself."""
+        """Return an independent copy."""
         other = copy.copy(self)
         other._lost = self._lost.copy()
         return other
@@ -70,7 +74,7 @@ class ChangeDetector:
         return gone
 
     def lose(self, object_id: str, o: SceneObject | None) -> None:
-        """Take an object as gone; by its shape it can be found again."""
+        """Record an object as gone; its shape helps to find it again."""
         self._odds.pop(object_id, None)
         if o is not None:
             self._lost[object_id] = o
@@ -107,7 +111,7 @@ class ChangeDetector:
             view: Its number.
             gone: Ids of the objects that are not where they were, each with the reason.
             appeared: Ids of the objects that are where space was free, each with the reason.
-            present: Ids of all objects there are; one both lost and present was moved.
+            present: Ids of all objects; one both lost and present was moved.
         """
         for object_id in sorted(self._lost.keys() | appeared.keys()):
             why = gone.get(object_id) or appeared.get(object_id, "it is found again")
@@ -142,7 +146,7 @@ def appeared(
 
 
 class Sight:
-    """What a view shows at points known from earlier ones.
+    """What a view shows at known points.
 
     Args:
         view: A view with a pose.
@@ -157,10 +161,10 @@ class Sight:
         self._T_camera_world = transforms.invert(view.T_world_camera)
 
     def cells(self, points_world: Array, normals_world: Array) -> tuple[int, int]:
-        """How many cells of a surface the view looks through, and how many it confirms.
+        """Number of cells of a surface that the view looks through, and that it confirms.
 
-        A point is looked through where all readings around it lie behind it, and confirmed where its own is
-        at its depth; where one lies before it, or it is turned away, it says nothing.
+        A point is looked through if all readings around it lie behind it, and confirmed if its own is at its
+        depth. It does not count if a reading lies in front of it, or if it is turned away.
 
         Args:
             points_world: (N, 3) [m].
@@ -186,7 +190,7 @@ class Sight:
         return distinct(points_world[rows[through]]), distinct(points_world[rows[confirmed]])
 
     def _nearest(self, u: NDArray[np.intp], v: NDArray[np.intp]) -> Array:
-        """Nearest reading (N,) [m] around each pixel (N,); infinite where there is none."""
+        """Nearest reading (N,) [m] around each pixel (N,); infinite if there is none."""
         step = np.arange(-self._reach, self._reach + 1)
         height, width = self._view.depth.shape
         columns = np.clip(u[:, None] + step, 0, width - 1)[:, None, :]
@@ -196,7 +200,7 @@ class Sight:
 
 
 def likelihood_ratio(contradicted: int, confirmed: int) -> float:
-    """Log of how much likelier cells are contradicted so often after a change than without one.
+    """Log-likelihood ratio of so many contradicted cells, after a change over without one.
 
     Without one a share of up to `ERRS` of them is, after one a larger share; any such share is as likely.
     """
@@ -206,7 +210,7 @@ def likelihood_ratio(contradicted: int, confirmed: int) -> float:
 
 
 def distinct(points_world: Array) -> int:
-    """How many cells hold points (N, 3) [m]."""
+    """Number of cells that hold points (N, 3) [m]."""
     cells = np.floor(points_world / CELL).astype(np.int64) + (1 << 20)
     return len(np.unique(cells @ np.array([1 << 42, 1 << 21, 1])))
 

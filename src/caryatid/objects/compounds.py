@@ -1,7 +1,7 @@
-"""Compounds: what one object may be that no primitive is, a body of revolution or an open box.
+"""Compounds: objects beyond primitives: a body of revolution or an open box.
 
-Convexity cuts such things to pieces, each of which a primitive explains. A compound is what says at a lower
-cost that they are one: the pieces of a bottle share an axis, the walls and the floor of a tray its corners.
+Convexity cuts such objects to pieces, and a primitive explains each. A compound explains them as one at a
+lower cost: the pieces of a bottle share an axis, the walls and the floor of a tray share its corners.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ Index = NDArray[np.intp]
 """Indices (M,) of points."""
 
 FEW = 5
-"""Points that make a face [1]; 3 cm² of them."""
+"""Minimum number of points of a face [1]; 3 cm² of them."""
 HYPOTHESES = 64
 """Points whose planes are tried as faces of a profile [1]."""
 ENOUGH = 300
-"""Points from which a profile is made out [1]."""
+"""Points from which a profile is found [1]."""
 FACES = 8
-"""Faces of a profile [1]: a bottle has five, a bowl six."""
+"""Maximum number of faces of a profile [1]: a bottle has five, a bowl six."""
 ROUND = 4
 """Twelfths of a turn from which a body of revolution must be seen [1]; one view shows five or six."""
 ROUND_SHARE = 0.7
 """Share of the normals of a body of revolution that point at its axis or along it [1]."""
 ALIKE = 0.8
-"""Cosine of the angle to a face's normal up to which points are of it [1]; normals err by up to 30°."""
+"""Cosine of the angle to a face's normal up to which points belong to it [1]; normals err by up to 30°."""
 
 
 class Compound(Protocol):
-    """A surface that several primitives could make up."""
+    """A surface that could be several primitives."""
 
     @property
     def parameters(self) -> int:
-        """Numbers that determine it."""
+        """Number of its parameters."""
         ...
 
     def costs(self, points: Array, normals: Array, noise: float, config: ExplanationConfig) -> Array:
@@ -54,7 +54,7 @@ class Compound(Protocol):
         ...
 
     def free(self, voxels: VoxelMap) -> int:
-        """How many voxels it fills that were seen free."""
+        """Number of voxels seen free that it fills."""
         ...
 
 
@@ -68,18 +68,18 @@ def compounds(
         normals: Unit normals (N, 3).
         noise: Standard deviation of the points [m].
         weight: Independent readings each point stands for [1].
-        thickness: Of walls of which one side was seen [m].
-        config: What explanations cost.
+        thickness: Thickness of walls seen from one side [m].
+        config: The costs of explanations.
 
     Yields:
-        Those that there is reason to try.
+        The compounds worth trying.
     """
     yield from _revolutions(points, normals, noise, weight, config)
     yield from _open_boxes(points, normals, thickness)
 
 
 def box_axes(normals: Array, up: Array) -> list[Array]:
-    """Up, and the two directions across it most faces look along, by their normals (N, 3)."""
+    """Up, and the two directions across it that most faces are normal to, by their normals (N, 3)."""
     level = normals - np.outer(normals @ up, up)
     length = np.linalg.norm(level, axis=1)
     upright = level[length > 0.5] / length[length > 0.5, None]
@@ -109,7 +109,7 @@ class Revolution:
 
     @property
     def parameters(self) -> int:
-        """Of the axis four, of each face two, and the two ends of the profile."""
+        """Four for the axis, two for each face, and two for the ends of the profile."""
         return 6 + 2 * len(self.ends)
 
     def costs(self, points: Array, normals: Array, noise: float, config: ExplanationConfig) -> Array:
@@ -122,7 +122,7 @@ class Revolution:
         return least
 
     def free(self, voxels: VoxelMap) -> int:
-        """How many voxels of its surface were seen free, all around; it may be hollow."""
+        """Number of voxels of its surface seen free, all around; it may be hollow."""
         size, rings, outward = voxels.config.size, [], []
         for (begin, end), facing in zip(self.ends, self.outward, strict=True):
             rings.append(begin + _middles(float(np.linalg.norm(end - begin)) / size)[:, None] * (end - begin))
@@ -134,7 +134,7 @@ class Revolution:
         angle = 2.0 * np.pi * (np.arange(len(index)) - first[index]) / number[index]
         x, y = _across(self.axis)
         away = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * y
-        # What was seen of a surface may lie in the voxel behind.
+        # The seen part of a surface may lie in the voxel behind.
         here = ring[index, :, None]
         behind = here - 0.5 * size * facing[index, :, None]
         free = np.ones(len(index), dtype=np.bool_)
@@ -146,7 +146,7 @@ class Revolution:
 def _revolutions(
     points: Array, normals: Array, noise: float, weight: float, config: ExplanationConfig
 ) -> Iterator[Revolution]:
-    """Bodies of revolution around each axis that there is reason to try."""
+    """Bodies of revolution around each axis worth trying."""
     for middle, axis in _axes(points, normals, noise):
         places, facing = _profile(points, normals, middle, axis)
         if np.count_nonzero(np.linalg.norm(facing, axis=1) > ALIKE) < ROUND_SHARE * len(points):
@@ -195,7 +195,7 @@ def _faces(
 
 
 def _longest_run(own: Index, along: Array, gap: float) -> Index:
-    """Those of some points (M,) along a line (N,) [m] that no gap parts from most of the others."""
+    """Those of some points (M,) along a line (N,) [m] that no gap separates from most of the others."""
     own = own[np.argsort(along[own])]
     run = np.cumsum(np.append(False, np.diff(along[own]) > gap))
     return own[run == np.bincount(run).argmax()]
@@ -214,7 +214,7 @@ def _axes(points: Array, normals: Array, noise: float) -> Iterator[tuple[Array, 
 
     Lines that meet a line are a linear complex (Pottmann and Wallner, Computational Line Geometry, 2001);
     normals that pass it at a distance lose their weight. On a bowl, which is nearly a ball, all lines through
-    the middle do about as well: then the vertical is tried too.
+    the middle fit about as well: then the vertical is tried too.
     """
     centre = points.mean(axis=0)
     moments = np.cross(points - centre, normals)
@@ -242,7 +242,7 @@ def _products(moments: Array, normals: Array, weights: Array) -> tuple[Array, Ar
 
 
 def _weights(miss: Array, noise: float) -> Array:
-    """Weights (N,) of normals that miss the axis by so much [m]."""
+    """Weights (N,) of normals that miss the axis by these distances [m]."""
     return 1.0 / (1.0 + (miss / (2.0 * noise)) ** 2) ** 2
 
 
@@ -274,7 +274,7 @@ class OpenBox:
 
     @property
     def parameters(self) -> int:
-        """Of a box, and how thick walls and floor are."""
+        """Those of a box, and the thickness of walls and floor."""
         return Box.parameters + 2
 
     def costs(self, points: Array, normals: Array, noise: float, config: ExplanationConfig) -> Array:
@@ -283,12 +283,12 @@ class OpenBox:
         return np.min(slabs, axis=0)
 
     def free(self, voxels: VoxelMap) -> int:
-        """How many voxels it fills that were seen free, and so were those on either side of them."""
+        """Number of voxels seen free that it fills, with free ones on either side."""
         size, count = voxels.config.size, 0
         for slab in self.slabs:
             axes = [_middles(n) - 0.5 for n in slab.extents / size]
             local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * slab.extents
-            # What was seen of a surface may lie in the voxel beside it.
+            # The seen part of a surface may lie in the voxel beside it.
             beside = 0.5 * size * np.eye(3)[slab.extents.argmin()]
             free = np.ones(len(local), dtype=np.bool_)
             for off in (-beside, 0.0, beside):
@@ -310,7 +310,7 @@ def _open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[Ope
     if np.linalg.det(R) < 0.0:
         R[:, 2] *= -1.0
     local, facing = points @ R, normals @ R
-    # At the low and the high end of each axis: where faces that look outwards and inwards lie.
+    # At the low and the high end of each axis: where faces that face outwards and inwards lie.
     outer = np.quantile(local, (0.01, 0.99), axis=0).T
     middle = outer.mean(axis=1)
     inner, gap = np.full((3, 2), np.nan), np.full((3, 2), np.nan)
@@ -332,7 +332,7 @@ def _open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[Ope
 
 
 def _level(heights: Array, width: float) -> float | None:
-    """Median [m] of the heights in the band of this width that holds most; None where those make no face."""
+    """Median [m] of the heights in the band of this width that holds most; None if they are few."""
     heights = np.sort(heights)
     ends = np.searchsorted(heights, heights + width, side="right")
     counts = ends - np.arange(len(heights))
@@ -345,14 +345,14 @@ def _level(heights: Array, width: float) -> float | None:
 def _open_box(
     R: Array, outer: Array, inner: Array, gap: Array, axis: int, end: int, thickness: float
 ) -> Iterator[OpenBox]:
-    """The box with its floor at one end (0 low, 1 high) of an axis; walls are as thick as each other."""
+    """The box with its floor at one end (0 low, 1 high) of an axis; all walls have one thickness."""
     others = [k for k in range(3) if k != axis]
     walls = gap[others][np.isfinite(gap[others])]
     thick = np.full((3, 2), np.median(walls) if len(walls) else thickness)
     thick[axis] = 0.0
     thick[axis, end] = gap[axis, end] if np.isfinite(gap[axis, end]) else thickness
     outwards = np.array([-1.0, 1.0])
-    # Of some the inside alone was seen.
+    # Some were seen from the inside only.
     outer = np.where(np.isfinite(inner) & ~np.isfinite(gap), inner + outwards * thick, outer)
     within = outer - outwards * thick
     if (np.diff(within) < thickness).any():
@@ -369,7 +369,7 @@ def _slab(R: Array, outer: Array, within: Array, axis: int, end: int) -> Box:
 
 
 def _middles(count: float) -> Array:
-    """Middles (N,) of as many equal parts of the range from 0 to 1, one at least."""
+    """Middles (N,) of equal parts of the range from 0 to 1, at least one."""
     number = max(round(count), 1)
     return (np.arange(number) + 0.5) / number
 

@@ -1,4 +1,4 @@
-"""Description length: what it costs to explain points by shapes, in nats. The least cost decides."""
+"""Description length: the cost of explaining points by shapes, in nats. The lowest cost decides."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from caryatid.sensing.voxel_map import VoxelMap
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Evidence:
-    """Oriented points of the objects to be explained, and what is known of the space around them.
+    """Oriented points of the objects to explain, and the known space around them.
 
     Attributes:
-        points: (N, 3) [m], thinned: a place counts once, as all that is seen there errs alike.
+        points: (N, 3) [m], thinned: a place counts once, because all points there share their errors.
         normals: Unit normals (N, 3).
         weight: Independent readings each point stands for [1].
-        noise: Standard deviation of the points from the surfaces they are on [m].
-        voxels: Space seen free, or None where nothing is known.
+        noise: Standard deviation of the points from their surfaces [m].
+        voxels: Space seen free, or None if unknown.
         rgb: Colours (N, 3), or None.
     """
 
@@ -60,7 +60,7 @@ class Explanation:
     """The best shape for some points.
 
     Attributes:
-        shape: The shape or compound, or None where the points cost less as an irregular object.
+        shape: The shape or compound, or None if the points cost less as an irregular object.
         cost: Cost of all the points and of the object itself [nats].
     """
 
@@ -69,7 +69,7 @@ class Explanation:
 
 
 def price(shape: Shape | Compound | None, config: ExplanationConfig) -> float:
-    """Price [nats] of an object: of the parameters of its shape; an irregular one has as many as a box."""
+    """Price [nats] of an object: that of its shape's parameters; an irregular one has as many as a box."""
     return config.parameter_cost * (Box if shape is None else shape).parameters
 
 
@@ -82,13 +82,13 @@ def point_costs(shape: Shape | Compound | None, evidence: Evidence, config: Expl
 
 
 def explained(explanation: Explanation, evidence: Evidence, config: ExplanationConfig) -> bool:
-    """Whether a shape explains points about as well as true shapes do, without space seen free inside it."""
+    """Whether a shape explains points about as well as true shapes do, with no free space inside it."""
     own = explanation.cost - price(explanation.shape, config)
     return explanation.shape is not None and own <= config.usual * evidence.weight * len(evidence)
 
 
 def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig) -> float:
-    """How much [nats] colours speak for two objects, or, if negative, for one; two prints say nothing."""
+    """Evidence [nats] of colours for two objects, or, if negative, for one; none from two prints."""
     if first.rgb is None or second.rgb is None:
         return 0.0
     sides = first.rgb, second.rgb, np.concatenate([first.rgb, second.rgb])
@@ -97,11 +97,11 @@ def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig
 
 
 def plain_colour(rgb: NDArray[np.uint8], config: ExplanationConfig) -> tuple[float, Array | None]:
-    """Cost [nats] of colours (N, 3), and the shares (3,) of the plain colour of most; None for a print.
+    """Cost [nats] of colours (N, 3), and the shares (3,) of the main plain colour; None for a print.
 
     A plain colour has two parameters: the shares add up to 1.
     """
-    # Enough of them to hold one of the most frequent colour.
+    # Enough of them to include one of the most frequent colour.
     tried = rgb[:: max(1, len(rgb) // 64)]
     costs = colour_costs(rgb, colour_shares(tried), config).sum(axis=0) + 2.0 * config.parameter_cost
     best, printed = int(costs.argmin()), config.irregular * len(rgb)
@@ -109,7 +109,7 @@ def plain_colour(rgb: NDArray[np.uint8], config: ExplanationConfig) -> tuple[flo
 
 
 def colour_costs(rgb: NDArray[np.uint8], plain: Array, config: ExplanationConfig) -> Array:
-    """Cost (N, M) [nats] of colours (N, 3) on things of plain colours with shares (M, 3)."""
+    """Cost (N, M) [nats] of colours (N, 3) on objects of plain colours with shares (M, 3)."""
     squares = cdist(colour_shares(rgb)[:, :2], plain[:, :2], "sqeuclidean") / (2.0 * PLAIN**2)
     return np.minimum(squares, config.outlier)
 
@@ -123,7 +123,7 @@ def best_explanation(
 
 
 def best_compound(evidence: Evidence, config: Config, below: float) -> Explanation:
-    """Explain points by the compound that costs least, if any costs less than `below` [nats], or by none."""
+    """Explain points by the cheapest compound, if any costs less than `below` [nats]."""
     best, costs = Explanation(None, below), config.explanation
     if len(evidence) < 2 * config.fit.min_points:
         return best
@@ -138,9 +138,9 @@ def best_compound(evidence: Evidence, config: Config, below: float) -> Explanati
 def _cost(
     shape: Shape | Compound | None, evidence: Evidence, config: ExplanationConfig, below: float = np.inf
 ) -> float:
-    """Cost [nats] of points as one object: of the points, the space seen free inside it, and its price.
+    """Cost [nats] of points as one object: that of the points, of the free space inside it, and its price.
 
-    Space is not looked at where the cost is not below a limit [nats] without it.
+    Space is not checked if the cost without it already exceeds a limit [nats].
     """
     cost = float(point_costs(shape, evidence, config).sum()) * evidence.weight + price(shape, config)
     if shape is None or evidence.voxels is None or cost >= below:
@@ -160,14 +160,14 @@ def explain(
     *,
     first_look: bool = False,
 ) -> Explanation:
-    """Find the shape that explains points at the least cost.
+    """Find the shape that explains points at the lowest cost.
 
     Args:
         evidence: The points.
-        config: What explanations cost.
+        config: The costs of explanations.
         fit_config: Settings of the fits.
         rng: Source of the samples.
-        first_look: A quick fit will do, which only tells what is worth a full one.
+        first_look: Make a quick fit, which only tells what is worth a full one.
     """
     settings = replace(fit_config, polish=1, search_points=fit_config.max_points)
     if first_look:

@@ -30,16 +30,16 @@ def fuse(
     """Add one view's support graph to those before, with the ids of the fused objects.
 
     Args:
-        graphs: Those of all views before.
+        graphs: The graphs of all earlier views.
         graph: G_s^{t+1}: of this view alone (`sg`), or of the registered cloud so far (`pc`, `pc+sg`).
         config: Tolerances of the match.
-        same_labels: A label means the same object in every view, so that shapes need not be compared.
+        same_labels: A label means the same object in every view, so shapes are not compared.
 
     Returns:
         All graphs, and the fused id of each of the new graph's objects.
     """
     sightings, _ = _by_view(graphs)
-    # By label alone, any sighting will do.
+    # By label alone, any sighting is enough.
     known = [_newest(seen) if same_labels else _vertex(seen, config) for seen in sightings.values()]
     names = match(known, list(graph.objects), config, same_labels=same_labels)
     taken = {*sightings, *names.values()}
@@ -51,11 +51,11 @@ def fuse(
 
 
 def renamed(graph: SupportGraph, names: Mapping[str, str]) -> SupportGraph:
-    """Return a graph in which objects have other ids; of two that get the same one stays.
+    """Return a graph in which objects have other ids; of two with the same new id, one stays.
 
     Args:
         graph: Of one view.
-        names: Id → id that takes its place; a support between two of the same is dropped.
+        names: Old id → new id; a support between two equal ids is dropped.
     """
     objects: dict[str, SceneObject] = {}
     for o in graph.objects:
@@ -80,13 +80,13 @@ def without(graph: SupportGraph, ids: Set[str]) -> SupportGraph:
 def fused_graph(
     graphs: Graphs, config: FusionConfig, *, shown: Sequence[frozenset[str]] | None = None
 ) -> SupportGraph:
-    """Read the fused graph off those of all views.
+    """Derive the fused graph from those of all views.
 
-    With `pc` it is the newest graph, with its counts; with `sg` all that most of the views that could tell
-    agree on; with `pc+sg` the newest graph's edges, and those of earlier ones that were mostly found.
+    With `pc` it is the newest graph, with its counts; with `sg` everything that most of the views that could
+    show it agree on; with `pc+sg` the newest graph's edges, and those earlier ones that were mostly found.
 
     Args:
-        graphs: Of all views, with the ids of the fused objects.
+        graphs: The graphs of all views, with the ids of the fused objects.
         config: Method and the share an edge must keep.
         shown: Ids of the objects each view showed; without it, those in its graph. Only a view that showed
             both ends could have shown an edge.
@@ -113,7 +113,7 @@ def fused_graph(
             last = found[max(found)]
             certain = last.certain if config.method != "sg" else any(s.certain for s in found.values())
             if last.probability is not None and newest not in found:
-                # Where it was not found it counts as nothing.
+                # A view that did not find it counts 0.
                 last = replace(last, probability=last.probability * occurrences / len(views))
             supports.append(replace(last, certain=certain, occurrences=occurrences, opportunities=len(views)))
     ordered = sorted(objects.values(), key=lambda o: (o.role != "support_surface", o.label))
@@ -131,10 +131,10 @@ def match(
         known: The fused objects.
         seen: The objects of a new graph.
         config: Tolerances.
-        same_labels: A label means the same object in both; nothing else is compared then.
+        same_labels: A label means the same object in both; then nothing else is compared.
 
     Returns:
-        Id of a new object → id of the known one it is.
+        Id of a new object → id of the same known object.
     """
     if not known or not seen:
         return {}
@@ -157,7 +157,7 @@ def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> 
     distance = float(np.linalg.norm(known.centre_world - seen.centre_world)) / reach
     if distance > 1.0:
         return np.inf
-    # Largest ratio of the sorted extents, once what both fits' uncertainty explains is taken off.
+    # Largest ratio of the sorted extents, less what the uncertainty of both fits explains.
     first, second = np.argsort(a.extents, kind="stable"), np.argsort(b.extents, kind="stable")
     unsure = np.hypot(sizes[first], other_sizes[second])
     excess = np.maximum(np.abs(a.extents[first] - b.extents[second]) - unsure, 0.0)
@@ -170,13 +170,13 @@ def _difference(known: SceneObject, seen: SceneObject, config: FusionConfig) -> 
 
 
 def _unsure(o: SceneObject) -> tuple[Array, Array]:
-    """Two standard deviations (3,) [m] of the centre and of the extents; zero where they are not known."""
+    """Two standard deviations (3,) [m] of the centre and of the extents; zero if unknown."""
     known = o.uncertainty
     return (np.zeros(3),) * 2 if known is None else (2.0 * known.position, 2.0 * known.sizes)
 
 
 def _is_round(shape: Shape) -> bool:
-    """Orientation says nothing of a sphere, nor of a cylinder about as high as wide."""
+    """A sphere has no orientation, nor does a cylinder about as high as wide."""
     across, along = shape.extents[[0, 2]]
     return len(set(shape.ties)) < 3 and bool(abs(along - across) < 0.2 * along)
 
@@ -213,16 +213,16 @@ def _fresh_id(o: SceneObject, taken: set[str]) -> str:
 
 
 def merged_sightings(sightings: Sequence[SceneObject]) -> SceneObject:
-    """Merge sightings of one object into a vertex whose shape is better than each.
+    """Merge sightings of one object into a vertex with a better shape.
 
-    The kind is the one with the most evidence; of solids the best is taken as it is. Poses and radii are
-    averaged with the evidence as weight; each side is averaged over the sightings that saw it, and lies
-    farthest out where none did. The result does not depend on the order of the sightings but for rounding.
+    The kind is the one with the most evidence; among solids, the best one is used as it is. Poses and radii
+    are averaged with the evidence as weight. Each side is averaged over the sightings that saw it, or lies
+    farthest out if none did. Apart from rounding, the result does not depend on the order of the sightings.
 
     Args:
-        sightings: At least one; the first lends id, label and role.
+        sightings: At least one; id, label and role are those of the first.
     """
-    # The sides seen, and little where none is; half of it where the residual is 1 cm.
+    # The number of seen sides, or little if there are none; half of it at a residual of 1 cm.
     weights = [(0.1 + sum(o.seen)) / (1.0 + (o.residual / 0.01) ** 2) for o in sightings]
     votes = {o.shape.kind: 0.0 for o in sorted(sightings, key=lambda o: o.shape.kind)}
     for weight, o in zip(weights, sightings, strict=True):
@@ -251,11 +251,11 @@ def merged_sightings(sightings: Sequence[SceneObject]) -> SceneObject:
 
 
 def axes_rotation(shape: Shape, reference: Shape) -> tuple[Array, float]:
-    """Turn of a shape's axes, within its symmetry, that brings them nearest to a reference's.
+    """Rotation of a shape's axes, within its symmetry, that brings them nearest to a reference's.
 
     Returns:
-        The turn (3, 3), to be applied on the right of the shape's rotation, and the angle left [rad]; of a
-        sphere, to which no turn matters, the identity and 0.
+        The rotation (3, 3), to be applied on the right of the shape's own, and the remaining angle [rad];
+        for a sphere the identity and 0.
     """
     if isinstance(shape, Sphere):
         return np.eye(3), 0.0
@@ -282,7 +282,7 @@ def _merged_sides(
     middles = T[:, :3, 3] @ R
     half = np.abs(np.einsum("kij,ki->kj", turns, extents))[:, :, None] / 2.0
     ends = middles[:, :, None] + half * (-1.0, 1.0)
-    # The sides along a new axis are those along one of the old axes, in the other order where it points back.
+    # The sides along a new axis are those along one of the old axes, in reverse order if it points back.
     sources = np.abs(turns).argmax(axis=1)
     seen = np.take_along_axis(np.array([o.seen for o in same]).reshape(-1, 3, 2), sources[:, :, None], axis=1)
     ahead = turns.sum(axis=1)[:, :, None] > 0.0
@@ -311,7 +311,7 @@ def _turns(R: Array, R_reference: Array, axis_only: bool) -> Array:
 
 
 def _mean_axes(mean: Array, axis_only: bool) -> Array:
-    """Chordal mean of rotations from their average; of a cylinder only the axis means something."""
+    """Chordal mean of rotations from their average; for a cylinder only the axis matters."""
     if axis_only:
         z = transforms.unit(mean[:, 2])
         x = transforms.perpendicular(z)

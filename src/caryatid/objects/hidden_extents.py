@@ -1,4 +1,4 @@
-"""Hidden extents: how far a shape reaches where nobody looked, bounded by free space and by what is there."""
+"""Hidden extents: how far a shape reaches into unseen space, limited by free space and other shapes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from caryatid.sensing.voxel_map import FREE, VoxelMap
 SPACING = 0.015
 """Spacing of the points tested on the moving side [m]."""
 LEAST = 0.0005
-"""Gaps below this are none [m]."""
+"""Smaller gaps do not count [m]."""
 
 
 Face = tuple[Array, Array]
-"""Points (N, 3) [m] all over a side, and its rim (M, 3), drawn in to lie inside the shape's walls."""
+"""Points (N, 3) [m] all over a side, and its rim (M, 3), moved inwards to lie inside the shape's walls."""
 
 
 def complete(
@@ -31,14 +31,13 @@ def complete(
 ) -> list[SceneObject]:
     """Extend the unseen lower side of each object until it meets free space, another shape or the table.
 
-    An object of which one side alone was seen is taken to be as deep as it is wide, in the same bounds.
-
-    Objects are taken from the lowest up, so that each finds what lies below it already completed.
+    An object with a single seen side is taken to be as deep as it is wide, within the same bounds. Objects
+    are extended from the lowest up, so that those below each one are complete.
 
     Args:
-        objects: Objects without the support surface; `seen` says which sides points bear out.
+        objects: Objects without the support surface; `seen` says which sides points confirm.
         surface: The table top.
-        voxels: What has been seen free.
+        voxels: The voxel map.
         config: Steps and tolerances.
     """
     done = list(objects)
@@ -91,7 +90,7 @@ def _moved_out(
     voxels: VoxelMap,
     config: CompletionConfig,
 ) -> SceneObject:
-    """Move a side (axis, sign) outwards up to a limit [m], another shape or free space: what comes first."""
+    """Move a side (axis, sign) outwards up to a limit [m], another shape or free space."""
     if limit < LEAST:
         return candidate
     (axis, sign), (points, rim) = side, face
@@ -111,14 +110,14 @@ def _moved_out(
 
 
 def _depth_side(candidate: SceneObject) -> tuple[int, float] | None:
-    """The hidden side (axis, sign) opposite the only one seen, where the points say nothing of the depth."""
+    """The hidden side (axis, sign) opposite the only seen one, if the points do not show the depth."""
     seen = np.flatnonzero(candidate.seen)
     if len(seen) != 1:
         return None
     axis, side = divmod(int(seen[0]), 2)
     if isinstance(candidate.shape, Solid) or (isinstance(candidate.shape, Cylinder) and axis != 2):
         return None
-    # Their noise makes a single side's points up to 2 cm deep.
+    # Noise spreads a single side's points over up to 2 cm of depth.
     return (axis, -1.0 if side else 1.0) if candidate.shape.extents[axis] <= 0.02 else None
 
 
@@ -127,7 +126,7 @@ def _way_to_others(
 ) -> float:
     """How far [m] points (N, 3) can move before they meet another shape, by sphere tracing."""
     shapes, middle = Primitives.of(others), points.mean(axis=0)
-    # No ball around a shape that is further than the limit from the one around the face bounds a step.
+    # A ball around a shape that is further than the limit from the one around the face limits no step.
     to_centres = shapes.centres - middle
     ahead = np.clip(to_centres @ outward, 0.0, limit)
     aside = np.linalg.norm(to_centres - ahead[:, None] * outward, axis=1)
@@ -181,7 +180,7 @@ def _face(shape: Shape, axis: int, sign: float) -> Face:
     else:
         outward = np.abs(points[:, across] / half[across]).max(axis=1)
     rim = points[outward > 0.99]
-    # A voxel inside the walls, so that their noise says nothing.
+    # A voxel inside the walls, so that their noise does not count.
     rim[:, across] *= np.maximum(1.0 - 0.01 / half[across], 0.0)
     T = shape.T_world_object
     return transforms.transform(T, points), transforms.transform(T, rim)

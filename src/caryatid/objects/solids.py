@@ -1,10 +1,9 @@
-"""Solids: what is known of an object that no primitive explains, its hull without the cavities seen in it.
+"""Solids: the shape of an object that no primitive explains, its hull less the cavities seen in it.
 
-A solid is bounded by what was seen: the convex hull of its points, and of the primitive fitted to them where
-nobody looked, less convex cavities. A cavity is found where one looks from a point of the object through
-space seen free before one leaves the hull; in it lies what is before all the faces that look at that space.
-Of a wall whose outside alone was seen, and of a floor that nobody saw, the other side is taken to be as near
-as that of the thinnest object.
+A solid is the convex hull of its points, and of the primitive fitted to them in unseen space, less convex
+cavities. A point of the object looks into a cavity if its normal leads through space seen free before it
+leaves the hull; the cavity lies in front of all the faces that look at that space. The other side of a wall
+seen from outside only, and of an unseen floor, is taken to be as near as that of the thinnest object.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ from caryatid.sensing.views import Cloud
 from caryatid.sensing.voxel_map import FREE, UNKNOWN, VoxelMap
 
 DIRECTIONS = fibonacci_sphere(200)
-"""Directions (N, 3) in which the hull of an object is as wide as its points; 16° apart."""
+"""Directions (N, 3) in which an object's hull is as wide as its points; 16° apart."""
 CAVITIES = 4
-"""Cavities that are looked for [1]."""
+"""Maximum number of cavities [1]."""
 FEW = 5
-"""Points that make a face of a cavity [1]; 3 cm² of them."""
+"""Minimum number of points of a cavity's face [1]; 3 cm² of them."""
 ALIKE = float(np.cos(np.radians(18.0)))
 """Cosine of the angle to the normal of a cavity's face up to which points are on it [1]."""
 
@@ -38,14 +37,14 @@ ALIKE = float(np.cos(np.radians(18.0)))
 def as_solid(
     fitted: SceneObject, cloud: Cloud, evidence: Evidence, others: Sequence[Shape], config: FitConfig
 ) -> SceneObject:
-    """Return an object with the solid of its points in place of the primitive fitted to it.
+    """Return an object with the solid of its points instead of its fitted primitive.
 
     Args:
-        fitted: The object; it stays as it is where its points span no volume.
+        fitted: The object; it does not change if its points span no volume.
         cloud: Its points.
         evidence: Some of them, evenly spread, their noise, and the space seen free.
         others: Shapes of the other objects.
-        config: `min_extent` is the thickness of a wall of which one side was seen.
+        config: `min_extent` is the thickness of a wall seen from one side.
     """
     places, outward = _smoothed(cloud, evidence)
     if not len(places) or evidence.voxels is None:
@@ -68,7 +67,7 @@ def as_solid(
 
 
 def _unseen(shape: Shape, places: Array, others: Sequence[Shape], voxels: VoxelMap) -> Array:
-    """Points (M, 3) of a primitive where nobody saw, as high as the object's: they may be its back."""
+    """Points (M, 3) of a primitive in unseen space, as high as the object's: they may be its back."""
     points = shape.surface(voxels.config.size)[0]
     low, high = places[:, 2].min(), places[:, 2].max()
     points = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
@@ -108,7 +107,7 @@ def _solid(
 
 
 def _smoothed(cloud: Cloud, evidence: Evidence) -> tuple[Array, Array]:
-    """Evenly spread points in the mean plane of those around that face alike; lone ones are left out."""
+    """Evenly spread points in the mean plane of neighbours that face alike; lone ones are left out."""
     points, normals = evidence.points, evidence.normals
     count = min(16, len(cloud))
     near = cKDTree(cloud.points_world).query(points, k=count, distance_upper_bound=0.01)[1].reshape(-1, count)
@@ -124,7 +123,7 @@ def _smoothed(cloud: Cloud, evidence: Evidence) -> tuple[Array, Array]:
 
 
 def _with_backs(places: Array, outward: Array, thickness: float) -> tuple[Array, Array]:
-    """Points (N, 3) with outward normals (N, 3), and behind them the other side of walls seen from one."""
+    """Points (N, 3) with outward normals (N, 3), and the other side of walls seen from one side."""
     backs = places - thickness * outward
     gap, near = cKDTree(places).query(backs, k=min(8, len(places)), distance_upper_bound=2.0 * thickness)
     opposite = np.einsum("ni,nki->nk", outward, outward[np.where(np.isfinite(gap), near, 0)]) < -0.5
@@ -133,7 +132,7 @@ def _with_backs(places: Array, outward: Array, thickness: float) -> tuple[Array,
 
 
 def _way_inside(parts: Sequence[Polytope], places: Array, outward: Array, step: float) -> Array:
-    """How far (N,) [m] one goes from each point along its normal before one leaves all parts."""
+    """Distance (N,) [m] from each point along its normal to the end of all parts."""
     solid = Solid(np.eye(4), tuple(parts))
     length, moving = np.zeros(len(places)), np.arange(len(places))
     for k in range(1, 64):
@@ -146,7 +145,7 @@ def _way_inside(parts: Sequence[Polytope], places: Array, outward: Array, step: 
 
 
 def _free_point(place: Array, normal: Array, length: float, voxels: VoxelMap) -> Array | None:
-    """The point (3,) seen free that is nearest to the middle of a way [m] from a place, if there is any."""
+    """The free point (3,) nearest to the middle of a line of this length [m] from a place, or None."""
     size = voxels.config.size
     ways = np.arange(1, max(round(length / size), 1) + 1) * size
     free = voxels.state_at(place + ways[:, None] * normal) == FREE

@@ -1,4 +1,4 @@
-"""The views a robot can reach, and the few of them that stand for all."""
+"""The views a robot can reach, and the few of them that represent all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from caryatid.geometry.transforms import Array
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Looks:
-    """Some of N views, which stand for all.
+    """Some of N views, which represent all.
 
     Attributes:
         chosen: Indices (C,) of the views, ascending.
@@ -38,8 +38,8 @@ class Candidates:
         T_world_camera: Camera poses (N, 4, 4).
         directions: Unit vectors (N, 3) from the view sphere's centre.
         path_length: Path length (N,) [m] from where the robot is: over the floor, or of its hand.
-        rejected: Reason → how many views of the sphere were refused for it.
-        indices: Which point of the view sphere each candidate is (N,), or None where they lie elsewhere.
+        rejected: Reason → number of views of the sphere refused for it.
+        indices: Point of the view sphere of each candidate (N,), or None if they lie elsewhere.
     """
 
     T_world_camera: Array
@@ -53,9 +53,9 @@ class Candidates:
         return len(self.directions)
 
     def looks(self, count: int) -> Looks:
-        """Pick the views nearest to those of `count` directions all over the sphere that have one near.
+        """Pick the views nearest to `count` directions all over the sphere, where there are any.
 
-        Where there are fewer than an eighth of that, all are picked. Found once for the same views.
+        If there are fewer than an eighth of that, all are picked. Cached for the same views.
         """
         if len(self) <= count // 8:
             return Looks(np.arange(len(self)), np.arange(len(self)))
@@ -67,7 +67,7 @@ class Candidates:
         return self._looks[count]
 
     def without(self, index: int, reason: str) -> Candidates:
-        """Return the other views, the one at an index being refused for a reason."""
+        """Return the views without the one at an index, refused for a reason."""
         fields = (self.T_world_camera, self.directions, self.path_length)
         poses, directions, lengths = (np.delete(of_each, index, axis=0) for of_each in fields)
         indices = None if self.indices is None else np.delete(self.indices, index)

@@ -1,4 +1,4 @@
-"""What a planner is given and what it decides."""
+"""Input and decision of a planner."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from caryatid.sensing.voxel_map import VoxelMap
 
 @dataclass(frozen=True, eq=False, slots=True)
 class PlanningState:
-    """Everything a planner may look at.
+    """Everything a planner may use.
 
     Attributes:
         graph: The fused support graph.
@@ -36,7 +36,7 @@ class PlanningState:
         visited: Unit directions (V, 3) from the centre to the views so far; the last is the current one.
         candidates: The views that can be reached.
         config: Settings of section IV.
-        goal: Id of the object that is to be taken away, which may not be known yet; None = all matter alike.
+        goal: Id of the object to remove, which may not be known yet; None = all matter alike.
     """
 
     graph: SupportGraph
@@ -53,7 +53,7 @@ class PlanningState:
 
 
 class PaintedLate:
-    """A field that holds an array, or a function that is called for it at the first look."""
+    """A field that holds an array, or a function that is called for it at the first access."""
 
     def __get__(self, holder: object, owner: type | None = None) -> Array | None:
         if holder is None:
@@ -73,17 +73,17 @@ class Decision(Pictured):
 
     Attributes:
         T_world_camera: Pose (4, 4) to go to.
-        index: Which of the candidates it is.
+        index: Index among the candidates.
         saliency: s of eq. 3 there, with the inhibition of return [1].
         cost: h of eq. 3 there [1].
         score: c = s − h, eq. 3 [1].
         why: One sentence for a person to read.
-        points_of_interest: What the planner took into account.
+        points_of_interest: The points that the planner considered.
         candidate_saliency: s (N,) of every candidate, or None.
-        sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None. A function may be
-            given that returns it, since most pictures are never drawn.
+        sphere_saliency: s (M,) of every point of the view sphere, for drawing, or None. It may be a function
+            that returns the array, because most pictures are never drawn.
         waypoints: The way there: postures from the robot's own to the one at the view, straight in between.
-            Only the last where the robot says no more, none before a robot has been asked.
+            Only the last if the robot gives no more; none without a robot.
     """
 
     T_world_camera: Array
@@ -98,7 +98,7 @@ class Decision(Pictured):
     waypoints: tuple[Posture, ...] = ()
 
     def with_waypoints(self, waypoints: tuple[Posture, ...]) -> Decision:
-        """Return the same decision with the way there; its picture stays unpainted."""
+        """Return the same decision with the way there."""
         decision = copy.copy(self)
         object.__setattr__(decision, "waypoints", waypoints)
         return decision
@@ -108,13 +108,13 @@ class Decision(Pictured):
 
 
 class Planner(Protocol):
-    """Chooses where to look next."""
+    """Chooses the next view."""
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
         """Choose one of the candidates.
 
         Args:
-            state: What is known.
+            state: The state to plan from.
             rng: For every random choice.
 
         Raises:
@@ -124,7 +124,7 @@ class Planner(Protocol):
 
 
 def check_candidates(state: PlanningState) -> None:
-    """Raise PlanningError, with the reasons, where no view can be reached.
+    """Raise PlanningError, with the reasons, if no view can be reached.
 
     Raises:
         PlanningError: There is none.
@@ -135,7 +135,7 @@ def check_candidates(state: PlanningState) -> None:
 
 
 def path_cost(state: PlanningState) -> Array:
-    """What it costs to go to each candidate, h(v) of eq. 3 (N,).
+    """Cost of going to each candidate, h(v) of eq. 3 (N,).
 
     `angle`: sin(α/2), α the angle at the sphere's centre between the current view and the candidate.
     `path`: the path length in diameters of the view sphere. `none`: nothing.
@@ -160,16 +160,16 @@ def decide(
     points: tuple[PointOfInterest, ...] = (),
     elsewhere: Callable[[], Array],
 ) -> Decision:
-    """Choose the view with the largest c = s − h, eq. 3; of equal ones the first.
+    """Choose the view with the largest c = s − h, eq. 3; the first of equal ones.
 
     Args:
         candidates: The views that can be reached.
-        saliency: s (C,) of each view that was judged.
+        saliency: s (C,) of each scored view.
         cost: h (C,) of each.
-        why: Gives the reason for one of these.
-        looks: Which of the candidates were judged, and stand for the others; None = all.
-        points: What was taken into account.
-        elsewhere: Gives s (M,) of the points of the view sphere, as a new array, but for the candidates.
+        why: Returns the reason for one of these.
+        looks: Which of the candidates were scored, and represent the others; None = all.
+        points: The points considered.
+        elsewhere: Returns s (M,) of the points of the view sphere, as a new array, without the candidates.
     """
     score = saliency - cost
     best = int(np.argmax(score))
@@ -190,6 +190,6 @@ def _paint(elsewhere: Callable[[], Array], indices: NDArray[np.intp] | None, sal
 
 
 def go_to(state: PlanningState, index: int, why: str) -> Decision:
-    """Take a candidate by its index: the decision of planners that do not look at the scene."""
+    """Choose a candidate by its index: for planners that do not use the scene."""
     cost = float(path_cost(state)[index])
     return Decision(state.candidates.T_world_camera[index], index, 0.0, cost, -cost, why)

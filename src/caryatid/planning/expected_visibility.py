@@ -1,4 +1,4 @@
-"""What there is to see, as weighted points: the objects' surfaces, unseen space, relations."""
+"""Targets of views, as weighted points: the objects' surfaces, unseen space, relations."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from caryatid.sensing.voxel_map import UNKNOWN, Occluders, VoxelMap
 from caryatid.support.stability import ground_outline
 
 SPACE = "unseen space"
-"""What a sample of unseen space is about."""
+"""Subject of a sample of unseen space."""
 SURFACE_SAMPLES = 400
 """Points on the fitted shapes that are tested for being seen [1]."""
 SPACE_WEIGHT = 0.5
-"""Worth of all the space on the table against all surfaces of objects [1]; little of it holds any."""
+"""Weight of all the space on the table, relative to all surfaces of objects [1]; little of it holds any."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
-    """Points a view is to show.
+    """Points that a view should show.
 
     Attributes:
         points_world: (K, 3) [m].
         normals_world: Outward unit normals (K, 3); zero where a point looks the same from all sides.
-        weights: Worth (K,) of each, 0 or more.
+        weights: Weight (K,) of each, 0 or more.
         subjects: Index (K,) into `names`.
         names: Ids of objects, or `SPACE`.
     """
@@ -59,8 +59,8 @@ def join(parts: Sequence[Samples]) -> Samples:
 def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
     """Spread points over the objects' surfaces; together they weigh 1.
 
-    Every object weighs the same, small or large: each is one vertex of the graph. What touches another
-    shape or the table can never be seen and is left out.
+    Every object weighs the same, small or large: each is one vertex of the graph. Points that touch another
+    shape or the table can never be seen and are left out.
     """
     objects = [o for o in graph.objects if o.role == "object"]
     size = occluders.voxels.config.size
@@ -79,7 +79,7 @@ def surface_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
 
 
 def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | None:
-    """Find the box over the table in which something may stand, up to the height of the highest object.
+    """Find the box over the table that may hold something, up to the height of the highest object.
 
     Args:
         graph: The objects and the table.
@@ -102,12 +102,12 @@ def space_above(graph: SupportGraph, voxels: VoxelMap) -> tuple[Array, Array] | 
 
 
 def space_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
-    """Spread points, four voxels apart, over the unseen space on the table, where something may stand.
+    """Spread points, four voxels apart, over the unseen space on the table, which may hold something.
 
-    Space counts up to the height of the highest object, fully at the table and less the higher it is: what
-    stands there has to be carried. All of the table unseen up to there weighs `SPACE_WEIGHT`; the
-    space among the objects, over the convex hull of their outlines, weighs 1 beside, as much as all their
-    surfaces: what holds up a heap, or leans on it, is in there.
+    Space counts up to the height of the highest object, fully at the table and less the higher it is,
+    because something must support its content. A completely unseen table weighs `SPACE_WEIGHT`. The space
+    among the objects, over the convex hull of their outlines, weighs 1 more, as much as all their surfaces:
+    it holds whatever supports a heap or leans on it.
     """
     table, corners = graph.support_surface, space_above(graph, occluders.voxels)
     if table is None or corners is None:
@@ -131,7 +131,7 @@ def space_samples(graph: SupportGraph, occluders: Occluders) -> Samples:
 
 
 def relation_samples(points: Sequence[PointOfInterest]) -> Samples:
-    """Take the points of interest of Algorithm 1 as points seen from any side; together they weigh 1."""
+    """Use the points of interest of Algorithm 1 as points visible from any side; together they weigh 1."""
     positions = np.array([p.position_world for p in points]).reshape(-1, 3)
     saliency = np.array([p.saliency for p in points])
     weights = saliency / max(float(saliency.sum()), 1e-9)
@@ -150,12 +150,12 @@ def visibility(
 def shown_anew(
     samples: Samples, before: Array, T_world_camera: Array, occluders: Occluders, config: ActiveVisionConfig
 ) -> Array:
-    """Worth (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).
+    """Value (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).
 
     A sample is seen when its line of sight is free and within the image; surface turned away by more than
     60° is seen less well, as the cosine. The first 2½ voxels of a line of sight do not count: they are the
-    sample's own surface. Lines of sight are all free where `config.occlusion` is `ignore`, and not
-    followed where they could show nothing new; `before` is from 0 to 1.
+    sample's own surface. Lines of sight are all free if `config.occlusion` is `ignore`, and not followed if
+    they cannot show anything new; `before` is from 0 to 1.
     """
     if config.occlusion == "ignore":
         occluders = replace(occluders, grid=np.zeros((0, 0, 0), dtype=np.uint8))

@@ -1,4 +1,4 @@
-"""A goal: an object that is to be taken away decides where to look, and when enough is known."""
+"""A goal: an object to remove decides where to look, and when to stop."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from caryatid.support.stability import ground_outline
 
 
 def relevant(graph: SupportGraph, goal: str) -> set[str]:
-    """Ids of the goal, of what it holds up, directly or not, and of whatever else holds any of these up."""
+    """Ids of the goal, of the objects it supports, directly or not, and of their other supporters."""
     moving = {goal}
     while above := {s.supported for s in graph.supports if s.supporter in moving} - moving:
         moving |= above
@@ -32,8 +32,8 @@ def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[n
 
     Args:
         samples: Points that views may show.
-        graph: What is known.
-        goal: Id of the object that is to be taken away. Without one, or before it is known, all matter.
+        graph: The support graph.
+        goal: Id of the object to remove. Without one, or before it is known, all matter.
     """
     if not _knows(goal, graph):
         return np.ones(len(samples.weights), dtype=np.bool_)
@@ -47,17 +47,17 @@ def matter(samples: Samples, graph: SupportGraph, goal: str | None) -> NDArray[n
 def settled(
     graph: SupportGraph, goal: str | None, until: float, voxels: VoxelMap, config: SupportConfig
 ) -> bool:
-    """Whether all that is asked for is known with a probability of at least `until`.
+    """Whether everything that matters is known with a probability of at least `until`.
 
-    Without a goal, that every support is there. With one, of each object that it moves or stays when the goal
-    is taken away, and that nothing unseen rests on the goal: so much of its free surface on which something
-    can, by `config.max_tilt`, is next to space that has been seen.
+    Without a goal, this is the existence of every support. With a goal, it is whether each object moves or
+    stays when the goal is removed, and that nothing unseen rests on the goal: at least that share of its
+    free surface up to `config.max_tilt` lies next to seen space.
 
     Args:
-        graph: What is known.
-        goal: Id of the object that is to be taken away, or None.
+        graph: The support graph.
+        goal: Id of the object to remove, or None.
         until: The probability [1].
-        voxels: The space that has been seen.
+        voxels: The voxel map.
         config: The numbers the graph was inferred with.
     """
     if goal is None:

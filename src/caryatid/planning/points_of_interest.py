@@ -21,8 +21,8 @@ class PointOfInterest:
 
     Attributes:
         position_world: (3,) [m].
-        direction: Where it is projected on the view sphere (3,), unit, from the sphere's centre.
-        saliency: How much it is worth, −1 … 1 [1].
+        direction: Its projection on the view sphere (3,), unit, from the sphere's centre.
+        saliency: Its value, −1 … 1 [1].
         subject: Ids of the objects it is about.
         why: For a person to read.
     """
@@ -40,11 +40,11 @@ def points_of_interest(
     """Generate the points of interest of a support graph, Algorithm 1.
 
     An object without a supporter gives the point where the line from the middle of the largest arc between
-    earlier views to its centre meets its surface. Every support relation gives one point where
-    `config.edge_point` says.
+    earlier views to its centre meets its surface. Every support relation gives one point, at the place set
+    by `config.edge_point`.
 
     Args:
-        graph: What is known.
+        graph: The support graph.
         sphere: The view sphere.
         visited: Unit directions (V, 3) of the earlier views, #views of eq. 2.
         config: λ_s, the period of eq. 2 and where a relation's point lies.
@@ -74,7 +74,7 @@ def points_of_interest(
 
 
 def points_of_doubt(graph: SupportGraph, sphere: ViewSphere, visited: Array) -> list[PointOfInterest]:
-    """Where shapes are implausible: a point each, to be looked at from the largest arc of views (V, 3)."""
+    """A point per implausible shape, to be seen from the largest arc of views (V, 3)."""
     middle = largest_arc(visited)
     return [_looked_at(o, sphere, middle, f"{o.id} {o.doubt}") for o in graph.objects if o.doubt]
 
@@ -82,7 +82,7 @@ def points_of_doubt(graph: SupportGraph, sphere: ViewSphere, visited: Array) -> 
 def largest_arc(visited: Array) -> float:
     """Azimuth [rad] of the middle of the largest arc between views (V, 3), V ≥ 1, on the horizontal circle.
 
-    With one earlier view it is the opposite side. Of arcs of the same size the first from −π upwards counts.
+    With one earlier view it is the opposite side. Among arcs of equal size, the first from −π upwards counts.
     """
     azimuth = np.sort(np.arctan2(visited[:, 1], visited[:, 0]))
     arc = np.diff(np.append(azimuth, azimuth[0] + 2.0 * np.pi))
@@ -92,14 +92,14 @@ def largest_arc(visited: Array) -> float:
 
 
 def relation_saliency(occurrences: int, views: int, config: ActiveVisionConfig) -> float:
-    """How interesting a relation is that was seen in some of the views, eq. 2.
+    """Interest of a relation that was seen in some of the views, eq. 2.
 
     s = λ_s + (1 − λ_s) · cos(2π · #occ / #views) as printed (`paper`), or with π in place of 2π
     (`decreasing`), which falls from 1 for a relation never seen to 2λ_s − 1 for one always seen.
 
     Args:
-        occurrences: #occ(e): in how many views it was extracted.
-        views: #views: how many there have been.
+        occurrences: #occ(e), the number of views in which it was extracted.
+        views: #views, the number of views so far.
         config: λ_s, and the period.
     """
     period = 2.0 * np.pi if config.saliency == "paper" else np.pi

@@ -1,4 +1,4 @@
-"""How a robot holds its camera; a decision says in which postures it gets there."""
+"""How a robot holds its camera; a decision holds the postures on its way."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Posture:
     Attributes:
         platform_world: Platform (3,): x, y, yaw [m, m, rad].
         camera_height: Height of the camera centre over the floor [m], set by the torso lift.
-        head_yaw: Against the platform, to the left [rad].
+        head_yaw: Relative to the platform, to the left [rad].
         head_pitch: Upwards [rad].
-        joints: Joint positions (J,) of an arm [rad, or m], or None where they are not known.
+        joints: Joint positions (J,) of an arm [rad, or m], or None if unknown.
     """
 
     platform_world: Array
@@ -28,7 +28,7 @@ class Posture:
     joints: Array | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """Return what `session next`, the service and view.json say of it."""
+        """Return it as in `session next`, the service and view.json."""
         return {
             "platform": self.platform_world.tolist(),
             "camera_height": self.camera_height,

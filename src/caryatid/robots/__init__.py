@@ -1,4 +1,4 @@
-"""Robots that carry the camera: `find_robot` finds what makes one by its name."""
+"""Robots that carry the camera: `find_robot` finds their makers by name."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ HUMANOID = "humanoid"
 """The robot of the paper, and the default."""
 
 ARM = "arm:"
-"""What a name begins with that goes on with the file of a map."""
+"""Prefix of a name that continues with the file of a map."""
 
 ENTRY_POINTS = "caryatid.robots"
 """Group under which other packages offer robots: callables that make one for `Surroundings`."""
@@ -40,7 +40,7 @@ class Surroundings:
 
     Attributes:
         centre_world: Middle of the table top (3,) [m].
-        floor: Where there is room on the floor, and the furniture.
+        floor: Free space on the floor, and the furniture.
         config: All settings.
     """
 
@@ -50,7 +50,7 @@ class Surroundings:
 
     @property
     def T_world_base(self) -> Array:
-        """Where the settings put the base of an arm (4, 4)."""
+        """Pose (4, 4) of an arm's base by the settings."""
         from caryatid.geometry.transforms import rigid, rotation_from_vector
 
         arm = self.config.arm
@@ -68,11 +68,11 @@ def offered() -> dict[str, EntryPoint]:
 
 
 def find_robot(name: str) -> RobotMaker:
-    """Return what makes a robot.
+    """Return the maker of a robot.
 
     Args:
-        name: `humanoid`; `arm:FILE.npz`, the file as `write_reachability` writes it; `module:callable`; or a
-            name another package offers.
+        name: `humanoid`; `arm:FILE.npz`, a file of `write_reachability`; `module:callable`; or a name that
+            another package offers.
 
     Raises:
         InputError: There is none of this name, its file is bad, or its module cannot be imported.

@@ -1,4 +1,4 @@
-"""An arm with a camera in its hand: which views of its sphere the hand reaches, and rolled how."""
+"""An arm with a camera in its hand: which views of its sphere the hand reaches, and with which roll."""
 
 from __future__ import annotations
 
@@ -37,39 +37,39 @@ REASONS = (
 """Why a view is refused; the first that applies counts."""
 
 UNCONFIRMED = "the arm cannot go there on a closer look"
-"""Why one is refused that seemed to be within reach."""
+"""Why a view that seemed within reach is refused."""
 
 RADIUS_SHARE = 0.65
-"""Share of the views within reach on the best of these spheres that makes a larger one do [1]; from farther
-away a view shows more of the table, and the nearest spheres show too little of it."""
+"""Share of the views within reach on the best of these spheres that is enough for a larger one [1]; from
+farther away a view shows more of the table, and the nearest spheres show too little of it.
+"""
 
 
 class ArmRobot(SimulatedRobot, OwnViews):
-    """An arm that stands still, in simulation or as the plan for a real one.
+    """A fixed arm, in simulation or as the model of a real one.
 
     The views of its sphere look at the centre. Each is tried level first and then rolled about the optical
-    axis, nearest to level first, since a picture shows the same however it is turned and a wrist seldom holds
-    a camera level everywhere; the candidate is the pose with the first roll that the hand reaches.
+    axis, nearest to level first, because a rolled image shows the same and a wrist seldom holds a camera
+    level everywhere; the candidate is the pose with the first roll that the hand reaches.
 
     The path to a view is the straight line between the camera's positions. Between two views of one sphere
     that is its diameter times sin(α/2), α the angle at the centre: the cost of eq. 3 of the paper.
 
-    For a real arm: inherit, have the arm go there in `move_to`, and then call that of this class.
+    For a real arm: inherit, move the arm in `move_to`, and then call `move_to` of this class.
 
     Args:
-        reachable: Which poses the hand can bring the camera to, in the frame of the arm's base: inverse
-            kinematics of your own, or a `ReachabilityMap`. It answers for itself, not for the table.
+        reachable: Which poses the hand can bring the camera to, in the frame of the arm's base: your own
+            inverse kinematics, or a `ReachabilityMap`. It need not consider the table.
         T_world_base: Where the base is (4, 4).
         config: Radii to choose among, rolls, clearance over the table.
-        confirm: Says of one pose (4, 4) in the frame of the base whether the arm can go there. It is asked
-            about a view before it is taken, and where it says no another one is chosen: for slow but exact
-            inverse kinematics, or a motion planner, behind a coarse map. For yes it may return the joint
-            positions (J,) there, which the waypoints then hold, and for no None; `reachable` knows none.
-            Without it `reachable` is taken for true.
+        confirm: Says whether the arm can go to one pose (4, 4) in the frame of the base. It is called for a
+            chosen view, and if it says no, another one is chosen: for slow but exact inverse kinematics, or
+            a motion planner, behind a coarse map. Instead of yes it may return the joint positions (J,),
+            which the waypoints then hold, and instead of no None; `reachable` has none. Without it,
+            `reachable` decides.
         centre_world: Centre (3,) of its view sphere [m], or None for the middle of the table top.
-        furniture: Knows the walls no view may look through, or None.
-        T_world_camera: Where its camera is (4, 4), or None while it has not been put anywhere; then any view
-            is reached by a path of length 0.
+        furniture: Walls that block views, or None.
+        T_world_camera: Camera pose (4, 4), or None before the first move, which has path length 0.
 
     Raises:
         InputError: A pose is not a rigid transform.
@@ -99,10 +99,10 @@ class ArmRobot(SimulatedRobot, OwnViews):
             self._T_world_camera = transforms.as_rigid(T_world_camera, "T_world_camera").copy()
 
     def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
-        """Choose the largest radius at which about as many views are within reach as at any other.
+        """Choose the largest radius with about as many views within reach as any other.
 
-        The points of the sphere are spread evenly in the frame of the base, so that the arm has the same
-        views wherever it and its table stand.
+        The points of the sphere are spread evenly in the frame of the base, so the arm has the same views
+        wherever it and its table stand.
         """
         centre = proposed.centre_world if self._centre is None else self._centre
         if self._sphere is None or not np.array_equal(self._sphere.centre_world, centre):
@@ -112,10 +112,10 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return self._sphere
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say how the arm would hold its camera at a pose (4, 4), with its roll, or why it cannot.
+        """Return the arm's posture with its camera at a pose (4, 4), with its roll, or why there is none.
 
-        The platform of the posture is the base; its yaw and pitch are where the camera looks. Joint positions
-        are known where `confirm` gave them.
+        The platform of the posture is the base; its yaw and pitch are where the camera looks. Joint
+        positions are known if `confirm` gave them.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
         if not self._reaches(T[None])[0]:
@@ -128,9 +128,9 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return self._posture if is_there and self._posture is not None else self._posture_of(T)
 
     def waypoints(self, T_world_camera: Array) -> tuple[Posture, ...]:
-        """Return the postures here and at a pose (4, 4); what lies between is the motion planner's.
+        """Return the postures here and at a pose (4, 4); the path between is up to the motion planner.
 
-        Joint positions are known of a pose that was confirmed last, or gone to.
+        Joint positions are known for a pose that was confirmed last, or reached.
         """
         there, here = self._posture_of(T_world_camera), self._T_world_camera
         return (there,) if here is None else (self._posture or self._posture_of(here), there)
@@ -138,7 +138,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the views of the sphere within reach, clear of the table, that see its centre past walls.
 
-        They are found once for a sphere; then only the path lengths are.
+        They are computed once for a sphere; later calls update only the path lengths.
         """
         if self._offer is None or self._offer[0] is not sphere:
             self._offer = sphere, self._offered(sphere)
@@ -146,7 +146,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return views.from_elsewhere(straight_lengths(self._T_world_camera, views.T_world_camera))
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
-        """Look closer whether the arm can go to a candidate (4, 4); None = it can."""
+        """Check in detail whether the arm can go to a candidate (4, 4); None = it can."""
         if self._confirm is None:
             return None
         answer = self._confirm(transforms.invert(self.T_world_base) @ T_world_camera)
@@ -190,7 +190,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return Candidates(held[reached], sphere.directions[good], np.zeros(len(good)), rejected, good)
 
     def _in_some_roll(self, T_world_camera: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Roll poses (N, 4, 4) as little as the hand needs; return them, and which it reaches (N,)."""
+        """Roll poses (N, 4, 4) by the smallest sufficient angle; return them, and which are reached (N,)."""
         held = T_world_camera.copy()
         reached = np.zeros(len(held), dtype=np.bool_)
         turns = np.arange(self._config.rolls) * (2.0 * np.pi / self._config.rolls)

@@ -1,4 +1,4 @@
-"""The floor the robot drives on: where its platform may stand, how far it is, what walls hide."""
+"""The robot's floor: where its platform may stand, path lengths, and what walls hide."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ STEP = 0.02
 """Anything on the floor lower than this is not an obstacle to the platform [m]."""
 
 TABLE_MARGIN = 0.1
-"""Furniture met this near to the view sphere's centre is the table, not a wall in the line of sight [m]."""
+"""Furniture this near to the view sphere's centre is the table, not a wall in the line of sight [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class FloorGrid:
         """Build the grid around static furniture.
 
         Args:
-            furniture: What stands on the floor.
+            furniture: Boxes on the floor.
             config: Footprint, cell, size of the floor and heights that matter.
             around_world: Middle (2,) of the floor the robot may use, x and y [m].
         """
@@ -57,7 +57,7 @@ class FloorGrid:
         cells = shapely.points(*np.meshgrid(x, y))
         free = np.ones((count, count), dtype=np.bool_)
         corners = 0.5 * config.cell * np.array([(-1.0, -1.0), (-1.0, 1.0), (1.0, -1.0), (1.0, 1.0)])
-        # What the head cannot meet, 15 cm above the highest camera centre, does not hinder.
+        # Anything above the head, 15 cm over the highest camera centre, is not an obstacle.
         head = config.camera_height[1] + 0.15
         for box in furniture:
             middle, reach = box.T_world_object[2, 3], box.support(np.array([[0.0, 0.0, 1.0]]))[0]
@@ -71,13 +71,13 @@ class FloorGrid:
     def from_occupancy(
         cls, occupied: NDArray[np.bool_], origin_world: ArrayLike, cell: float, config: RobotConfig
     ) -> FloorGrid:
-        """Build the grid from a map of obstacles (H, W), rows along y, as a robot's own mapping gives.
+        """Build the grid from a map of obstacles (H, W), rows along y, such as a robot's own map.
 
         Args:
             occupied: Cells (H, W) with an obstacle.
             origin_world: Corner (2,) of cell [0, 0], x and y [m].
             cell: Edge of a cell [m].
-            config: Footprint. Heights are not known, so no wall hides anything.
+            config: Footprint. Heights are unknown, so no wall hides anything.
         """
         free = np.ones(occupied.shape, dtype=np.bool_)
         if occupied.any():
@@ -90,7 +90,7 @@ class FloorGrid:
         """Find the cells under points (N, 2+) [m].
 
         Returns:
-            Flat cell indices (N,), 0 where outside, and which points are on the floor (N,).
+            Flat cell indices (N,), 0 if outside, and which points are on the floor (N,).
         """
         column, row = np.floor((points_world[:, :2] - self.origin_world) / self.cell).astype(np.intp).T
         height, width = self.free.shape
@@ -105,7 +105,7 @@ class FloorGrid:
     def paths_from(self, start_world: ArrayLike) -> FloorPaths:
         """Find the shortest paths over the floor from a point (2,), x and y [m], by one Dijkstra.
 
-        A platform that stands beside the free cells (because the grid is coarse) starts at the nearest one.
+        A platform outside the free cells (because the grid is coarse) starts at the nearest one.
         """
         start = np.asarray(start_world, dtype=np.float64)[:2]
         (cell,), (inside,) = self.cells(start[None])
@@ -140,7 +140,7 @@ class FloorGrid:
         height, width = self.free.shape
         index = np.arange(height * width).reshape(height, width)
         edges = []
-        # Half of the eight neighbours of a cell; the other half are the same edges backwards.
+        # Half of the eight neighbours of a cell; the other half has the same edges reversed.
         for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
             here = (slice(0, height - down), slice(max(0, -right), width - max(0, right)))
             there = (slice(down, height), slice(max(0, right), width + min(0, right)))
@@ -182,7 +182,7 @@ class FloorPaths:
         return np.where(cells == self.cell, straight, self.to_centres[cells] + last_leg)
 
     def corners(self, point_world: Array) -> Array:
-        """Corners (C, 2) [m] of the path to a point (2+,), with both ends; of equal paths one of few."""
+        """Corners (C, 2) [m] of the path to a point (2+,), with both ends; few among equal paths."""
         end_world = point_world[None, :2]
         (cell,), _ = self.grid.cells(end_world)
         if cell == self.cell:

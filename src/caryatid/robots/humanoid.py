@@ -1,4 +1,4 @@
-"""Which camera poses a humanoid can reach, how it would stand there, and how long the path is."""
+"""Which camera poses a humanoid can reach, its postures there, and the path lengths."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ Indices = NDArray[np.intp]
 class HumanoidRobot(SimulatedRobot, OwnViews):
     """A humanoid of ARMAR-6's kind in simulation: holonomic platform, torso lift, head with yaw and pitch.
 
-    It is nowhere at first, and goes to its first place by a path of length 0.
+    It has no pose at first; its first move has path length 0.
 
     Args:
-        floor: Where it may drive, and the furniture it knows of.
+        floor: Free space, and the known furniture.
         config: Its limits.
     """
 
@@ -48,7 +48,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         self._offer: tuple[ViewSphere, NDArray[np.bool_], Candidates, Array] | None = None
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot."""
+        """Return the robot's posture with its camera at a pose (4, 4), or why there is none."""
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
         (code,), (platform,), (head_yaw,), (pitch,) = self._reach(T[None])
         if code >= 0:
@@ -60,7 +60,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
     def candidates(self, sphere: ViewSphere) -> Candidates:
         """Return the views of the sphere that can be reached and see its centre past the furniture.
 
-        Another sphere, or other cells in reach, need new ones; otherwise only their paths change.
+        They are computed again for another sphere or other cells in reach; otherwise only their paths change.
         """
         offer = self._offer
         if offer is None or offer[0] is not sphere or not np.array_equal(offer[1], self._reached):
@@ -68,7 +68,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         return offer[2] if self._paths is None else offer[2].from_elsewhere(self._paths.lengths(offer[3]))
 
     def waypoints(self, T_world_camera: Array) -> tuple[Posture, ...]:
-        """Return how it drives to a pose (4, 4): corners of the shortest path, turning and lifting evenly.
+        """Return its way to a pose (4, 4): corners of the shortest path, turning and lifting evenly.
 
         The platform's straight lines between them are as long as the path.
 
@@ -108,7 +108,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         return Candidates(poses[good], directions, lengths, rejected, indices), platform_world[good]
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
-        """Drive along the waypoints; return how far [m]. From there on paths begin there."""
+        """Drive along the waypoints and return the path length [m]. Later paths begin there."""
         driven = np.array([p.platform_world[:2] for p in self.waypoints(T_world_camera)])
         self._paths = self._floor.paths_from(driven[-1])
         self._reached = np.isfinite(self._paths.to_centres)
@@ -124,7 +124,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         eyes = T_world_camera[:, :3, 3]
         right, forward = T_world_camera[:, :3, 0], T_world_camera[:, :3, 2]
         pitch = np.arcsin(np.clip(forward[:, 2], -1.0, 1.0))
-        # Without roll the right axis is level: it gives the heading even where the view is straight down.
+        # Without roll the right axis is level: it gives the heading even if the view is straight down.
         heading = np.arctan2(right[:, 0], -right[:, 1])
 
         yaws = np.deg2rad(np.linspace(*config.yaw, config.head_yaws))

@@ -1,4 +1,4 @@
-"""What carries the camera: the `Robot` protocol, its answers, and what robots in simulation share."""
+"""The `Robot` protocol, its answers, and a base of simulated robots."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ class Unreachable:
 
 
 class Robot(Protocol):
-    """What carries the camera; one with views of its own is an `OwnViews` too."""
+    """Carries the camera; a robot with views of its own is an `OwnViews` too."""
 
     @property
     def T_world_camera(self) -> Array:
-        """Where the camera is now (4, 4)."""
+        """Current camera pose (4, 4)."""
         ...
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say how the robot would stand with its camera at a pose (4, 4), or why it cannot."""
+        """Return the robot's posture with its camera at a pose (4, 4), or why there is none."""
         ...
 
     def candidates(self, sphere: ViewSphere) -> Candidates:
@@ -57,12 +57,12 @@ class Robot(Protocol):
 
 
 class OwnViews:
-    """What a robot may say beyond `Robot`: one that inherits this is asked, another is not."""
+    """Optional methods of a robot, called only if it inherits this class."""
 
     def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
-        """Say on which sphere this robot's views lie: radius, centre and points.
+        """Return the sphere of this robot's views: radius, centre and points.
 
-        What is asked twice, also about its own answer, is answered with the same sphere.
+        Equal arguments give the same sphere, and so does its own answer as the argument.
 
         Args:
             proposed: The sphere of the settings around the middle of the table top.
@@ -70,32 +70,29 @@ class OwnViews:
         return proposed
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
-        """Say why a candidate (4, 4) that was chosen cannot be taken after all; then another one is chosen.
-
-        None = go ahead.
-        """
+        """Say why a chosen candidate (4, 4) cannot be taken after all, so that another is chosen; or None."""
         return None
 
     def waypoints(self, T_world_camera: Array) -> Sequence[Posture]:
-        """Say in which postures this robot goes to a pose (4, 4), from the one it is in to the one there.
+        """Return the postures on the way to a pose (4, 4), with both ends and straight lines in between.
 
-        Between two of them it moves straight. None said = only the posture there is known, from `solve`.
+        None at all = only the posture there is known, from `solve`.
         """
         return ()
 
 
 class SimulatedRobot(Robot):
-    """What robots in simulation share: where the camera is, and going on from there."""
+    """Base of simulated robots: the camera's pose, and moves from there."""
 
     _T_world_camera: Array | None = None
     _posture: Posture | None = None
 
     @property
     def T_world_camera(self) -> Array:
-        """Where the camera is now (4, 4).
+        """Current camera pose (4, 4).
 
         Raises:
-            PlanningError: It has not been put anywhere.
+            PlanningError: It has no pose yet.
         """
         if self._T_world_camera is None:
             raise PlanningError("the robot is nowhere yet; move it to a first view")
@@ -113,7 +110,7 @@ class SimulatedRobot(Robot):
         return posture
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
-        """Take a posture that `solve` gave; return the path length [m] from where the robot was."""
+        """Take a posture of `solve`; return the path length [m] from the previous one."""
         return float(straight_lengths(self._T_world_camera, T_world_camera))
 
     def move_to(self, T_world_camera: Array) -> float:
@@ -129,7 +126,7 @@ class SimulatedRobot(Robot):
 
 
 def straight_lengths(T_world_from: Array | None, T_world_camera: Array) -> Array:
-    """Straight path length (...) [m] from one camera pose (4, 4) to others (..., 4, 4); 0 from nowhere."""
+    """Straight path length (...) [m] from one camera pose (4, 4) to others (..., 4, 4); 0 from None."""
     eyes = T_world_camera[..., :3, 3]
     start = eyes if T_world_from is None else T_world_from[:3, 3]
     return np.linalg.norm(eyes - start, axis=-1)
@@ -145,23 +142,23 @@ def posture_at(T_world_camera: Array, platform_world: Array) -> Posture:
 
 
 def count_reasons(code: NDArray[np.intp], reasons: Sequence[str]) -> dict[str, int]:
-    """How many of N views were refused for each reason, by its index (N,) for each view; −1 = not refused."""
+    """Number of views refused for each reason, by the index (N,) of each view's reason; −1 = not refused."""
     counts = {reason: int((code == index).sum()) for index, reason in enumerate(reasons)}
     return {reason: count for reason, count in counts.items() if count}
 
 
 def view_sphere_of(robot: Robot | None, proposed: ViewSphere) -> ViewSphere:
-    """Return the sphere a robot's views lie on: its own where it inherits `OwnViews`, else the proposed."""
+    """Return the sphere of a robot's views: its own if it inherits `OwnViews`, else the proposed one."""
     return robot.view_sphere(proposed) if isinstance(robot, OwnViews) else proposed
 
 
 def refusal_of(robot: Robot | None, T_world_camera: Array) -> Unreachable | None:
-    """Why a robot that inherits `OwnViews` does not take a candidate (4, 4) on a closer look, or None."""
+    """Why a robot that inherits `OwnViews` refuses a candidate (4, 4) after a closer check, or None."""
     return robot.confirm(T_world_camera) if isinstance(robot, OwnViews) else None
 
 
 def waypoints_of(robot: Robot | None, T_world_camera: Array) -> tuple[Posture, ...]:
-    """In which postures a robot goes to a pose (4, 4); of one that does not say, only the posture there."""
+    """Postures of a robot on the way to a pose (4, 4); only the posture there if it gives no others."""
     if robot is None:
         return ()
     if isinstance(robot, OwnViews) and (told := robot.waypoints(T_world_camera)):

@@ -1,4 +1,4 @@
-"""Where an arm can hold its camera: a map of positions, directions and rolls, sampled from its joints."""
+"""Reachability of an arm's camera: a map of positions, directions and rolls, sampled from its joints."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ Forward = Callable[[Array], Array]
 """Forward kinematics: joints (N, J) [rad, or m] → `T_base_camera` (N, 4, 4)."""
 
 FORMAT, VERSION = "caryatid/reachability", 1
-"""What the file says it is."""
+"""The format's name in the file."""
 
 REMEDY = "sample it again and write it with write_reachability"
-"""What to do where a file is broken."""
+"""Remedy for a broken file."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ReachabilityMap:
-    """In which cells, looking which way, and rolled how an arm has been seen to hold its camera.
+    """Cells, directions and rolls in which an arm can hold its camera.
 
-    A camera looks the same way however it is rolled, so a cell and a direction have one byte, and each of its
-    bits is an eighth of a turn about the optical axis. A pose is reached if its own roll is.
+    A cell and a direction have one byte, and each of its bits is an eighth of a turn about the optical axis.
+    A pose is reached if its own roll is.
 
     Attributes:
         reached: Rolls (X, Y, Z, D) uint8 by cell and by the nearest of D directions all over the sphere.
         origin_base: Lowest corner (3,) of the cells in the frame of the base [m].
         cell: Edge of a cell [m].
-        fresh: Share of the last tenth of the samples that were the first in their cell and direction [1]; so
-            much of what such an arm can reach is about missing in the map.
+        fresh: Share of the last tenth of the samples that were the first in their cell and direction [1];
+            about this share of the arm's reach is missing in the map.
     """
 
     reached: NDArray[np.uint8]
@@ -66,19 +66,18 @@ def sample_reachability(
     rng: np.random.Generator,
     config: ArmConfig | None = None,
 ) -> ReachabilityMap:
-    """Map where an arm brings its camera, from postures drawn evenly between the limits of its joints.
+    """Map the reach of an arm's camera, from postures drawn evenly between the limits of its joints.
 
     Args:
         forward: Forward kinematics up to the camera's optical frame (x right, y down, z forward): with the
-            transform from hand to camera. Postures in which the arm meets itself or its surroundings may be
-            given as NaN; they are left out.
+            transform from hand to camera. It may return NaN for postures in collision; they are left out.
         limits: Lowest and highest value (J, 2) of each joint [rad, or m].
-        count: Postures to draw [1]; see `ReachabilityMap.fresh` whether they were enough.
+        count: Number of postures to draw [1]; `ReachabilityMap.fresh` says if they were enough.
         rng: Draws them.
         config: Size of cells and number of directions.
 
     Raises:
-        InputError: Limits, count or what `forward` returns are not as they should be.
+        InputError: Limits, count or the result of `forward` are not valid.
     """
     config = config or ArmConfig()
     bounds = np.asarray(limits, dtype=np.float64)
@@ -152,7 +151,7 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
 class _Bins:
     """The bins of directions (D) and rolls.
 
-    A roll is measured from a vector at right angles to its bin's middle: so it is known straight down too.
+    A roll is measured from a vector at right angles to its bin's middle, so it is defined straight down too.
     """
 
     def __init__(self, count: int) -> None:

@@ -1,4 +1,4 @@
-"""A recording played back: the robot can only be where a recorded view is, the camera gives that view."""
+"""A recording played back: the robot moves between recorded views, and the camera returns them."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class RecordingRobot(SimulatedRobot):
         return min(same, key=lambda i: (i in self._used, i), default=None)
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Say where the recording's camera was, or that it has not been at a pose (4, 4)."""
+        """Return the posture at a recorded pose (4, 4), or say that the recording has no such view."""
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
         index = self._index_of(T)
         if index is None:
@@ -62,7 +62,7 @@ class RecordingRobot(SimulatedRobot):
 
 
 class RecordingCamera:
-    """Gives the recorded frame nearest to a pose.
+    """Returns the recorded frame nearest to a pose.
 
     Args:
         recording: Frames with poses, or a single frame.

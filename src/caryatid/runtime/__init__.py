@@ -1,4 +1,4 @@
-"""Running: compiled kernels, threads, what decides results, and names imported when first asked for."""
+"""Compiled kernels, threads, the code that decides results, and late imports."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
 BYSTANDERS = frozenset(
     {"benchmark", "cli", "exports.py", "service.py", "sessions", "sources.py", "viewer", "viz"}
 )
-"""Parts of caryatid that only arrange, hand on, draw or tell what others found, but for `DECIDING`."""
+"""Parts of caryatid that only pass on or show results, except the modules in `DECIDING`."""
 
 DECIDING = frozenset({"benchmark/episodes.py"})
 """Modules in these parts that decide figures."""
@@ -40,7 +40,7 @@ DECIDING = frozenset({"benchmark/episodes.py"})
 
 @cache
 def fingerprint() -> str:
-    """Digest of the code and library releases that decide what an episode gives."""
+    """Digest of the code and library releases that decide the result of an episode."""
     import hashlib
     from importlib.metadata import version
 

@@ -1,10 +1,10 @@
 """Kernels are compiled once after installation, by a few processes side by side, before the first view.
 
 numba compiles a kernel at its first call and keeps it on disk. So there is no list of kernels to maintain:
-the processes *warm up*. Each does on small scenes all that calls kernels (`caryatid.simulation.warm_up`),
-beginning with another part. A kernel that one of them is compiling the others wait for, and then read from
-disk. What no warm-up calls is compiled at its first call, as ever; a new kernel needs an entry there only
-if nothing in the warm-up calls it yet.
+the processes *warm up*. Each runs everything that calls kernels on small scenes
+(`caryatid.simulation.warm_up`), starting with a different part. While one of them compiles a kernel, the
+others wait for it, and then read it from disk. A kernel that no warm-up calls is compiled at its first call;
+only such a kernel needs an entry there.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ log = logging.getLogger(__name__)
 
 ROOT = Path(__file__).parents[1]
 MARK = "CARYATID_COMPILES"
-"""Set in the environment of the processes that warm up: they start no more of their kind."""
+"""Set in the environment of the processes that warm up, so that they start no others."""
 
 CODE = """
 import os, sys, threading
@@ -47,19 +47,19 @@ sys.path.append(sys.argv[1])
 from caryatid.runtime.compiling import warm_up
 warm_up(sys.argv[2], int(sys.argv[3]))
 """
-"""What such a process runs; it ends with the one that started it.
+"""The program of such a process; it ends with its parent.
 
-Where it does not find caryatid otherwise, it looks where this process did.
+It looks for caryatid where its parent found it.
 """
 
 
 def compile_kernels() -> None:
-    """Compile all kernels that are not compiled yet: after installation, and where their sources changed.
+    """Compile all kernels that are not compiled yet: after installation, and after a change of their sources.
 
     Several processes may call this at once: one compiles, the others wait.
 
     Raises:
-        InputError: There is no folder that compiled kernels can be kept in.
+        InputError: There is no writable folder for compiled kernels.
     """
     if numba.config.DISABLE_JIT or MARK in os.environ or not sys.executable or hasattr(sys, "frozen"):
         return
@@ -89,7 +89,7 @@ def warm_up(locks: str, number: int) -> None:
 
     Args:
         locks: Folder of the locks by which the processes take turns.
-        number: Number of the process, which says what it begins with.
+        number: Number of the process, which decides where it starts.
     """
     # A compiler makes many objects that last: looking for garbage among them is a tenth of its time.
     gc.set_threshold(200_000, 50, 100)
@@ -117,7 +117,7 @@ def cache_of(folder: Path) -> Path:
 
 
 def _run_processes(folder: Path) -> None:
-    """Rehearse in several processes that take turns by locks in a folder, and wait for them."""
+    """Warm up in several processes that take turns by locks in a folder, and wait for them."""
     # A killed process leaves the folder, and the next one takes it over.
     work, processes = folder / "compiling", list[subprocess.Popen[bytes]]()
     shutil.rmtree(work, ignore_errors=True)
@@ -147,10 +147,11 @@ def _run_processes(folder: Path) -> None:
 
 
 def _take_turns(folder: Path) -> None:
-    """Have numba compile a kernel only where no other process does, and otherwise wait for what that keeps.
+    """Let numba compile a kernel only if no other process does, and otherwise wait for the result.
 
-    This makes writing to numba's cache exclusive, too: two processes that write to the index of one kernel
-    would lose entries. A process waits only for kernels called by those it is compiling: never in a circle.
+    This also makes writing to numba's cache exclusive: two processes that write the index of one kernel
+    would lose entries. A process waits only for kernels called by those it is compiling, so never in a
+    circle.
     """
     load, save = FunctionCache.load_overload, FunctionCache.save_overload
     locks: dict[str, FileLock] = {}

@@ -1,4 +1,4 @@
-"""How values show themselves: hooks that the package fills in, so that no room imports one above it."""
+"""Hooks by which values display themselves; the package fills them, so that no room imports one above it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Work on several cores: Python's threads call compiled kernels that release its lock.
 
-numba's own parallel loop compiles all that it calls once more, which takes many seconds where that is much.
+numba's own parallel loop compiles everything it calls again, which can take many seconds.
 Here each piece of work is compiled once, and the loop needs no compiling. BLAS gets one thread: our matrices
 are small, and threads that wait for work cost more than they save.
 """
@@ -60,8 +60,8 @@ def one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
     """Call compiled work for each index from 0 to count − 1, on as many threads as numba uses.
 
-    What it does for one index must touch nothing that it reads or writes for another: then the result is the
-    same on any number of threads.
+    The work for one index must not touch the data of another; then the result is the same on any number of
+    threads.
 
     Args:
         work: Kernel, called as `work(index, data)`; it must not raise. It is compiled without Python's lock.
@@ -95,7 +95,7 @@ def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
 
 
 def _read_or_forget(self: FunctionCache, signature: Any, context: Any) -> Any:
-    """A kept kernel; what is damaged, or names types that have since been renamed, is compiled again."""
+    """A cached kernel; a damaged one, or one with types that have been renamed, is compiled again."""
     try:
         return _read_kernel(self, signature, context)
     except Exception:

@@ -1,4 +1,4 @@
-"""Where a view has no reading over the support surface and no shadow explains it: glass, gloss, black."""
+"""Regions without readings above the support surface that no shadow explains: glass, gloss, black."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import View
 
 BASELINE = 0.1
-"""Distance of a depth camera's two eyes, or of eye and projector, at the most [m]; a Kinect's is 0.075."""
+"""Maximum distance of a depth camera's two eyes, or of eye and projector [m]; a Kinect's is 0.075."""
 COARSER = 2
-"""How much coarser holes are sampled than segments [1]; what is to be found is as large as an object."""
+"""How much coarser holes are sampled than segments [1]; they are as large as an object."""
 
 
 def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig) -> int:
     """Count the regions over the support surface that have no depth and are as large as an object.
 
-    What one of the sensor's eyes sees and the other does not has no depth either. Such a shadow lies beside
-    what casts it, in the same row, and is no wider than the sensor's baseline makes it on the surface.
+    Places that only one of the sensor's eyes sees have no depth either. Such a shadow lies beside the object
+    that casts it, in the same row, and is no wider than the sensor's baseline makes it on the surface.
 
     Args:
         view: A view with a pose.
         surface: The support surface.
-        config: Sampling, and what the smallest segment is.
+        config: Sampling, and size of the smallest segment.
     """
     step = COARSER * config.stride
     every = np.s_[::step, ::step]
@@ -41,14 +41,14 @@ def count_holes(view: View, surface: SupportSurface, config: SegmentationConfig)
     there = np.divide(1.0, level, out=np.zeros(level.shape), where=level > 0.0)
     on_surface = View(there.astype(np.float32), K, ignored=ignored)
     over = surface.pixels_over(on_surface, -config.clearance, config.clearance, 0.0)
-    # What is ignored is as near as can be: shadows beside it have any width.
+    # Ignored pixels count as infinitely near: shadows beside them have any width.
     inverse_depth = np.divide(1.0, depth, out=np.where(ignored, np.inf, 0.0), where=depth > 0.0)
     known = inverse_depth > 0.0
     left = np.maximum.accumulate(np.where(known, u, 0), axis=1)
     right = np.minimum.accumulate(np.where(known, u, depth.shape[1] - 1)[:, ::-1], axis=1)[:, ::-1]
     ends = inverse_depth[v, left], inverse_depth[v, right]
     shadow = BASELINE * K[0, 0] * (np.maximum(*ends) - np.minimum(np.minimum(*ends), level))
-    # A gap at the side of the image may be the shadow of what is outside.
+    # A gap at the side of the image may be the shadow of something outside.
     hole = over & ~known & (np.minimum(*ends) > 0.0) & (right - left - 1 > shadow)
     parts, count = ndimage.label(hole)
     numbers = np.arange(1, count + 1)

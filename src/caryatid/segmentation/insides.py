@@ -1,4 +1,4 @@
-"""Insides of hollow things: convexity cuts them to pieces, and from the outside they belong to."""
+"""Insides of hollow objects: convexity cuts them to pieces, and off the outside they belong to."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from caryatid.segmentation.samples import Labels, Samples
 Mask = NDArray[np.bool_]
 
 MEETING = 5
-"""Rows and columns of samples on which two parts must meet to be taken for one [1]; 3 cm at 1.5 m."""
+"""Rows and columns of samples on which two parts must meet to be one [1]; 3 cm at 1.5 m."""
 HOLLOW = 0.2
 """Hollowness of an inside [1]; that of a bowl is 0.6, of flat faces and their noise 0.05."""
 RIM = 0.015
@@ -28,11 +28,11 @@ ALONG = 0.35
 
 
 def merge_insides(samples: Samples, part: Labels) -> tuple[Labels, Mask]:
-    """Make one part of each hollow thing.
+    """Make one part of each hollow object.
 
-    Pieces beside each other that end at one rim and together look inwards, more than each by itself, are one
-    inside. What lies within its hull in the image is of it too, unless it looks outwards as contents do. The
-    outside lies along the hull and does not rise over the rim.
+    Pieces beside each other that end at one rim and together face inwards, more than each by itself, are one
+    inside. Samples within its hull in the image belong to it too, unless they face outwards as contents do.
+    The outside lies along the hull and does not rise above the rim.
 
     Returns:
         Part (N,) of each sample, and the places (H, W) within the hulls of insides.
@@ -87,12 +87,12 @@ def _meet(image: Labels, first: int, second: int, reach: int) -> bool:
 
 
 def _box(own: Mask) -> tuple[slice, ...]:
-    """Rows and columns of what is set in an image (H, W)."""
+    """Rows and columns of the pixels set in an image (H, W)."""
     return tuple(ndimage.find_objects(own.astype(np.intp))[0])
 
 
 def _outside(inner: Mask, image: Labels, possible: Mask, reach: int) -> int:
-    """The possible part that lies along most of the contour of an inside, if along enough; 0 = none does."""
+    """The possible part that lies along most of the contour of an inside, if along enough; 0 = none."""
     rows, columns = (slice(max(0, own.start - 2 * reach), own.stop + 2 * reach) for own in _box(inner))
     inner, image = inner[rows, columns], image[rows, columns]
     contour = inner & ~ndimage.binary_erosion(inner)

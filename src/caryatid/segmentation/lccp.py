@@ -68,8 +68,8 @@ def _find_pairs(number, points, normals, planes, ways, edge_jump):  # type: igno
                 from_j += planes[j, axis] * points[i, axis]
             first, second = 1.0 / points[i, 2], 1.0 / points[j, 2]
             off = min(abs(from_i - 1.0) * second, abs(from_j - 1.0) * first)
-            # A difference in inverse depth of more than 0.009 / m parts two surfaces, however steep; a step
-            # repels from 1.5 cm on, above staircases on steep faces.
+            # A difference in inverse depth of more than 0.009 / m separates two surfaces, however steep; a
+            # step repels from 1.5 cm on, above staircases on steep faces.
             if abs(first - second) <= 0.009 and off <= edge_jump:
                 if k < 4:
                     edges[edge_count, 0], edges[edge_count, 1] = i, j
@@ -91,8 +91,8 @@ def convex_parts(
     clusters weighing the mean over its length, so that one bad edge joins nothing.
 
     Samples are points (N, 3) [m] with normals (N, 3), edges pairs (E, 2) of neighbours on one surface. Steps
-    are pairs (F, 2) of neighbours in the image, one in front of the other: they repel, for a convex body does
-    not hide itself. Parts (N,) are 1 … n in the order of their first samples, 0 = none.
+    are pairs (F, 2) of neighbours in the image, one in front of the other: they repel, because a convex body
+    does not hide itself. Parts (N,) are 1 … n in the order of their first samples, 0 = none.
     """
     if len(points) == 0:
         return np.zeros(0, dtype=np.int32)
@@ -121,9 +121,9 @@ def convex_parts(
 def _spread_seeds(points, normals, edges, start, seeds, surfel, crease):  # type: ignore[no-untyped-def]
     """For each node (N,), the number of the seed (S,) nearest along the edges (E, 2), −1 = none.
 
-    Edges are as long as they are [surfels], and longer where the normal turns; their lengths (E,) [m] come
-    second. They are relaxed in sweeps back and forth until nothing changes (Bellman and Ford); faster than a
-    heap here. The neighbours of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them.
+    Edges are longer where the normal turns [surfels]; their own lengths (E,) [m] come second. They are
+    relaxed in sweeps back and forth until nothing changes (Bellman and Ford); faster than a heap here. The
+    neighbours of node i are neighbour[start[i]:start[i + 1]], at the lengths beside them.
     """
     count = len(start) - 1
     distance, owner = np.full(count, np.inf), np.full(count, -1)
@@ -191,12 +191,12 @@ def _border_attraction(
 
 @kernel
 def _merge_all(count, node, total, length):  # type: ignore[no-untyped-def]
-    """Merge the two clusters whose common border attracts most in the mean, while one attracts at all.
+    """Merge the two clusters whose common border attracts most in the mean, while any attracts.
 
     Of the clusters of each node (N,) it gives one of its nodes, or one that was merged into it. The sides 2e
     and 2e + 1 of border e lie at the nodes `node` (2B,). `first` (N,) is the first side at each node and
     `after` (2B,) the next at the same one, −1 = none; `degree` (N,) is how many there are. `total` (B,) is
-    attraction times length, and 0 the `length` of a border that is no more.
+    attraction times length; the `length` of a border that is gone is 0.
     """
     first, after, degree = np.full(count, -1), np.full(len(node), -1), np.zeros(count, dtype=np.intp)
     parent, shared = np.arange(count), np.full(count, -1)
@@ -279,9 +279,9 @@ def _absorb_slivers(
 
 
 def wide_parts(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Which parts 0 … n of a label image (H, W) have a sample amid eight of their own.
+    """Which parts 0 … n of a label image (H, W) have a sample among eight of their own.
 
-    At the image's border what lies beyond it speaks for neither.
+    Beyond the image's border, nothing counts for either.
     """
     wide = np.zeros(int(labels.max(initial=0)) + 1, dtype=np.bool_)
     around = (
@@ -293,7 +293,7 @@ def wide_parts(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
 
 
 def hollowness(points: Array, normals: Array, part: NDArray[np.integer]) -> Array:
-    """How much parts 0 … P − 1 look inwards: mean cosine (P,) between normals and the way to their middle.
+    """How much parts 0 … P − 1 face inwards: mean cosine (P,) of normals to the direction of the middle.
 
     0 on a plane, positive on the inside of a bowl, negative on the outside. Points are (N, 3) [m].
     """

@@ -18,15 +18,15 @@ from caryatid.sensing.clouds import oriented_points
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 
 WHOLE = 0.1
-"""What is smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
+"""A piece smaller than this share of a mask's largest body is a crumb [1]; something thin may cut a body."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Observation:
-    """What one view shows.
+    """One view, perceived.
 
     Attributes:
-        view: The view, posed and thinned; None where the source was a cloud.
+        view: The view, posed and thinned; None for a cloud.
         cloud: Oriented points in the world frame with labels: 0 nothing, 65535 the support surface.
         pixels: Flat index (N,) of each point in the image, or in the cloud it came from.
         surface: The support surface as this view shows it.
@@ -78,17 +78,17 @@ def observe(
     known: SupportSurface | None,
     rng: np.random.Generator,
 ) -> Observation:
-    """Find the support surface and the parts on it.
+    """Find the support surface and the segments on it.
 
     Args:
         source: A view (only the first one may lack a pose: the table then gives it one) or a cloud, z up.
         config: All stages' settings.
-        segmentation: `labels` demands labels, `auto` ignores them, None takes them where they are given.
-        known: The support surface as known before, or None.
+        segmentation: `labels` requires labels, `auto` ignores them, None uses them where given.
+        known: The known support surface, or None.
         rng: Source of the samples.
 
     Raises:
-        InputError: Labels are demanded and missing, or a later view has no pose.
+        InputError: Required labels are missing, or a later view has no pose.
         NoSurfaceError: No support surface is known, and none seen.
         PerceptionError: There are no readings.
     """
@@ -119,7 +119,7 @@ def observe(
 
 
 def _with_whole_masks(view: View, jump: float) -> View:
-    """Take from the masks of a view the crumbs they show of other things, beyond a jump of 1/z [1/m].
+    """Remove from the masks of a view their crumbs of other objects, beyond a jump of 1/z [1/m].
 
     Masks drawn or learned are a few pixels too wide, and pixels at depth edges mix both sides.
     """
@@ -180,7 +180,7 @@ def label_image(observation: Observation, source: View | Cloud) -> NDArray[np.in
 
 
 def thinned(source: View | Cloud, config: CloudConfig) -> View | Cloud:
-    """Return every n-th pixel of a view whose pixels are nearer to each other than points need be."""
+    """Return every n-th pixel of a view whose pixels are denser than needed."""
     step = 1 if isinstance(source, Cloud) else int(config.voxel * source.K[0, 0] / config.max_depth)
     return source.every(step) if isinstance(source, View) and step > 1 else source
 
@@ -188,9 +188,9 @@ def thinned(source: View | Cloud, config: CloudConfig) -> View | Cloud:
 def _points(
     source: View | Cloud, config: Config, known: SupportSurface | None = None
 ) -> tuple[Cloud, NDArray[np.intp]]:
-    """Oriented points of a view, and their pixels; of a cloud, all there are.
+    """Oriented points of a view, and their pixels; for a cloud, all its points.
 
-    What is further below the known support surface than that may be sought is left out, unless labelled.
+    Unlabelled points further below the known support surface than its search range are left out.
     """
     if isinstance(source, Cloud):
         if len(source) == 0:
@@ -226,13 +226,13 @@ def _why_nothing(view: View, config: CloudConfig) -> str:
 def level_transform(
     source: View | Cloud, config: Config, rng: np.random.Generator, *, use_labels: bool = False
 ) -> Array:
-    """`T_world_source` (4, 4) by the support plane: of a view without a pose, a cloud in its sensor's frame.
+    """`T_world_source` (4, 4) by the support plane, for a view without a pose or a raw cloud.
 
     Args:
         source: The view or cloud.
         config: How points and planes are found.
         rng: Draws the hypotheses.
-        use_labels: Leave out what belongs to a labelled object.
+        use_labels: Leave out points of labelled objects.
 
     Raises:
         NoSurfaceError: There is no support surface.
@@ -253,7 +253,7 @@ def _surface(
     config: Config,
     rng: np.random.Generator,
 ) -> SupportSurface:
-    """Find the support surface in points that belong to no given object: near the known one, or anywhere."""
+    """Find the support surface in points without a labelled object: near the known one, or anywhere."""
     loose = np.ones(len(cloud), dtype=bool) if given is None else given == 0
     if known is None and not loose.any():
         raise NoSurfaceError(
@@ -262,8 +262,8 @@ def _surface(
         )
     if known is not None:
         loose &= np.abs(known.height(cloud.points_world)) < config.surface.search
-    # Spread evenly, 20,000 points give its height to 0.1 mm. Once it is known a quarter will do: as many of a
-    # first view's are the table's, the rest is floor.
+    # Spread evenly, 20,000 points give its height to 0.1 mm. Once it is known, a quarter is enough: as many
+    # of a first view's are the table's, the rest is floor.
     index, (count, planes) = np.flatnonzero(loose), (20_000, 6) if known is None else (5_000, 1)
     some = cloud.select(index[:: max(1, len(index) // count)])
     try:

@@ -1,4 +1,4 @@
-"""A view as automatic segmentation samples it: oriented points of what stands on the support surface."""
+"""A view sampled for automatic segmentation: oriented points above the support surface."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Labels = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Samples:
-    """The foreground of a view on a grid of pixels (H, W), and what holds for the N samples on it.
+    """The foreground of a view on a grid of pixels (H, W), and the N samples on it.
 
     Attributes:
         grid: Rows and columns of the view that are the grid's.
@@ -29,7 +29,7 @@ class Samples:
         points_camera: (N, 3) [m].
         normals_camera: Unit normals (N, 3).
         height: Over the support surface (N,) [m].
-        depth: Readings (H, W) [m], 0 = none; of all that is seen, not of the foreground only.
+        depth: Readings (H, W) [m], 0 = none; of the whole view, not only of the foreground.
         rgb: Colours (H, W, 3), or None.
         K: Pinhole matrix (3, 3) of the grid [px].
     """
@@ -44,7 +44,7 @@ class Samples:
     K: Array
 
     def image(self, part: Labels) -> Labels:
-        """Lay out the parts (N,) of the samples on the grid (H, W), 0 elsewhere."""
+        """Put the parts (N,) of the samples on the grid (H, W), 0 elsewhere."""
         image = np.zeros(self.places.shape, dtype=np.int32)
         image[self.places] = part
         return image
@@ -59,8 +59,8 @@ def take_samples(
 ) -> Samples:
     """Take oriented points of the foreground, which is not empty, on a grid of pixels.
 
-    Where the view has no normals of its own, point and normal are those of a plane through the readings
-    around the pixel that ends at creases. The smooth planes of `sensing` will not do: they round creases.
+    If the view has no normals of its own, point and normal are those of a plane through the readings around
+    the pixel that ends at creases. The smooth planes of `sensing` are unsuitable: they round creases.
 
     Args:
         view: The view; without a pose, the surface is in the camera frame.
@@ -79,7 +79,7 @@ def take_samples(
     x, y = (column - view.K[0, 2]) / view.K[0, 0], (row - view.K[1, 2]) / view.K[1, 1]
     rays = np.column_stack([x, y, np.ones(len(row))])
     if view.normals_camera is None:
-        scale = view.K[0, 0] / float(np.median(depth[places]))  # Of the usual object [px/m].
+        scale = view.K[0, 0] / float(np.median(depth[places]))  # For the usual object [px/m].
         # 13 mm at the objects' median distance; fewer than 5 px leave the noise, more than 13 px cost time.
         radius = int(np.clip(np.floor(0.013 * scale / 2.0), 2, 6))
         radius = min(radius, max(1, round((clouds.normal_size * scale - 1.0) / 2.0)))
@@ -114,8 +114,8 @@ def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-
     """Planes 1/z = c + a·du + b·dv (N, 3) [1/m, 1/m per px] of the surface around pixels, up to its creases.
 
     By least squares: first over the readings of a narrow window that lie near the pixel's own, then in two
-    rounds over those of a wide one that lie near the plane. Where a wide window determines none, the plane
-    stays as it was; where readings are too few for a first plane it is zero.
+    rounds over those of a wide one that lie near the plane. If a wide window determines none, the plane
+    stays as it was; if readings are too few for a first plane, it is zero.
     """
     planes = np.zeros((len(pixels), 3))
     side = 2.0 * radius + 1.0
@@ -123,7 +123,8 @@ def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-
         row, column, plane = pixels[n, 0], pixels[n, 1], planes[n]
         own = float(image[row, column])
         plane[0] = own
-        # A quarter of the window is needed, less is a corner, or flying; and more than readings on a line.
+        # A quarter of the window is needed, because less is a corner or flying pixels; and more than
+        # readings on a line.
         known = _refit(image, row, column, radius, jump, slope, 0.25 * side * side, 0.01, plane)
         if not known or plane[0] <= 0.0:
             plane[0] = plane[1] = plane[2] = 0.0
@@ -132,8 +133,8 @@ def _fit_planes(image, pixels, radius, jump, slope):  # type: ignore[no-untyped-
         plane[2] *= own / plane[0]
         plane[0] = own
         for _ in range(2):
-            # Three times the readings that determine a plane even out their noise, if not on a line. They lie
-            # as near to it as 3σ of the sensor at 2 m.
+            # Three times the readings that determine a plane average out their noise, if not on a line. They
+            # lie as near to it as 3σ of the sensor at 2 m.
             if not _refit(image, row, column, 5, 0.004, 0.0, 9.0, 12.0, plane):
                 break
     return planes

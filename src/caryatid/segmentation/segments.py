@@ -1,4 +1,4 @@
-"""Automatic segmentation: what stands on the support surface, in convex parts of one colour, some merged."""
+"""Automatic segmentation: convex parts of one colour on the support surface, some merged."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 PLAIN = 0.02
-"""How much the shares of red, green and blue differ on a thing of one colour [1]."""
+"""How much the shares of red, green and blue differ on an object of one colour [1]."""
 
 
 def segment(
@@ -37,7 +37,7 @@ def segment(
     fit_config: FitConfig,
     rng: np.random.Generator,
 ) -> Labels:
-    """Cut one view into the parts that stand on the support surface.
+    """Cut one view into the parts on the support surface.
 
     Args:
         view: The view; without a pose, the surface is in the camera frame.
@@ -60,14 +60,14 @@ def segment(
     edges, steps = grid_edges(samples.places, points, normals, config.edge_jump)
     part = convex_parts(points, normals, edges, config, steps)
     wide = wide_parts(samples.image(part))
-    # What stands beside the surface, as at its edge or in the room behind, is not an object on it.
+    # Something beside the surface, at its edge or in the room behind, is not an object on it.
     over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
     part = number_by_appearance(_with_share(np.where(wide[part], part, 0), over, 0.5) - 1)
     if samples.rgb is not None:
         part = cut_by_colour(samples.image(part), samples.rgb, config.min_size)[samples.places]
     part, enclosed = merge_insides(samples, part)
     part = merge_occluded(samples, part, config, fit_config, rng)
-    # Readings of the surface that err together get over the clearance, but not twice as high.
+    # Readings of the surface with a common error exceed the clearance, but not by twice as much.
     part = number_by_appearance(_with_share(part, samples.height > 2.0 * config.clearance, 0.05) - 1)
     labels[samples.grid] = samples.image(part)
     around = tuple(slice(side.start, side.stop) for side in samples.grid)
@@ -75,7 +75,7 @@ def segment(
     waiting = foreground[around] & (labels[around] == 0)
     _spread_labels(labels[around], np.flatnonzero(waiting), view.depth[around], jump, rounds)
     if enclosed.any():
-        # The bottom of a bowl is as near to the surface as the surface's own readings.
+        # The bottom of a bowl is as low as the surface's own readings.
         low = surface.pixels_over(view, -config.clearance, config.clearance, config.margin)[around]
         low &= enclosed.repeat(config.stride, 0).repeat(config.stride, 1)[: low.shape[0], : low.shape[1]]
         waiting = low & (labels[around] == 0)
@@ -117,7 +117,7 @@ def segment_cloud(cloud: Cloud, surface: SupportSurface, config: SegmentationCon
 
 @kernel
 def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-untyped-def]
-    """Bring labels (H, W) to waiting pixels (N,), ascending, no depth step from a labelled neighbour.
+    """Spread labels (H, W) to waiting pixels (N,), ascending, without a depth step from a labelled neighbour.
 
     In each round a pixel takes the label to its right, then others to their left, below and above. There is a
     step where depth differs by more than a jump at 1 m, times z² [m].
@@ -127,7 +127,7 @@ def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-unt
     for turn in range(4 * rounds):
         down, right = ((0, 1), (0, -1), (1, 0), (-1, 0))[turn % 4]
         for step in range(left):
-            # Against the direction labels are taken from, so that none moves on in the same turn.
+            # Against the direction that labels come from, so that none spreads twice in one turn.
             place = waiting[step] if down + right > 0 else waiting[left - 1 - step]
             row, col = place // width, place % width
             v, u = row + down, col + right
@@ -146,11 +146,11 @@ def _spread_labels(labels, waiting, depth, jump, rounds):  # type: ignore[no-unt
 
 
 def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labels:
-    """Cut parts that consist of plainly coloured pieces with straight borders, and of hardly anything else.
+    """Cut parts that consist almost only of pieces of one plain colour each with straight borders.
 
-    This tells flush boxes apart. A printed box has more colours, or borders all over; it stays whole. Parts
-    are an image (H, W), 1 … n, and so are colours (H, W, 3); pieces that are cut off, of `min_size` pixels at
-    least, get numbers above n.
+    This separates flush boxes. A printed box has more colours, or borders all over; it stays whole. Parts
+    are an image (H, W), 1 … n, and so are colours (H, W, 3); pieces that are cut off, of at least `min_size`
+    pixels, get numbers above n.
     """
     result = labels.copy()
     shares = colour_shares(rgb)
@@ -175,7 +175,7 @@ def cut_by_colour(labels: Labels, rgb: NDArray[np.uint8], min_size: int) -> Labe
 
 
 def colour_shares(rgb: NDArray[np.uint8]) -> Array:
-    """Shares of red, green and blue (N, 3) or (H, W, 3) of such colours, which shading leaves as they are."""
+    """Shares of red, green and blue (N, 3) or (H, W, 3) of such colours, which shading does not change."""
     bright = rgb.astype(np.float64) + 1.0
     shares: Array = bright / bright.sum(axis=-1, keepdims=True)
     return shares
@@ -183,7 +183,7 @@ def colour_shares(rgb: NDArray[np.uint8]) -> Array:
 
 def _colour_patches(labels: Labels, shares: Array) -> NDArray[np.intp]:
     """Connected patches (H, W), 1 … n, of one part in which neighbours' colours (H, W, 3) are alike."""
-    # Between each two pixels is a place that is set where they are connected.
+    # A place between two pixels is set if they are connected.
     height, width = labels.shape
     connected = np.zeros((2 * height - 1, 2 * width - 1), dtype=np.bool_)
     connected[::2, ::2] = labels > 0
@@ -216,15 +216,14 @@ def merge_occluded(
     fit_config: FitConfig,
     rng: np.random.Generator,
 ) -> Labels:
-    """Merge parts of one object that something nearer cuts apart.
+    """Merge parts of one object that something nearer separates.
 
     Two parts are one object when a nearer surface hides what would lie between them, neither rises above the
     other's tangent planes, a single shape explains as many samples of both as the shape of each does, and
-    that shape fills no space seen empty. The parts (N,) of samples get the number of the larger where two
-    are merged.
+    that shape fills no space seen empty. Merged parts (N,) of samples get the number of the larger.
     """
     inverse_depth = _inverse_depth(samples, part > 0)
-    # Samples are evened out and hold few outliers.
+    # Samples are smoothed and hold few outliers.
     quick = replace(fit_config, hypotheses=40, polish=1, max_points=300)
     refused: set[tuple[int, int]] = set()
     while True:
@@ -258,7 +257,7 @@ def _candidates(
 
 
 def _inverse_depth(samples: Samples, own: Mask) -> Array:
-    """1/z (H, W) [1/m] of all that is seen, 0 = no reading; of the parts' samples as they are evened out."""
+    """1/z (H, W) [1/m] of the whole view, 0 = no reading; smoothed at the parts' samples."""
     inverse_depth = np.zeros(samples.depth.shape)
     np.divide(1.0, samples.depth, out=inverse_depth, where=samples.depth > 0.0)
     places = samples.places.copy()
@@ -287,9 +286,9 @@ def _hidden_pairs(
 def _convex_together(
     samples: Samples, part: Labels, pair: tuple[int, int], config: SegmentationConfig
 ) -> bool:
-    """Whether hardly a sample of one part rises above the tangent plane of one of the other.
+    """Whether almost no sample of one part rises above a tangent plane of the other.
 
-    It may by a height, and by an angle as normals err; creases are rounded.
+    It may by a height, and by an angle, the error of normals; creases are rounded.
     """
     own = [np.flatnonzero(part == number) for number in pair]
     first, second = (index[:: max(1, len(index) // 60)] for index in own)
@@ -302,10 +301,10 @@ def _convex_together(
 
 
 def _is_one(joint: Fit | None, alone: list[tuple[Mask, Fit | None]], samples: Samples) -> bool:
-    """Whether a shape explains about as many samples of each part as its own and fills nothing seen empty."""
+    """Whether a shape explains each part about as well as its own does, and fills nothing seen empty."""
     if joint is None:
         return False
-    # Faces towards the camera behind which it saw something; edges fray.
+    # Faces towards the camera that it looked through; edges are frayed.
     behind = depth_behind(joint.shape, samples.depth, samples.K)
     if len(behind) == 0 or float((behind > 0.02).mean()) > 0.1:
         return False
@@ -316,7 +315,7 @@ def _is_one(joint: Fit | None, alone: list[tuple[Mask, Fit | None]], samples: Sa
 
 
 def _explained(shape: Shape, samples: Samples, own: Mask) -> float:
-    """Share of a part's evened out samples that lie within 3σ of a shape and face as it does."""
+    """Share of a part's smoothed samples that lie within 3σ of a shape and face as it does."""
     distance, outward = Primitives.of([shape]).gradient(0, samples.points_camera[own])
     cosine = np.sum(outward * samples.normals_camera[own], axis=1)
     return float(((np.abs(distance) < 0.006) & (cosine > 0.7)).mean())
@@ -327,8 +326,8 @@ def _count_gaps(labels, inverse_depth, jump, longest, votes):  # type: ignore[no
     """Add one for each row on which one part ends, another begins, and all between lies nearer.
 
     Between, each reading of inverse depth (H, W) [1/m] must lie nearer than the line from end to beginning by
-    the jump [1/m]; a pixel without one, 0, says nothing, but one at least must be nearer. Two pixels at
-    either end of a gap mix both sides. Gaps of up to `longest` pixels are looked across.
+    the jump [1/m]; a pixel without one, 0, does not count, but at least one must be nearer. Two pixels at
+    either end of a gap mix both sides. Gaps are at most `longest` pixels wide.
     """
     height, width = labels.shape
     for row in range(height):

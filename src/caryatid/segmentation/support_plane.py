@@ -51,8 +51,8 @@ class SupportSurface:
     def pixels_over(self, view: View, low: float, high: float, margin: float = np.inf) -> Mask:
         """Which pixels (H, W) of a view show something between two heights [m] over the surface.
 
-        The margin is as of `over`; where it is infinite, what is anywhere above or below counts. Where the
-        view has no pose, the surface is in the camera frame.
+        The margin is as for `over`; if it is infinite, anything above or below counts. If the view has no
+        pose, the surface is in the camera frame.
         """
         surface = self if view.T_world_camera is None else self.moved(transforms.invert(view.T_world_camera))
         x, y = ((np.arange(n) - view.K[k, 2]) / view.K[k, k] for k, n in enumerate(view.depth.shape[::-1]))
@@ -88,7 +88,7 @@ class _Plane(NamedTuple):
 
 
 class _Scene(NamedTuple):
-    """Points (N, 3) [m] and normals (N, 3) among which planes are sought, what is up (3,), and limits."""
+    """Points (N, 3) [m] and normals (N, 3) to search for planes, the up direction (3,), and limits."""
 
     points: Array
     normals: Array
@@ -98,7 +98,7 @@ class _Scene(NamedTuple):
     def largest_plane(self, among: Mask, rng: np.random.Generator) -> _Plane | None:
         """MSAC over three-point hypotheses, and with `up` also one-point ones; refined on all the points.
 
-        400 hypotheses find a plane of a fifth of the points with confidence 0.96; 4000 points judge them.
+        400 hypotheses find a plane of a fifth of the points with confidence 0.96; 4000 points score them.
         """
         points, normals, up, config = self
         index = np.flatnonzero(among)
@@ -153,10 +153,10 @@ class _Scene(NamedTuple):
         return _Plane(normal, offset, inliers, area) if inliers.sum() >= config.min_points else None
 
     def _main_part(self, normal: Array, inliers: Mask) -> tuple[Mask, float]:
-        """Keep the largest part of a plane that holds together over gaps; say how much of it is seen [m²]."""
+        """Keep the largest part of a plane that is connected across gaps; say how much of it is seen [m²]."""
         index = np.flatnonzero(inliers)
         flat = _basis(normal) @ np.take(self.points, index, axis=0).T
-        # Cells are wider than the points' spacing at 3 m; where a cloud is not in metres, they are no more
+        # Cells are wider than the points' spacing at 3 m; if a cloud is not in metres, there are no more
         # than memory holds.
         cell = max(0.03, float((flat.max(axis=1) - flat.min(axis=1)).max()) / 1000.0)
         cells = np.floor(flat / cell).astype(np.intp)
@@ -183,18 +183,18 @@ def find_support_surface(
 ) -> SupportSurface:
     """Find the table among the planes of a scene.
 
-    The planes across `up` are taken out one by one, largest first. Those that have a table-sized plane a
-    storey above them are floors; of the rest the one with most points, what the camera looks at, is the
-    table. Without `up`, the largest plane that faces the camera and has the rest of the scene in front of it
-    gives the direction.
+    The planes across `up` are taken out one by one, largest first. Those with a table-sized plane a storey
+    above them are floors; of the rest, the one with most points, at which the camera looks, is the table.
+    Without `up`, the largest plane that faces the camera and has the rest of the scene in front of it gives
+    the direction.
 
     Args:
         cloud_points: (N, 3) [m]; in the camera frame if `up` is None.
         normals: Unit normals (N, 3) towards the sensor.
-        up: Upward direction (3,), or None where the camera's pose is not known.
+        up: Upward direction (3,), or None if the camera's pose is unknown.
         config: Tolerances and sizes.
         rng: Draws the hypotheses.
-        max_planes: Horizontal planes looked at, largest first, before the table is chosen.
+        max_planes: Maximum number of horizontal planes, largest first, among which the table is chosen.
 
     Raises:
         NoSurfaceError: No plane has enough points.
@@ -221,7 +221,7 @@ def find_support_surface(
 
 
 def _tried(scene: _Scene, rng: np.random.Generator) -> str:
-    """Say among what a support surface was sought in vain, and what may help."""
+    """Say why no support surface was found, and what may help."""
     points, normals, up, config = scene
     if len(points) < config.min_points:
         few = f"only {len(points)} points are on a surface, {config.min_points} are needed"
@@ -240,10 +240,7 @@ def _tried(scene: _Scene, rng: np.random.Generator) -> str:
 def refitted(
     surface: SupportSurface, points: Array, normals: Array, up: Array, config: SurfaceConfig
 ) -> SupportSurface | None:
-    """Fit a support surface that is known within the tolerance to more points (N, 3) [m] with normals (N, 3).
-
-    None where too few are near it.
-    """
+    """Refit a known support surface to points (N, 3) [m] with normals (N, 3); None if few are near it."""
     normal, everywhere = surface.normal_world, np.ones(len(points), dtype=bool)
     scene = _Scene(points, normals, up, config)
     plane = scene.refined(everywhere, normal, float(normal @ surface.point_world))
@@ -252,7 +249,7 @@ def refitted(
 
 def _choose_table(planes: list[_Plane], up: Array, config: SurfaceConfig) -> _Plane:
     """The plane with most points among those that have no table a storey above them."""
-    # Where each cuts the line along `up` through the origin. A shelf behind has few points for a table.
+    # Where each cuts the line along `up` through the origin. A shelf behind has too few points for a table.
     heights = [plane.offset / (plane.normal @ up) for plane in planes]
     counts = [np.count_nonzero(plane.inliers) for plane in planes]
     sizeable = [plane.area >= config.min_area for plane in planes]
@@ -294,7 +291,7 @@ def _basis(normal: Array) -> Array:
 
 @kernel
 def _score_planes(share, data):  # type: ignore[no-untyped-def]
-    """Score a share of the planes (4, B), n·p = offset: 1 − (distance/tolerance)² for each point that agrees.
+    """Score a share of the planes (4, B), n·p = offset: 1 − (distance/tolerance)² for each point that fits.
 
     A point further than three tolerances behind a plane costs it the penalty.
     """

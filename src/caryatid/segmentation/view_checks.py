@@ -18,8 +18,9 @@ log = logging.getLogger(__name__)
 COARSER = 4
 """Edge of the cells in which views are compared [voxels]; points of small images are nearer to each other."""
 THROUGH = 0.2
-"""Share of what a view shows over the table from which it is warned of what lies where earlier views looked
-through [1]; of right poses a twentieth does."""
+"""Share of what a view shows over the table, in space that earlier views looked through, that leads to a
+warning [1]; with right poses it is a twentieth.
+"""
 
 
 def check_camera(view: View, max_coordinate: float) -> None:
@@ -51,9 +52,9 @@ def check_place(
 
     Args:
         cloud: What the view shows, registered.
-        aligned: Whether registration found what it shows in earlier views.
+        aligned: Whether registration matched it with earlier views.
         surface: The support surface.
-        voxels: What earlier views saw around it.
+        voxels: The map of earlier views.
         config: All settings.
 
     Raises:
@@ -84,13 +85,13 @@ def check_place(
 def check_free(
     name: str, points_world: Array, surface: SupportSurface, voxels: VoxelMap, config: Config
 ) -> None:
-    """Warn where a view shows much over the table where earlier views looked through.
+    """Warn if a view shows much in space over the table that earlier views looked through.
 
     Args:
         name: Name of the view.
         points_world: Points (N, 3) [m] of it that no change explains.
         surface: The support surface.
-        voxels: What earlier views saw around it.
+        voxels: The map of earlier views.
         config: All settings.
     """
     points = points_world[:: max(1, len(points_world) // 20_000)]

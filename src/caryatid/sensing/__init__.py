@@ -1,1 +1,1 @@
-"""What cameras give: views and clouds, normals, registration of views, the voxel map."""
+"""Camera data: views and clouds, normals, registration of views, the voxel map."""

@@ -16,7 +16,7 @@ from caryatid.sensing.views import View
 Image = NDArray[np.float32]
 
 ZERO = np.float32(0.0)
-"""Leaves sums and comparisons in single precision."""
+"""Keeps sums and comparisons in single precision."""
 
 
 def oriented_points(
@@ -43,7 +43,7 @@ def oriented_points(
         points = transforms.transform(T, view.points_camera.reshape(-1, 3)[pixels])
         return points, transforms.rotate(T, given.reshape(-1, 3)[pixels].astype(float)), pixels
     inverse_depth = np.divide(np.float32(1.0), view.depth, out=np.zeros_like(view.depth), where=taken)
-    # The median depth of all readings in range, of every fourth row and column, tells how wide a window is.
+    # The median depth of readings in range, in every fourth row and column, decides how wide a window is.
     radius, readings = config.normal_window // 2, view.depth[::4, ::4][taken[::4, ::4]]
     if len(readings) > 0:
         width = config.normal_size * view.K[0, 0] / float(np.median(readings))
@@ -66,16 +66,16 @@ def local_planes(inverse_depth: Image, radius: int, edge_jump: float, max_slope:
     """Fit a plane to the surface around each pixel, up to its creases and depth edges but not across them.
 
     A plane is linear in inverse depth, 1/z = a·du + b·dv + c, and the noise of a structured-light sensor is
-    nearly even in it: least squares over 7 × 7 readings take it to a quarter or less. Where the readings of a
-    window scatter more than by chance, the pixel takes the plane of the steadiest of the eight windows that
-    end at it, if this holds for its own reading too (the filter of Kuwahara et al. 1976, with planes in place
-    of means).
+    nearly even in it: least squares over 7 × 7 readings reduce it to a quarter or less. If the readings of a
+    window scatter more than by chance, the pixel gets the plane of the steadiest of the eight windows that
+    end at it, if that plane also fits its own reading (the filter of Kuwahara et al. 1976, with planes
+    instead of means).
 
     Args:
         inverse_depth: 1/z (H, W) [1/m], 0 = no reading.
         radius: The window is 2·radius + 1 pixels wide [px].
         edge_jump: Readings further than this from the pixel's own lie beyond a depth edge [1/m].
-        max_slope: Added to it a pixel of distance, so that steep surfaces hold together [1/m per px].
+        max_slope: Added to it per pixel of distance, so that steep surfaces hold together [1/m per px].
 
     Returns:
         a, b, c (3, H, W) [1/m per px, 1/m]; c is 0 where too few readings agree.
@@ -89,10 +89,10 @@ def local_planes(inverse_depth: Image, radius: int, edge_jump: float, max_slope:
     # The usual standard deviation [1/m] of readings about their window's plane, over windows half apart.
     apart = (slice(None, None, radius), slice(None, None, radius))
     noise = float(np.sqrt(np.median(variance[apart][c[apart] > 0.0]))) if (c[apart] > 0.0).any() else 0.0
-    # Variance of a full window's readings that chance may reach: three standard deviations of it.
+    # Variance of a full window's readings within chance: three standard deviations of it.
     limit = np.float32(noise**2 * (1.0 + 3.0 * np.sqrt(2.0 / (2 * radius + 1) ** 2)))
     unsteady = np.flatnonzero((image > 0.0) & ((c == 0.0) | (variance > limit)))
-    # Another window's plane speaks for a reading within 3.5 standard deviations of it.
+    # Another window's plane fits a reading within 3.5 standard deviations of it.
     planes.reshape(4, -1)[:3, unsteady] = _steadier(
         unsteady, image, planes, radius, limit, np.float32(3.5 * noise)
     )
@@ -184,7 +184,7 @@ def _solve(own, sums, enough, a, b, c, variance):  # type: ignore[no-untyped-def
 
 @kernel
 def _steadier(pixels, image, planes, radius, limit, trusted):  # type: ignore[no-untyped-def]
-    """The planes (3, N) of unsteady pixels: each of the steadiest window next to it, or its own."""
+    """The planes (3, N) of unsteady pixels: that of the steadiest window beside each, or its own."""
     height, width = image.shape
     found = np.empty((3, len(pixels)), np.float32)
     for i in range(len(pixels)):
@@ -229,7 +229,7 @@ def _orient(share, data):  # type: ignore[no-untyped-def]
 def estimate_normals(points: Array, viewpoint: Array, neighbours: int) -> Array:
     """Normals of an unorganised cloud: the direction of least spread among each point's neighbours.
 
-    Where the neighbours lie on one line, or on one spot, the normal points straight at the viewpoint.
+    If the neighbours lie on one line or in one spot, the normal points straight at the viewpoint.
 
     Args:
         points: (N, 3) [m].
@@ -240,7 +240,7 @@ def estimate_normals(points: Array, viewpoint: Array, neighbours: int) -> Array:
         Unit normals (N, 3).
     """
     normals, tree, count = np.zeros_like(points), cKDTree(points), min(neighbours, len(points))
-    # Neighbourhoods of some points at a time bound the memory.
+    # Neighbourhoods of some points at a time limit the memory.
     for start in range(0, len(points), 100_000):
         part = slice(start, start + 100_000)
         _, index = tree.query(points[part], k=count)

@@ -1,4 +1,4 @@
-"""From the masks of a learned segmenter to the label image a view takes."""
+"""From the masks of a learned segmenter to a view's label image."""
 
 from __future__ import annotations
 
@@ -16,16 +16,15 @@ Masks = NDArray[np.bool_]
 def labels_from_masks(
     masks: ArrayLike | Sequence[ArrayLike], scores: ArrayLike | None = None, config: MaskConfig | None = None
 ) -> NDArray[np.int32]:
-    """Lay masks that may overlap over each other, the smallest on top, into one label image.
+    """Make one label image of masks that may overlap, the smallest on top.
 
-    A pixel belongs to a mask of scores where its score is at least 0.5; of overlapping ones the largest wins.
-
-    Masks that are too small, as large as a background, doubted by the segmenter, or another mask once more
-    are left out; of two that are the same the one with the better score stays, without scores the first.
+    A pixel belongs to a mask of scores if its score is at least 0.5; of overlapping ones the largest wins.
+    Left out are masks that are too small, as large as a background, of a low score, or duplicates; of two
+    duplicates the one with the better score stays, without scores the first.
 
     Args:
         masks: N masks (N, H, W), or a sequence of (H, W): true where the object is, or its score in [0, 1].
-        scores: The segmenter's confidence in each mask (N,), or None where it gives none.
+        scores: The segmenter's confidence in each mask (N,), or None if it gives none.
         config: What is left out.
 
     Returns:
@@ -33,7 +32,7 @@ def labels_from_masks(
 
     Raises:
         InputError: The masks are not a stack of images of one size, or hold values that are neither true and
-            false nor scores in [0, 1]; or there is not one finite score a mask.
+            false nor scores in [0, 1]; or there is not one finite score per mask.
     """
     config = config or MaskConfig()
     stack, certainty = _stack(masks)
@@ -51,7 +50,7 @@ def labels_from_masks(
     kept &= quality >= config.min_score
     chosen: list[int] = []
     for k in sorted(np.flatnonzero(kept).tolist(), key=lambda k: (-quality[k], k)):
-        # Of the same object masks overlap by more.
+        # Masks of the same object overlap by more.
         if all(_iou(stack[k], stack[other]) <= 0.8 for other in chosen):
             chosen.append(k)
     labels = np.zeros(stack.shape[1:], dtype=np.int32)
@@ -67,7 +66,7 @@ def labels_from_masks(
 
 
 def _stack(masks: ArrayLike | Sequence[ArrayLike]) -> tuple[Masks, NDArray[np.floating] | None]:
-    """The masks (N, H, W), and the score of each of their pixels where scores were given."""
+    """The masks (N, H, W), and the scores of their pixels if given."""
     try:
         stack = np.asarray(masks)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Registration: a new view is laid onto the earlier ones, then all views but the first move jointly.
+"""Registration: a new view is aligned with the earlier ones, then all views but the first move jointly.
 
 Surfels of one view look for correspondences in another; Gauss–Newton on the robust, symmetric point-to-plane
 distance, with the reported poses as priors.
@@ -22,47 +22,51 @@ from caryatid.sensing.surfels import MIN_COSINE, even_sample, surfels_of
 from caryatid.sensing.views import Cloud
 
 BUCKETS = 4096
-"""Lists a view's patches are kept in, by a hash of label and cell [1]; more patches make longer lists."""
+"""Lists in which a view's patches are kept, by a hash of label and cell [1]; more patches make longer
+lists.
+"""
 OUTLIER = 0.3
 """Share of the reach beyond which distances lose their weight [1]."""
 INDEPENDENT = 0.1
-"""Share of the partners that err independently [1]: neighbouring patches err alike."""
+"""Share of the partners with independent errors [1]: neighbouring patches share theirs."""
 
 EDGE = np.dtype(
     [
-        ("still", np.intp),  # The view in which partners were looked for,
-        ("moving", np.intp),  # and the one whose patches looked for them.
-        ("apart", np.float64, 6),  # Twist of the moving view less that of the still one when they did.
-        ("asked", np.float64),  # How many patches looked for a partner,
+        ("still", np.intp),  # The view in which partners were searched for,
+        ("moving", np.intp),  # and the one whose patches searched for them.
+        ("apart", np.float64, 6),  # Twist of the moving view less that of the still one at that time.
+        ("asked", np.float64),  # How many patches searched for a partner,
         ("found", np.float64),  # and how many found one.
         ("misfit", np.float64),  # Sum of their distances [m], none counting more than an outlier.
         ("gradient", np.float64, 6),  # Of half the sum of squares by the moving view's twist.
-        ("information", np.float64, (6, 6)),  # Inverse covariance of one view's twist against the other.
+        ("information", np.float64, (6, 6)),  # Inverse covariance of one view's twist relative to the other.
     ]
 )
-"""What a pair of views says of their poses: half the sum of the partners' squared distances over their
-variance is quadratic in the twist of one view against the other as long as partners keep their weight."""
+"""The evidence of a pair of views about their poses: half the sum of the partners' squared distances over
+their variance is quadratic in the twist of one view relative to the other, as long as partners keep their
+weight.
+"""
 
 Outcome = Literal[
     "reference", "fits as reported", "aligned", "too few partners", "beyond the limits", "no better"
 ]
-"""What became of a view's alignment when it came; later views may move it whatever that was."""
+"""Outcome of a view's alignment when it was new; later views may move it in any case."""
 
 EXACT = ("reference", "fits as reported")
-"""Views that stay where they were reported, whatever comes later."""
+"""Views that stay where they were reported for good."""
 
 
 class ViewRegistration:
     """Where the views are; the first one defines the world.
 
     Args:
-        pivot_world: What twists turn about (3,) [m]; best amid the points.
+        pivot_world: Pivot of twists (3,) [m]; best amid the points.
         config: Expected errors and limits.
 
     Attributes:
         twists: Move (V, 6) of each view from where it was reported, 3 × m and 3 × rad about the pivot, as
             `add` returned it.
-        outcomes: What became of the alignment of each.
+        outcomes: Outcome of each alignment.
     """
 
     def __init__(self, pivot_world: Array, config: RegistrationConfig) -> None:
@@ -82,21 +86,21 @@ class ViewRegistration:
         return self.outcomes[-1] not in ("too few partners", "beyond the limits")
 
     def copy(self) -> ViewRegistration:
-        """Return a registration that knows the same and goes on by itself; the views so far are shared."""
+        """Return an independent copy; the views so far are shared."""
         other = copy.copy(self)
         other.outcomes, other._views = self.outcomes.copy(), self._views.copy()
         return other
 
     def add(self, cloud: Cloud, *, same_labels: bool) -> dict[int, Array]:
-        """Take in a view.
+        """Add a view.
 
         Args:
             cloud: Its labelled points in the world as reported; 65535 = the support surface.
             same_labels: Whether labels mean the same in every view.
 
         Returns:
-            How the new view is to be moved and, on top of what they were moved before, earlier ones: view →
-            transform (4, 4) of the world.
+            Moves of the new view and, in addition to earlier moves, of earlier ones: view → transform (4, 4)
+                of the world.
         """
         new = len(self.outcomes)
         self._views[new] = self._prepared(cloud, same_labels=same_labels)
@@ -114,7 +118,7 @@ class ViewRegistration:
         return moves
 
     def _prepared(self, cloud: Cloud, *, same_labels: bool) -> _View:
-        """What is kept of a view; errors of its orientation turn about the camera."""
+        """The stored form of a view; errors of its orientation turn about the camera."""
         config, arm = self._config, np.zeros(3)
         if cloud.viewpoint_world is not None:
             arm = cloud.viewpoint_world - self._pivot
@@ -130,7 +134,7 @@ class ViewRegistration:
         return _View(found, starts, sample, information)
 
     def _lay(self) -> Outcome:
-        """Lay the newest view onto those that are kept, from where it was reported and coarse to fine."""
+        """Align the newest view with those that are kept, from its reported pose, coarse to fine."""
         config, reach = self._config, self._config.reaches[-1]
         outlier = OUTLIER * reach
         *others, new = self._views
@@ -171,7 +175,7 @@ class ViewRegistration:
         return outcome
 
     def _matched(self, pairs: Iterable[tuple[int, int]]) -> NDArray[Any]:
-        """What pairs (still, moving) say of each other where they are, from the whole of their samples."""
+        """Evidence of pairs (still, moving) at their current poses, from all their samples."""
         pairs, reach = list(pairs), self._config.reaches[-1]
         edges, upper = np.zeros(len(pairs), EDGE), np.triu_indices(6)
         found = self._correspondences(pairs, self._now, reach)
@@ -186,17 +190,17 @@ class ViewRegistration:
         return edges
 
     def _descend(self, twists: Array, reach: float) -> tuple[Array, float, float]:
-        """Move the newest view such that partners come to lie in each other's planes; the others stay.
+        """Move the newest view so that partners lie in each other's planes; the others stay.
 
         Gauss–Newton, maximum a posteriori, starts from `twists` (V, 6). It gives its twist (6,), and the mean
-        distance [m] over the patches that looked for a partner, an outlier's without one, before and after.
+        distance [m] over the patches that searched for a partner, an outlier's without one, before and after.
         """
         *others, new = self._views
         view, pairs = self._views[new], [(v, new) for v in others]
-        # 250 patches will do here; the fewer they are, the more of them err independently.
+        # 250 patches are enough here; the fewer they are, the more independent their errors.
         stride = max(1, len(view.sample) * len(others) // 250)
         independent, outlier = min(1.0, stride * INDEPENDENT), OUTLIER * reach
-        # What a step this small leaves, the next reach or the joint solution takes.
+        # The next reach or the joint solution covers what so small a step leaves.
         settled = 0.1 * outlier
         twists, misfits = twists.copy(), []
         for _ in range(3):
@@ -229,9 +233,9 @@ class ViewRegistration:
         return bool(turn > np.radians(self._config.max_rotation) or move > self._config.max_translation)
 
     def _refine(self) -> None:
-        """Move all kept views together that are not exact, unless that lays them worse.
+        """Move all kept views together that are not exact, unless they then fit worse.
 
-        Views that few partners tie to the others stay where they are.
+        Views that few partners link to the others stay in place.
         """
         before, edges_before = self._now, self._edges
         for _ in range(3):
@@ -249,12 +253,12 @@ class ViewRegistration:
             self._let_go([])
 
     def _change(self) -> Array:
-        """By how much (E, 6) pairs moved since partners were looked for."""
+        """How far (E, 6) pairs moved since partners were searched for."""
         moving, still = (self._now[self._edges[end]] for end in ("moving", "still"))
         return np.asarray(moving - still - self._edges["apart"], dtype=np.float64)
 
     def _mean_misfit(self, edges: NDArray[Any]) -> float:
-        """Mean distance [m] over the patches that looked for a partner; one without is an outlier."""
+        """Mean distance [m] over the patches that searched for a partner; one without is an outlier."""
         asked, found = edges["asked"].sum(), edges["found"].sum()
         missing = (asked - found) * OUTLIER * self._config.reaches[-1]
         return float((edges["misfit"].sum() + missing) / max(asked, 1))
@@ -267,7 +271,7 @@ class ViewRegistration:
         return number >= self._config.min_points
 
     def _solve(self) -> bool:
-        """Move all views to where the pairs want them, if any is free; let go of what would go too far."""
+        """Move all views as the pairs suggest, if any is free; free those that would move too far."""
         while True:
             enough = self._enough()
             free = [v for v in self._views if enough[v] and self.outcomes[v] not in EXACT]
@@ -279,7 +283,7 @@ class ViewRegistration:
             self._let_go(far)
 
     def _solution(self, free: Sequence[int]) -> Array:
-        """Where all views are (V, 6) once the pairs and the reported poses moved the free ones together."""
+        """Twists (V, 6) of all views after the pairs and the reported poses moved the free ones together."""
         information, count, each = self._edges["information"], len(free), np.arange(len(free))
         gradient = self._edges["gradient"] + np.einsum("eij,ej->ei", information, self._change())
         reported = np.array([self._views[v].information for v in free]).reshape(-1, 6, 6)
@@ -301,7 +305,7 @@ class ViewRegistration:
         return moved
 
     def _moves(self, views: dict[int, _View]) -> dict[int, Array]:
-        """How views are to be moved now: the newest, and those whose points moved since they last were."""
+        """Moves of views: of the newest, and of those whose points moved since their last move."""
         numbers, moves, twists = list(views), {}, self.twists.copy()
         T, T_told = (twist_transform(t[numbers], self._pivot) for t in (self._now, self.twists))
         for v, now, told in zip(numbers, T, T_told, strict=True):
@@ -314,14 +318,14 @@ class ViewRegistration:
         return moves
 
     def _let_go(self, views: Sequence[int]) -> None:
-        """Let views stay where they are from now on, and lay no others onto them."""
+        """Freeze views, and align no others with them."""
         for v in views:
             del self._views[v]
         kept = [np.isin(self._edges[end], list(self._views)) for end in ("still", "moving")]
         self._edges = self._edges[np.logical_and(*kept)]
 
     def _least_missed(self) -> int:
-        """The kept view whose surfaces another one shows best; the first that nothing ties to any, if any."""
+        """The kept view whose surfaces another one shows best; or the first that nothing links to another."""
         kept, edges, enough = list(self._views), self._edges, self._enough()
         loose = [v for v in kept[1:] if not enough[v]]
         if loose:
@@ -334,11 +338,11 @@ class ViewRegistration:
 
 
 class _View(NamedTuple):
-    """A view as registration keeps it.
+    """A view as registration stores it.
 
     Its patches (P, 8) lie in the world as reported, sorted to be found, with where the list of each bucket
-    begins (BUCKETS + 1,). A sample of them (S, 8) looks for partners in other views. The information is the
-    inverse covariance (6, 6) of the reported pose's error, as a twist about the pivot.
+    begins (BUCKETS + 1,). A sample of them (S, 8) searches for partners in other views. The information is
+    the inverse covariance (6, 6) of the reported pose's error, as a twist about the pivot.
     """
 
     patches: Array
@@ -352,7 +356,7 @@ def twist_transform(twist: Array, pivot_world: Array) -> Array:
 
     Args:
         twist: Twists (..., 6): 3 × m, 3 × rad.
-        pivot_world: What is turned about (3,) [m].
+        pivot_world: The pivot (3,) [m].
     """
     x, y, z = np.moveaxis(twist[..., 3:], -1, 0)
     angle = np.sqrt(x * x + y * y + z * z)[..., None, None]
@@ -377,7 +381,7 @@ def _bucket(label, x, y, z):  # type: ignore[no-untyped-def]
 
 @kernel
 def _find_correspondences(samples, patches, starts, T, T_other, T_back, pivot, edge, reach, noise):  # type: ignore[no-untyped-def]
-    """Look for the patch of another view that is nearest in place and direction, and linearise the distance.
+    """Find the patch of another view that is nearest in place and direction, and linearise the distance.
 
     Distance is along the mean of both normals, and its derivative by a move of either view that about the
     middle between the two patches: a move of both views together changes nothing. The samples (S, 8) are
@@ -415,7 +419,7 @@ def _partner(patches, starts, edge, reach, point, normal, label):  # type: ignor
     cx, cy, cz = np.floor(x / edge), np.floor(y / edge), np.floor(z / edge)
     fx, fy, fz = x - cx * edge, y - cy * edge, z - cz * edge
     inside = min(min(fx, edge - fx), min(fy, edge - fy), min(fz, edge - fz))
-    # Directions at right angles count as √2 · 5 cm.
+    # A right angle between directions counts as √2 · 5 cm.
     turned = 2.0 * 0.05 * 0.05
     widest = reach * reach
     best = widest + turned * (1.0 - MIN_COSINE)
@@ -494,9 +498,9 @@ def _normal_equations(rows, step, outlier):  # type: ignore[no-untyped-def]
 def _step_down(rows, twist, information, independent, outlier, steps, settled):  # type: ignore[no-untyped-def]
     """Move a view by Gauss–Newton on the robust distances and its pose as reported; partners stay the same.
 
-    Rows (N, 8) are those of the view where it is. A share of the partners errs independently; a step smaller
-    than settled [m, rad] is the last. It gives the change of the twist (6,), and the number of partners and
-    the sum of their distances [m] before and after (2, 2).
+    Rows (N, 8) are those of the view where it is. A share of the partners has independent errors; a step
+    smaller than settled [m, rad] is the last. It gives the change of the twist (6,), and the number of
+    partners and the sum of their distances [m] before and after (2, 2).
     """
     step, gradient, hessian, ends = np.zeros(6), np.zeros(6), np.zeros((6, 6)), np.zeros((2, 2))
     largest = np.inf

@@ -17,7 +17,7 @@ from caryatid.runtime.parallel import SHARES, kernel, on_threads
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud
 
 MIN_COSINE = 0.9
-"""Cosine of the angle between normals that agree at least [1]."""
+"""Minimum cosine of the angle between normals that agree [1]."""
 OFFSET = 1 << 20
 """Added to a cell's number along an axis, so that three of 21 bits make one key: 10 km of 1 cm cells."""
 
@@ -25,7 +25,7 @@ OFFSET = 1 << 20
 def surfels_of(
     cloud: Cloud, config: RegistrationConfig, *, same_labels: bool
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Average the readings of each voxel that are of one label and face one way.
+    """Average the readings of each voxel that have one label and face one way.
 
     The mean of a dozen readings is several times better than any of them. Patches across an edge, whose
     normals disagree, are left out.
@@ -43,14 +43,14 @@ def surfels_of(
     voxels, kinds, sums = _gathered(cloud.points_world, cloud.normals_world, cloud.labels, config)
     far = kinds // 6 == SUPPORT_LABEL
     count = sums[:, 0]
-    # Rims, and sides at a grazing angle, have few readings; in coarse images all patches have.
+    # Rims, and sides at a grazing angle, have few readings; in coarse images all patches do.
     enough = np.full(len(far), 4.0)
     for alike in (far, ~far):
         if alike.any():
             enough[alike] = min(4, 0.33 * quantile(count[alike], 0.9))
     u, v, w = sums[:, 4:7].T / count
     length = np.sqrt(u * u + v * v + w * w)
-    # Where the mean of the normals is shorter, there is an edge.
+    # If the mean of the normals is shorter, there is an edge.
     keep = np.flatnonzero((count >= enough) & (length > 0.97))
     voxels, kinds, count = voxels[keep], kinds[keep], count[keep]
     x, y, z, u, v, w, xx, xy, xz, yy, yz, zz = means = np.ascontiguousarray(sums[keep, 1:].T) / count
@@ -69,7 +69,7 @@ def surfels_of(
 def _gathered(
     points: Array, normals: Array, labels: NDArray[np.int32], config: RegistrationConfig
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Sum up the readings of each voxel that are of one label, not 0, and face roughly one way.
+    """Sum up the readings of each voxel that have one label, not 0, and face roughly one way.
 
     Of each patch (P,), ascending, it gives its voxel, three cell numbers of 21 bits; its kind, 6·label + (0,
     1, 2 for +x, +y, +z, 3, 4, 5 for −x, −y, −z); and a row (P, 13): how many readings, the sums of their
@@ -96,7 +96,7 @@ def _gathered(
 
 @kernel
 def _gather(points, normals, labels, spacing, spacing_far):  # type: ignore[no-untyped-def]
-    """Do as `_gathered` does with a part of the readings, patches in the order of their first readings."""
+    """Like `_gathered` for a part of the readings, with patches in the order of their first readings."""
     counted, size = 0, 64
     for label in labels:
         counted += label != 0
@@ -126,7 +126,7 @@ def _gather(points, normals, labels, spacing, spacing_far):  # type: ignore[no-u
         if normals[i, way] < 0.0:
             way += 3
         kind = 6 * np.int64(label) + way
-        # Neighbours in the image are often of one patch.
+        # Neighbours in the image often belong to one patch.
         if found == 0 or voxels[k] != voxel or kinds[k] != kind:
             mixed = (voxel ^ (kind << 50)) * np.int64(-7046029254386353131)
             slot = (mixed ^ (mixed >> 32)) & (size - 1)
@@ -149,10 +149,10 @@ def _gather(points, normals, labels, spacing, spacing_far):  # type: ignore[no-u
 def _flattened(
     patches: Array, side: NDArray[np.intp], config: RegistrationConfig
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Give all patches of a flat side its plane's normal; those that do not lie in it are left out.
+    """Give all patches of a flat side its plane's normal; leave out those that do not lie in it.
 
-    A single patch's normal errs by degrees, and more near edges, which many patches of one plane would sum
-    up to the belief that they say something of positions in the plane.
+    A single patch's normal is wrong by degrees, and more near edges. Many such patches of one plane would
+    seem to determine positions in the plane.
     """
     sizes = np.bincount(side)
     tolerance = 1.5 * config.noise
@@ -161,7 +161,7 @@ def _flattened(
     agreement = np.sum(plane * patches[:, 3:6], axis=1)
     lies_in = (np.abs(heights) < 2.0 * tolerance) & (np.abs(agreement) > MIN_COSINE)
     share = np.bincount(side, lies_in) / np.maximum(sizes, 1)
-    # A flat side is 2 cm wide at least: its patches have a standard deviation of 6 mm.
+    # A flat side is at least 2 cm wide: its patches have a standard deviation of 6 mm.
     flat = ((share > 0.7) & (widths > 0.006**2))[side]
     patches[flat, 3:6] = (plane * np.where(agreement < 0.0, -1.0, 1.0)[:, None])[flat]
     # Sides of fewer than six patches are blurred edges.
@@ -198,7 +198,7 @@ def even_sample(side: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     if len(side) <= count:
         return np.arange(len(side))
     sizes = np.bincount(side)
-    # Within a side the patches take turns in an order that spreads them evenly whatever the count.
+    # Within a side, the patches come in an order that spreads them evenly for any count.
     spread = np.mod(np.arange(len(side)) * (np.sqrt(5.0) - 1.0) / 2.0, 1.0)
     order = np.lexsort((spread, side))
     turn = np.arange(len(side)) - np.repeat(np.cumsum(sizes) - sizes, sizes)

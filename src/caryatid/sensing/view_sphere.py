@@ -41,7 +41,7 @@ class ViewSphere:
     def poses(self, directions: Array) -> Array:
         """Camera poses that look at the centre without roll.
 
-        Straight above and below, where that leaves the roll open, the image's top points along world +x.
+        Straight above and below, where the roll is open, the image's top points along world +x.
 
         Args:
             directions: Unit vectors (M, 3) from the centre.

@@ -1,4 +1,4 @@
-"""What a camera gives: one registered RGB-D view, and the oriented points in it."""
+"""Camera data: one registered RGB-D view, and the oriented points in it."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class View(Pictured):
     Attributes:
         depth: Depth along the optical axis (H, W) [m]; 0 or NaN = no reading.
         K: Pinhole matrix (3, 3) [px].
-        T_world_camera: Camera pose (4, 4), OpenCV camera frame, or None where it is not known.
+        T_world_camera: Camera pose (4, 4), OpenCV camera frame, or None if unknown.
         rgb: Colour (H, W, 3) uint8, or None.
-        labels: Object number of each pixel (H, W), 0 = nothing, or None where no segmentation is given. A
+        labels: Object number of each pixel (H, W), 0 = nothing, or None without segmentation. A
             stack of masks (N, H, W), boolean or scores in [0, 1], becomes such an image of segments.
         normals_camera: Surface normals (H, W, 3) in the camera frame, or None to estimate them from depth.
         name: What to call the view in messages.
@@ -64,7 +64,7 @@ class View(Pictured):
         if np.isinf(depth).any() or (depth < 0.0).any():
             bad = "infinite" if np.isinf(depth).any() else "negative"
             raise InputError(self.name, f"depth holds {bad} values", "mark missing readings with 0 or NaN")
-        # What is nearer than a micrometre is not a reading, and its inverse may be infinite.
+        # Anything nearer than a micrometre is not a reading, and its inverse may be infinite.
         depth = np.where(depth < 1e-6, np.float32(0.0), depth)
         object.__setattr__(self, "depth", depth)
         object.__setattr__(self, "K", check_intrinsics(self.K, self.name))
@@ -122,7 +122,7 @@ class View(Pictured):
 
     @property
     def pose(self) -> Array:
-        """`T_world_camera` (4, 4), for code that cannot go on without one.
+        """`T_world_camera` (4, 4), for code that needs one.
 
         Raises:
             InputError: The view has no pose.
@@ -221,19 +221,19 @@ class Cloud(Pictured):
 
 
 class Camera(Protocol):
-    """What gives a view from a pose: simulation, recording or hardware."""
+    """Takes a view from a pose: simulation, recording or hardware."""
 
     def capture(self, T_world_camera: Array) -> View:
         """Take a view.
 
         Args:
-            T_world_camera: Where the camera is to be (4, 4); the view says where it believes it was.
+            T_world_camera: Requested camera pose (4, 4); the view holds the pose the camera believes in.
         """
         ...
 
 
 def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
-    """How far readings lie behind the surface of a shape where it faces the camera.
+    """Distance of readings behind the surface of a shape that faces the camera.
 
     Args:
         shape: In the camera frame.
@@ -241,7 +241,7 @@ def depth_behind(shape: Shape, depth: NDArray[np.float32], K: Array) -> Array:
         K: Pinhole matrix (3, 3) [px].
 
     Returns:
-        Of points about 1 cm apart that are in the image (N,) [m]; −inf where there is no reading.
+        Distances (N,) [m] for points about 1 cm apart in the image; −inf without a reading.
     """
     points, outward = shape.surface(0.01)
     facing = np.einsum("ij,ij->i", points, outward) < 0.0

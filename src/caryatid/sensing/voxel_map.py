@@ -1,10 +1,10 @@
-"""The voxel map: which space around the scene has been seen free, seen occupied, or not seen at all.
+"""The voxel map: the space around the scene, seen free, seen occupied, or unseen.
 
 Each voxel counts the views that hit it (a reading ends in it) and the views that looked through it (a ray
 crosses it and none ends in it: within a view a hit wins). Over several views it is occupied while
-log-odds of `config.hit` and `config.miss` sum to more than nought: with 0.7 and 0.4 one hit outweighs two
-views that looked through. So a surface outlives a registration error that puts it a voxel off in the next
-views, and a stray reading is gone after three views. A ray ends `config.margin` short of its reading, so
+log-odds of `config.hit` and `config.miss` sum to more than zero: with 0.7 and 0.4 one hit outweighs two
+views that looked through. So a surface survives a registration error that puts it a voxel off in the next
+views, and a stray reading disappears after three views. A ray ends `config.margin` short of its reading, so
 noise in depth never carves the surface it hits.
 """
 
@@ -40,8 +40,8 @@ class VoxelMap:
 
     Attributes:
         origin_world: Corner (3,) [m] of voxel [0, 0, 0]; the grid's axes are the world's.
-        hits: Views (X, Y, Z) that had a reading in the voxel; 255 are the most it counts.
-        passes: Views (X, Y, Z) that looked through it; 255 are the most it counts.
+        hits: Number of views (X, Y, Z) with a reading in the voxel, at most 255.
+        passes: Number of views (X, Y, Z) that looked through it, at most 255.
         config: Size and evidence.
     """
 
@@ -52,7 +52,7 @@ class VoxelMap:
 
     @classmethod
     def around(cls, center_world: ArrayLike, config: VoxelConfig) -> VoxelMap:
-        """Build a map in which nothing is known, around the middle of the table top (3,) [m]."""
+        """Build an unknown map around the middle of the table top (3,) [m]."""
         extent = np.asarray(config.extent, dtype=np.float64)
         shape = tuple(int(n) for n in np.ceil(extent / config.size - 1e-9))
         corner = np.array([-extent[0] / 2.0, -extent[1] / 2.0, -config.below])
@@ -71,7 +71,7 @@ class VoxelMap:
 
     @cached_property
     def _known(self) -> tuple[NDArray[np.int8], NDArray[np.intp]]:
-        """States of the voxels, and where they are occupied; few voxels have hits to be weighed."""
+        """States of the voxels, and where they are occupied; few voxels have hits to weigh."""
         states = (self.passes.ravel() > 0).view(np.int8)
         hit = np.flatnonzero(self.hits.ravel() != 0)
         log_odds = _log_odds(self.config)[self.passes.ravel()[hit], self.hits.ravel()[hit]]
@@ -81,10 +81,10 @@ class VoxelMap:
 
     @property
     def occupancy(self) -> NDArray[np.float32]:
-        """Probability (X, Y, Z) that a voxel is occupied: 0.5 where nothing is known, else within the clamp.
+        """Probability (X, Y, Z) that a voxel is occupied: 0.5 if unknown, otherwise within the clamp.
 
-        A view weighs as much as five images of a moving camera, from which the usual clamp is: as many misses
-        reach its lower end.
+        A view weighs as much as five images of a moving camera, for which the usual clamp is made: as many
+        misses reach its lower end.
         """
         low, high = (np.log(p / (1.0 - p)) for p in (0.12, 0.97))
         log_odds = np.clip(5.0 * _log_odds(self.config), low, high)
@@ -99,7 +99,7 @@ class VoxelMap:
         """Return the map with one more view: free along its rays, occupied where they end.
 
         Args:
-            view: A view with a pose. Pixels without a reading say nothing.
+            view: A view with a pose. Pixels without a reading have no effect.
             max_depth: Readings beyond this count as free space up to this depth [m].
         """
         config, T_world_camera = self.config, np.ascontiguousarray(view.pose)
@@ -111,12 +111,12 @@ class VoxelMap:
         return VoxelMap(self.origin_world, hits, passes, config)
 
     def forgotten(self, which: NDArray[np.bool_]) -> VoxelMap:
-        """Return the map as if nobody had looked at some of its voxels (X, Y, Z)."""
+        """Return the map with some of its voxels (X, Y, Z) unseen."""
         hits, passes = (np.where(which, np.uint8(0), counts) for counts in (self.hits, self.passes))
         return VoxelMap(self.origin_world, hits, passes, self.config)
 
     def within(self, shape: Shape, points_world: Array) -> NDArray[np.bool_]:
-        """Which voxels (X, Y, Z) a shape reaches into, or hold one of some points (N, 3) [m]."""
+        """Which voxels (X, Y, Z) a shape reaches into, or contain one of some points (N, 3) [m]."""
         which = np.zeros(self.hits.shape, dtype=np.bool_)
         size, outline = self.config.size, shape.surface(self.config.size)[0]
         low = np.floor((outline.min(axis=0) - self.origin_world) / size).astype(np.intp) - 1
@@ -149,7 +149,7 @@ class VoxelMap:
         """What blocks lines of sight: the voxels seen occupied, and everything inside the shapes.
 
         Args:
-            shapes: Fitted shapes in the world frame: what is hidden of them hides what is behind.
+            shapes: Fitted shapes in the world frame; their unseen parts block views too.
         """
         arrays, size = Primitives.of(shapes), self.config.size
         low, high = ((corner - self.origin_world) / size for corner in arrays.bounds())
@@ -164,7 +164,7 @@ class VoxelMap:
         low, high = low - lowest, high - lowest
         for number, shape in enumerate(shapes):
             if len(shape.parts) > 1:
-                # Kernels know no parts.
+                # Kernels do not know parts.
                 axes = [np.arange(a, b) for a, b in zip(low[number], high[number], strict=True)]
                 index = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
                 inside = shape.signed_distance(origin_world + size * (index + 0.5)) < 0.0
@@ -213,12 +213,12 @@ class VoxelMap:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Occluders:
-    """What stands in the way of looks.
+    """The voxels that block lines of sight.
 
     Attributes:
         origin_world: Corner (3,) [m] of voxel [0, 0, 0] of the grid.
-        grid: 1 where a voxel hides what is behind it (X, Y, Z), 0 elsewhere; outside nothing is.
-        voxels: The map it is of.
+        grid: 1 for a voxel that blocks (X, Y, Z), 0 otherwise; nothing blocks outside.
+        voxels: The map it comes from.
     """
 
     origin_world: Array
@@ -239,7 +239,7 @@ class Occluders:
             clearance: Occluding voxels this near to the point do not count [m]: its own surface.
 
         Returns:
-            (P, T), True where something stands between.
+            (P, T), True if something is in between.
         """
         points, eyes = (np.asarray(x, dtype=np.float64) for x in (points_world, targets_world))
         anywhere, known, worth = np.zeros_like(points), np.zeros(len(points)), np.ones(len(points))
@@ -257,7 +257,7 @@ class Occluders:
         clearance: float,
         cone: float,
     ) -> Array:
-        """Worth of what each camera shows of each point for the first time.
+        """Value of what each camera shows of each point for the first time.
 
         A camera shows a point fully up to 60° from its normal, then as well as the cosine; not at all where
         the point lies outside its image or the line of sight is blocked.
@@ -266,11 +266,11 @@ class Occluders:
             points_world: (P, 3) [m].
             normals_world: Outward unit normals (P, 3); zero where a point looks the same from all sides.
             before: How well each has been shown (P,), from 0 to 1.
-            weights: Worth (P,) of showing each fully.
+            weights: Value (P,) of showing each fully.
             eyes_world: Camera centres (C, 3) [m].
             axes_world: Optical axes (C, 3), unit.
-            clearance: Length of a line of sight's beginning at the point that does not count [m].
-            cone: Least cosine of the angle to the optical axis within the image.
+            clearance: Length at the point's end of a line of sight that does not count [m].
+            cone: Minimum cosine of the angle to the optical axis within the image.
 
         Returns:
             (P, C): weight · (how well it is shown − how well before), 0 where that is less.
@@ -351,7 +351,7 @@ def _count_marks(share, data):  # type: ignore[no-untyped-def]
     """Turn the marks in a share of the map into counts, at most 255; no ray passes where one ends."""
     hits, passes, new_hits, new_passes = data
     low, high = share * hits.size // SHARES, (share + 1) * hits.size // SHARES
-    # Slices of their own let the compiler count many voxels at once.
+    # Separate slices let the compiler count many voxels at once.
     hits, passes = hits.reshape(-1)[low:high], passes.reshape(-1)[low:high]
     new_hits, new_passes = new_hits.reshape(-1)[low:high], new_passes.reshape(-1)[low:high]
     for n in range(len(hits)):
@@ -380,7 +380,7 @@ def _fill_layer(i, data):  # type: ignore[no-untyped-def]
 
 @kernel
 def _show(share, data):  # type: ignore[no-untyped-def]
-    """Write the worth of a share of the work: each piece is one point and 128 of the cameras."""
+    """Write the values of a share of the work: each piece is one point and 128 of the cameras."""
     occluders, worth = data[0], data[-1]
     found, count = room(occluders.shape), worth.shape[1]
     across = (count + 127) // 128
@@ -410,7 +410,7 @@ def _face(data, p, first, end):  # type: ignore[no-untyped-def]
 
 @inner(fastmath={"contract"})
 def _hide(data, found, p, first, end):  # type: ignore[no-untyped-def]
-    """Set to nought what cameras would show of one point but for what is in between."""
+    """Set to zero what something in between hides of one point."""
     occluders, origin, per_metre, points, _, _, _, eyes, _, clearance, _, worths = data
     shape, flat, worth = occluders.shape, occluders.reshape(-1), worths[p]
     x, y, z = points[p, 0], points[p, 1], points[p, 2]

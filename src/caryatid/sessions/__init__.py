@@ -1,4 +1,4 @@
-"""Sessions: a scene model in a folder, updated view by view with what a robot's own software hands in."""
+"""Sessions: a scene model in a folder, updated view by view by a robot's own software."""
 
 from caryatid.sessions.captures import Capture
 from caryatid.sessions.session import Added, Session

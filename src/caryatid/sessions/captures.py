@@ -1,4 +1,4 @@
-"""One view as it is handed in and kept: encoded images and the camera that took them."""
+"""One view as it is received and stored: encoded images and their camera."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from caryatid.io.staging import read_errors
 from caryatid.sensing.views import View
 
 REMEDY: Final = "take this view and all later ones out of the session's folder"
-"""What to do where a kept view is damaged."""
+"""Remedy for a damaged view."""
 
 
 _FILES: Final = {
@@ -41,7 +41,7 @@ _ARRAYS: Final[dict[str, tuple[type[np.generic], tuple[int, ...], str]]] = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CameraRecord:
-    """camera.json: what is known of a view without decoding its images.
+    """camera.json: the data of a view besides its images.
 
     Attributes:
         K: Pinhole matrix (3, 3) [px].
@@ -49,7 +49,7 @@ class CameraRecord:
         depth_scale: Millimetres of one unit of a depth PNG.
         name: What to call the view in messages.
         labels_are: Whether a label is an object's in all views or a segment's in this view alone.
-        digest: Digest of camera and images; empty where the view is not kept yet.
+        digest: Digest of camera and images; empty until the view is stored.
     """
 
     K: Annotated[Array, Numbers(3, 3)]
@@ -99,7 +99,7 @@ class Capture:
         """Read the files of one view.
 
         Args:
-            files: Images: `depth` and, where there are any, `rgb` and `labels`.
+            files: Images: `depth`, and optionally `rgb` and `labels`.
             camera: JSON with K, T_world_camera and, for a depth PNG, depth_scale.
             config: How large images may be.
 
@@ -112,7 +112,7 @@ class Capture:
 
     @classmethod
     def read(cls, folder: Path) -> Capture:
-        """Read the files of a kept view.
+        """Read the files of a stored view.
 
         Raises:
             InputError: Something is missing, or is not what was written.
@@ -137,7 +137,7 @@ class Capture:
         return replace(c, digest=digest.hexdigest())
 
     def files(self) -> dict[str, bytes]:
-        """Return the files that are kept: name → content."""
+        """Return the files to store: name → content."""
         document = json.dumps(asdict(self.record), indent=1, default=np.ndarray.tolist)
         files = {f"{key}{_suffix(content)}": content for key, content in self.images.items()}
         return files | {"camera.json": f"{document}\n".encode()}

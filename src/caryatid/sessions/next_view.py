@@ -1,4 +1,4 @@
-"""Where to look next, and how the robot would stand there."""
+"""The next view, and the robot's posture there."""
 
 from __future__ import annotations
 
@@ -26,9 +26,8 @@ class NextView:
     """Where to look next.
 
     Attributes:
-        number: Which view it would be, 0 the first.
-        decision: Pose, the way there, expected gain, cost, and why. Where candidates were given there are no
-            waypoints.
+        number: Number of the next view, from 0.
+        decision: Pose, the way there, expected gain, cost, and why. Given candidates have no waypoints.
         stop: Why another view may not pay, or None.
     """
 
@@ -69,7 +68,7 @@ class Reachable:
 
 
 def table_floor(scene: Scene) -> FloorGrid:
-    """The floor around the table: under its top, and everything on it, nobody can stand.
+    """The floor around the table; the area under its top and under the objects on it is blocked.
 
     Raises:
         PlanningError: No view is known yet.
@@ -85,9 +84,9 @@ def table_floor(scene: Scene) -> FloorGrid:
 
 
 def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
-    """What a robot reaches from where its camera (4, 4) is, as it is held or without roll.
+    """What a robot reaches from its camera pose (4, 4), as held or without roll.
 
-    Where it cannot stand there, paths are straight lines.
+    If it cannot stand there, paths are straight lines.
     """
     for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
         if isinstance(robot.solve(T), Posture):

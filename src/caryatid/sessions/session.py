@@ -66,7 +66,7 @@ KNOWN: Final = {
     ("numpy._core.multiarray", "scalar"),
     ("numpy._core.numeric", "_frombuffer"),
 }
-"""What a snapshot may name besides classes of caryatid: a session that came from elsewhere runs no code."""
+"""What a snapshot may name besides classes of caryatid, so that a session from elsewhere runs no code."""
 
 
 class SessionConflictError(InputError):
@@ -79,10 +79,10 @@ class SessionBusyError(SessionConflictError):
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """What a session was begun with.
+    """Options of a session.
 
     Attributes:
-        segmentation: `labels`, `auto`, or None to use labels where the first view has them.
+        segmentation: `labels`, `auto`, or None to use labels if the first view has them.
         seed: Seed of every random choice.
         planner: Name of the planner that chooses the next view.
         robot: Name of the robot that takes it.
@@ -128,7 +128,7 @@ class Added:
     """Result of adding a view.
 
     Attributes:
-        number: Number of the view, 0 the first.
+        number: Number of the view, from 0.
         graph: The fused support graph with it.
         changed: Whether it changed the graph.
         note: That the view waits for one that shows the table top, or None.
@@ -153,8 +153,8 @@ class Session:
 
     Attributes:
         path: The folder.
-        beginning: What it was begun with.
-        scene: What is known; not to be updated.
+        beginning: Its options.
+        scene: The scene model; do not update it.
     """
 
     def __init__(self, path: Path, beginning: Beginning, lock: FileLock | None) -> None:
@@ -188,17 +188,16 @@ class Session:
         Args:
             path: The folder.
             config: All settings.
-            segmentation: `labels` demands them of every view, `auto` ignores them, None takes them where the
+            segmentation: `labels` requires them in every view, `auto` ignores them, None uses them if the
                 first view has them.
             seed: Seed of every random choice.
             planner: Name of the planner that chooses the next view.
-            robot: Name of the robot that takes it, as `find_robot` knows it; it stands by the table, with
-                nothing else on its floor.
+            robot: Name of the robot that takes it, as for `find_robot`; the table is the only obstacle on
+                its floor.
             ignore: Pixels (H, W) that are ignored in every view, such as the robot's own arm, or None.
 
         Raises:
-            InputError: The folder holds something, there is no such planner or robot, or nothing can be
-                written there.
+            InputError: The folder is not empty or cannot be written, or there is no such planner or robot.
         """
         make_planner(planner)
         find_robot(robot)
@@ -273,7 +272,7 @@ class Session:
 
         Args:
             view: A view with a pose, or one that is not decoded yet.
-            number: Number the view is meant to have, 0 the first. The last view is not added a second time,
+            number: Expected number of the view, from 0. The last view is not added a second time,
                 so a client that missed the answer can send it again. None = the next one.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Simulated tables: scenes in physics, a depth camera without GL, and the truth about what holds up what."""
+"""Simulated tables: scenes in physics, a depth camera without GL, and the true support graph."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ def axial_sigma(depth: Array, config: NoiseConfig) -> Array:
 
 
 def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np.random.Generator) -> Array:
-    """Corrupt a perfect depth image as the sensor does.
+    """Add the sensor's noise to a perfect depth image.
 
     No return outside the range, from surfaces seen at a grazing angle, and beside depth edges; Gaussian noise
     along the optical axis; then rounding to equal steps of 1/z.
@@ -33,8 +33,8 @@ def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np
     Args:
         depth: True depth (H, W) [m], 0 = nothing there.
         incidence: Angle (H, W) [rad] between each ray and the surface's normal.
-        config: The sensor's figures.
-        rng: Source of the noise; one draw a pixel, whatever is seen.
+        config: Parameters of the sensor.
+        rng: Source of the noise; always one draw per pixel.
 
     Returns:
         Depth (H, W) [m], 0 = no reading.
@@ -59,14 +59,14 @@ def _depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
 
 
 def misregister(T_world_camera: Array, config: NoiseConfig, rng: np.random.Generator) -> Array:
-    """Return the pose (4, 4) registration believes in: shifted, and turned about the camera's centre.
+    """Return the reported pose (4, 4): shifted, and turned about the camera's centre.
 
     The shift is Gaussian with σ = `config.translation` along each axis; the turn is about an axis drawn
     uniformly, by a Gaussian angle with σ = `config.rotation`.
 
     Args:
         T_world_camera: True pose (4, 4).
-        config: The errors' sizes.
+        config: Sizes of the errors.
         rng: Source of the error.
     """
     angle = np.deg2rad(config.rotation) * rng.standard_normal()
@@ -78,7 +78,7 @@ def misregister(T_world_camera: Array, config: NoiseConfig, rng: np.random.Gener
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Rendering:
-    """What the rays of a perfect camera meet.
+    """The image of a perfect camera.
 
     Attributes:
         depth: Along the optical axis (H, W) [m], 0 = nothing.
@@ -96,23 +96,23 @@ class Rendering:
 
 
 class SimulatedCamera:
-    """A depth camera that can be anywhere in a simulated scene.
+    """A depth camera anywhere in a simulated scene.
 
-    The first capture is the reference the others are registered to, so its pose is exact: the error is one
-    between views. Captures are numbered; each draws its noise from its own stream made of the seed and its
-    number, so a run is reproduced from the seed whatever else draws random numbers meanwhile.
+    The first capture is the reference for registration, so its pose is exact: the error is between views.
+    Each capture draws its noise from its own stream, made of the seed and its number, so a run is
+    reproducible whatever else draws random numbers.
 
     Args:
-        scene: What it looks at.
+        scene: The scene.
         noise: `none`, or `carmine` for sensor noise and registration error.
-        noise_config: Figures of the noise.
-        rng: Where the seed of all captures is drawn from.
+        noise_config: Parameters of the noise.
+        rng: Source of the seed of all captures.
         sensor: Image size, focal length and light.
-        around: Gives a scene with the body of the robot that holds the camera at a pose (4, 4), which is
-            seen where it is in the image, or None where none can stand there. None = it floats.
+        around: Returns a scene with the body of the robot that holds the camera at a pose (4, 4), which the
+            camera may see, or None if no robot can stand there. None = the camera floats.
 
     Attributes:
-        scene: What it looks at; another state of the same scene may take its place.
+        scene: The scene; another state of the same scene may replace it.
         captures: Number of views so far, which decides the noise of the next one.
 
     Raises:
@@ -140,18 +140,18 @@ class SimulatedCamera:
         self._around = around
 
     def fork(self) -> SimulatedCamera:
-        """Return a camera whose next captures have the noise this one's would have; this one stays put."""
+        """Return a copy with the same noise in its next captures; this one does not change."""
         return copy.copy(self)
 
     def capture(self, T_world_camera: Array) -> View:
         """Take one view from a pose.
 
         Args:
-            T_world_camera: Where the camera truly is (4, 4), OpenCV camera frame.
+            T_world_camera: True camera pose (4, 4), OpenCV camera frame.
 
         Returns:
-            The view. With noise its depth is noisy, it has no normals, and the pose it carries is the one
-            registration believes in; labels stay as seen also where depth is missing.
+            The view. With noise, its depth is noisy, it has no normals, and its pose is the reported one;
+            labels stay even where depth is missing.
 
         Raises:
             InputError: The pose is not a rigid transform.
@@ -182,7 +182,7 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
     """Cast one ray through the middle of each pixel.
 
     Args:
-        scene: What is there; geoms of group 3 are not seen.
+        scene: The scene; geoms of group 3 are invisible.
         T_world_camera: Camera pose (4, 4).
         K: Pinhole matrix (3, 3) [px].
         sensor: Image size, range and light.
@@ -192,7 +192,9 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
     geoms = np.empty(lengths.size, dtype=np.int32)
     depth = np.empty(lengths.size)
     normals_world = np.empty((lengths.size, 3))
-    visible = np.array([1, 1, 1, 0, 1, 1], dtype=np.uint8)  # of MuJoCo's six groups, the fourth only collides
+    visible = np.array(
+        [1, 1, 1, 0, 1, 1], dtype=np.uint8
+    )  # the fourth of MuJoCo's six groups is for collisions only
     mujoco.mj_multiRay(
         scene.model, scene.data, T_world_camera[:3, 3], rays_world.ravel(), visible, 1, -1, geoms, depth,
         normals_world.reshape(-1), lengths.size, sensor.far * float(lengths.max()),
@@ -214,7 +216,7 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
 def pixel_rays(K: Array, R_world_camera: Array, width: int, height: int) -> tuple[Array, Array]:
     """Rays through the pixels, row by row.
 
-    Each ray is one metre long along the optical axis, so that distances counted in rays are depths.
+    Each ray is one metre long along the optical axis, so distances in rays are depths.
 
     Args:
         K: Pinhole matrix (3, 3) [px].
@@ -238,7 +240,7 @@ def _shade(
     """Lambert's law with one lamp and ambient light: colours (N, 3)."""
     model = scene.model
     colours = model.geom_rgba[:, :3].astype(np.float32)
-    # A geom that is given no colour is grey: its material's counts then.
+    # A geom without a colour is grey: then that of its material counts.
     plain = (model.geom_matid >= 0) & (colours == 0.5).all(axis=1)
     colours[plain] = model.mat_rgba[model.geom_matid[plain], :3]
     colours = np.concatenate([colours, np.array([(0.55, 0.62, 0.70)], dtype=np.float32)])

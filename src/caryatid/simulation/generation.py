@@ -1,4 +1,4 @@
-"""Random scenes by size and seed: piles, heaps between screens, packed things, households, blocks."""
+"""Random scenes by size and seed: piles, heaps between screens, packed objects, household objects, blocks."""
 
 from __future__ import annotations
 
@@ -39,22 +39,23 @@ SIZES: dict[GeneratedKind, tuple[int, int]] = {
     "house": (1, 14),
     "blocks": (2, 10),
 }
-"""Kind of a scene → fewest and most objects, the screens of a dense one among them."""
+"""Kind of a scene → minimum and maximum number of objects, including the screens of a dense one."""
 GAP = 0.002
-"""Height over what is below from which an object is let go [m]."""
+"""Height above the support from which an object is dropped [m]."""
 CLOSE = 0.0005
-"""Distance of things that touch before they settle [m]: far below what a camera can see."""
+"""Distance of touching objects before they settle [m]: far below what a camera can see."""
 TRIES = 10
-"""Times an object is set down again while it falls off, rolls away or upsets others; then the one before it
-is taken up again as well."""
+"""Attempts to set down an object that falls off, rolls away or upsets others; then the one before it is
+removed again as well.
+"""
 
 _Drop = tuple[Body, bool]
-"""A solid where it is let go, and whether it is meant to stay on another one."""
+"""A solid where it is dropped, and whether it should stay on another one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Plan:
-    """How a scene is set up: what draws each object, solids from the start, size of the table [m], walls."""
+    """Setup of a scene: the drawing of each object, initial solids, size of the table [m], walls."""
 
     draw: Callable[[SimulatedScene | None], _Drop]
     screens: tuple[Body, ...] = ()
@@ -67,19 +68,19 @@ def generate(
 ) -> SimulatedScene:
     """Set down random objects one by one, each when all are at rest.
 
-    A `pile` has most of them on what is there already, `dense` heaps them between tall free screens with
-    walls that close part of the circle for a robot, `packed` pushes them together until they touch. All these
-    are of primitives; `house` has trays, bowls, mugs, plates, books and the like on and in each other;
-    `blocks` are equal boxes in a row, a wall or a pyramid with gaps of 0 to 15 mm.
+    A `pile` has most of them on earlier ones, `dense` heaps them between tall free screens with walls that
+    close part of the circle for a robot, `packed` pushes them together until they touch. All these use
+    primitives; `house` has trays, bowls, mugs, plates, books and the like on and in each other; `blocks` are
+    equal boxes in a row, a wall or a pyramid with gaps of 0 to 15 mm.
 
     Args:
         kind: Kind of scene.
-        size: Number of objects, screens among them.
+        size: Number of objects, including screens.
         seed: Seed; the same kind, size and seed give the same scene.
         physics: When an object is at rest.
 
     Raises:
-        InputError: The size or the seed is out of range, or an object would not stay where it is put.
+        InputError: The size or the seed is out of range, or an object does not stay in place.
     """
     name = f"{kind}-{size}-{seed}"
     least, most = SIZES[kind]
@@ -137,16 +138,16 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
 
 
 def _house(rng: np.random.Generator, size: int) -> _Plan:
-    """Seven in ten things are set down on another one, or in it, the others anywhere on the table."""
+    """Seven in ten objects are set down on another one, or in it, the others anywhere on the table."""
     return _stacked(rng, thing, 0.12)
 
 
 def _blocks(rng: np.random.Generator, size: int) -> _Plan:
-    """Equal boxes side by side and in layers, all turned alike."""
+    """Equal boxes side by side and in layers, with one orientation."""
     extents = rng.uniform((0.04, 0.04, 0.04), (0.07, 0.1, 0.08))
     gap = rng.uniform(CLOSE, 0.015)
     pyramid = int(np.ceil(np.sqrt(2.0 * size + 0.25) - 0.5))
-    # Boxes of the lowest layer, and how many fewer each layer has than the one below it.
+    # Number of boxes in the lowest layer, and how many fewer each layer has than the one below.
     base, fewer = [(size, 0), ((size + 1) // 2, 0), (pyramid, 1)][int(rng.integers(3))]
     layers = [(layer, base - fewer * layer) for layer in range(base if fewer else 2)]
     cells = [(k - (count - 1) / 2.0, layer) for layer, count in layers for k in range(count)][:size]
@@ -175,10 +176,10 @@ def _stacked(rng: np.random.Generator, make: Callable[[np.random.Generator], Sha
 
 
 def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> SimulatedScene:
-    """Let solids go one after the other, each when all are at rest; what goes wrong is tried again.
+    """Drop solids one after the other, each when all are at rest; failures are tried again.
 
-    Screens must not be upset; where there are none, no earlier object must be. Where nothing can be set down
-    any more, the last solid is taken up again too; after 40 drops for each object the scene is given up.
+    Screens must not be upset; without screens, no earlier object. If nothing can be set down, the last solid
+    is removed again too; after 40 drops per object the scene fails.
     """
 
     def build(solids: Sequence[Body], config: PhysicsConfig = physics, least: float = 0.0) -> SimulatedScene:
@@ -210,10 +211,10 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
 
 
 def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: PhysicsConfig) -> bool:
-    """All objects are at rest on or over the table, and the firm ones, the first, about where they were.
+    """Whether all objects are at rest on or over the table, and the firm ones, the first, about in place.
 
-    An object whose middle is within a centimetre of the table's edge has as good as fallen; none may reach
-    higher than 36 cm over the table. Setting another one down may shift the firm ones by 4 cm.
+    An object with its middle within a centimetre of the table's edge counts as fallen; none may reach higher
+    than 36 cm over the table. Setting another one down may shift the firm ones by 4 cm.
     """
     shapes = true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01
@@ -229,7 +230,7 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
             return False
     if not scene.at_rest:
         return False
-    # Nothing moves by itself, not even slowly, while one would watch what taking an object away does.
+    # Nothing moves by itself, not even slowly, while the effect of a removal is observed.
     data = state_of(scene)
     mujoco.mj_step(scene.model, data, nstep=round(physics.removal_time / scene.model.opt.timestep))
     limits = physics.moved / 2.0, physics.turned / 2.0
@@ -237,7 +238,7 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
 
 
 def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
-    """Put a shape at the origin a little over whatever is below a place (2,) [m], by boxes around objects."""
+    """Put a shape at the origin a little above the objects below a place (2,) [m], by their boxes."""
     over = shape.moved(transforms.rigid(np.eye(3), (*xy, 0.0)))
     tops = [TABLE_HEIGHT]
     if scene is not None:
@@ -262,7 +263,7 @@ def _overlap(shape: Shape, other: Shape) -> bool:
 
 
 def _yaw(rng: np.random.Generator) -> Array:
-    """Any turn (3, 3) about the vertical."""
+    """A random rotation (3, 3) about the vertical."""
     return transforms.rotation_from_vector((0.0, 0.0, rng.uniform(-np.pi, np.pi)))
 
 
@@ -274,7 +275,7 @@ def _upright(rng: np.random.Generator) -> Shape:
 
 
 def _shape(rng: np.random.Generator, R: Array) -> Shape:
-    """A shape at the origin of a size a hand takes from a table; most are boxes."""
+    """A shape at the origin, of a graspable size; most are boxes."""
     T = transforms.rigid(R, np.zeros(3))
     kind = rng.choice(3, p=(0.6, 0.25, 0.15))
     radius = float(rng.uniform(0.022, 0.045))
@@ -286,7 +287,7 @@ def _shape(rng: np.random.Generator, R: Array) -> Shape:
 
 
 def _screens(rng: np.random.Generator) -> list[Body]:
-    """Two to four thin boxes, taller than most of a heap, all around it, their broad sides to the middle."""
+    """Two to four thin boxes, taller than most of a heap, around it, with their broad sides to the middle."""
     count = int(rng.integers(2, 5))
     step = 2.0 * np.pi / count
     azimuths = rng.uniform(-np.pi, np.pi) + step * (np.arange(count) + rng.uniform(-0.2, 0.2, size=count))
@@ -333,12 +334,12 @@ def _gap(a: Shape, b: Shape) -> float:
     )
 
 
-# Things of a household, upright at the origin
+# Household objects, upright at the origin
 
 WALL = 0.006
-"""How thick walls are [m]."""
+"""Thickness of walls [m]."""
 CORNERS = 12
-"""Corners of a ring of a round thing [1]."""
+"""Corners of a ring of a round object [1]."""
 
 Ring = tuple[float, float]
 """Radius and height [m]."""
@@ -394,7 +395,7 @@ def _mug(rng: np.random.Generator) -> Shape:
 
 
 def _bottle(rng: np.random.Generator) -> Shape:
-    """A body, a shoulder and a neck; nothing gets into it."""
+    """A body, a shoulder and a neck; nothing fits into it."""
     radius, height = float(rng.uniform(0.03, 0.04)), float(rng.uniform(0.17, 0.24))
     rings = [(radius, 0.0), (radius, 0.6 * height), (0.013, 0.78 * height), (0.013, height)]
     return Solid.of([_hull([*_ring(a), *_ring(b)]) for a, b in pairwise(rings)])
@@ -422,14 +423,14 @@ def _carton(rng: np.random.Generator) -> Shape:
 
 
 def _wall(low: Ring, high: Ring) -> list[Polytope]:
-    """A ring of a wall, in as many parts as it has corners."""
+    """A ring of a wall, in one part per corner."""
     rings = [_ring((radius - inset, height)) for radius, height in (low, high) for inset in (0.0, WALL)]
     turned = [np.roll(ring, -1, axis=0) for ring in rings]
     return [_hull([ring[k] for ring in [*rings, *turned]]) for k in range(CORNERS)]
 
 
 def _disc(radius: float) -> Polytope:
-    """The floor of a round thing."""
+    """The floor of a round object."""
     return _hull([*_ring((radius - WALL / 2.0, 0.0)), *_ring((radius - WALL / 2.0, WALL))])
 
 

@@ -1,7 +1,7 @@
-"""Objects lifted, held and taken away in MuJoCo, and what happens to the others meanwhile.
+"""Objects lifted, held and removed in MuJoCo, and the effect on the others.
 
-A grasp is a weld to a body that moves as commanded (a mocap body), one for each object: the object that is
-lifted follows it straight up at constant speed, those that are held stay where they are.
+A grasp is a weld to a body that moves as commanded (a mocap body), one per object: the lifted object follows
+it straight up at constant speed, and held objects stay in place.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from caryatid.geometry.transforms import Array
 from caryatid.simulation.world import mujoco_warnings_ignored, strayed
 
 ASIDE = 50.0
-"""How far up an object is put when it has been lifted [m]; nothing meets it there."""
+"""Height at which a lifted object is put away [m]; nothing meets it there."""
 
 HAND = "caryatid-hand-"
-"""Names of the bodies that grasp begin so."""
+"""Prefix of the names of the grasping bodies."""
 
 _STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
 _GRASPS = int(
@@ -33,11 +33,11 @@ _GRASPS = int(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Lift:
-    """What came of a lift.
+    """Result of a lift.
 
     Attributes:
-        disturbed: Which objects (N,) were moved or turned beyond the limits; not what was lifted or gone.
-        film: States (T, N, 7) on the way, one each quarter of a second; the last one is that afterwards.
+        disturbed: Which objects (N,) moved or turned beyond the limits, without lifted and removed ones.
+        film: States (T, N, 7) on the way, one per quarter of a second; the last one is the final state.
     """
 
     disturbed: NDArray[np.bool_]
@@ -48,11 +48,11 @@ class Lifting:
     """A table in physics whose objects can be lifted one by one.
 
     States are arrays (N, 7): position [m] and quaternion (w first) of each object, at rest. Nothing is kept
-    between calls, so that several threads may lift at once.
+    between calls, so several threads may lift at once.
 
     Args:
         spec: `mujoco.MjSpec` with free bodies; it is copied.
-        bodies: Names of those that are objects, in their order.
+        bodies: Names of the objects among them, in order.
     """
 
     def __init__(self, spec: Any, bodies: Sequence[str]) -> None:
@@ -68,7 +68,7 @@ class Lifting:
 
     @property
     def start(self) -> Array:
-        """State (N, 7) in which the spec has the objects."""
+        """State (N, 7) of the objects in the spec."""
         return np.asarray(self.model.qpos0[self._qpos])
 
     def rest(self, state: Array, held: Collection[int], seconds: float) -> Array:
@@ -84,14 +84,14 @@ class Lifting:
         held: Collection[int] = (),
         to_the_end: bool = True,
     ) -> Lift:
-        """Lift an object straight up, take it aside and watch the others.
+        """Lift an object straight up, put it aside and observe the others.
 
         Args:
-            state: State (N, 7) to begin with.
-            index: Which object.
-            config: How it is lifted, and what counts as harm.
-            held: Objects that are held where they are meanwhile.
-            to_the_end: False stops as soon as one is disturbed, and watches no longer than something moves.
+            state: Initial state (N, 7).
+            index: Index of the object.
+            config: Parameters of the lift, and what counts as harm.
+            held: Objects that are held in place meanwhile.
+            to_the_end: False stops as soon as one is disturbed, and observes only while something moves.
         """
         watched = state[:, 2] < ASIDE / 2.0
         watched[index] = False
@@ -100,11 +100,11 @@ class Lifting:
         disturbed = np.zeros(len(state), dtype=np.bool_)
         film: list[Array] = []
         for speed, seconds in ((config.speed, lifted), (0.0, config.watch)):
-            segments = max(1, int(np.ceil(seconds / 0.25)))  # what falls is seen falling
+            segments = max(1, int(np.ceil(seconds / 0.25)))  # a falling object is seen falling
             for _ in range(segments):
                 film.append(self._after(data, speed, seconds / segments, index))
                 disturbed |= watched & strayed(state, film[-1], config.moved, config.turned)
-                # Contacts creep as slowly as by 0.2 mm or 0.2°.
+                # Contacts creep by up to 0.2 mm or 0.2°.
                 at_rest = speed == 0.0 and not strayed(film[-2], film[-1], 2e-4, 0.2).any()
                 if not to_the_end and (at_rest or disturbed.any()):
                     return Lift(disturbed, np.array(film))
@@ -113,7 +113,7 @@ class Lifting:
         return Lift(disturbed, np.array(film))
 
     def _data(self, state: Array, grasped: Collection[int]) -> Any:
-        """MuJoCo's data for a state; what is grasped, or aside, is held where it is."""
+        """MuJoCo's data for a state; grasped and removed objects are held in place."""
         data = mujoco.MjData(self.model)
         data.qpos[self._qpos] = state
         data.mocap_pos[self._hand], data.mocap_quat[self._hand] = state[:, :3], state[:, 3:]
@@ -124,13 +124,13 @@ class Lifting:
         return data
 
     def _put_aside(self, data: Any, index: int) -> None:
-        """Put an object out of the way, at rest, in place."""
+        """Put an object out of the way, at rest; changes the data."""
         place = np.array([0.0, 0.0, ASIDE + index])
         data.qpos[self._qpos[index, :3]] = data.mocap_pos[self._hand[index]] = place
         data.qvel[self._qvel[index]] = 0.0
 
     def _after(self, data: Any, speed: float, seconds: float, index: int = 0) -> Array:
-        """Simulate for some time [s], in place, while one hand goes up [m/s]; the objects' state then."""
+        """Simulate for some time [s] while one hand goes up [m/s]; return the objects' new state."""
         model = self.model
         steps = max(1, round(seconds / model.opt.timestep))
         told = np.empty(mujoco.mj_stateSize(model, _GRASPS))
@@ -147,7 +147,7 @@ class Lifting:
         return np.array(data.qpos[self._qpos])
 
     def _rise(self, data: Any, watched: NDArray[np.bool_], index: int) -> float:
-        """How far up [m] an object has to go for its lowest point to be 2 cm above all others."""
+        """Height [m] at which an object's lowest point is 2 cm above all others."""
         low, _ = self._span(data, index)
         tops = [self._span(data, int(k))[1] for k in np.flatnonzero(watched)]
         return max(max(tops, default=low) - low, 0.0) + 0.02
@@ -163,17 +163,17 @@ class Lifting:
 
 
 def _with_hands(spec: Any, bodies: Sequence[str]) -> Any:
-    """Compile a spec with a hand for each object, that grasps nothing yet."""
+    """Compile a spec with one hand per object, without grasps yet."""
     spec = spec.copy()
     for name in bodies:
         spec.worldbody.add_body(name=HAND + name, mocap=True)
         weld = spec.add_equality(
             name=HAND + name, name1=HAND + name, name2=name, active=False, type=mujoco.mjtEq.mjEQ_WELD,
             objtype=mujoco.mjtObj.mjOBJ_BODY,
-            # A grasp gives way by well under a millimetre, at time steps up to 5 ms.
+            # A grasp yields by well under a millimetre, at time steps up to 5 ms.
             solref=[0.01, 1.0], solimp=[0.95, 0.99, 0.001, 0.5, 2.0],
         )  # fmt: skip
-        # Both at the same place: anchor, relative position and quaternion, and how much rotation counts [m].
+        # Both in the same place: anchor, relative position and quaternion, and the weight of rotation [m].
         weld.data = [*[0.0] * 6, 1.0, *[0.0] * 3, 1.0, 0.0]
     with mujoco_warnings_ignored():
         return spec.compile()

@@ -86,7 +86,7 @@ DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
         ),
     }
 )
-"""Bodies of each designed scene, by name; heights count from the table top."""
+"""Bodies of each designed scene, by name; heights are above the table top."""
 
 DESCRIPTIONS: Final[Mapping[str, str]] = {
     "tower": "a stack of four and a ball",
@@ -102,7 +102,7 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
     "house": "household objects on and in each other: trays, bowls, mugs, plates, books, bottles",
     "blocks": "equal boxes in a row, a wall or a pyramid",
 }
-"""What each designed scene and each kind of generated one shows."""
+"""Descriptions of the designed scenes and of the generated kinds."""
 
 
 SCENE_FILE = "scene.xml"
@@ -124,7 +124,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
     """Load a scene and let it come to rest.
 
     Built-in names come before files: a designed scene (`tower`, `bridge`, …), or KIND-SIZE-SEED for a
-    generated one, say `pile-8-3`, of the kinds of `generate`. A folder called so is reached as `./tower`.
+    generated one of the kinds of `generate`, such as `pile-8-3`. For a folder of that name, use `./tower`.
 
     Args:
         source: A built-in name, an MJCF file, or a folder with a `scene.xml`.
@@ -134,7 +134,7 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
         InputError: No such file or scene, broken XML, no static body `table`, no objects, or it is unstable.
     """
     text = fspath(source)
-    if text in DESIGNED:  # the solids are given a second to find their contacts
+    if text in DESIGNED:  # give the solids a second to find their contacts
         return scene_from_spec(build_spec(DESIGNED[text], text), text, text, config, least=1.0)
     if match := _GENERATED.fullmatch(text):
         return generate(cast(GeneratedKind, match[1]), int(match[2]), int(match[3]), config)
@@ -160,13 +160,13 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
 
 
 def _check_sizes(path: Path, config: PhysicsConfig) -> None:
-    """Refuse what would take all memory before MuJoCo, which expands it while it reads, begins to.
+    """Refuse a file that would exhaust memory, before MuJoCo expands it on reading.
 
     Raises:
         InputError: An element makes too many copies, or a height field or texture is too large.
     """
     copies = [1.0]
-    # MuJoCo itself refuses what is not XML or not a number, with the line.
+    # MuJoCo itself refuses bad XML and numbers, with the line.
     with suppress(ElementTree.ParseError, ValueError, OSError):
         for event, element in ElementTree.iterparse(path, ("start", "end")):
             if event == "end":
@@ -182,11 +182,11 @@ def _check_sizes(path: Path, config: PhysicsConfig) -> None:
 
 
 def list_scenes() -> dict[str, str]:
-    """Names `load_scene` knows, and what each scene shows: the designed scenes, then the generated kinds."""
+    """Names for `load_scene`, and descriptions: the designed scenes, then the generated kinds."""
     generated = {f"{kind}-SIZE-SEED": f"{DESCRIPTIONS[kind]}; SIZE {a}–{b}" for kind, (a, b) in SIZES.items()}
     return {name: DESCRIPTIONS[name] for name in DESIGNED} | generated
 
 
 def is_builtin(source: str | PathLike[str]) -> bool:
-    """Whether `load_scene` takes this for the name of a built-in scene."""
+    """Whether this is the name of a built-in scene."""
     return fspath(source) in DESIGNED or bool(_GENERATED.fullmatch(fspath(source)))

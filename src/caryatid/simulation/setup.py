@@ -1,4 +1,4 @@
-"""A simulated robot with its body and its camera before a scene, ready to explore."""
+"""A simulated robot with its body and its camera in front of a scene, ready to explore."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.world import SimulatedScene, static_boxes, table_centre
 
 PLATFORM, MAST, NECK = 0.3, 0.04, 0.15
-"""Greatest height of the platform, radius of the mast on it, and how far under the camera that ends [m]."""
+"""Maximum height of the platform, radius of its mast, and distance from the mast's end to the camera [m]."""
 
 
 class HumanoidBody:
-    """A platform and a mast that the torso lift makes longer, in a copy of a scene.
+    """A platform and a mast that the torso lift extends, in a copy of a scene.
 
-    Nothing is pushed by it. The head is left out: it is behind the camera, which is at its front.
+    It pushes nothing. The head is left out, because it is behind the camera.
 
     Args:
-        scene: Where it stands; stays as it is.
-        robot: Says how it stands for a camera pose.
+        scene: The scene; it does not change.
+        robot: Gives the posture for a camera pose.
         config: Its footprint and heights.
 
     Attributes:
-        scene: The copy, with the body where it was placed last.
+        scene: The copy, with the body at its last place.
     """
 
     def __init__(self, scene: SimulatedScene, robot: HumanoidRobot, config: RobotConfig) -> None:
@@ -41,7 +41,7 @@ class HumanoidBody:
         self._platform_height = min(PLATFORM, low / 2.0)
         spec = scene.spec.copy()
         body = spec.worldbody.add_body(name="robot", mocap=True)
-        # The mast is made as long as it can be, since MuJoCo bounds a geom only once.
+        # The mast has its maximum length, because MuJoCo bounds a geom only once.
         for radius, height in ((config.footprint, self._platform_height), (MAST, high)):
             body.add_geom(
                 type=mujoco.mjtGeom.mjGEOM_CYLINDER, pos=[0.0, 0.0, height / 2.0],
@@ -55,7 +55,7 @@ class HumanoidBody:
         self._geoms = np.flatnonzero(model.geom_bodyid == model.body("robot").id)
 
     def place(self, posture: Posture) -> None:
-        """Put it where a posture has it."""
+        """Move it to a posture."""
         model, data, mast = self.scene.model, self.scene.data, self._geoms[1]
         top = max(posture.camera_height - NECK, self._platform_height)
         model.geom_pos[mast, 2] = model.geom_size[mast, 1] = top / 2.0
@@ -63,7 +63,7 @@ class HumanoidBody:
         mujoco.mj_kinematics(model, data)
 
     def around(self, scene: SimulatedScene, T_world_camera: Array) -> SimulatedScene | None:
-        """A state of the scene with the body that holds a camera (4, 4), or None where it cannot stand."""
+        """A state of the scene with the body that holds a camera (4, 4), or None if it cannot stand there."""
         posture = self._robot.solve(T_world_camera)
         if not isinstance(posture, Posture):
             return None
@@ -74,10 +74,10 @@ class HumanoidBody:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Simulation:
-    """What `explore` needs of a simulation.
+    """Camera and robot of a simulation, for `explore`.
 
     Attributes:
-        camera: Gives views of the scene.
+        camera: Takes views of the scene.
         robot: Stands where the first view is taken.
     """
 
@@ -93,14 +93,14 @@ def make_simulation(
     seed: int,
     robot: RobotMaker | str = HUMANOID,
 ) -> Simulation:
-    """Put a robot before the table, at its home view, with the furniture on its floor map.
+    """Put a robot in front of the table, at its home view, with the furniture on its floor map.
 
     Args:
         scene: The scene in physics.
         config: Robot, sensor, noise and view sphere.
         noise: Noise of the camera.
         seed: Seed of the noise.
-        robot: Makes the robot, or the name of one as `find_robot` knows it.
+        robot: Makes the robot, or its name for `find_robot`.
 
     Raises:
         InputError: There is no robot of this name.

@@ -1,4 +1,4 @@
-"""Who supports whom by physics: contact forces, and what moves when an object is taken away."""
+"""The true support graph by physics: contact forces, and what moves when an object is removed."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class TrueEdge:
     Attributes:
         supporter: Name of the body that holds.
         supported: Name of the body that is held.
-        kind: How.
+        kind: Kind of the support.
     """
 
     supporter: str
@@ -37,7 +37,7 @@ class TrueEdge:
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """What gt.json holds.
+    """Content of gt.json.
 
     Attributes:
         vertices: Body names, the table first.
@@ -54,12 +54,12 @@ class GroundTruth:
 
 
 def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> GroundTruth:
-    """Ask physics what holds up what.
+    """Derive the support graph from physics.
 
     A supports B `bottom-up` when the mean contact force of A on B has an upward part above 3 % of B's weight.
-    Each object A is then taken away for a second: a B in contact with A that moves by more than 1 cm or 8°
-    and is not held by A from below is supported by it all the same: `top-down` where A presses on B, `lean`
-    where the force between them is mostly horizontal.
+    Each object A is then removed for a second. A also supports a B in contact with it that moves by more
+    than 1 cm or 8° and that A does not hold from below: `top-down` if A presses on B, `lean` if the force
+    between them is mostly horizontal.
 
     Args:
         scene: A settled scene; its state is not changed.
@@ -79,7 +79,7 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
     falling = dict(zip(labels, moved, strict=True))
     for a, b in others:
         if b in falling[a]:
-            # A force nearer to the horizontal than 30° leans, a steeper one that points down presses.
+            # A force within 30° of the horizontal leans, a steeper one that points down presses.
             force = forces[a, b]
             steep = -force[2] > np.sin(np.deg2rad(30.0)) * np.linalg.norm(force)
             kinds[a, b] = "top-down" if steep else "lean"
@@ -90,7 +90,7 @@ def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> 
 def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
     """Mean force of A on B over a fifth of a second, for every pair of bodies that touch.
 
-    Soft contacts creep, and longer means would drift.
+    Soft contacts creep, so longer means would drift.
 
     Returns:
         (label of A, label of B) to the force (3,) [N] in the world frame, for both directions of a pair.
@@ -115,10 +115,10 @@ def mean_contact_forces(scene: SimulatedScene) -> dict[tuple[int, int], Array]:
 
 
 def displaced_without(scene: SimulatedScene, label: int, config: PhysicsConfig) -> set[int]:
-    """Labels of the objects that have moved beyond the limits a while after another one is taken away."""
+    """Labels of the objects that have moved beyond the limits some time after a removal."""
     data = state_of(scene)
     joint = int(scene.model.body_jntadr[scene.body_id(label)])
-    # 100 m up it falls 5 m in the second the others are watched.
+    # 100 m up, it falls 5 m in the second in which the others are observed.
     data.qpos[int(scene.model.jnt_qposadr[joint]) + 2] += 100.0
     mujoco.mj_forward(scene.model, data)
     others = [other for other in scene.object_bodies if other != label]

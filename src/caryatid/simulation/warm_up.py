@@ -1,4 +1,4 @@
-"""All that calls compiled kernels, called on small images, so that they are compiled beforehand."""
+"""Calls everything that uses compiled kernels, on small images, so that they are compiled beforehand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulated scene: its model in physics, the table and solids it is built of, and its true shapes."""
+"""A simulated scene: its model in physics, its table and solids, and its true shapes."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ class SimulatedScene:
     """A settled table-top scene in physics.
 
     The model and its state belong to MuJoCo, which changes states in place: nothing in caryatid steps `data`
-    of a scene once it is loaded; who simulates takes a copy (`state_of`).
+    of a loaded scene; simulations use a copy (`state_of`).
 
     Attributes:
         model: The compiled MuJoCo model.
         data: Its state, at rest, with positions and contacts computed.
-        spec: What the model was compiled from.
+        spec: The specification of the model.
         name: Short name of the scene.
         source: File or built-in name it came from, for messages.
         object_bodies: Body name of each object by its label 1…n, in the order of the bodies.
         table: Body name of the support surface.
         geom_labels: Label (G,) of the object each geom belongs to, 0 for the table and everything else.
-        at_rest: Nothing moved any more when settling ended.
+        at_rest: Whether nothing moved when settling ended.
     """
 
     model: Any
@@ -70,14 +70,14 @@ def scene_from_spec(
 ) -> SimulatedScene:
     """Compile a MuJoCo spec and let it come to rest.
 
-    A scene that is at rest as described keeps its poses to the last digit, unless it is to run for a while.
+    A scene that is already at rest keeps its poses to the last digit, unless `least` is positive.
 
     Args:
         spec: `mujoco.MjSpec` with a static body `table` and bodies with free joints.
         name: Short name of the scene.
         source: File or built-in name, for messages.
         config: When an object is at rest.
-        least: Time simulated in any case [s], for poses that were only thought out.
+        least: Minimum time to simulate [s], for poses that were only designed.
 
     Raises:
         InputError: It does not compile, has no static body `table`, no object, or its simulation is unstable.
@@ -120,9 +120,9 @@ def scene_from_spec(
 
 
 def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float) -> bool:
-    """Simulate in place until nothing moves, and say whether that was in time.
+    """Simulate until nothing moves, and say whether that was in time; changes the data.
 
-    A state that is at rest stays exactly as it is, unless a time `least` [s] is to be simulated in any case.
+    A state at rest stays exactly as it is, unless a minimum time `least` [s] is simulated.
     """
     window = max(1, round(config.rest_window / model.opt.timestep))
     kinds = mujoco.mjtWarning
@@ -157,14 +157,14 @@ def body_poses(data: Any) -> Array:
 
 
 def strayed(before: Array, after: Array, moved: float, turned: float) -> NDArray[np.bool_]:
-    """Which (N,) of poses (N, 7), positions and quaternions, moved [m] or turned [deg] by more than that."""
+    """Which (N,) of poses (N, 7), positions and quaternions, moved [m] or turned [deg] beyond limits."""
     cosine = np.abs(np.einsum("ni,ni->n", before[:, 3:], after[:, 3:]))
     angle = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
     return (np.linalg.norm(after[:, :3] - before[:, :3], axis=1) > moved) | (angle > np.deg2rad(turned))
 
 
 def state_of(scene: SimulatedScene) -> Any:
-    """Return a copy of the scene's settled `MjData`, for simulating on."""
+    """Return a copy of the scene's settled `MjData`, to simulate further."""
     data = mujoco.MjData(scene.model)
     data.qpos[:] = scene.data.qpos
     data.mocap_pos[:] = scene.data.mocap_pos
@@ -179,7 +179,7 @@ def poses_of(scene: SimulatedScene) -> Array:
 
 
 def posed(scene: SimulatedScene, state: Array) -> SimulatedScene:
-    """Return a scene with its objects in another state (N, 7), as of `poses_of`."""
+    """Return a scene with its objects in another state (N, 7), as from `poses_of`."""
     data = state_of(scene)
     data.qpos[_addresses(scene)] = state
     mujoco.mj_forward(scene.model, data)
@@ -192,7 +192,7 @@ def _addresses(scene: SimulatedScene) -> Array:
 
 
 def _subtree(model: Any, body: int) -> list[int]:
-    """A body and all that hang from it; MuJoCo numbers bodies after the ones they hang from."""
+    """A body and its descendants; MuJoCo numbers bodies after their parents."""
     inside = [body]
     for child in range(body + 1, model.nbody):
         if model.body_parentid[child] in inside:
@@ -202,7 +202,7 @@ def _subtree(model: Any, body: int) -> list[int]:
 
 @contextmanager
 def mujoco_warnings_ignored() -> Iterator[None]:
-    """Keep MuJoCo from printing and from writing a log where the user is; the state counts its warnings."""
+    """Keep MuJoCo from printing and from writing a log file; the state counts its warnings."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
@@ -218,7 +218,7 @@ TABLE_SIZE = (0.6, 0.9)
 """Depth (along world x, towards the robot) and width (along y) of the usual table top [m]."""
 
 Side = Literal["+x", "+y", "-y"]
-"""Where a wall may stand; the robot comes from -x."""
+"""Possible places of walls; the robot comes from -x."""
 
 Vector = tuple[float, float, float]
 
@@ -228,7 +228,7 @@ class Body:
     """A free body of one shape.
 
     Attributes:
-        shape: Where it is set down and how large it is, in the world.
+        shape: Its shape and initial pose, in the world.
         density: [kg/m³].
         friction: Sliding friction [1]; the larger one of two bodies in contact counts.
     """
@@ -261,7 +261,7 @@ def sphere(radius: float, at: Vector) -> Body:
 
 
 def empty_spec(name: str) -> Any:
-    """A `mujoco.MjSpec` of nothing, with a solver under which stacks stand and slide little."""
+    """An empty `mujoco.MjSpec`, with a solver under which stacks stand and slide little."""
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.option.impratio = 10.0
@@ -279,7 +279,7 @@ def build_spec(
     """Build a floor, a table with legs, walls beside it and free bodies `object0`, `object1`, … on it.
 
     Args:
-        bodies: The free ones, in order.
+        bodies: The free bodies, in order.
         name: Name of the model.
         table_size: Depth along x and width along y of the top [m].
         walls: Sides of the table where a wall stands.
@@ -317,13 +317,13 @@ def build_spec(
 
 def palette(index: int) -> tuple[float, float, float, float]:
     """Colour of the object with this number; neighbours in number differ widely in hue."""
-    hue = (0.02 + index * 0.618034) % 1.0  # turns by the golden ratio never come back near
+    hue = (0.02 + index * 0.618034) % 1.0  # steps by the golden ratio stay apart
     value = (0.88, 0.7, 0.55)[(index // 7) % 3]
     return (*colorsys.hsv_to_rgb(hue, 0.75, value), 1.0)
 
 
 def quaternion(R: Array) -> Array:
-    """Unit quaternion (4,), w first as MuJoCo wants it, of a rotation (3, 3)."""
+    """Unit quaternion (4,), w first as in MuJoCo, of a rotation (3, 3)."""
     wxyz = np.zeros(4)
     mujoco.mju_mat2Quat(wxyz, np.ascontiguousarray(R).reshape(-1))
     return wxyz
@@ -341,8 +341,8 @@ def add_body(
 
     Args:
         spec: `mujoco.MjSpec`, changed in place.
-        name: Of the body.
-        body: What it is and where.
+        name: Name of the body.
+        body: Its shape, pose and matter.
         rgba: Its colour.
     """
     shape = body.shape
@@ -376,8 +376,8 @@ def add_body(
 def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[np.bool_]:
     """Which points lie inside an object's true solid.
 
-    Primitives are tested as what they are, meshes as the convex hulls they collide as. An object of several
-    colliding geoms is their common convex hull: what is hollow counts with its inside.
+    Primitives are exact, and meshes are the convex hulls they collide as. An object of several colliding
+    geoms is their common convex hull: a hollow object counts with its inside.
 
     Args:
         scene: The scene.
@@ -398,7 +398,7 @@ def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[
 
 
 def _outline(scene: SimulatedScene, geom: int) -> Array:
-    """Points (N, 3) [m] whose convex hull is a geom, to 1 % where it is round."""
+    """Points (N, 3) [m] whose convex hull is a geom, to 1 % if it is round."""
     shape, model, size = _primitive(scene, geom), scene.model, scene.model.geom_size[geom]
     if shape is not None:
         return shape.outline()
@@ -447,7 +447,7 @@ def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
 
 
 def table_centre(scene: SimulatedScene) -> Array:
-    """Middle (3,) [m] of the table's upper face, world frame: of the geom with the largest."""
+    """Middle (3,) [m] of the table's upper face, world frame: that of the geom with the largest one."""
     faces = []
     for box in (_geom_box(scene, g) for g in scene.geoms(0)):
         R, half = box.T_world_object[:3, :3], box.extents / 2.0
@@ -487,7 +487,7 @@ def _geom_box(scene: SimulatedScene, geom: int) -> Box:
 
 
 def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:
-    """Test points (N, 3) in the own frame of a geom that is none of our shapes."""
+    """Test points (N, 3) in the frame of a geom that is none of our shapes."""
     size = model.geom_size[geom]
     match model.geom_type[geom]:
         case _GEOM.mjGEOM_ELLIPSOID:

@@ -1,4 +1,4 @@
-"""Contacts between shapes: MuJoCo finds them, one separating plane a pair."""
+"""Contacts between shapes, found by MuJoCo, with one separating plane per pair."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
         margin: Largest gap [m].
 
     Returns:
-        One contact a pair of convex parts, sorted by (a, b) and the parts' numbers.
+        One contact per pair of convex parts, sorted by (a, b) and the parts' numbers.
 
     Raises:
         InputError: The margin is negative.
@@ -93,7 +93,7 @@ def find_contacts(shapes: Sequence[Shape], margin: float) -> list[Contact]:
 def local_frames(
     shapes: Primitives, pairs: NDArray[np.intp], points_world: Array, normals_world: Array
 ) -> tuple[Array, Array]:
-    """Contacts in the frames of both shapes they are between.
+    """Contacts in the frames of their two shapes.
 
     Args:
         shapes: N shapes.
@@ -111,11 +111,11 @@ def local_frames(
 
 
 def find_gap(a: Shape, b: Shape) -> float:
-    """Distance [m] between two shapes however far apart; negative where they overlap.
+    """Distance [m] between two shapes at any range; negative if they overlap.
 
     Args:
-        a: The one.
-        b: The other.
+        a: One shape.
+        b: The other shape.
     """
     parts, count = [*a.parts, *b.parts], len(a.parts)
     data = _collide(parts, np.arange(len(parts)), 0.0)
@@ -130,7 +130,7 @@ def find_gap(a: Shape, b: Shape) -> float:
 def _collide(parts: Sequence[Shape], owners: NDArray[np.intp], margin: float) -> mujoco.MjData:
     """Run MuJoCo's collision detection on convex parts up to gaps of a margin [m].
 
-    Parts with the same owner need not be told apart; most are not. The result holds until the next call in
+    Contacts between parts of one owner may be missing; most are. The result holds until the next call in
     the same thread.
     """
     count, (kinds, R, centres, half) = len(parts), Primitives.of(parts)
@@ -169,13 +169,13 @@ def _collide(parts: Sequence[Shape], owners: NDArray[np.intp], margin: float) ->
 
 
 def _room(count: int, least: int) -> int:
-    """A power of two that is enough."""
+    """A sufficient power of two."""
     return max(least, 1 << (count - 1).bit_length())
 
 
 @lru_cache(maxsize=8)
 def _engine(capacity: int, corners: int, thread: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-    """Free bodies with a geom and a mesh each, set before each use; one per thread, as two must not write."""
+    """Free bodies with a geom and a mesh each, set before each use; one per thread."""
     spec = mujoco.MjSpec()
     ball = fibonacci_sphere(corners).ravel().tolist() if corners else []
     for number in range(capacity):

@@ -1,4 +1,4 @@
-"""Equilibrium: the contact forces that hold a scene at rest, in draws of what is not known exactly."""
+"""Equilibrium: the contact forces that hold a scene at rest, in draws of the uncertain quantities."""
 
 from __future__ import annotations
 
@@ -22,31 +22,31 @@ from caryatid.support.stability import contact_area
 _GRAVITY = 9.81
 """[m/s²]."""
 _SOFTNESS = 1e-3
-"""Share of the load by which a contact gives way [1]: where forces are not determined they spread evenly."""
+"""Share of the load by which a contact yields [1]: undetermined forces then spread evenly."""
 _SLIP = 10.0
-"""How much more friction gives way than pressure [1]: it carries what pressure cannot. Nothing presses
+"""How much more friction yields than pressure [1]: it carries what pressure cannot. Nothing presses
 neighbours together sideways, and side by side they settle without holding each other up."""
 _SMOOTH = 1e-4
-"""Coefficient of next to no friction [1]; MuJoCo wants some."""
+"""Coefficient of almost no friction [1]; MuJoCo needs some."""
 
 
 def support_shares(
     graph: SupportGraph, config: SupportConfig, rng: np.random.Generator
 ) -> tuple[list[float], list[float]]:
-    """How often each support of a graph is among those that hold the scene, in draws of what is not known.
+    """How often each support of a graph is among those that hold the scene, in draws of the unknowns.
 
-    A supports B in a draw where it carries more than a small share of B's weight; from the side or from above
-    also where B is at rest with A and moves without it. A draw in which B does not rest, though the real one
+    A supports B in a draw if it carries more than a small share of B's weight; from the side or from above,
+    also if B is at rest with A and moves without it. A draw in which B does not rest, although the real one
     was seen at rest, counts little for B.
 
     Args:
-        graph: Objects, and the supports that are asked for.
-        config: What is not known, and when an object is at rest.
+        graph: Objects, and the supports in question.
+        config: The unknowns, and when an object is at rest.
         rng: Source of the draws.
 
     Returns:
-        The share (E,) of draws that have each support [1], and the share (N,) of those in which each object
-        is the one of the graph by an intersection over union of 0.5 [1].
+        The share (E,) of draws with each support [1], and the share (N,) of draws in which each object
+        agrees with that of the graph by an intersection over union of 0.5 [1].
     """
     scene = Equilibrium(graph.objects, config)
     index = {o.id: k for k, o in enumerate(graph.objects)}
@@ -72,12 +72,12 @@ def support_shares(
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Draw:
-    """One way a scene of N objects and K contacts may be.
+    """One possible scene of N objects and K contacts.
 
     Attributes:
-        shifts: How far each centre of mass lies from where it is thought to be (N, 3) [m], world frame.
-        likeness: Intersection over union of each shape with the one it is drawn from (N,) [1].
-        gaps: How far apart the shapes are at each contact (K,) [m].
+        shifts: Offset of each centre of mass from its estimate (N, 3) [m], world frame.
+        likeness: Intersection over union of each shape with its estimate (N,) [1].
+        gaps: Gap at each contact (K,) [m].
         frictions: Coefficient at each contact (K,) [1].
         densities: (N,) [kg/m³].
     """
@@ -91,7 +91,7 @@ class Draw:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Balance:
-    """How a draw is held.
+    """The forces and motions in a draw.
 
     Attributes:
         motion: Acceleration (N,) of each object's centre, or of its rim if that is more [g]; 0 at rest.
@@ -105,7 +105,7 @@ class Balance:
 
 
 def touching(objects: Sequence[SceneObject], margin: float) -> list[Contact]:
-    """Find the contacts of a scene; those with the support surface have its normal, as all lies above it.
+    """Find the contacts of a scene; those with the support surface have its normal.
 
     Args:
         objects: The support surface and the objects.
@@ -126,17 +126,17 @@ class Equilibrium:
 
     The forces are the solution of one convex program, Gauss's principle of least constraint: within the
     friction cones, with normal forces that only press, they hold all objects nearest to rest. MuJoCo solves
-    it. A contact that is open presses only once its gap is closed by the way an object falls in the time it
-    falls `max_drop`, so that a gap is closed where an object would fall or tip into it, and nowhere else.
+    it. An open contact presses only if an object closes its gap within the time of a fall of `max_drop`, so
+    a gap is closed only where an object would fall or tip into it.
 
     Args:
         objects: The support surface, which does not move, and the objects; N in all. Without a surface those
             that touch nothing below them do not.
-        config: What is not known, and how far an object may fall.
+        config: The unknowns, and how far an object may fall.
 
     Attributes:
         contacts: K contacts.
-        areas: Corners (M, 3) [m] of the area of each.
+        areas: Corners (M, 3) [m] of each contact's area.
     """
 
     def __init__(self, objects: Sequence[SceneObject], config: SupportConfig) -> None:
@@ -162,12 +162,12 @@ class Equilibrium:
         self._warm = np.zeros(self._model.nv)
 
     def draws(self, rng: np.random.Generator) -> Iterator[Draw]:
-        """Draw scenes: first the one that is thought to be, then others as likely.
+        """Draw scenes: first the estimated one, then others as likely.
 
         Shapes move, turn and grow by their fits' uncertainty. Each contact that weight can press shut, its
-        normal within the friction cone around the vertical, is shut with the probability that its gap says:
-        before that is known a gap is as likely none as any up to `max_drop`. What is shut corrects all
-        shapes, as in `reconcile`. Gaps into which objects fall or tip in the first draw are shut in all.
+        normal within the friction cone around the vertical, is closed with the probability that its gap
+        implies; before that, no gap is as likely as any gap up to `max_drop`. Closed gaps correct all
+        shapes, as in `reconcile`. Gaps into which objects fall or tip in the first draw are closed in all.
 
         Args:
             rng: Source of the draws.
@@ -208,18 +208,18 @@ class Equilibrium:
                 densities,
             )
             if first:
-                # What falls along a wall is not held by it.
+                # A wall does not hold an object that falls along it.
                 falling = replace(draw, frictions=np.where(level, draw.frictions, _SMOOTH))
                 fallen = self.solve(falling).pressed & (draw.gaps > config.at_rest * self._fall)
                 draw = replace(draw, gaps=np.where(fallen, 0.0, draw.gaps))
             yield draw
 
     def solve(self, draw: Draw, without: int | None = None) -> Balance:
-        """Find the forces that hold a draw, and what moves all the same.
+        """Find the forces that hold a draw, and the objects that still move.
 
         Args:
             draw: The scene.
-            without: Index of an object that is taken away.
+            without: Index of an object to remove.
         """
         model, data, count = self._model, self._data, len(self._objects)
         self._set(draw)
@@ -228,7 +228,7 @@ class Equilibrium:
         if len(gone):
             data.contact.exclude[:] = gone
             data.contact.dist[:] = draw.gaps[self._contact]
-            # What is open does not rub; the program would have what slides along it push it away.
+            # Open contacts have no friction; otherwise objects sliding along them would push them away.
             rough = np.where(draw.gaps > 0.0, _SMOOTH, draw.frictions)
             data.contact.friction[:, :2] = rough[self._contact, None]
         for stage in (
@@ -255,7 +255,7 @@ class Equilibrium:
         return Balance(motion, pushes / (_GRAVITY * draw.densities * self._volumes)[:, None], pressed)
 
     def _set(self, draw: Draw) -> None:
-        """Give the bodies of the model the draw's masses and places."""
+        """Set masses and positions of the model's bodies to the draw's."""
         model, data, count = self._model, self._data, len(self._objects)
         masses, inertias = np.ones(model.nbody - 1), np.ones((model.nbody - 1, 3))
         masses[:count] = draw.densities * self._volumes
@@ -280,7 +280,7 @@ class Equilibrium:
         contact.dim, contact.flex, contact.elem, contact.vert = 3, [-1, -1], [-1, -1], [-1, -1]
         contact.includemargin, contact.mu, contact.exclude = 0.0, 0.0, 0
         contact.friction[:] = _SMOOTH
-        # An open gap is closed by an acceleration of one g where it is as wide as the furthest fall.
+        # An acceleration of one g closes an open gap as wide as the furthest fall.
         contact.solref[:], contact.solreffriction[:] = (-_GRAVITY / self._fall, -1.0), 0.0
         contact.solimp[:] = (1.0 - _SOFTNESS, 1.0 - _SOFTNESS, 1e-3, 0.5, 2.0)
         for _ in self._points:
@@ -305,12 +305,12 @@ def _likeness(half: Array, moved: Array, grown: Array) -> Array:
 
 @lru_cache(maxsize=8)
 def _engine(capacity: int, thread: int) -> mujoco.MjModel:
-    """Free bodies whose contacts are given; one per thread, as masses are set before each use."""
+    """Free bodies with given contacts; one per thread, because masses are set before each use."""
     spec = mujoco.MjSpec()
     spec.option.cone, spec.option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 1.0 / _SLIP
     spec.option.tolerance, spec.option.gravity = 1e-8, (0.0, 0.0, -_GRAVITY)
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    spec.memory = 1 << 26  # Of address space; only what contacts fill is used.
+    spec.memory = 1 << 26  # Address space; only what contacts fill is used.
     bodies = [
         spec.worldbody.add_body(mass=1.0, inertia=np.ones(3), explicitinertial=True) for _ in range(capacity)
     ]

@@ -1,4 +1,4 @@
-"""Physical plausibility of the whole scene: shapes do not fill one another, and nothing floats."""
+"""Physical plausibility of the whole scene: shapes do not overlap, and nothing floats."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
 
     Each overlap is a measurement that the gap there is zero, and so is the smallest gap, up to 1 cm, below
     an object that touches nothing below it. All of them together correct poses, sizes and hidden extents at
-    once, each in proportion to its variance (the update of a Kalman filter). A gap beyond what the fits'
-    uncertainty can explain is left as it is and said of the objects: their shapes are doubtful.
+    once, each in proportion to its variance (the update of a Kalman filter). A gap that the fits'
+    uncertainty cannot explain stays as it is, and becomes a doubt of the objects.
 
     Args:
-        objects: The support surface and the objects on it; without `uncertainty` they stay as they are.
-        config: How exactly shapes touch, and what uncertainty can explain.
+        objects: The support surface and the objects on it; without `uncertainty` they do not change.
+        config: How exactly shapes touch, and limits of the uncertainty.
 
     Returns:
-        The objects in the same order, `doubt` telling what could not be explained.
+        The objects in the same order; `doubt` says what could not be explained.
     """
     done = list(objects)
     sigma = np.array([deviations(o) for o in objects]).reshape(-1, 9)
@@ -59,12 +59,12 @@ def reconcile(objects: Sequence[SceneObject], config: PlausibilityConfig) -> lis
 
 
 def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) -> SceneObject:
-    """Return an object whose shape is as likely as its own: moved, turned and sized by its uncertainty.
+    """Return an object with a shape drawn from its uncertainty: moved, turned and resized.
 
     Args:
-        o: An object; without `uncertainty` it stays as it is.
+        o: An object; without `uncertainty` it does not change.
         rng: Source of the draw.
-        config: How many standard deviations uncertainty can explain.
+        config: Maximum number of standard deviations.
     """
     draw = np.clip(rng.standard_normal(9), -config.sigmas, config.sigmas)
     return replace(o, shape=_changed(o.shape, draw * deviations(o)))
@@ -72,7 +72,7 @@ def drawn(o: SceneObject, rng: np.random.Generator, config: PlausibilityConfig) 
 
 @cache
 def effect(ties: tuple[int, int, int]) -> Array:
-    """What each independent variable (9,) does to translation, rotation and half extents (9, 9).
+    """Effect of each independent variable (9,) on translation, rotation and half extents (9, 9).
 
     Args:
         ties: Which extents of the shape are one number.
@@ -81,7 +81,7 @@ def effect(ties: tuple[int, int, int]) -> Array:
     matrix[3:6, 3:6] = np.eye(3)
     for axis, round_ in enumerate(_round(ties)):
         if round_:
-            # What is round moves as a whole, and its radius is one number.
+            # A round shape moves as a whole, and its radius is one number.
             matrix[axis, axis] = 1.0
         else:
             matrix[[axis, 6 + axis], axis] = -0.5, 0.5
@@ -100,7 +100,7 @@ def deviations(o: SceneObject) -> Array:
     """Standard deviation of each of an object's independent variables (9,); zero where it cannot change.
 
     Args:
-        o: An object; the support surface, and what has no `uncertainty`, cannot change.
+        o: An object; the support surface, and objects without `uncertainty`, cannot change.
     """
     sigma = np.zeros(9)
     if (known := o.uncertainty) is None or o.role == "support_surface":
@@ -128,7 +128,7 @@ def _floating(
 
 
 def gap_rows(objects: Sequence[SceneObject], contacts: Sequence[Contact], pairs: NDArray[np.intp]) -> Array:
-    """How much (K, 2, 9) each variable of the two objects of a contact closes its gap.
+    """How far (K, 2, 9) each variable of the two objects of a contact closes its gap.
 
     Args:
         objects: All of them.
@@ -153,7 +153,7 @@ def closing(pairs: NDArray[np.intp], rows: Array, variance: Array, gaps: Array, 
     Args:
         pairs: The two objects of each gap (K, 2).
         rows: How much (K, 2, V) each variable of the two closes it.
-        variance: Of each variable (N, V); zero for what cannot change.
+        variance: Variance of each variable (N, V); zero if it cannot change.
         gaps: (K,).
         noise: Variance of a gap that is closed [m²].
     """
@@ -176,7 +176,7 @@ def _changed(shape: Shape, change: Array) -> Shape:
 
 
 def _doubts(objects: Sequence[SceneObject], contacts: Sequence[Contact]) -> dict[int, str]:
-    """What to say of the objects of contacts that uncertainty does not explain."""
+    """The doubts about objects of contacts that uncertainty does not explain."""
     doubts: dict[int, str] = {}
     for c in contacts:
         for k, other in ((c.a, c.b), (c.b, c.a)):

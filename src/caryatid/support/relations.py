@@ -29,7 +29,7 @@ from caryatid.support.stability import (
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Touch:
-    """A contact as one of its two objects feels it.
+    """A contact from the side of one of its two objects.
 
     Attributes:
         other: The object that touches it.
@@ -39,7 +39,7 @@ class Touch:
         tilt: Angle of the normal to the vertical [deg]; below 90 where `other` is the lower one.
         points_world: Contact points (K, 3) [m].
         point_world: Centre (3,) [m] of the contact.
-        margin: Gap up to which the two are taken to touch [m].
+        margin: Gap up to which the two count as touching [m].
     """
 
     other: SceneObject
@@ -57,10 +57,10 @@ class Touch:
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """An object that moves when another one is taken away.
+    """An object that moves when another one is removed.
 
     Attributes:
-        object_id: Which.
+        object_id: Its id.
         certain: False where it may move, or may not.
         why: What it loses, for a person to read.
         probability: Probability that it moves [1].
@@ -75,17 +75,17 @@ class Effect:
 def infer(
     objects: Sequence[SceneObject], config: SupportConfig, rng: np.random.Generator | None = None
 ) -> SupportGraph:
-    """Infer who supports whom among the objects of one scene model, and how likely.
+    """Infer which objects of a scene model support which, and how likely.
 
     From each separating plane the lower object supports the upper one. An object whose centre of mass lies
-    outside what then carries it looks for what keeps it from tipping: first contacts below it that a slightly
-    wrong fit may have opened or made steep, then neighbours it leans on and objects that weigh it down. What
-    touches nothing below it is let down until it does.
+    outside its support polygon needs something else that keeps it from tipping: first contacts below it that
+    a slightly wrong fit may have opened or made steep, then neighbours it leans on and objects that weigh it
+    down. An object that touches nothing below it is lowered until it does.
 
     Args:
-        objects: Shapes in the world frame; the one with role `support_surface` is supported by nothing.
+        objects: Shapes in the world frame; nothing supports the one with role `support_surface`.
         config: The stage's numbers.
-        rng: Source of the draws that probabilities come from; None draws the same ones every time.
+        rng: Source of the draws for probabilities; None draws the same ones every time.
 
     Returns:
         The graph. The probability of a support is the mean of two witnesses: the rules, which say 1, and the
@@ -104,7 +104,7 @@ def infer(
 
 
 def _by_rules(objects: Sequence[SceneObject], config: SupportConfig) -> SupportGraph:
-    """What planes, support polygons and the ways objects tip say of supports."""
+    """The supports by planes, support polygons and the ways objects tip."""
     if len({o.id for o in objects}) < len(objects):
         raise InputError("objects", "two of them have the same id", "give every object an id of its own")
     ordered = tuple(sorted(objects, key=lambda o: (o.role != "support_surface", o.label)))
@@ -133,7 +133,7 @@ def _by_rules(objects: Sequence[SceneObject], config: SupportConfig) -> SupportG
         edges += _weighed_down(o, riders, stability[o.id], tipping, config)
     rank = {o.id: i for i, o in enumerate(ordered)}
     edges.sort(key=lambda s: (rank[s.supporter], rank[s.supported]))
-    # Solids touch by several parts.
+    # Solids touch with several parts.
     once = {s.pair: s for s in reversed(edges)}
     return SupportGraph(ordered, tuple(reversed(once.values())), stability)
 
@@ -177,20 +177,20 @@ def explain(graph: SupportGraph, supporter: str, supported: str, config: Support
 
 
 def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) -> tuple[Effect, ...]:
-    """Say which objects will or may move when one is taken away.
+    """Say which objects will or may move when one is removed.
 
-    What loses a support is looked at again as if the supporter had never been there: it falls for certain
-    where nothing touches it from below any more, or its centre of mass is further outside what is left of its
-    support polygon than the fits' uncertainty explains. It may move where that is not so sure, or where only
-    a support that is uncertain itself is lost. What falls takes its support from others in turn.
+    An object that loses a support is judged as if the supporter had never existed. It falls for certain if
+    nothing touches it from below any more, or if its centre of mass is further outside the rest of its
+    support polygon than the fits' uncertainty explains. It may move if that is less certain, or if only an
+    uncertain support is lost. An object that falls takes its support from others in turn.
 
     The probability that an object moves is that of losing a support it has, times that of falling without: a
     support is lost with the probability that its supporter moves, one independently of the other, and the
-    centre of mass is off by the standard deviation of the fit. Where all supports and fits are sure it is 1.
+    centre of mass is off by the standard deviation of the fit. If all supports and fits are certain, it is 1.
 
     Args:
-        graph: What is known.
-        object_id: The object that is taken away.
+        graph: The support graph.
+        object_id: The object to remove.
         config: The numbers the graph was inferred with.
 
     Returns:
@@ -203,7 +203,7 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
         raise InputError(object_id, "is the support surface", "ask about one of the objects on it")
     effects: dict[str, Effect] = {}
     for certain in (True, False):
-        # First what moves for certain; then what may, once all that certainly moves is gone.
+        # First the objects that certainly move; then those that may, once the others are gone.
         while True:
             moving = {i: e.probability for i, e in effects.items() if e.certain or not certain}
             gone = {object_id: 1.0} | moving
@@ -215,7 +215,7 @@ def predict_removal(graph: SupportGraph, object_id: str, config: SupportConfig) 
 
 
 def _known(graph: SupportGraph, object_id: str) -> SceneObject:
-    """The object of that id; an InputError where there is none."""
+    """The object of that id; an InputError if there is none."""
     for o in graph.objects:
         if o.id == object_id:
             return o
@@ -230,7 +230,7 @@ def _next_effect(
     certain: bool,
     config: SupportConfig,
 ) -> Effect | None:
-    """One more object that moves once some are gone, each with a probability: for certain, or perhaps."""
+    """The next object that moves, for certain or perhaps, once some are gone, each with a probability."""
     staying = [o for o in graph.objects if o.id not in gone]
     losses = [(o, [s for s in graph.supporters(o.id) if s.supporter in gone]) for o in staying]
     losses = [(o, lost) for o, lost in losses if lost and o.id not in known]
@@ -257,7 +257,7 @@ def _next_effect(
 def _find_touches(
     objects: Sequence[SceneObject], reach: float, config: SupportConfig
 ) -> dict[str, list[Touch]]:
-    """What touches each object, or is nearer than a reach [m], by the object's id."""
+    """The contacts of each object, and those within a reach [m], by the object's id."""
     shapes = [o.shape for o in objects]
     low, high = Primitives.of(shapes).bounds()
     contacts = [c for c in find_contacts(shapes, reach) if not _parted(c, shapes, low, high)]
@@ -286,7 +286,7 @@ def _find_touches(
 
 
 def _parted(contact: Contact, shapes: Sequence[Shape], low: Array, high: Array) -> bool:
-    """Whether a third shape fills the gap: the floor of a tray parts what is in it from the table.
+    """Whether a third shape fills the gap: the floor of a tray separates its content from the table.
 
     Only one whose level box, from corners low to high (N, 3) [m], holds all the contact's points can.
     """
@@ -341,7 +341,7 @@ def _from_below(
 def _let_down(
     o: SceneObject, near: Sequence[SceneObject], config: SupportConfig
 ) -> tuple[list[Support], list[Array]]:
-    """Supports of an object that touches nothing below it: what it lands on first when let straight down."""
+    """Supports of an object that touches nothing below it: what it lands on first when lowered."""
     landings: list[tuple[float, SceneObject, Touch]] = []
     for other in near:
         drop = drop_distance(o.shape, other.shape, config.max_drop)
@@ -362,7 +362,7 @@ def _let_down(
 
 
 def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: SupportConfig) -> list[Support]:
-    """Leaning supports of an object that tips: who pushes against it, the nearest one if none touches."""
+    """Leaning supports of an object that tips: what pushes against it, or the nearest if none touches."""
     push = np.cos(np.radians(75.0))  # A push may come aslant, but not across the direction of tipping.
     aside = [t for t in touches if config.max_tilt < t.tilt < 180.0 - config.max_tilt]
     against = [t for t in aside if t.normal_world[:2] @ tipping.direction_xy < -push]
@@ -375,7 +375,7 @@ def _leaning(o: SceneObject, touches: list[Touch], tipping: Tipping, config: Sup
 def _weighed_down(
     o: SceneObject, riders: list[Touch], stability: Stability, tipping: Tipping, config: SupportConfig
 ) -> list[Support]:
-    """Top-down supports: what rests on an unstable object, all or only what weighs against its tipping."""
+    """Top-down supports of an unstable object: all objects on it, or those that weigh against tipping."""
     if stability.stable:
         return []
     head, found = _verdict(o.id, stability, config), []

@@ -19,13 +19,13 @@ from caryatid.support.contacts import Contact
 
 _UP = np.array([0.0, 0.0, 1.0])
 _NO_AREA = 1e-12
-"""Contact areas below this are lines and points, blurred by rounding [m²]; a micrometre squared."""
+"""Smaller contact areas are lines and points, blurred by rounding [m²]; a micrometre squared."""
 _HIT = 5e-4
 """A point this near to the other shape has met it [m]."""
 _STEEP = 0.1
 """Cosine to the vertical of a normal below which a contact is nearly a line from above: 84°."""
 _CORNERS = 8
-"""Most corners of a contact area [1]; a disc keeps nine tenths of its area."""
+"""Maximum number of corners of a contact area [1]; a disc keeps nine tenths of its area."""
 _EDGES = {
     "box": np.array([(i, i + bit) for i in range(8) for bit in (1, 2, 4) if not i & bit]),
     "cylinder": np.concatenate(
@@ -37,11 +37,11 @@ _EDGES = {
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Tipping:
-    """How the centre of mass lies to the support polygon, in the ground plane.
+    """Position of the centre of mass relative to the support polygon, in the ground plane.
 
     Attributes:
         polygon: P_s (M, 2) [m]: the convex hull of the contact areas.
-        overhang: How far the centre of mass lies outside [m], negative inside; infinite without any support.
+        overhang: Distance of the centre of mass outside [m], negative inside; infinite without any support.
         pivot_xy: Point (2,) [m] of the polygon's border nearest to the centre of mass: what it tips over.
         direction_xy: Unit vector (2,) the object tips towards; zero without any support.
     """
@@ -64,14 +64,14 @@ def contact_patch(
 ) -> Array:
     """Project to the ground the area over which two shapes touch: a polygon (M, 2) [m].
 
-    What of each shape lies within `patch_depth` of its extreme point along the normal counts as touching, and
-    a little more on long shapes, so that faces a fit has turned against each other still touch all over.
+    The part of each shape within `patch_depth` of its extreme point along the normal counts as touching, and
+    a little more on long shapes, so that faces turned slightly by a fit still touch all over.
 
     Args:
         shape: The shape the normal points to.
         other: The shape the normal comes from.
         normal_world: Unit normal (3,) of the separating plane, from `other` to `shape`.
-        points_world: Contact points (K, 3) [m]; they stand in where those parts do not overlap.
+        points_world: Contact points (K, 3) [m]; used if those parts do not overlap.
         config: `patch_depth`.
     """
     depth = _touching_depth(shape, config)
@@ -84,7 +84,7 @@ def contact_area(contact: Contact, config: SupportConfig) -> Array:
     """Corners (K, 3) [m] of the area over which the shapes of a contact touch, in its separating plane.
 
     Args:
-        contact: Steep ones, whose area has no outline seen from above, give their own points.
+        contact: The contact; a steep one, whose area has no outline from above, gives its own points.
         config: `patch_depth`.
     """
     x, y, z = contact.normal_world
@@ -115,7 +115,7 @@ def beneath(shapes: Primitives, index: int, limit: float) -> list[int]:
 
 
 def find_tipping(shape: Shape, patches: Sequence[Array]) -> Tipping:
-    """Where the centre of mass projects against the contact areas, each (M, 2) [m]."""
+    """The centre of mass relative to the contact areas, each (M, 2) [m]."""
     polygon = polygons.hull(np.concatenate([np.empty((0, 2)), *patches]))
     centre_xy = shape.centre_of_mass[:2]
     if not len(polygon):
@@ -146,13 +146,13 @@ def centroid(polygon: Array) -> Array:
 
 
 def _touching_depth(shape: Shape, config: SupportConfig) -> float:
-    """How deep [m] a shape touches: faces turned by a degree in a fit do so all over; a ball has none."""
+    """Depth [m] to which a shape touches, so that faces a degree apart touch all over; 0 for a ball."""
     turned = 0.0 if shape.kind == "sphere" else np.sin(np.radians(1.0)) * float(shape.extents.max()) / 2.0
     return config.patch_depth + float(turned)
 
 
 def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) -> float:
-    """Way [m] until the first surface point meets the target; what touches at once lies beside it."""
+    """Distance [m] until the first surface point meets the target; points touching at once lie beside."""
     spacing = float(shape.extents.max()) / 16.0
     corners_world = shape.outline() if shape.kind != "sphere" else np.empty((0, 3))
     points_world = np.concatenate([shape.surface(spacing)[0], corners_world])
@@ -160,7 +160,7 @@ def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) ->
     points_world = points_world[in_front & (target.signed_distance(points_world) > _HIT)]
     travelled = np.zeros(len(points_world))
     step = np.full(len(points_world), np.inf)
-    for _ in range(40):  # Enough to come within a hair wherever the way is not along a wall.
+    for _ in range(40):  # Enough to come very close unless the path runs along a wall.
         step = target.signed_distance(points_world + travelled[:, None] * direction_world)
         on_its_way = (travelled + step <= limit) & (step > -_HIT)
         points_world, step = points_world[on_its_way], step[on_its_way]
@@ -171,7 +171,7 @@ def _march(shape: Shape, target: Shape, direction_world: Array, limit: float) ->
 
 
 def _cap(shape: Shape, direction_world: Array, depth: float) -> Array:
-    """Outline on the ground (M, 2) [m] of what lies within `depth` of a shape's extreme point that way."""
+    """Outline on the ground (M, 2) [m] of the part within `depth` of a shape's extreme point."""
     if shape.kind == "sphere":
         return polygons.hull(_ball_cap(shape, direction_world, depth))
     if isinstance(shape, Solid):
@@ -188,7 +188,7 @@ def _outline(shape: Shape) -> Array:
 
 
 def _ball_cap(ball: Shape, direction_world: Array, depth: float) -> Array:
-    """Rim (48, 2) [m] of a ball's cap, or of its middle where the cap is deeper, laid onto the ground."""
+    """Rim (48, 2) [m] of a ball's cap, or of its middle if the cap is deeper, projected to the ground."""
     radius = float(ball.extents[0]) / 2.0
     depth = min(depth, radius)
     x, y, z = direction_world.tolist()

@@ -48,7 +48,7 @@ def make_planner(name: Planner | str) -> Planner:
     """Return the planner of this name; a planner is returned as it is.
 
     Raises:
-        InputError: There is none, then the message lists those there are; or it is `oracle`.
+        InputError: There is none, and the message lists the known ones; or it is `oracle`.
     """
     planner: Planner
     if not isinstance(name, str):

@@ -1,4 +1,4 @@
-"""Planners that do not look at the scene: random placement (the paper's baseline), a ring, farthest point."""
+"""Planners that do not use the scene: random placement (the paper's baseline), a ring, farthest point."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class FarthestPlanner:
 class RingPlanner:
     """Goes around the scene in `STOPS` equal steps of azimuth, at the first view's elevation.
 
-    Each further round is turned into the gaps of those before: by a half, a quarter, three quarters of a
+    Each further round fills the gaps of those before: by a half, a quarter, three quarters of a
     step, and so on.
     """
 

@@ -1,10 +1,10 @@
-"""The default planner: look where most of what is hidden would come into sight.
+"""The default planner: look where most of what is hidden becomes visible.
 
-It keeps the frame of Algorithm 2, c = s − h with inhibition of return over the reachable part of the view
-sphere, and asks of each candidate what it would show that no earlier view has: the surface of the fitted
-objects, most of those of which least has been seen; the unseen space on the table in which a supporter may
-stand, most of it among the objects; and the points of Algorithm 1. A point counts when its line of sight is
-free of what was seen occupied and of the fitted shapes. With a goal, only what its removal depends on counts.
+As in Algorithm 2, it maximises c = s − h with inhibition of return over the reachable part of the view
+sphere. s is what a candidate would show for the first time: the surface of the fitted objects, the least
+seen ones first; the unseen space on the table that may hold a supporter, most of it among the objects; and
+the points of Algorithm 1. A point counts when its line of sight is free of what was seen occupied and of the
+fitted shapes. With a goal, only what its removal depends on counts.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ WORTH_SAYING = 0.05
 
 
 class SupportPlanner:
-    """Takes the candidate that promises to show most of what is hidden, at little cost."""
+    """Chooses the candidate that promises to show most of what is hidden, at little cost."""
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
-        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
+        """Choose the candidate with the largest c = s − h, eq. 3; the first of equal ones.
 
         s is the worth of what a candidate shows for the first time, h the cost of going there,
         `config.effort` times that
@@ -83,7 +83,7 @@ def _expected_gain(
     seen = visibility(join([surfaces, points]), T_world_visited, occluders, config).max(axis=1, initial=0.0)
     shares = unseen_shares(surfaces, seen[: len(surfaces.weights)])
     surfaces = replace(surfaces, weights=surfaces.weights * shares)
-    # All relations' points of interest are worth a tenth of all the objects' surfaces.
+    # All relations' points of interest weigh a tenth of all the objects' surfaces.
     points = replace(points, weights=0.1 * points.weights)
     space = space_samples(state.graph, occluders)
     samples = join([surfaces, points, space])
@@ -101,9 +101,9 @@ def _on_sphere(
 
 
 def _hidden_points(state: PlanningState, samples: Samples, gain: Array) -> list[PointOfInterest]:
-    """One point of interest per object and for the unseen space: the middle of what is left to be seen of it.
+    """One point of interest per object and for the unseen space: the middle of its unseen part.
 
-    Its saliency is how much of that there is, in shares of the subject with most of it.
+    Its saliency is the size of that part, relative to the largest one.
     """
     left = gain.max(axis=1, initial=0.0)
     sums = np.zeros((len(samples.names), 8))

@@ -28,7 +28,7 @@ class PaperPlanner:
     """
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
-        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
+        """Choose the candidate with the largest c = s − h, eq. 3; the first of equal ones.
 
         A point of interest counts where the robot reaches its projection on the view sphere. It raises the
         saliency of the views around it, or lowers it where something stands in the line of sight.
@@ -58,7 +58,7 @@ class PaperPlanner:
 
 
 def _at_reachable_height(point: PointOfInterest, candidates: Candidates) -> PointOfInterest:
-    """An object without support asks for an azimuth alone: look from the middle of the reachable heights."""
+    """An object without support asks only for an azimuth: look from the middle of the reachable heights."""
     if len(point.subject) > 1:
         return point
     height = float(np.median(candidates.directions[:, 2]))
@@ -72,7 +72,7 @@ def _reachable(direction: Array, state: PlanningState) -> bool:
     nearest = int(np.argmax(candidates.directions @ direction))
     if candidates.indices is not None:
         return int(np.argmax(state.sphere.directions @ direction)) == int(candidates.indices[nearest])
-    # Elsewhere than at its points: within their mean spacing.
+    # Off its points: within their mean spacing.
     angle = np.arccos(np.clip(candidates.directions[nearest] @ direction, -1.0, 1.0))
     return bool(angle <= np.sqrt(4.0 * np.pi / len(state.sphere.directions)))
 
@@ -93,7 +93,7 @@ def _on_sphere(
     directions: Array,
     config: ActiveVisionConfig,
 ) -> Array:
-    """Saliency (M,) of all directions (M, 3); a function that can be pickled, since most never draw it."""
+    """Saliency (M,) of all directions (M, 3); a picklable function, because most never draw it."""
     return _saliency(points, hidden, visited, directions, config)[0]
 
 
@@ -104,7 +104,7 @@ def _saliency(
     directions: Array,
     config: ActiveVisionConfig,
 ) -> tuple[Array, NDArray[np.intp]]:
-    """Saliency (M,) of views in directions (M, 3), and the point it is of (M,); −1 where none adds any."""
+    """Saliency (M,) of views in directions (M, 3), and the point it comes from (M,); −1 for none."""
     given = painted(points, directions, float(np.deg2rad(config.spread)))
     raised = np.where(hidden, 0.0, given)
     lowered = np.where(hidden, given, 0.0).max(axis=1, initial=0.0)

@@ -28,9 +28,9 @@ class AttentionPlanner:
     """
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
-        """Choose the candidate with the largest c = s − h, eq. 3; of equal ones the first.
+        """Choose the candidate with the largest c = s − h, eq. 3; the first of equal ones.
 
-        Of several points of interest that reach a candidate the one with the largest saliency there counts,
+        If several points of interest reach a candidate, the one with the largest saliency there counts,
         after that of the hidden ones is negated; a candidate that none reaches has none.
         """
         check_candidates(state)
@@ -56,7 +56,7 @@ class AttentionPlanner:
 def _on_sphere(
     points: Sequence[PointOfInterest], visited: Array, directions: Array, config: ActiveVisionConfig
 ) -> Array:
-    """Saliency (M,) of views that are not asked whether points are hidden from them."""
+    """Saliency (M,) of views without a test whether points are hidden from them."""
     return _largest(points, directions, config)[0] + inhibition_of_return(visited, directions, config)
 
 
@@ -88,7 +88,7 @@ def _largest(
 
 
 def _hidden(points: Sequence[PointOfInterest], state: PlanningState) -> NDArray[np.bool_] | None:
-    """Which points are hidden from which candidates (N, K); None where that does not matter."""
+    """Which points are hidden from which candidates (N, K); None if that does not matter."""
     if not points or state.config.occlusion == "ignore":
         return None
     positions = np.stack([p.position_world for p in points])

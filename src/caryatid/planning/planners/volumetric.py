@@ -1,4 +1,4 @@
-"""Planners of the field: the view whose rays gather most volumetric information in the voxel map.
+"""Planners from the literature: the view whose rays gather most volumetric information in the voxel map.
 
 The formulations are those of Isler et al. (An Information Gain Formulation for Active Volumetric 3D
 Reconstruction, 2016) and Delmerico et al. (A Comparison of Volumetric Information Gain Metrics for Active 3D
@@ -17,7 +17,7 @@ They come from the reconstruction of one object in a box known beforehand. Here 
 the table up to the height of the highest object. Without it the room behind, the floor, and what is outside
 the image would outweigh everything: half of the map's voxels are still unknown after a first view. For the
 same reason p_v is 1 where a ray enters the box. Unknown space inside objects counts, as it does there: these
-planners know of no shapes.
+planners do not know shapes.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ PROXIMITY = 0.1
 
 
 class VolumetricPlanner:
-    """Takes the candidate with the largest utility IG / ΣIG − cost / Σcost.
+    """Chooses the candidate with the largest utility IG / ΣIG − cost / Σcost.
 
     Args:
         formulation: How information is counted, one of `VOLUMETRIC`.
@@ -53,12 +53,12 @@ class VolumetricPlanner:
         self._column = VOLUMETRIC.index(formulation)
 
     def plan(self, state: PlanningState, rng: np.random.Generator) -> Decision:
-        """Choose the candidate with the largest utility; of equal ones the first.
+        """Choose the candidate with the largest utility; the first of equal ones.
 
         The decision's saliency, cost and score are the two terms of the utility and their difference, in
-        units of the largest share of information. Candidates beside an earlier view are left out: a planner
-        of the field does not choose a view of its list twice. Without a table or objects there is no box to
-        look into, and nothing is gathered.
+        units of the largest share of information. Candidates beside an earlier view are left out: these
+        planners do not choose a view of their list twice. Without a table or objects there is no box to look
+        into, and nothing is gathered.
         """
         check_candidates(state)
         candidates, config = state.candidates, state.config
@@ -88,7 +88,7 @@ class VolumetricPlanner:
 
 
 def _new_views(state: PlanningState, looks: Looks) -> Looks:
-    """Leave out what is nearer to an earlier view than candidates are to one another, unless that is all."""
+    """Leave out candidates nearer to an earlier view than to one another, unless that is all."""
     directions = state.candidates.directions
     cosine = directions[looks.chosen] @ state.visited.T
     old = cosine.max(axis=1) >= np.cos(np.sqrt(4.0 * np.pi / state.config.look_directions))
@@ -117,7 +117,7 @@ def ray_information(voxels: VoxelMap, T_world_camera: Array, rays_camera: Array)
         rays_camera: Unit directions (R, 3) of the rays in the camera.
 
     Returns:
-        (C, 5), a column each of `VOLUMETRIC`: [bit] for entropies, [m] for `proximity-count`.
+        (C, 5), one column per name of `VOLUMETRIC`: [bit] for entropies, [m] for `proximity-count`.
     """
     occupancy, states = voxels.occupancy, np.ascontiguousarray(voxels.states)
     entropy = -occupancy * np.log2(occupancy) - (1.0 - occupancy) * np.log2(1.0 - occupancy)
