@@ -52,11 +52,13 @@ class Run:
 RUNS = {
     "bridge-labels": Run("explore bridge --views 4 --noise carmine", exports=True, slow=False),
     "clutter-auto": Run("explore clutter --views 4 --noise carmine --segmentation auto", exports=True),
-    "plank-labels": Run("explore leaning_plank --views 3 --planner paper --seed 3", slow=False),
+    "plank-labels": Run("explore leaning_plank --views 3 --noise none --planner paper --seed 3", slow=False),
     "dense-auto": Run("explore dense-12-0 --views 4 --noise carmine --segmentation auto --no-early-stop"),
     "packed-auto": Run("explore packed-20-0 --views 3 --noise carmine --segmentation auto --no-early-stop"),
     "pile-sg": Run("explore pile-8-3 --views 3 --noise carmine --fusion sg", slow=False),
-    "tower-pc-auto": Run("explore tower --views 3 --segmentation auto --fusion pc --planner occlusion-aware"),
+    "tower-pc-auto": Run(
+        "explore tower --views 3 --noise none --segmentation auto --fusion pc --planner occlusion-aware"
+    ),
     "house-labels": Run("explore SHARED/scenes/house02_7/scene.xml --views 3 --noise carmine", exports=True),
     "ycb-auto": Run("explore SHARED/scenes/ycb03_7/scene.xml --views 3 --noise carmine --segmentation auto"),
     "frame-auto": Run("extract SHARED/data/mosd/learn22 --segmentation auto", exports=True),

@@ -93,6 +93,8 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
         ("explore tower --out x --seed -1", "-1 is not a whole number of at least 0"),
         ("explore tower --out x --colour", "--colour"),
         ("juggle", "juggle"),
+        ("expore tower", "Did you mean explore?"),
+        ("explore tower --planner suport", "Did you mean support?"),
         ("", "explore"),
     ],
 )

@@ -67,7 +67,7 @@ def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
     assert run_command("session", "add", folder, *files(0)) == 0
     assert capsys.readouterr().out == "view 1: 2 objects, 2 supports\n"
     assert run_command("session", "add", folder, *files(1), "--number", 0) == 1
-    assert "the next one is view 1" in capsys.readouterr().err
+    assert "the next one is 1" in capsys.readouterr().err
 
     path = folder.parent / "candidates.json"
     poses = [view.pose.tolist() for view in views[1:]]
@@ -81,7 +81,7 @@ def test_a_robot_gives_the_poses_it_reaches(folder, files, capsys, views):
 
 
 BAD = (
-    ({"T_world_camera": None}, "'T_world_camera' is null: must be 4×4 finite numbers; give K"),
+    ({"T_world_camera": [1]}, "'T_world_camera' is [1]: must be 4×4 finite numbers; give K"),
     ({"T_world_camera": np.diag((2, 2, 2, 2)).tolist()}, "camera.json"),
     ({"depth_scale": 0}, "'depth_scale' is 0"),
 )

@@ -332,7 +332,7 @@ def test_a_view_whose_answer_was_lost_may_be_sent_again(begun, views):
         again = session.add(views[2], number=2)
         assert (again.number, again.changed, again.graph) == (first.number, first.changed, first.graph)
         for number, view in ((2, views[0]), (0, views[0]), (4, views[0])):
-            with pytest.raises(SessionConflictError, match="the next one is view 3"):
+            with pytest.raises(SessionConflictError, match="the next one is 3"):
                 session.add(view, number=number)
         assert session.views == 3
 
@@ -413,6 +413,18 @@ def test_views_that_cannot_be_used_change_nothing(begun, views, graph_after):
             assert contents(begun) == before, case
         session.add(views[2])
         assert graph_text(session.graph) == graph_after(0, 1, 2)
+
+
+def test_the_first_view_needs_no_pose(folder, views):
+    with Session.begin(folder) as session:
+        added = session.add(replace(views[0], T_world_camera=None))
+        assert added.graph.supports
+        assert added.T_world_camera is not None
+        T = added.T_world_camera @ np.linalg.inv(views[0].pose)
+        session.add(views[1].with_pose(T @ views[1].pose))
+    with Session.open(folder) as session:
+        assert session.views == 2
+        assert np.allclose(session.next([T @ views[2].pose]).decision.T_world_camera, T @ views[2].pose)
 
 
 def test_labels_come_with_all_views_or_with_none(folder, views):

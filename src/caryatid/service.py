@@ -126,7 +126,7 @@ class NewView(Document):
     def capture(self) -> Capture:
         """The view, its images not decoded yet."""
         images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
-        name = "view" if self.number is None else f"view {self.number}"
+        name = "view" if self.number is None else f"view {self.number + 1}"
         given = {key: content for key, content in images.items() if content is not None}
         return Capture(given, replace(self.camera, name=name))
 
@@ -136,6 +136,9 @@ class ViewAnswer(Document):
 
     view: int = Field(description="Number of the view, from 0")
     changed: bool = Field(description="Whether it changed the graph")
+    T_world_camera: list[list[float]] | None = Field(
+        description="Pose [m] after registration, or null while the view waits"
+    )
     note: str | None = Field(description="That the view waits for one that shows the table top, or null")
     graph: dict[str, Any] = Field(description="graph.json")
 

@@ -9,6 +9,8 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from itertools import pairwise
 from pkgutil import resolve_name
 from typing import Annotated, Any, Literal, Union
 
@@ -21,9 +23,9 @@ DESCRIPTION = """Explore a cluttered table until it is known which object suppor
 To begin:
   caryatid demo                                     a built-in table, explored in simulation
   caryatid view clutter                             the same in the browser, view by view
-  caryatid explore tower --noise carmine --out run  another, or a scene or recording of your own
-  caryatid extract table.pcd --out run              one cloud, or all views of a recording
-  caryatid order run                                a safe order to take away what was found
+  caryatid explore tower                            another one, or your own scene or recording
+  caryatid extract sample-cloud                     one cloud, or all views of a recording
+  caryatid order run                                a safe order in which to remove what was found
   caryatid COMMAND --help                           what a command does, its options, and examples
   caryatid --version                                the version of caryatid
 """
@@ -73,12 +75,30 @@ def read_command(arguments: Sequence[str]) -> Any:
     """
     shown = sys.stdout.isatty() and sys.stderr.isatty() and not os.environ.get("NO_COLOR")
     tyro._experimental_options["ansi_codes"] = shown
-    if arguments and arguments[0] in COMMANDS:
-        name, *options = arguments
-        return tyro.cli(find_command(name), prog=f"caryatid {name}", args=options, config=MARKERS)
-    return tyro.cli(
-        _any_command(), prog="caryatid", description=DESCRIPTION, args=list(arguments), config=MARKERS
-    )
+    name, *options = [*arguments] or [""]
+    try:
+        if name in COMMANDS:
+            return tyro.cli(find_command(name), prog=f"caryatid {name}", args=options, config=MARKERS)
+        return tyro.cli(
+            _any_command(), prog="caryatid", description=DESCRIPTION, args=list(arguments), config=MARKERS
+        )
+    except SystemExit as end:
+        if end.code:
+            _suggest(name, options)
+        raise
+
+
+def _suggest(name: str, options: Sequence[str]) -> None:
+    """Print the command or planner that a mistyped one resembles."""
+    from caryatid.planning.planners import BUILT_IN, ORACLE, offered
+
+    known, given = [*COMMANDS], [name]
+    if name in COMMANDS:
+        known = [*BUILT_IN, *offered(), ORACLE]
+        given = [value for option, value in pairwise(options) if option == "--planner"]
+    for word in given:
+        if word not in known and (meant := get_close_matches(word, known, 1)):
+            sys.stderr.write(f"Did you mean {meant[0]}?\n")
 
 
 def _any_command() -> Any:

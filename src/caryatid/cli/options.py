@@ -243,7 +243,7 @@ class ExploringCommand(PlanningCommand):
     """Maximum number of views, including the first."""
     level: Flag = False
     """Turn the world of a recording so that the table is level, for poses whose z is not up."""
-    noise: NoiseModel = "none"
+    noise: NoiseModel = "carmine"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 
     def config(self) -> Config:

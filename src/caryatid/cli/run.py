@@ -49,16 +49,6 @@ class RunCommand(options.Command):
         """Open the source; returns its name, its ground truth, and the steps of the run."""
         raise NotImplementedError
 
-    def conditions(self) -> str:
-        """Where segments come from, and the noise of a simulation."""
-        from caryatid.sources import is_cloud, is_recording
-
-        simulated = not is_cloud(self.source) and not is_recording(self.source)
-        masks = self.settings.masks_from or ("simulator" if simulated else "of the source, if it has any")
-        segments = "automatic" if getattr(self, "segmentation", None) == "auto" else f"masks: {masks}"
-        text = segments if segments.startswith("masks") else f"segments: {segments}"
-        return f"{text}, noise: {getattr(self, 'noise', 'none')}" if simulated else text
-
     def run(self, config: Config, page: PageProcess | None = None) -> None:
         """Keep all steps, write the report and print the result."""
         from caryatid.cli.output import profile
@@ -69,7 +59,7 @@ class RunCommand(options.Command):
         output = self.output
         with RunWriter(self.out, config, _about(self)) as writer:
             name, truth, steps = self.open(config)
-            writer.more["conditions"] = conditions = self.conditions()
+            writer.more["conditions"] = conditions = _conditions(self)
             graph = _record(writer, steps, truth, output, page, f"{name}: {conditions}").graph
         if not self.no_report:
             _draw_report(self.out, output)
@@ -117,7 +107,7 @@ class Explore(RunCommand, Exploring):
       a recording: a folder in the BOP format; the camera can only be where a recorded view is
 
     To try:
-      caryatid explore tower --noise carmine --out run
+      caryatid explore tower --out run
       caryatid explore clutter --goal o3 --out run
       caryatid explore scene.xml --views 5 --out run
       caryatid explore tower --robot arm:arm.npz --out run
@@ -139,8 +129,8 @@ class Explore(RunCommand, Exploring):
         source, steps = self.explore(config, goal=self.goal, until=self.until)
         return source.name, source.truth, steps
 
-    def __call__(self, config: Config | None = None) -> None:
-        config = config or self.config()
+    def __call__(self) -> None:
+        config = self.config()
         with _watched(self.source, config, self.output) if self.view else nullcontext() as page:
             self.run(config, page)
 
@@ -156,18 +146,13 @@ class Demo(RunCommand):
 
     source: Annotated[str, tyro.conf.arg(name="scene", metavar="NAME")] = "clutter"
     """A built-in scene, such as tower, bridge or dense-12-0."""
-    views: Annotated[options.OptionalCount, options.shown(default=5)] = None
+    views: Annotated[options.OptionalCount, options.default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
     view: options.Flag = False
     """Show every view in the browser; the page then stays until Ctrl-C."""
 
     def __call__(self) -> None:
-        from caryatid.config.settings import changed_settings, preset
-
-        fewer = changed_settings(preset(self.settings.preset), {"active": {"max_views": 5}}, "demo")
-        config = self.settings.read({"active.max_views": self.views}, fewer, takes_views=True)
-        shared = {field.name: getattr(self, field.name) for field in fields(self)}
-        Explore(**shared | {"noise": "carmine"})(config)
+        Explore(**{field.name: getattr(self, field.name) for field in fields(self)})()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -182,7 +167,7 @@ class View(options.ExploringCommand):
 
     To try:
       caryatid view run
-      caryatid view clutter --noise carmine
+      caryatid view clutter
       caryatid view recording/ --segmentation auto --port 8080 --no-browser
     """
 
@@ -283,7 +268,7 @@ class Clear(options.ExploringCommand):
     more than 2 cm or 15°. After a kill, the same command continues.
 
     To try:
-      caryatid clear bridge --noise carmine
+      caryatid clear bridge
       caryatid clear clutter --goal o3 --hands 1
       caryatid clear scene.xml --risk 0.1 --out run
     """
@@ -363,7 +348,8 @@ class Clear(options.ExploringCommand):
 
             known = {"hands": self.hands, "threads": cores()}
             steps = clear(explorer, take, past=() if past is None else read_steps(past), **known)
-            last = _record(writer, steps, None, output)
+            writer.more["conditions"] = conditions = _conditions(self)
+            last = _record(writer, steps, None, output, heading=f"{source.name}: {conditions}")
         if not self.no_report:
             _draw_report(self.out, output)
         harmed = sorted({body for lift in lifts for body in lift["disturbed"]})
@@ -415,6 +401,17 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
         page.close()
 
 
+def _conditions(command: RunCommand | Clear) -> str:
+    """Where segments come from, and the noise of a simulation."""
+    from caryatid.sources import is_cloud, is_recording
+
+    simulated = not is_cloud(command.source) and not is_recording(command.source)
+    masks = command.settings.masks_from or ("simulator" if simulated else "of the source, if it has any")
+    automatic = getattr(command, "segmentation", None) == "auto"
+    text = "segments: automatic" if automatic else f"masks: {masks}"
+    return f"{text}, noise: {getattr(command, 'noise', 'carmine')}" if simulated else text
+
+
 def _about(command: RunCommand | Clear) -> dict[str, Any]:
     """Entries of run.json about the command."""
     names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands")
@@ -429,7 +426,7 @@ def _about(command: RunCommand | Clear) -> dict[str, Any]:
 
 
 def _record(
-    writer: RunWriter | None,
+    writer: RunWriter,
     steps: Iterable[Step],
     truth: TrueScene | None,
     output: Output,
@@ -440,12 +437,10 @@ def _record(
     from caryatid.evaluation.scores import score
 
     last = None
-    if writer is not None:
-        writer.more["warnings"] = output.warnings
+    writer.more["warnings"] = output.warnings
     for step in steps:
         scored = None if truth is None else score(step.graph, truth)
-        if writer is not None:
-            writer.add(step, None if scored is None else asdict(scored))
+        writer.add(step, None if scored is None else asdict(scored))
         if heading and last is None:
             output.say(heading)
         output.step(step, None if last is None else last.graph, scored)

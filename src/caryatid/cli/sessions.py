@@ -68,6 +68,8 @@ class Add(SessionStep):
     """Add a view; once the command ends with status 0, the view is on disk and stays.
 
     camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm of one unit of depth, else 1}
+    The first view needs no T_world_camera: its table then defines the world (z = 0), --json prints its pose,
+    and `next` needs --candidates.
 
     To try:
       caryatid session add table --depth depth.png --camera camera.json

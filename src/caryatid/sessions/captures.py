@@ -45,7 +45,8 @@ class CameraRecord:
 
     Attributes:
         K: Pinhole matrix (3, 3) [px].
-        T_world_camera: Camera pose (4, 4) [m]; OpenCV camera frame, world z up.
+        T_world_camera: Camera pose (4, 4) [m]; OpenCV camera frame, world z up. The first view may lack one;
+            its table then defines the world.
         depth_scale: Millimetres of one unit of a depth PNG.
         name: What to call the view in messages.
         labels_are: Whether a label is an object's in all views or a segment's in this view alone.
@@ -53,7 +54,7 @@ class CameraRecord:
     """
 
     K: Annotated[Array, Numbers(3, 3)]
-    T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)]
+    T_world_camera: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
     depth_scale: Annotated[float, Gt(0.0)] = 1.0
     name: str = "view"
     labels_are: Literal["objects", "segments"] = "objects"
@@ -84,15 +85,12 @@ class Capture:
 
     @classmethod
     def of(cls, view: View) -> Capture:
-        """Return the capture that decodes to exactly this view.
-
-        Raises:
-            InputError: It has no pose.
-        """
+        """Return the capture that decodes to exactly this view."""
         arrays = (view.depth, view.rgb, view.labels, view.normals_camera)
         named = zip(("depth", "rgb", "labels", "normals"), arrays, strict=True)
         images = {key: npy(array) for key, array in named if array is not None}
-        return cls(images, CameraRecord(view.K, view.pose, name=view.name, labels_are=view.labels_are))
+        camera = CameraRecord(view.K, view.T_world_camera, name=view.name, labels_are=view.labels_are)
+        return cls(images, camera)
 
     @classmethod
     def from_files(cls, files: Mapping[str, Path | None], camera: Path, config: SessionConfig) -> Capture:
@@ -107,7 +105,9 @@ class Capture:
             InputError: One is missing or too large, or the camera is not valid.
         """
         images = {key: _read(path, config.max_bytes) for key, path in files.items() if path is not None}
-        given = CameraRecord.read(camera, "give K (3×3) and T_world_camera (4×4, in metres)")
+        given = CameraRecord.read(
+            camera, "give K (3×3), and T_world_camera (4×4, in metres) for all views but the first"
+        )
         return cls(images, replace(given, name=str(files["depth"])))
 
     @classmethod

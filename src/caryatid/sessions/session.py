@@ -32,6 +32,7 @@ from pydantic import Base64Bytes
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import given_candidates, next_best_view, reason_to_stop
+from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import png, read_mask
@@ -131,18 +132,21 @@ class Added:
         number: Number of the view, from 0.
         graph: The fused support graph with it.
         changed: Whether it changed the graph.
+        T_world_camera: Registered camera pose (4, 4), or None while the view waits.
         note: That the view waits for one that shows the table top, or None.
     """
 
     number: int
     graph: SupportGraph
     changed: bool
+    T_world_camera: Array | None = None
     note: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer of `caryatid session add` and of the service."""
-        graph = graph_to_json(self.graph)
-        return {"view": self.number, "changed": self.changed, "note": self.note, "graph": graph}
+        pose = None if self.T_world_camera is None else self.T_world_camera.tolist()
+        document = {"view": self.number, "changed": self.changed, "T_world_camera": pose}
+        return document | {"note": self.note, "graph": graph_to_json(self.graph)}
 
 
 class Session:
@@ -271,7 +275,7 @@ class Session:
         """Add a view; when this returns, it is on the disk.
 
         Args:
-            view: A view with a pose, or one that is not decoded yet.
+            view: A view, or one that is not decoded yet. Only the first one may lack a pose.
             number: Expected number of the view, from 0. The last view is not added a second time,
                 so a client that missed the answer can send it again. None = the next one.
 
@@ -286,7 +290,7 @@ class Session:
         if number is not None and number != self.views:
             if number != self.views - 1 or record.digest != self._records[-1].digest:
                 raise SessionConflictError(
-                    record.name, f"is to be view {number}, the next one is view {self.views}"
+                    record.name, f"was given the number {number}, the next one is {self.views}"
                 )
             return self._added()
         decoded = self._decode(capture)
@@ -318,7 +322,8 @@ class Session:
         sphere, robot = self.scene.sphere, None
         if sphere is None:
             raise PlanningError("nothing has been seen yet; add a view that shows the table top")
-        T_world_cameras = np.stack([record.T_world_camera for record in self._records])
+        poses = [record.T_world_camera for record in self._records]
+        T_world_cameras = np.stack([self.scene.T_world_cameras[0] if T is None else T for T in poses])
         if candidates is not None:
             reachable = given_candidates(candidates, path_length, T_world_cameras[-1], sphere)
         else:
@@ -357,7 +362,8 @@ class Session:
 
     def _added(self) -> Added:
         note = KEPT % "no support surface has been seen yet" if self.scene.waiting else None
-        return Added(self.views - 1, self.graph, self.scene.changed, note)
+        pose = None if self.scene.waiting else self.scene.T_world_camera
+        return Added(self.views - 1, self.graph, self.scene.changed, pose, note)
 
     def _check_writable(self) -> None:
         if self._lock is None:
