@@ -1,4 +1,4 @@
-"""From one cloud of labelled points to the graph of what holds up what."""
+"""From one cloud of labelled points to the support graph."""
 
 import numpy as np
 
@@ -42,7 +42,7 @@ def main() -> None:
         print(f"  {support.supporter} holds {support.supported}: {support.why}")
     assert {support.pair for support in graph.supports} == truth
 
-    # The same as a networkx graph: what comes down when the first pillar is taken away?
+    # The same as a networkx graph: what falls if the first pillar is removed?
     assert sorted(scene.supports.successors("o1")) == ["o3"]
     print("taking o1 away would disturb", ", ".join(sorted(scene.supports.successors("o1"))))
 

@@ -1,4 +1,4 @@
-"""The whole loop: a simulated humanoid walks around a cluttered table until it knows what holds up what."""
+"""The whole loop: a simulated humanoid explores a table until it knows which object supports which."""
 
 import numpy as np
 

@@ -9,8 +9,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 TEXTS = [
-    *(ROOT / "src").rglob("*.py"), *(ROOT / "examples").rglob("*.py"), *(ROOT / "docs").glob("*.md"),
-    ROOT / "README.md",
+    *(ROOT / "src").rglob("*.py"), *(ROOT / "examples").rglob("*.py"),
+    *(page for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")) if "_build" not in page.parts),
+    *(ROOT / ".github").rglob("*.yml"),
 ]  # fmt: skip
 COMPARED = "longer|more|smaller|larger|higher|wider|later|surer|better|shorter|difference|inhibition|IG"
 """Words that may follow `is no`."""
@@ -22,6 +23,15 @@ BANNED = {
     r"\bwhat there is\b": "what it is",
     r"\bmend the\b": "correct the",
     r"\bviews? 0\b(?!\d|[.,]\d)": "people count views from 1",
+    r"\bat the most\b": "at most",
+    r"\bknown by then\b": "known so far",
+    r"\bholds? up what\b|\bwho supports whom\b": "which object supports which",
+    r"\bbears? out\b": "confirm",
+    r"\blaid (?:on|onto|into)\b": "registered to, projected to",
+    r"\bnought\b": "zero",
+    r"\bgoes on where\b|\bgo on with\b": "continue",
+    r"\bsomething else than\b": "anything but",
+    r"\bas it is by now\b": "current",
 }
 """Pattern → what to write in its place."""
 

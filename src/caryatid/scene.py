@@ -403,7 +403,7 @@ class Scene(Pictured):
         if holes:
             log.warning(
                 "%s: no depth in %s over the table (transparent, black or shiny things?); "
-                "what is there is left out",
+                "objects there are missed",
                 view.name, "1 region" if holes == 1 else f"{holes} regions",
             )  # fmt: skip
 

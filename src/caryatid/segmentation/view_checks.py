@@ -101,7 +101,7 @@ def check_free(
     if free.sum() > THROUGH * len(free):
         log.warning(
             "%s: %.0f%% of what it shows over the table is where earlier views looked through; its pose is "
-            "wrong, or things have been moved",
+            "wrong, or objects have been moved",
             name, 100.0 * free.mean(),
         )  # fmt: skip
 
