@@ -22,7 +22,7 @@ from caryatid.config import ReportConfig
 from caryatid.exploration import RobotPose, Step
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Sphere, fibonacci_sphere
-from caryatid.graph import SceneObject, Stability, Support, SupportGraph
+from caryatid.graph import Change, SceneObject, Stability, Support, SupportGraph
 from caryatid.planning.candidates import Candidates
 from caryatid.planning.decision import Decision
 from caryatid.planning.points_of_interest import PointOfInterest
@@ -234,8 +234,8 @@ def test_charts_need_several_views_or_scores_and_changes_are_said(make_step):
 
     def charts(steps, scores=()):
         sections = make_report("t", steps, scores=scores, config=SMALL).sections
-        (how,) = (section for section in sections if section.title == "How it went")
-        return [figure.picture.name for figure in how.figures if not figure.link]
+        how = [figure for section in sections if section.title == "How it went" for figure in section.figures]
+        return [figure.picture.name for figure in how if not figure.link]
 
     assert charts(steps, scores) == ["F1 over views", "Found so far"]
     stood = RobotPose(Posture(np.array([-1.2, 0.0, 0.0]), 1.6, 0.0, -0.5), steps[0].view.pose, 0.35, False)
@@ -243,6 +243,9 @@ def test_charts_need_several_views_or_scores_and_changes_are_said(make_step):
     assert charts(steps[:1]) == []
     (changed,) = (s.text for s in make_report("t", steps, config=SMALL).sections if s.title == "View 2")
     assert "now: o1 (box) held by the table, o2 (cylinder) held by o1; gone: o7" in changed
+    taken = Change("removed", "o2", 1, "empty <space> where it stood")
+    page = Page(render_html(make_report("t", [steps[0], replace(steps[1], changes=(taken,))], config=SMALL)))
+    assert "o2 was removed: empty <space> where it stood" in page.text
     with pytest.raises(ValueError, match="1 scores for 2 views"):
         charts(steps, scores[:1])
 
@@ -422,10 +425,10 @@ def test_views_of_noise_stay_small(make_step):
     K_vga = np.array([[525.0, 0.0, 319.5], [0.0, 525.0, 239.5], [0.0, 0.0, 1.0]])
     view = View(np.ones((480, 640), np.float32), K_vga, step.view.pose, noisy)
     labels = rng.integers(0, 8, (480, 640)).astype(np.int32)
-    steps = [replace(step, view=view, labels=labels, index=index) for index in range(2)]
-    one, two = (len(render_html(make_report("t", steps[:count]))) for count in (1, 2))
+    steps = [replace(step, view=view, labels=labels, index=index) for index in range(3)]
+    one, two, three = (len(render_html(make_report("t", steps[:count]))) for count in (1, 2, 3))
     assert one < 3e6
-    assert two - one < 9e5  # its picture and a small one
+    assert three - two < 9e5  # its picture and a small one
 
 
 # The command

@@ -27,7 +27,7 @@ from caryatid.graph import Support, SupportGraph, TakeStep
 from caryatid.io.graph_json import graph_text
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.viewer.drawing import BY_HAND, LAYERS, reduced, visible_points
+from caryatid.viewer.drawing import BY_HAND, LAYERS, SPACING, reduced, visible_points
 from caryatid.viewer.loop import LoopPage, candidate_under, taken_apart
 from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
@@ -68,12 +68,18 @@ EYE = transforms.look_at((-1.0, -0.7, 1.3), (0.0, 0.0, 0.8))
 @pytest.fixture
 def drawn(page):
     """Draw a step and return the nodes of the scene by name."""
+    for name in LAYERS:
+        page.show_layer(name, True)
+    page.wait()
 
     def draw(step, **look):
         page.drawing.show(step, [step], T_world_eye=EYE, **look)
         return {node.name: node for nodes in page.drawing.nodes.values() for node in nodes}
 
-    return draw
+    yield draw
+    for name, shown in LAYERS.items():
+        page.show_layer(name, shown)
+    page.wait()
 
 
 def with_supports(step, *supports):
@@ -100,6 +106,22 @@ def test_only_layers_that_changed_are_sent_again(step, drawn):
     first = drawn(step)
     again = drawn(step, point_size=0.01)
     assert [name for name in first if first[name] is not again[name]] == ["/cloud/points"]
+
+
+def test_what_is_hidden_is_not_sent_until_it_is_asked_for(opening, settings):
+    page = LoopPage(opening, settings, segmentation="labels")
+    page.turn()
+    page.wait()
+    assert [name for name, nodes in page.drawing.nodes.items() if nodes] == [
+        "shapes",
+        "names",
+        "supports",
+        "cameras",
+    ]
+    page.show_layer("cloud", True)
+    page.wait()
+    assert page.drawing.nodes["cloud"]
+    page.close()
 
 
 def test_arrows_tell_direction_doubt_and_kind(page, step, drawn):
@@ -132,7 +154,7 @@ def test_names_are_on_what_can_be_seen_of_their_objects():
         shapes = [
             Box(T, rng.uniform(0.05, 0.2, 3)) if k % 2 else Sphere(T, 0.06) for k, T in enumerate(places)
         ]
-        surfaces = [shape.surface(0.004)[0] for shape in shapes]
+        surfaces = [shape.surface(SPACING)[0] for shape in shapes]
         owner = np.repeat(np.arange(6), [len(points) for points in surfaces])
         eye = 1.2 * transforms.unit(rng.normal(size=3))
         T_eye_world = transforms.invert(transforms.look_at(eye, np.zeros(3)))

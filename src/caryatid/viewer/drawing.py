@@ -34,6 +34,8 @@ ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.02}
 """Sizes of an arrow at 1 m from the eye [m]."""
 LETTER = 0.03
 """Height of a name plate over its distance from the eye [1]."""
+SPACING = 0.008
+"""Distance between the points of surfaces that decide what can be seen [m]."""
 ON_TOP = 0.85
 """Where names and arrows are between the eye, 0, and what they belong to, 1: before whatever is near it."""
 SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
@@ -62,7 +64,7 @@ def step_of_scene(scene: Scene) -> Step:
 
 
 class SceneDrawing:
-    """The page's scene; a layer is sent again only when what it shows has changed.
+    """The page's scene; a layer is sent when it is shown, and again only when what it shows has changed.
 
     Args:
         server: A `viser.ViserServer`.
@@ -80,12 +82,13 @@ class SceneDrawing:
         for name, shown in LAYERS.items():
             self._frames[name].visible = shown
         self._shown: dict[str, tuple[object, ...]] = {}
+        self._graph = SupportGraph()
         self._surface: tuple[SupportGraph, Array, NDArray[np.intp]] | None = None
         self.anchors: dict[str, Array] = {}
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
 
     def show_layer(self, name: str, visible: bool) -> None:
-        """Show or hide a layer."""
+        """Show or hide a layer; what it shows is sent with the next `show`."""
         self._frames[name].visible = visible
 
     def show(
@@ -120,24 +123,24 @@ class SceneDrawing:
         }
         with self._server.atomic():
             for name, shown in layers.items():
-                if self._shown.get(name) != shown:
+                if self._frames[name].visible and self._shown.get(name) != shown:
                     for node in self.nodes[name]:
                         node.remove()
                     self.nodes[name], self._shown[name] = getattr(self, f"_{name}")(*shown), shown
-            self.face(step.graph, T_world_eye)
+            self._graph = step.graph
+            self.face(T_world_eye)
 
-    def face(self, graph: SupportGraph, T_world_eye: Array) -> None:
+    def face(self, T_world_eye: Array) -> None:
         """Turn names and arrows to the eye (4, 4), each before what it belongs to."""
-        eye_world, facing = T_world_eye[:3, 3], _pose(T_world_eye)["wxyz"]
-        drawn = (graph, T_world_eye.round(4).tobytes())
+        graph, eye_world, facing = self._graph, T_world_eye[:3, 3], _pose(T_world_eye)["wxyz"]
+        drawn = (graph, T_world_eye.round(4).tobytes(), self.nodes["names"])
         if self._shown.get("supports") == drawn:
             return
         if self._surface is None or self._surface[0] is not graph:
-            surfaces = [
-                item.shape.surface(float(item.shape.extents.max()) / 40.0)[0] for item in graph.objects
-            ]
-            owner = np.repeat(np.arange(len(surfaces)), [len(points) for points in surfaces])
-            self._surface = graph, np.concatenate(surfaces or [np.zeros((0, 3))]), owner
+            numbers = [k for k, o in enumerate(graph.objects) if o.role != "support_surface"]
+            surfaces = [graph.objects[k].shape.surface(SPACING)[0] for k in numbers]
+            owner = np.repeat(np.array(numbers, dtype=np.intp), [len(points) for points in surfaces])
+            self._surface = graph, np.concatenate([*surfaces, np.zeros((0, 3))]), owner
         found = visible_points(*self._surface[1:], eye_world)
         self.anchors = {graph.objects[k].id: point for k, point in found.items()}
         with self._server.atomic():
@@ -328,7 +331,7 @@ def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Arra
     than a centimetre nearer in its pixel and those around.
 
     Args:
-        points_world: Points (N, 3) of all surfaces.
+        points_world: Points (N, 3) of all surfaces, `SPACING` apart.
         owner: Number (N,) of the object of each.
         eye_world: Where it is looked from (3,) [m].
 
@@ -341,10 +344,12 @@ def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Arra
         return {}
     T_world_eye = transforms.look_at(eye_world, points_world.mean(axis=0))
     x, y, z = transforms.transform(transforms.invert(T_world_eye), points_world).T
-    before = np.flatnonzero(z > 1e-3)
+    before = np.flatnonzero(z > 0.02)
+    if len(before) == 0:
+        return {}
     at = np.stack([x[before], y[before]], axis=1) / z[before, None]
-    pixels = ((at - at.min(axis=0)) / max(float(np.ptp(at, axis=0).max()), 1e-9) * 120.0).astype(int)
-    depth = np.full((121, 121), np.inf)
+    pixels = ((at - at.min(axis=0)) * z[before].min() / SPACING).astype(int)  # No wider apart than a pixel.
+    depth = np.full(pixels.max(axis=0) + 1, np.inf)
     np.minimum.at(depth, tuple(pixels.T), z[before])
     seen = z[before] <= minimum_filter(depth, size=3)[tuple(pixels.T)] + 0.01
     found = {}

@@ -264,8 +264,7 @@ class LoopPage(Page):
     def _listen(self, wanted: bool) -> None:
         scene = self.server.scene
         scene.remove_click_callback("all")
-        self._boxes["sphere"].value = wanted
-        self.drawing.show_layer("sphere", wanted)
+        self.show_layer("sphere", wanted)
         if wanted and self.steps:
             sphere = self.steps[-1].sphere
             for client in self.server.get_clients().values():  # Back to where the whole sphere is in sight.

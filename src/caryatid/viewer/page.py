@@ -7,7 +7,7 @@ import logging
 import os
 import secrets
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
 from importlib.util import find_spec
@@ -85,6 +85,7 @@ class Page:
         self._charted: list[float | None] = []
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
+        self._turning: Future[None] | None = None
         self._T_world_eye = transforms.look_at((-1.0, 0.0, 1.0), (0.0, 0.0, 0.0))
         self._build()
         self.server.on_client_connect(self._follow)
@@ -110,6 +111,12 @@ class Page:
         if scene.views:
             self.add(step_of_scene(scene))
 
+    def show_layer(self, name: str, visible: bool) -> None:
+        """Show or hide one of `LAYERS`."""
+        self._boxes[name].value = visible
+        self.drawing.show_layer(name, visible)
+        self.redraw()
+
     def go_to(self, index: int) -> None:
         """Show what was known after a view."""
         index = min(max(index, 0), len(self.steps) - 1)
@@ -131,10 +138,15 @@ class Page:
 
     def redraw(self) -> None:
         """Draw what is to be shown, soon; where that is already about to be done, once."""
-        if self._pending is None or self._pending.running() or self._pending.done():
-            with contextlib.suppress(RuntimeError):
-                self._pending = self._drawer.submit(self._draw)
-                self._pending.add_done_callback(_log_failure)
+        self._pending = self._soon(self._pending, self._draw)
+
+    def _soon(self, pending: Future[None] | None, work: Callable[[], None]) -> Future[None] | None:
+        """Have work done by the thread that draws, unless it is about to be."""
+        if pending is None or pending.running() or pending.done():
+            with contextlib.suppress(RuntimeError):  # The page is being closed.
+                pending = self._drawer.submit(work)
+                pending.add_done_callback(_log_failure)
+        return pending
 
     def wait(self) -> None:
         """Wait until all that has been asked for is drawn; what went wrong meanwhile is raised."""
@@ -164,7 +176,7 @@ class Page:
         with gui.add_folder("show", order=90):
             for name, shown in LAYERS.items():
                 box = self._boxes[name] = gui.add_checkbox(name, shown)
-                box.on_update(lambda event, name=name: self.drawing.show_layer(name, event.target.value))
+                box.on_update(lambda event, name=name: self.show_layer(name, event.target.value))
             self._true_colours = gui.add_checkbox("colours of the camera", False)
             self._size = gui.add_slider("point size [mm]", 1.0, 12.0, 0.5, 3.0)
         for control in (self._true_colours, self._size):
@@ -207,7 +219,7 @@ class Page:
         def moved(camera: Any) -> None:
             rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
             self._T_world_eye = transforms.rigid(rotation, camera.position)
-            self.redraw()
+            self._turning = self._soon(self._turning, lambda: self.drawing.face(self._T_world_eye))
 
         client.camera.on_update(moved)
 

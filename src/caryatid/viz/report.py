@@ -171,7 +171,8 @@ def make_report(
     facts = [(f"Before view {step.index + 1}", _told(change)) for step in seen for change in step.changes]
     facts += [("Finished", sentence(last.stop))] if last.stop else []
     pictures = [*contacts * (len(contacts) > 1), *_charts(seen, scores)]
-    sections.append(Section("How it went", figures=pictures, facts=facts))
+    if pictures or facts:
+        sections.append(Section("How it went", figures=pictures, facts=facts))
     if strip:
         text = "Each object lifted straight up in physics, one after the other."
         sections.append(Section("Taken apart", text, strip))
