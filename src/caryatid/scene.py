@@ -340,7 +340,8 @@ class Scene(Pictured):
             # Where everything it shows would have changed, its pose is wrong rather.
             explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
             unexplained = observation.cloud.points_world[~np.isin(observation.labels, explained)]
-            check_free(source.name, unexplained, self.surface, before, self.config)
+            aligned = self._registration.aligned
+            check_free(source.name, unexplained, aligned, self.surface, before, self.config)
         if not named and (given or self.config.fusion.method != "sg"):
             known = self._models.objects()
             if self.config.fusion.method == "sg":  # its models have the newest view's objects alone

@@ -11,7 +11,7 @@ from caryatid.errors import WrongViewError
 from caryatid.geometry.transforms import Array
 from caryatid.segmentation.support_plane import SupportSurface
 from caryatid.sensing.views import Cloud, View
-from caryatid.sensing.voxel_map import VoxelMap
+from caryatid.sensing.voxel_map import FREE, VoxelMap
 
 log = logging.getLogger(__name__)
 
@@ -20,6 +20,10 @@ COARSER = 4
 THROUGH = 0.2
 """Share of what a view shows over the table, in space that earlier views looked through, that leads to a
 warning [1]; with right poses it is a twentieth.
+"""
+UNALIGNED = 0.1
+"""The same for a view that could not be aligned with earlier ones, counting all voxels seen free [1]; with
+right poses it is a twentieth, with swapped poses and mirrored images a fifth.
 """
 
 
@@ -83,13 +87,14 @@ def check_place(
 
 
 def check_free(
-    name: str, points_world: Array, surface: SupportSurface, voxels: VoxelMap, config: Config
+    name: str, points_world: Array, aligned: bool, surface: SupportSurface, voxels: VoxelMap, config: Config
 ) -> None:
     """Warn if a view shows much in space over the table that earlier views looked through.
 
     Args:
         name: Name of the view.
         points_world: Points (N, 3) [m] of it that no change explains.
+        aligned: Whether registration found what it shows in earlier views.
         surface: The support surface.
         voxels: The map of earlier views.
         config: All settings.
@@ -97,8 +102,8 @@ def check_free(
     points = points_world[:: max(1, len(points_world) // 20_000)]
     over = (points - surface.point_world) @ surface.normal_world > 2.0 * config.surface.tolerance
     over &= ((points > voxels.origin_world) & (points < voxels.end_world)).all(axis=1)
-    free = voxels.free_around(points[over])
-    if free.sum() > THROUGH * len(free):
+    free = voxels.free_around(points[over]) if aligned else voxels.state_at(points[over]) == FREE
+    if free.sum() > (THROUGH if aligned else UNALIGNED) * len(free):
         log.warning(
             "%s: %.0f%% of what it shows over the table is where earlier views looked through; its pose is "
             "wrong, or objects have been moved",
