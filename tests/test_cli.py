@@ -98,7 +98,7 @@ def test_all_views_of_a_recording_are_extracted(tmp_path, recording):
 
 @pytest.mark.parametrize("segmentation", ["labels", "auto"])
 def test_views_before_the_first_that_shows_the_table_are_kept_for_it(tmp_path, capsys, segmentation):
-    views, graphs = simulated_views("tower")[:2], []
+    views, graphs = simulated_views("tower")[1:3], []
     wall, options = wall_of(views[0]), ("--segmentation", segmentation, "--no-report")
     for name, seen in (("without", views), ("before", [wall, wall, *views])):
         write_recording(tmp_path / name, seen)

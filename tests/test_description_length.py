@@ -235,6 +235,20 @@ def test_flush_boxes_are_two_where_a_view_showed_each_in_a_colour_of_its_own(lef
         assert (groups is not None) == divided
 
 
+def test_a_row_of_flush_boxes_is_divided_where_a_view_showed_each_in_a_colour_of_its_own():
+    points, normals, _ = points_of([box((0.0, 0.0, 0.03), (0.06, 0.24, 0.06))])
+    rng, place = np.random.default_rng(2), np.floor(points[:, 1] / 0.06).astype(int) + 2
+    colours = np.array([(200, 30, 30), (30, 60, 190), (30, 160, 40), (200, 180, 30)])
+    rgb = np.clip(colours[place] + rng.normal(0.0, 3.0, (len(points), 3)), 0, 255).astype(np.uint8)
+    whole = gather(Cloud(points, normals, rgb=rgb))
+    place = np.floor(whole.points[:, 1] / 0.06).astype(int) + 2
+    hints = [place == k for k in range(4)]
+    groups = split(whole, alone_in(whole), partial(list, hints), up=UP, config=CONFIG, rng=rng)
+    assert [np.mean(groups == np.bincount(groups[own]).argmax()) for own in hints] == pytest.approx(
+        [own.mean() for own in hints], abs=0.02
+    )
+
+
 @pytest.mark.parametrize(("back", "merged"), [((200, 30, 30), True), ((30, 60, 190), False)])
 def test_opposite_sides_of_one_colour_are_one_where_a_shape_explains_both(back, merged):
     points, normals = box((0.0, 0.0, 0.03), (0.06, 0.08, 0.06)).surface(0.003)

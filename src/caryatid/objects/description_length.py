@@ -108,6 +108,19 @@ def plain_colour(rgb: NDArray[np.uint8], config: ExplanationConfig) -> tuple[flo
     return (float(costs[best]), colour_shares(tried[best])) if costs[best] < printed else (printed, None)
 
 
+def side_colours(
+    rgb: NDArray[np.uint8], sides: Sequence[NDArray[np.uint8]], config: ExplanationConfig
+) -> Array:
+    """Cost (M, N) [nats] of colours (N, 3) on each of M things that have these colours."""
+    plain = (plain_colour(side, config)[1] for side in sides)
+    return np.stack(
+        [
+            np.full(len(rgb), config.irregular) if own is None else colour_costs(rgb, own[None], config)[:, 0]
+            for own in plain
+        ]
+    )
+
+
 def colour_costs(rgb: NDArray[np.uint8], plain: Array, config: ExplanationConfig) -> Array:
     """Cost (N, M) [nats] of colours (N, 3) on objects of plain colours with shares (M, 3)."""
     squares = cdist(colour_shares(rgb)[:, :2], plain[:, :2], "sqeuclidean") / (2.0 * PLAIN**2)

@@ -28,6 +28,7 @@ from caryatid.objects.description_length import (
     plain_colour,
     point_costs,
     price,
+    side_colours,
 )
 from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.segments import PLAIN
@@ -49,11 +50,13 @@ class TwoObjects:
         second: Which points (N,) are the second's.
         explanations: Of both.
         cost: Of both and of the border between them, less what their colours speak for two [nats].
+        by_colour: Whether their colours alone pay for another object.
     """
 
     second: Mask
     explanations: tuple[Explanation, Explanation]
     cost: float
+    by_colour: bool = False
 
 
 def split(
@@ -108,19 +111,20 @@ def _parts(
 ) -> list[tuple[Groups, float]] | None:
     """Points of each object among those with this index, and its cost [nats]; None where they are one.
 
-    A shape must explain each: pieces of a thing that has no shape are not objects.
+    A shape must explain each, or their colours pay for another object: pieces of a thing that has no shape
+    are not objects.
     """
     own = evidence.select(index)
     found = _best_two(own, whole, index, hints, up, config, rng)
     if found is None:
         return None
     parts: list[tuple[Groups, float]] = []
+    border = found.cost - sum(e.cost for e in found.explanations)
     for side, explanation in zip((~found.second, found.second), found.explanations, strict=True):
         further = _parts(evidence, explanation, index[side], hints, up, config, rng)
-        if further is None and not explained(explanation, own.select(side), config.explanation):
+        if not (found.by_colour or further or explained(explanation, own.select(side), config.explanation)):
             return None
         parts += further or [(index[side], explanation.cost)]
-    border = found.cost - sum(e.cost for e in found.explanations)
     compound = best_compound(own, config, border + sum(cost for _, cost in parts))
     return parts if compound.shape is None else None
 
@@ -150,24 +154,19 @@ def _best_two(
     if excess + free + colours < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
         return None
     starts += _hypotheses(evidence, bad, up, config)
-    looks = _settled(evidence, starts, near, 0, config, rng, first_look=True)
-    looks = [_coloured(evidence, two, k < hinted, costs) for k, two in enumerate(looks)]
+    looks = _settled(evidence, starts, hinted, near, 0, config, rng, first_look=True)
     # The best two of those with a shape for one side at least are settled with full fits.
     shaped = [k for k, look in enumerate(looks) if look and any(e.shape for e in look.explanations)]
     tried = [k for _, k in sorted((look.cost, k) for k, look in enumerate(looks) if look and k in shaped)[:2]]
-    settled = _settled(evidence, [starts[k] for k in tried], near, config.split.rounds, config, rng)
-    settled = [_coloured(evidence, two, k < hinted, costs) for k, two in zip(tried, settled, strict=True)]
-    better = [two for two in settled if two and two.cost < whole.cost and not _is_layer(evidence, two)]
+    tried.sort()
+    hinted = sum(k < hinted for k in tried)
+    settled = _settled(evidence, [starts[k] for k in tried], hinted, near, config.split.rounds, config, rng)
+    better = [
+        two
+        for two in settled
+        if two and two.cost < whole.cost and (two.by_colour or not _is_layer(evidence, two))
+    ]
     return min(better, key=lambda two: two.cost, default=None)
-
-
-def _coloured(
-    evidence: Evidence, two: TwoObjects | None, hinted: bool, costs: ExplanationConfig
-) -> TwoObjects | None:
-    """Weigh colours too where a view showed a border between the two: elsewhere it may be one of a print."""
-    if two is None or not hinted:
-        return two
-    return replace(two, cost=two.cost - _colours(evidence, two.second, costs))
 
 
 def _colours(evidence: Evidence, second: Mask, costs: ExplanationConfig) -> float:
@@ -187,6 +186,7 @@ def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
 def _settled(
     evidence: Evidence,
     starts: Sequence[Mask],
+    hinted: int,
     near: Groups,
     rounds: int,
     config: Config,
@@ -195,6 +195,9 @@ def _settled(
     first_look: bool = False,
 ) -> list[TwoObjects | None]:
     """Fit both sides of each start, give each point to the side that explains it better, and so on.
+
+    Colours count for the first starts, the `hinted` ones: a view showed a border between their sides, and
+    elsewhere a border of colours may be one of a print.
 
     Returns:
         What each start settles at; None where one side is left with too few points.
@@ -216,10 +219,17 @@ def _settled(
             if number < rounds:
                 # To the shape that explains a point better, together with the points around it.
                 cost = np.stack([point_costs(e.shape, evidence, config.explanation) for e in pair])
+                if k < hinted and evidence.rgb is not None:
+                    rgb = evidence.rgb
+                    colours = side_colours(rgb, (rgb[~second], rgb[second]), config.explanation)
+                    cost = cost * evidence.weight + colours
                 cost = (cost + cost[:, near].mean(axis=2)) / 2.0
                 second = _connected(evidence.points, cost[1] < cost[0])
             if (second == moving[k]).all():
-                settled[k] = _two(evidence, second, pair, near, config)
+                two = _two(evidence, second, pair, near, config)
+                gain = _colours(evidence, second, config.explanation) if k < hinted else 0.0
+                by_colour = gain > price(None, config.explanation)
+                settled[k] = replace(two, cost=two.cost - gain, by_colour=by_colour)
                 del moving[k]
             else:
                 moving[k] = second

@@ -530,7 +530,8 @@ def associate(
     """Give the points of each new segment the label of the object they belong to, or one never used before.
 
     An automatic segment that lies at several known objects, with a tenth of its points or more, is divided
-    among them: each point goes to the nearest, and to one of another colour only where it is near no other.
+    among them: each point goes to the nearest. A point of another colour than these goes to the object that
+    is nearest of all with its colour, if one is near.
     A mask is all that a view shows of one object: masks and objects are matched one to one, so that they
     share as many points as possible.
 
@@ -549,7 +550,8 @@ def associate(
         Label of the object (N,) of each point; 0 where there was no segment.
     """
     names = np.array(sorted(known_points), dtype=np.int32)
-    spacing = config.overlap_reach / 4.0
+    reach = config.overlap_reach
+    spacing = reach / 4.0
     owners = np.repeat(np.arange(len(names), dtype=np.int32), [len(known_points[k]) for k in names])
     points = np.concatenate([np.zeros((0, 3)), *(known_points[k] for k in names)])
     thinned = most_central(points, owners, np.full(len(names), spacing))
@@ -559,7 +561,7 @@ def associate(
     kept = most_central(points_world, labels, np.where(np.arange(len(counts)) > 0, spacing, 0.0))
     if unlike is None:
         unlike = np.zeros((len(labels), len(names)), dtype=bool)
-    owner = _nearest_objects(points_world[kept], points, owners, shapes, unlike[kept], config.overlap_reach)
+    owner = _nearest_objects(points_world[kept], points, owners, shapes, unlike[kept], reach)
     segments = np.flatnonzero(counts[1:]) + 1
     shared = np.zeros((len(segments), len(names)), dtype=np.intp)
     near = owner >= 0
@@ -574,17 +576,19 @@ def associate(
         if not len(among):
             fresh += 1
             result[index] = fresh
-        elif len(among) == 1:
-            result[index] = names[among[0]]
         else:
+            own, other = points_world[index], unlike[index]
             theirs = np.isin(owners, among)
-            some = [shape if k in among else None for k, shape in enumerate(shapes)]
-            nearest = _nearest_objects(
-                points_world[index], points[theirs], owners[theirs], some, unlike[index], config.overlap_reach
-            )
+            nearest = np.full(len(index), among[0], dtype=np.int32)
+            if len(among) > 1:
+                some = [shape if k in among else None for k, shape in enumerate(shapes)]
+                nearest = _nearest_objects(own, points[theirs], owners[theirs], some, other, reach)
+            stray = other[:, among].all(axis=1)
+            if stray.any():
+                nearest[stray] = _nearest_objects(own[stray], points, owners, shapes, other[stray], reach)
             far = nearest < 0
             if far.any():
-                nearest[far] = owners[theirs][cKDTree(points[theirs]).query(points_world[index[far]])[1]]
+                nearest[far] = owners[theirs][cKDTree(points[theirs]).query(own[far])[1]]
             result[index] = names[nearest]
     return result
 
@@ -624,6 +628,11 @@ def _nearest_objects(
         reach: Objects from here on count as none [m].
     """
     nearest, gap = np.full(len(points), -1, dtype=np.int32), np.full(len(points), reach)
+
+    def take(rows: NDArray[np.intp], distance: Array, number: int) -> None:
+        nearer = distance < gap[rows]
+        nearest[rows[nearer]], gap[rows[nearer]] = number, distance[nearer]
+
     for number, shape in enumerate(shapes):
         own = known[owners == number]
         rows = np.flatnonzero(~unlike[:, number])
@@ -631,11 +640,7 @@ def _nearest_objects(
             among = (points[rows] > own.min(axis=0) - reach) & (points[rows] < own.max(axis=0) + reach)
             close = rows[among.all(axis=1)]
             tree = cKDTree(own, compact_nodes=False, balanced_tree=False)
-            distance = tree.query(points[close], distance_upper_bound=reach)[0]
-            nearer = distance < gap[close]
-            nearest[close[nearer]], gap[close[nearer]] = number, distance[nearer]
+            take(close, tree.query(points[close], distance_upper_bound=reach)[0], number)
         if shape is not None and len(rows):
-            distance = np.abs(shape.signed_distance(points[rows]))
-            nearer = distance < gap[rows]
-            nearest[rows[nearer]], gap[rows[nearer]] = number, distance[nearer]
+            take(rows, np.abs(shape.signed_distance(points[rows])), number)
     return nearest
