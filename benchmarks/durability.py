@@ -166,6 +166,44 @@ def kill_adding(folder: Path, views: Sequence[View], kills: int, seed: int) -> C
     return tally
 
 
+def kill_taking(folder: Path, views: Sequence[View], kills: int, seed: int) -> Counter[str]:
+    """Kill `session take` at random moments, while it takes one object after the other.
+
+    Returns what became of the reports, as `kill_adding` does of views.
+    """
+    chance, tally, usual = random.Random(seed), Counter[str](), 1.0
+    scene = Scene(segmentation="labels")
+    for view in views:
+        scene.update(view)
+    ids = [o.id for o in scene.graph.objects if o.role == "object"]
+    graphs = [graph_text(scene.graph), *(graph_text(scene.removed(i)) for i in ids)]
+    session, known = folder / "taking", len(ids)
+    while tally["kept"] + tally["not kept"] < kills:
+        if known == len(ids):
+            session, known = folder / f"taking-{sum(tally.values())}", 0
+            with Session.begin(session, segmentation="labels") as begun:
+                for view in views:
+                    begun.add(view)
+        at = time.monotonic()
+        process = start(["session", "take", session, ids[known], "--json"], folder / "said")
+        process.join(None if tally["acknowledged"] == 0 else 1.2 * usual * chance.random())
+        status = kill(process)
+        with Session.open(session) as opened:
+            found = graphs.index(graph_text(opened.graph))
+            assert opened.views == len(views)
+            assert len(opened.scene.changes) == found
+        if status == 0:
+            usual = 0.7 * usual + 0.3 * (time.monotonic() - at)
+            assert found == known + 1, "a report that was acknowledged is lost"
+            tally["acknowledged"] += 1
+        else:
+            assert status == -9, (folder / "said").read_text()
+            assert found in (known, known + 1)
+            tally["kept" if found > known else "not kept"] += 1
+        known = found
+    return tally
+
+
 def _wait(session: Path, chance: random.Random, usual: float, *, writing: bool) -> None:
     """Wait for a random moment of an `add`: of all its time, or of that after it has begun to write."""
     end = time.monotonic() + 1.1 * usual * (1.0 if writing else chance.random())

@@ -73,8 +73,12 @@ class RobotClient:
         """The support graph, as graph.json."""
         return self._ask("GET", f"/sessions/{name}/graph")
 
+    def take(self, name: str, object_id: str, T: Matrix | None = None) -> dict[str, Any]:
+        """Report that an object was taken away, or moved by a rigid transform T of the world."""
+        return self._ask("POST", f"/sessions/{name}/reports", {"object": object_id, "T": T})
+
     def undo(self, name: str) -> dict[str, Any]:
-        """Take the last view back."""
+        """Take back the last view, or the report after it."""
         return self._ask("DELETE", f"/sessions/{name}/views/last")
 
     def views(self, name: str) -> int:
@@ -94,8 +98,9 @@ class RobotClient:
                 if error.code != 503 or time.monotonic() - begun > self.patience:
                     raise RuntimeError(f"{method} {path}: {error.code} {error.read().decode()}") from None
             except (OSError, http.client.HTTPException):
-                # What takes a view back would take another one back.
-                if method == "DELETE" or path == "/sessions" or time.monotonic() - begun > self.patience:
+                # What takes a view back would take another one back; what was moved would move again.
+                once = method == "DELETE" or path == "/sessions" or path.endswith("/reports")
+                if once or time.monotonic() - begun > self.patience:
                     raise
             time.sleep(0.2)
 

@@ -144,6 +144,7 @@ WORKING = {
     "session add": ("{session} {view}", {"view", "changed", "graph"}),
     "session next": ("{session}", {"T_world_camera", "why"}),
     "session graph": ("{session}", {"objects", "supports"}),
+    "session take": ("{session} o1", {"views", "graph"}),
     "session undo": ("{session}", {"views", "graph"}),
     "scenes": ("", {"scenes", "samples"}),
     "config": ("", {"fit", "fusion"}),

@@ -25,6 +25,7 @@ from conftest import npy, run_command, wall_of
 
 from caryatid import service
 from caryatid.config import Config
+from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import png
 from caryatid.scene import Scene
@@ -105,6 +106,17 @@ def test_a_session_over_http_is_the_session(client, views):
     chosen = client.post("/sessions/a/next", json=reach).json()
     assert chosen["T_world_camera"] == reach["T_world_camera"][chosen["candidate"]]
     assert chosen["platform"] is None
+
+    taken = client.post("/sessions/a/reports", json={"object": "o2"})
+    assert (taken.status_code, taken.json()["views"]) == (201, 2)
+    assert [o["id"] for o in taken.json()["graph"]["objects"]] == ["o0", "o1"]
+    assert client.post("/sessions/a/reports", json={"object": "o2"}).status_code == 422
+    moved = {"object": "o1", "T": transforms.rigid(np.eye(3), (0.0, 0.1, 0.0)).tolist()}
+    assert client.post("/sessions/a/reports", json=moved).json()["graph"] != taken.json()["graph"]
+    assert client.post("/sessions/a/reports", json=moved | {"T": np.ones((4, 4)).tolist()}).status_code == 422
+    for _ in range(2):
+        left = client.delete("/sessions/a/views/last").json()
+    assert left == {"views": 2, "graph": graph_of(views[:2])}
 
     assert client.delete("/sessions/a/views/last").json() == {"views": 1, "graph": graph_of(views[:1])}
     assert client.delete("/sessions/a/views/last").json()["views"] == 0

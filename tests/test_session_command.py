@@ -9,6 +9,7 @@ import pytest
 from conftest import run_command, write_view_files
 
 from caryatid.config import Config
+from caryatid.geometry import transforms
 from caryatid.io.graph_json import graph_text
 from caryatid.scene import Scene
 from caryatid.sessions import Capture, Session
@@ -57,8 +58,19 @@ def test_a_session_from_the_first_view_to_the_last(folder, files, capsys, views)
     assert told["expected_gain"] > 0.0
     assert told["why"]
 
-    assert run_command("session", "undo", folder) == 0
-    assert capsys.readouterr().out.startswith("1 view left: ")
+    aside = transforms.rigid(np.eye(3), (0.0, 0.1, 0.0))
+    (folder.parent / "moved.json").write_text(json.dumps({"T": aside.tolist()}))
+    assert run_command("session", "take", folder, "o1", "--moved", folder.parent / "moved.json") == 0
+    assert capsys.readouterr().out.startswith("o1 moved: 2 objects")
+    assert run_command("session", "take", folder, "o2") == 0
+    assert capsys.readouterr().out == "o2 taken: 1 object, 1 support\n"
+    assert run_command("session", "take", folder, "o2") == 1
+    assert "not an object of the graph; there are o1" in capsys.readouterr().err
+
+    for left in (2, 2, 1):
+        assert run_command("session", "undo", folder) == 0
+        assert capsys.readouterr().out.startswith(f"{left} view")
+    assert len(list((folder / "reports").iterdir())) == 0
     with Session.open(folder) as session:
         assert np.allclose(session.scene.T_world_camera, views[0].pose, atol=0.02)
 

@@ -173,6 +173,30 @@ def test_undo_goes_back_view_by_view(begun, views, graph_after):
         assert graph_text(session.graph) == graph_after(2, 1, 0)
 
 
+def test_what_the_robot_reports_stays_and_can_be_taken_back(begun, views):
+    aside, scene = transforms.rigid(np.eye(3), (0.0, 0.1, 0.0)), Scene(segmentation="labels", seed=7)
+    for view in views[:2]:
+        scene.update(view)
+    graphs = [graph_text(scene.graph), graph_text(scene.removed("o2"))]
+    graphs += [graph_text(scene.update(views[2])), graph_text(scene.moved("o1", aside))]
+    with Session.open(begun) as session:
+        session.take("o2")
+        session.add(views[2])
+        assert graph_text(session.take("o1", aside)) == graphs[-1]
+        before = contents(begun)
+        for change in (lambda: session.take("o9"), lambda: session.take("o1", np.diag([2.0, 1.0, 1.0, 1.0]))):
+            with pytest.raises(InputError):
+                change()
+        assert contents(begun) == before
+    shutil.rmtree(begun / "state")
+    with Session.open(begun) as session:
+        assert session.scene.changes == scene.changes
+        for views_left, graph in ((3, graphs[3]), (3, graphs[2]), (2, graphs[1]), (2, graphs[0])):
+            assert (session.views, graph_text(session.graph)) == (views_left, graph)
+            session.undo()
+        assert session.views == 1
+
+
 # Snapshots that cannot be trusted
 
 

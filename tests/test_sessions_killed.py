@@ -33,6 +33,12 @@ def test_however_adding_is_killed_no_view_is_lost(tmp_path, around):
     assert tally["acknowledged"]
 
 
+def test_however_taking_is_killed_no_report_is_lost(tmp_path, around):
+    tally = durability.kill_taking(tmp_path, around[:3], kills=10, seed=3)
+    assert tally["kept"] + tally["not kept"] == 10
+    assert tally["acknowledged"]
+
+
 def test_however_a_service_is_killed_no_view_is_lost(tmp_path, around):
     tally = durability.kill_serving(tmp_path, around, kills=8, seed=1)
     assert tally["kills"] == 8

@@ -35,8 +35,10 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from caryatid.config import Config, SegmentationMethod
 from caryatid.config.settings import changed_settings
 from caryatid.errors import CaryatidError, InputError, PlanningError, in_one_line
+from caryatid.geometry.transforms import Array
 from caryatid.io.graph_json import graph_to_json
 from caryatid.io.images import read_mask
+from caryatid.io.json_files import Numbers
 from caryatid.sessions import Capture, Session
 from caryatid.sessions.captures import CameraRecord
 from caryatid.sessions.next_view import Reachable
@@ -143,10 +145,19 @@ class ViewAnswer(Document):
     graph: dict[str, Any] = Field(description="graph.json")
 
 
-class UndoAnswer(Document):
-    """What is left."""
+class NewReport(Document):
+    """What the robot did to an object."""
 
-    views: int = Field(description="Number of views left")
+    object: str = Field(description="Its id")
+    T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = Field(
+        None, description="Rigid transform of the world [m] that moved it; null = it was taken away"
+    )
+
+
+class Known(Document):
+    """What is known after a change."""
+
+    views: int = Field(description="Number of views")
     graph: dict[str, Any] = Field(description="graph.json")
 
 
@@ -368,10 +379,18 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
         """Add a view; when this answers, the view is on disk."""
         return pool.add(name, given.capture(), given.number).to_json()
 
-    @app.delete("/sessions/{name}/views/last", response_model=UndoAnswer)
+    @app.post("/sessions/{name}/reports", status_code=201, response_model=Known)
+    @queued
+    def report_change(name: SessionName, given: NewReport) -> Any:
+        """Report an object that was taken away or moved; when this answers, it is on the disk and stays."""
+        session = pool.session(name)
+        graph = session.take(given.object, given.T)
+        return {"views": session.views, "graph": graph_to_json(graph)}
+
+    @app.delete("/sessions/{name}/views/last", response_model=Known)
     @queued
     def undo_view(name: SessionName) -> Any:
-        """Take the last view back."""
+        """Take the last view back, or the report after it."""
         session = pool.session(name)
         return {"views": session.undo(), "graph": graph_to_json(session.graph)}
 

@@ -15,7 +15,7 @@ from caryatid.errors import needs_extra
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[Path | None, options.shown("FILE")]
-KEPT = "the session keeps every view that is in it"
+KEPT = "the session keeps every view and report that is in it"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,8 +146,39 @@ class Graph(SessionStep):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Take(SessionStep):
+    """Report that the robot took an object away, or moved it; once the command ends with status 0, it stays.
+
+    moved.json: {"T": 4×4 [m], the rigid transform of the world that moved the object}
+
+    To try:
+      caryatid session take table o3
+      caryatid session take table o3 --moved moved.json
+    """
+
+    object: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ID")]
+    """Id of the object."""
+    moved: Annotated[Path | None, options.shown("T.json")] = None
+    """How it was moved; when left out, it is gone."""
+
+    def __call__(self) -> None:
+        from caryatid.cli.output import kept
+        from caryatid.io.graph_json import graph_to_json
+        from caryatid.io.json_files import parse_json, read_json
+        from caryatid.sessions import Session
+        from caryatid.sessions.session import Moved
+        from caryatid.viz.tables import census
+
+        T = None if self.moved is None else parse_json(Moved, read_json(self.moved), self.moved).T
+        with kept(KEPT), Session.open(self.folder) as session:
+            graph = session.take(self.object, T)
+            document = {"views": session.views, "graph": graph_to_json(graph)}
+            self.show(document, f"{self.object} {'taken' if T is None else 'moved'}: {census(graph)}")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Undo(SessionStep):
-    """Take the last view back.
+    """Take back the last view, or the last report of an object taken or moved.
 
     To try:
       caryatid session undo table
@@ -169,10 +200,10 @@ class Undo(SessionStep):
 class SessionCommand:
     """Keep a scene model in a folder, to which a robot's own software adds views.
 
-    A view that was added stays, whatever happens to the process. One command writes at a time.
+    What was added or reported stays, whatever happens to the process. One command writes at a time.
     """
 
-    step: New | Add | Next | Graph | Undo
+    step: New | Add | Next | Graph | Take | Undo
 
     @property
     def general(self) -> options.General:

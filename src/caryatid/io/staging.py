@@ -179,6 +179,17 @@ def remove_folder(folder: Path) -> None:
     shutil.rmtree(partial, ignore_errors=True)
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file; once this returns it will not come back.
+
+    Raises:
+        InputError: The disk refuses.
+    """
+    with write_errors(path):
+        path.unlink()
+        sync(path.parent)
+
+
 def clear_partials(folder: Path) -> None:
     """Remove the staged files of killed processes; for the only writer of the folder."""
     for path in folder.glob(f"{PARTIAL}*"):

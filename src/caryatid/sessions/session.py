@@ -2,10 +2,11 @@
 
     DIR/session.json           settings, seed, planner and robot
     DIR/views/NNNNNN/          one view: its images, and camera.json; the record
-    DIR/state/NNNNNN.pickle    the scene after so many views; a cache, which may go at any time
+    DIR/reports/NNNNNN.json    an object that the robot took away or moved, after so many views
+    DIR/state/NNNNNN.pickle    the scene after so many views and reports; a cache, which may go at any time
     DIR/lock                   locked by the process that writes
 
-A view's folder appears whole, once it is on the disk, by a rename, and goes by one.
+A view's folder appears whole, once it is on the disk, by a rename, and goes by one; so does a report.
 """
 
 from __future__ import annotations
@@ -32,15 +33,16 @@ from pydantic import Base64Bytes
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError
 from caryatid.exploration import given_candidates, next_best_view, reason_to_stop
-from caryatid.geometry.transforms import Array
+from caryatid.geometry.transforms import Array, as_rigid
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
 from caryatid.io.images import png, read_mask
-from caryatid.io.json_files import parse_json, read_json
+from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import (
     StagedFolder,
     clear_partials,
     read_errors,
+    remove_file,
     remove_folder,
     sync,
     write_errors,
@@ -149,11 +151,57 @@ class Added:
         return document | {"note": self.note, "graph": graph_to_json(self.graph)}
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Moved:
+    """moved.json: how an object was moved.
+
+    Attributes:
+        T: Rigid transform (4, 4) of the world [m].
+    """
+
+    T: Annotated[Array, Numbers(4, 4, rigid=True)]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Report:
+    """What the robot said it did to an object.
+
+    Attributes:
+        object: Its id.
+        after: Number of views before it.
+        T: Rigid transform (4, 4) of the world that moved it, or None where it was taken away.
+    """
+
+    object: str
+    after: Annotated[int, Ge(0)]
+    T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = None
+
+    def to_json(self) -> bytes:
+        """Return the content of its file."""
+        return (json.dumps(asdict(self), default=np.ndarray.tolist) + "\n").encode()
+
+    def tell(self, scene: Scene) -> None:
+        """Let a scene know.
+
+        Raises:
+            InputError: It has no such object.
+        """
+        if self.T is None:
+            scene.removed(self.object)
+        else:
+            scene.moved(self.object, self.T)
+
+
+Event = CameraRecord | Report
+"""A view, or a report."""
+
+
 class Session:
     """A scene model in a folder; `begin` or `open` one.
 
     A view that has been added stays, whatever happens to this process, the machine or its power: it is on
-    the disk before `add` returns. There is one writer at a time; others may read meanwhile.
+    the disk before `add` returns; so is a report before `take` does. There is one writer at a time; others
+    may read meanwhile.
 
     Attributes:
         path: The folder.
@@ -169,11 +217,11 @@ class Session:
         most, name = beginning.settings.recording.max_pixels, f"{path / 'session.json'}: ignore"
         self._ignored = None if mask is None else read_mask(mask, name, most)
         if lock is not None:
-            for folder in (path, path / "views", path / "state"):
+            for folder in (path, path / "views", path / "reports", path / "state"):
                 clear_partials(folder)
-        self._records = self._kept()
+        self._events = self._kept()
         self._first = self._decoded(0) if self._records else None
-        self.scene = self._after(self._records)
+        self.scene = self._after(self._events)
 
     @classmethod
     def begin(
@@ -262,6 +310,10 @@ class Session:
             self._lock = None
 
     @property
+    def _records(self) -> list[CameraRecord]:
+        return [event for event in self._events if isinstance(event, CameraRecord)]
+
+    @property
     def views(self) -> int:
         """Number of views."""
         return len(self._records)
@@ -301,11 +353,40 @@ class Session:
             for name, content in capture.files().items():
                 folder.write(name, content)
             folder.publish()
-        self._records.append(record)
+        self._keep(record, scene)
         self._first = self._first or decoded
-        self.scene = scene
-        self._write_snapshot(scene, self._records)
         return self._added()
+
+    def take(self, object_id: str, T: ArrayLike | None = None) -> SupportGraph:
+        """Report that the robot took an object away, or moved it; when this returns, that is on the disk.
+
+        Args:
+            object_id: Id of the object.
+            T: Rigid transform (4, 4) of the world that moved it; None = it is gone.
+
+        Returns:
+            The graph without it, or with it where it is now.
+
+        Raises:
+            InputError: There is no such object, or T is not a rigid transform; the session is as it was.
+        """
+        self._check_writable()
+        report = Report(object_id, self.views, None if T is None else as_rigid(T, "T"))
+        scene = self.scene.copy()
+        report.tell(scene)
+        graph_text(scene.graph)
+        with write_errors(self.path):
+            (self.path / "reports").mkdir(exist_ok=True)
+            sync(self.path)
+        write_file(self._report(len(self._events) - self.views), report.to_json(), durable=True)
+        self._keep(report, scene)
+        return self.graph
+
+    def _keep(self, event: Event, scene: Scene) -> None:
+        """Go on with a scene that knows of an event, which is on the disk."""
+        self._events.append(event)
+        self.scene = scene
+        self._write_snapshot(scene, self._events)
 
     def next(self, candidates: ArrayLike | None = None, path_length: ArrayLike | None = None) -> NextView:
         """Choose where to look next.
@@ -342,7 +423,7 @@ class Session:
         return NextView(self.views, decision, stop)
 
     def undo(self) -> int:
-        """Remove the last view.
+        """Remove the last view, or the report after it.
 
         Returns:
             How many views are left.
@@ -351,14 +432,17 @@ class Session:
             InputError: There is none, or an earlier one is broken; the session is as it was.
         """
         self._check_writable()
-        if not self._records:
+        if not self._events:
             raise SessionConflictError(self.path, "has no views to take back", "add one first")
-        left = self._records[:-1]
+        left = self._events[:-1]
         scene = self._after(left)
-        remove_folder(self._folder(len(left)))
-        self._records, self.scene = left, scene
-        self._first = self._first if left else None
-        return len(left)
+        if isinstance(self._events[-1], Report):
+            remove_file(self._report(len(left) - self.views))
+        else:
+            remove_folder(self._folder(self.views - 1))
+        self._events, self.scene = left, scene
+        self._first = self._first if self._records else None
+        return self.views
 
     def _added(self) -> Added:
         note = KEPT % "no support surface has been seen yet" if self.scene.waiting else None
@@ -388,14 +472,27 @@ class Session:
     def _folder(self, number: int) -> Path:
         return self.path / "views" / f"{number:06d}"
 
-    def _kept(self) -> list[CameraRecord]:
+    def _report(self, number: int) -> Path:
+        return self.path / "reports" / f"{number:06d}.json"
+
+    def _kept(self) -> list[Event]:
         with read_errors(self.path / "views", "put the folder of the views back"):
             folders = sorted(p for p in (self.path / "views").iterdir() if p.name[0].isdigit())
-        for number, folder in enumerate(folders):
-            if folder != self._folder(number):
-                remedy = "put it back, or take the later ones out"
-                raise InputError(folder.parent, f"holds no view {number:06d}", remedy)
-        return [CameraRecord.read(folder / "camera.json") for folder in folders]
+        files = sorted(p for p in (self.path / "reports").glob("*.json") if p.name[0].isdigit())
+        for found, place, what in ((folders, self._folder, "view"), (files, self._report, "report")):
+            for number, path in enumerate(found):
+                if path != place(number):
+                    remedy = "put it back, or take the later ones out"
+                    raise InputError(path.parent, f"holds no {what} {number:06d}", remedy)
+        records = [CameraRecord.read(folder / "camera.json") for folder in folders]
+        remedy = "take this report and all later ones out of the session's folder"
+        reports = [parse_json(Report, read_json(path, remedy), path, remedy) for path in files]
+        events: list[Event] = []
+        # What another process reports of views that it has added meanwhile is left to the next reader.
+        for number in range(len(records) + 1):
+            events += [report for report in reports if report.after == number]
+            events += records[number : number + 1]
+        return events
 
     def _decoded(self, number: int) -> View:
         return self._decode(Capture.read(self._folder(number)))
@@ -404,45 +501,50 @@ class Session:
         view = capture.decode(self.beginning.settings.recording.max_pixels)
         return view if self._ignored is None else replace(view, ignored=self._ignored)
 
-    def _after(self, records: Sequence[CameraRecord]) -> Scene:
-        """The scene after some views, from the newest usable snapshot and the views after it."""
+    def _after(self, events: Sequence[Event]) -> Scene:
+        """The scene after some events, from the newest usable snapshot and what came after it."""
         b = self.beginning
-        scene = self._read_snapshot(records) or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
-        for number in range(_given(scene), len(records)):
-            scene.update(self._decoded(number))
+        done, scene = self._read_snapshot(events)
+        scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
+        for number, event in enumerate(events[done:], start=done):
+            if isinstance(event, Report):
+                event.tell(scene)
+            else:
+                scene.update(self._decoded(_given(scene)))
             if self._lock is not None:
-                self._write_snapshot(scene, records[: number + 1])
+                self._write_snapshot(scene, events[: number + 1])
         return scene
 
-    def _read_snapshot(self, records: Sequence[CameraRecord]) -> Scene | None:
-        """The newest scene that this code made of the first of these views."""
-        for views in range(len(records), 0, -1):
-            with suppress(Exception):  # whatever a damaged file leads to: the views are still there
-                content = self._snapshot(views).read_bytes()
-                if content[:32] == self._seal(records[:views], content[32:]):
+    def _read_snapshot(self, events: Sequence[Event]) -> tuple[int, Scene | None]:
+        """The newest scene that this code made of the first of these events, and their number."""
+        for number in range(len(events), 0, -1):
+            with suppress(Exception):  # whatever a damaged file leads to: the events are still there
+                content = self._snapshot(number).read_bytes()
+                if content[:32] == self._seal(events[:number], content[32:]):
                     scene = _Unpickler(io.BytesIO(content[32:])).load()
+                    views = sum(isinstance(event, CameraRecord) for event in events[:number])
                     if isinstance(scene, Scene) and _given(scene) == views:
-                        return scene
-        return None
+                        return number, scene
+        return 0, None
 
-    def _write_snapshot(self, scene: Scene, records: Sequence[CameraRecord]) -> None:
-        """Keep the scene of all views, and those of the seven views before; a failure costs only time."""
+    def _write_snapshot(self, scene: Scene, events: Sequence[Event]) -> None:
+        """Keep the scene of all events, and those of the seven before; a failure costs only time."""
         with suppress(Exception):
-            path = self._snapshot(len(records))
+            path = self._snapshot(len(events))
             path.parent.mkdir(exist_ok=True)
             payload = pickle.dumps(scene, protocol=5)
-            write_file(path, self._seal(records, payload) + payload)
-            kept = {self._snapshot(len(records) - back) for back in range(8)}
+            write_file(path, self._seal(events, payload) + payload)
+            kept = {self._snapshot(len(events) - back) for back in range(8)}
             for older in set(path.parent.iterdir()) - kept:
                 older.unlink()
 
-    def _snapshot(self, views: int) -> Path:
-        return self.path / "state" / f"{views:06d}.pickle"
+    def _snapshot(self, events: int) -> Path:
+        return self.path / "state" / f"{events:06d}.pickle"
 
-    def _seal(self, records: Sequence[CameraRecord], payload: bytes) -> bytes:
-        """Digest of the code and the views that made a snapshot, and of the snapshot itself."""
-        views = (record.digest for record in records)
-        made_of = " ".join((fingerprint(), self.beginning.to_json(), *views))
+    def _seal(self, events: Sequence[Event], payload: bytes) -> bytes:
+        """Digest of the code and the events that made a snapshot, and of the snapshot itself."""
+        told = (e.digest if isinstance(e, CameraRecord) else e.to_json().decode() for e in events)
+        made_of = " ".join((fingerprint(), self.beginning.to_json(), *told))
         return hashlib.sha256(made_of.encode() + b"\0" + payload).digest()
 
 
