@@ -72,9 +72,7 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
     config = read_settings(None, args.set, base)
     simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
     known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
-    explorer = Explorer(
-        simulation.camera, simulation.robot, goal=None if goal is None else f"o{goal}", **known
-    )
+    explorer = Explorer(simulation.camera, simulation.robot, **known)
     hands, done = SimulatedHands(scene, config), list[Taken]()
 
     def take(step: TakeStep) -> bool:
@@ -82,7 +80,8 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
         simulation.camera.scene = hands.scene
         return done[-1].body is not None
 
-    steps = list(clear(explorer, take, hands=args.hands))
+    wanted = None if goal is None else f"o{goal}"
+    steps = list(clear(explorer, take, goal=wanted, hands=args.hands))
     lifted = [t for t in done if t.body is not None]
     harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
     row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}

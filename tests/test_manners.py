@@ -81,7 +81,7 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
     [
         ("explore", "SOURCE"),
         ("extract", "SOURCE"),
-        ("session", "{new, add, next, graph, undo}"),
+        ("session", "{new, add, next, graph, take, undo}"),
         ("session add", "DIR"),
         ("explore tower --out x --fusion k", "Expected one of ('pc', 'sg', 'pc+sg')"),
         ("explore tower --out x --segmentation k", "Expected one of ('labels', 'auto')"),

@@ -160,7 +160,7 @@ class Explorer:
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
         self._masks = masks
         self.goal = goal
-        self._until = until
+        self._until = UNTIL if until is None and goal is not None else until
         self.robot = robot
         self.step: Step | None = None
         self._camera = camera
@@ -269,8 +269,7 @@ class Explorer:
         if step.decision is None or step.candidates is None:
             return step.stop
         state = self._state(step.candidates)
-        goal, config = self.goal, self.scene.config.support
-        until = UNTIL if self._until is None and goal is not None else self._until
+        goal, until, config = self.goal, self._until, self.scene.config.support
         # Without a goal, nothing checks whether the first view hides objects.
         asked = until if goal is not None or step.index > 0 else None
         if asked is not None and settled(state.graph, goal, asked, state.voxels, config):

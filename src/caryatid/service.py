@@ -146,11 +146,11 @@ class ViewAnswer(Document):
 
 
 class NewReport(Document):
-    """What the robot did to an object."""
+    """What the robot did to an object: T (4, 4) moved it, or it is gone."""
 
     object: str = Field(description="Its id")
     T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = Field(
-        None, description="Rigid transform of the world [m] that moved it; null = it was taken away"
+        None, description="Rigid transform (4, 4) of the world [m] that moved it; null = it was taken"
     )
 
 

@@ -320,7 +320,7 @@ class Clear(options.ExploringCommand):
             remedy = "give an MJCF scene; for a run, use `caryatid order`"
             raise InputError(self.source, "cannot be simulated", remedy)
         known: dict[str, Any] = {"segmentation": self.segmentation, "seed": seed, "masks": masks}
-        known |= {"planner": self.chosen_planner, "goal": self.goal, "config": config}
+        known |= {"planner": self.chosen_planner, "config": config}
         explorer = Explorer(camera, source.robot, **known)
         hands = SimulatedHands(camera.scene, config)
         with RunWriter(self.out, config, _about(self), stepwise=True) as writer:
@@ -346,7 +346,7 @@ class Clear(options.ExploringCommand):
                     writer.files[lift_file(len(writer.steps))] = lift_picture(drawn)
                 return taken.body is not None
 
-            known = {"hands": self.hands, "threads": cores()}
+            known = {"goal": self.goal, "hands": self.hands, "threads": cores()}
             steps = clear(explorer, take, past=() if past is None else read_steps(past), **known)
             writer.more["conditions"] = conditions = _conditions(self)
             last = _record(writer, steps, None, output, heading=f"{source.name}: {conditions}")

@@ -17,6 +17,7 @@ def clear(
     explorer: Explorer,
     take: Callable[[TakeStep], bool],
     *,
+    goal: str | None = None,
     hands: int = 2,
     threads: int = 1,
     past: Iterable[Step] = (),
@@ -24,12 +25,13 @@ def clear(
     """Look until the next lift is safe, lift, look again, until nothing or nothing safe is left.
 
     A lift is safe if no other object moves with a higher probability than `config.rehearsal.risk`, as in
-    `plan_order`. It is done when that is known with the explorer's `until`, or when no view is expected to
-    show more. After each lift the robot looks again, which shows objects that slid or fell.
+    `plan_order`. It is done when no view is expected to show more of what it depends on than its path costs.
+    After each lift the robot looks again, and so notices what slid or fell.
 
     Args:
-        explorer: Has a camera and a robot. Its goal is the object to reach; None = all of them.
+        explorer: Has a camera and a robot, and no goal.
         take: Removes an object; returns whether it was there.
+        goal: Id of the object to reach; None = all of them.
         hands: 2 if another hand can hold one object, else 1.
         threads: Number of rehearsals at a time.
         past: Steps of a run to continue; their views are used again, and nothing is removed again.
@@ -40,7 +42,7 @@ def clear(
     Raises:
         CaryatidError: A view cannot be used.
     """
-    goal, missed = explorer.goal, 0
+    missed = 0
     for step in past:
         _repeat(explorer, step)
     while explorer.step is None or explorer.step.decision is not None:
@@ -78,14 +80,14 @@ def _lift(
     explorer.goal = lift.object_id if lift is not None and lift.safe else goal
     explorer.plan()
     reason = explorer.reason_to_stop()
+    used_up = scene.views >= scene.config.active.max_views
     if reason is None:
         return None, None
-    used_up = reason if scene.views >= scene.config.active.max_views else None
     if lift is None:
         return None, f"{reason}; {goal} has not been found"
     if lift.safe:
-        return lift, used_up
-    return None, used_up or f"no lift is safe: {lift.why}"
+        return lift, reason if used_up else None
+    return None, reason if used_up else f"no lift is safe: {lift.why}"
 
 
 def _repeat(explorer: Explorer, step: Step) -> None:
