@@ -128,6 +128,16 @@ def test_an_image_too_small_to_tell_objects_in(tmp_path, capsys):
     assert "no object among" in capsys.readouterr().err
 
 
+def test_an_object_without_readings_on_the_grid_of_samples(tmp_path, capsys):
+    depth, higher = a_plane(160, 120, DOWN), a_plane(160, 120, DOWN, top=0.85)
+    box = slice(40, 80), slice(60, 100)
+    depth[box] = np.where(np.arange(60, 100) % 2 == 1, higher[box], 0.0)
+    K = [[128, 0, 79.5], [0, 128, 59.5], [0, 0, 1]]
+    write_recording(tmp_path / "stripes", [View(depth, K, DOWN)])
+    assert run_command("extract", tmp_path / "stripes", "--out", tmp_path / "run") == 0
+    assert "no depth in 1 region" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("width", "says"), [(12000, "has more than 89478485"), (9000, "has 9000×9000")])
 def test_an_image_larger_than_any_cameras(recording, refused, width, says):
     """Its header says so; nothing is decoded."""

@@ -53,7 +53,7 @@ def segment(
     labels = np.zeros(view.depth.shape, dtype=np.int32)
     foreground = surface.pixels_over(view, config.clearance, config.max_height, config.margin)
     foreground &= (view.depth >= clouds.min_depth) & (view.depth <= clouds.max_depth)
-    if not foreground.any():
+    if not foreground[:: config.stride, :: config.stride].any():
         return labels
     samples = take_samples(view, foreground, surface, config, clouds)
     points, normals = samples.points_camera, samples.normals_camera
