@@ -96,7 +96,7 @@ class Page:
         self._notice.visible = bool(text)
 
     def add(self, step: Step, f1: float | None = None) -> None:
-        """Add a step, or put it in place of that of the same view; who looks at the newest goes along."""
+        """Add a step, or replace that of the same view; a page that shows the newest step moves to it."""
         newest = self._shown == len(self.steps) - 1
         self.steps[step.index : step.index + 1] = [reduced(step)]
         self.scores[step.index : step.index + 1] = [f1]
@@ -413,7 +413,7 @@ def _serve(title: str, host: str, port: int, token: str) -> Any:
 
         return whole(*given, process_request=answer, **options)
 
-    # viser has no option for who may come; it serves before it returns.
+    # viser has no option that restricts access, and it serves before it returns.
     setattr(sockets, "serve", guarded)  # noqa: B010  (mypy knows the class)
     try:
         with _silent():
