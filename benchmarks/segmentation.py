@@ -73,7 +73,7 @@ def views_of(source: str, args: Args, config: Config) -> Iterator[View]:
     opened = open_source(source, config, noise=args.noise, segmentation="labels", seed=args.seed)
     if opened.truth is None:
         raise CaryatidError(f"{source}: has no truth to score against")
-    sphere = ViewSphere.around(np.array([0.0, 0.0, opened.truth.table_top or 0.0]), config.active)
+    sphere = ViewSphere.around(np.array([0.0, 0.0, opened.truth.table_top]), config.active)
     found = opened.robot.candidates(sphere)
     first = opened.robot.T_world_camera
     others = spread_out(found.directions, sphere.direction_of(first)[None], args.views - 1)

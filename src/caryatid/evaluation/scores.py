@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+import math
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, fields
-from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.optimize import linear_sum_assignment
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
 from caryatid.geometry.shapes import Box, Shape
-from caryatid.geometry.solids import in_hull
+from caryatid.geometry.solids import Solid, in_hull
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SupportGraph
 from caryatid.sensing.views import SUPPORT_LABEL
@@ -24,37 +24,22 @@ TABLE: Final = "table"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class TrueObject:
-    """A solid with a test for its inside.
-
-    Attributes:
-        name: Body name, or `object<obj_id>`.
-        contains: Which of the points (N, 3) [m], world frame, lie inside: (N,) bool.
-        aabb_world: Lowest and highest corner (2, 3) [m] of a world-aligned box around it.
-    """
-
-    name: str
-    contains: Callable[[Array], NDArray[np.bool_]]
-    aabb_world: Array
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class TrueScene:
-    """A support graph over solids: the ground truth, or a graph to compare with it.
+    """The ground truth: a support graph over shapes.
 
     Attributes:
         vertices: Names, the table's too.
         edges: Directed pairs (supporter, supported) of names.
-        objects: The solids of the vertices that are objects; a vertex without one is never found.
+        objects: Shape of each vertex that is an object; a vertex without one is never found.
         table: Name of the vertex that is the support surface, or None.
-        table_top: Height of its top [m], or None without a table.
+        table_top: Height of its top [m], NaN without a table.
     """
 
     vertices: tuple[str, ...]
     edges: frozenset[tuple[str, str]]
-    objects: tuple[TrueObject, ...]
+    objects: Mapping[str, Shape]
     table: str | None = None
-    table_top: float | None = None
+    table_top: float = math.nan
 
 
 class Forecast(NamedTuple):
@@ -132,33 +117,29 @@ class Score:
 
 
 def score(
-    found: SupportGraph | TrueScene,
+    graph: SupportGraph,
     truth: TrueScene,
     rng: np.random.Generator | None = None,
     config: EvaluationConfig | None = None,
 ) -> Score:
-    """Score a graph of fitted shapes, or a scene of solids, against true solids; the truth itself scores 1.
+    """Score a graph of fitted shapes against true ones.
 
     Every edge of the graph counts, also uncertain ones: a wrong guess costs precision. An edge is
     true when both its ends are matched and the directed pair is in the truth, whatever its kind.
 
     Args:
-        found: The extracted graph, in the world frame of the truth.
+        graph: The extracted graph, in the world frame of the truth.
         truth: The true scene.
         rng: Draws the points that measure volumes; None draws the same ones every time.
         config: Minimum IoU, tolerance of the table's height, points per pair.
     """
     config = config or EvaluationConfig()
-    edges = _said(found)
-    found = as_scene(found) if isinstance(found, SupportGraph) else found
-    iou = _volume_ious(found.objects, truth.objects, config.samples, rng or np.random.default_rng(0))
-    names, true_names = [o.name for o in found.objects], [o.name for o in truth.objects]
-    matches, ious = _matched(iou, names, true_names, config.min_iou)
-    tops = [t.table_top for t in (found, truth) if t.table_top is not None]
-    same = len(tops) == 2 and abs(tops[0] - tops[1]) <= config.table_tolerance
-    if same and found.table is not None and truth.table is not None:
-        matches[found.table] = truth.table
-    return _score_matches(found.vertices, edges, truth.vertices, truth.edges, matches, ious)
+    shapes = [o.shape for o in graph.objects if o.role == "object"]
+    rng = rng or np.random.default_rng(0)
+    iou = _volume_ious(shapes, list(truth.objects.values()), config.samples, rng)
+    same = abs(_top_height(graph) - truth.table_top) <= config.table_tolerance
+    table = truth.table if same else None
+    return _matched(graph, truth.vertices, truth.edges, iou, list(truth.objects), table, config.min_iou)
 
 
 def score_masks(
@@ -186,48 +167,39 @@ def score_masks(
         InputError: Images differ in number or size.
     """
     config = config or EvaluationConfig()
-    objects = [o for o in graph.objects if o.role == "object"]
     names = [name for name in vertices if name != TABLE]
-    numbers = [_object_number(name) for name in names]
-    iou = mask_ious(labels, true_labels, [o.label for o in objects], numbers)
-    matches, ious = _matched(iou, [o.id for o in objects], names, config.min_iou)
-    surface = graph.support_surface
-    if surface is not None and TABLE in vertices:
-        matches[surface.id] = TABLE
-    found = [o.id for o in graph.objects]
-    return _score_matches(found, _said(graph), vertices, edges, matches, ious)
-
-
-def _said(found: SupportGraph | TrueScene) -> dict[tuple[str, str], tuple[float, float]]:
-    """Probability of each edge, and that by `certain` alone; all are certain in a scene of solids."""
-    if isinstance(found, TrueScene):
-        return dict.fromkeys(found.edges, (1.0, 1.0))
-    return {s.pair: (s.belief, 1.0 if s.certain else 0.5) for s in found.supports}
+    found = [o.label for o in graph.objects if o.role == "object"]
+    iou = mask_ious(labels, true_labels, found, [_object_number(name) for name in names])
+    table = TABLE if TABLE in vertices else None
+    return _matched(graph, vertices, edges, iou, names, table, config.min_iou)
 
 
 def _matched(
-    iou: Array, found: Sequence[str], true: Sequence[str], min_iou: float
-) -> tuple[dict[str, str], dict[str, float]]:
-    """One-to-one match of found (F) to true names (T) by IoUs (F, T); and the IoU of each."""
-    pairs = assign(iou, min_iou)
-    return {found[i]: true[j] for i, j in pairs}, {found[i]: float(iou[i, j]) for i, j in pairs}
-
-
-def _score_matches(
-    found_vertices: Sequence[str],
-    found_edges: Mapping[tuple[str, str], tuple[float, float]],
+    graph: SupportGraph,
     vertices: Sequence[str],
     edges: Set[tuple[str, str]],
-    matches: dict[str, str],
-    ious: dict[str, float],
+    iou: Array,
+    names: Sequence[str],
+    table: str | None,
+    min_iou: float,
 ) -> Score:
-    """All scores, given the one-to-one match of extracted and true vertices."""
-    named = {(matches.get(a, ""), matches.get(b, "")): said for (a, b), said in found_edges.items()}
-    judged = {pair: Forecast(*said, pair in edges) for pair, said in named.items() if all(pair)}
+    """Match the graph's objects (F) one to one with those of these names (T) by IoUs (F, T), and score."""
+    objects = [o.id for o in graph.objects if o.role == "object"]
+    pairs = assign(iou, min_iou)
+    matches = {objects[i]: names[j] for i, j in pairs}
+    ious = {objects[i]: float(iou[i, j]) for i, j in pairs}
+    if graph.support_surface is not None and table is not None:
+        matches[graph.support_surface.id] = table
+    found = {(matches.get(s.supporter, ""), matches.get(s.supported, "")): s for s in graph.supports}
+    judged = {
+        pair: Forecast(s.belief, 1.0 if s.certain else 0.5, pair in edges)
+        for pair, s in found.items()
+        if all(pair)
+    }
     v, e = len(matches), sum(forecast.true for forecast in judged.values())
-    precision, recall = _ratios(v + e, len(found_vertices) + len(found_edges), len(vertices) + len(edges))
-    of_vertices = _ratios(v, len(found_vertices), len(vertices))
-    of_edges = _ratios(e, len(found_edges), len(edges))
+    claimed_v, claimed_e = len(graph.objects), len(graph.supports)
+    precision, recall = _ratios(v + e, claimed_v + claimed_e, len(vertices) + len(edges))
+    of_vertices, of_edges = _ratios(v, claimed_v, len(vertices)), _ratios(e, claimed_e, len(edges))
     mean_iou = float(np.mean(list(ious.values()))) if ious else 0.0
     f1 = _harmonic_mean(precision, recall)
     there = set(matches.values())
@@ -237,8 +209,8 @@ def _score_matches(
     of_forecasts = brier, average_precision(forecasts)
     shares = precision, recall, f1, *of_edges, *of_vertices, mean_iou, *of_forecasts
     known_as = {true: name for name, true in matches.items()}
-    wrong = [(a, b) for a, b in found_edges if (matches.get(a, ""), matches.get(b, "")) not in edges]
-    missing = [(known_as.get(a, a), known_as.get(b, b)) for a, b in sorted(edges - named.keys())]
+    wrong = [s.pair for s in graph.supports if tuple(matches.get(end, "") for end in s.pair) not in edges]
+    missing = [(known_as.get(a, a), known_as.get(b, b)) for a, b in sorted(edges - found.keys())]
     unfound = tuple(name for name in vertices if name not in there)
     return Score(*shares, matches, ious, forecasts, tuple(wrong), tuple(missing), unfound)
 
@@ -264,23 +236,38 @@ def average_precision(forecasts: Sequence[Forecast]) -> float:
 
 
 def _volume_ious(
-    found: Sequence[TrueObject], true: Sequence[TrueObject], samples: int, rng: np.random.Generator
+    found: Sequence[Shape], true: Sequence[Shape], samples: int, rng: np.random.Generator
 ) -> Array:
-    """Intersection over union (F, T) of solids by Monte Carlo; 10,000 points per pair: σ = 0.01 at worst."""
+    """Intersection over union (F, T) of shapes by Monte Carlo; 10,000 points per pair: σ = 0.01 at worst."""
     iou = np.zeros((len(found), len(true)))
+    true_bounds = [_bounds(shape) for shape in true]
     for i, a in enumerate(found):
-        for j, b in enumerate(true):
-            low = np.maximum(a.aabb_world[0], b.aabb_world[0])
-            high = np.minimum(a.aabb_world[1], b.aabb_world[1])
-            if (low >= high).any():
+        low_a, high_a = _bounds(a)
+        for j, (b, (low_b, high_b)) in enumerate(zip(true, true_bounds, strict=True)):
+            if (np.maximum(low_a, low_b) >= np.minimum(high_a, high_b)).any():
                 continue
-            start = np.minimum(a.aabb_world[0], b.aabb_world[0])
-            end = np.maximum(a.aabb_world[1], b.aabb_world[1])
+            start, end = np.minimum(low_a, low_b), np.maximum(high_a, high_b)
             points_world = rng.uniform(start, end, size=(samples, 3))
-            in_a, in_b = a.contains(points_world), b.contains(points_world)
+            in_a, in_b = _inside(a, points_world), _inside(b, points_world)
             union = int(np.count_nonzero(in_a | in_b))
             iou[i, j] = np.count_nonzero(in_a & in_b) / union if union else 0.0
     return iou
+
+
+def _inside(shape: Shape, points_world: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) lie inside a shape (N,); a hollow object counts with its inside."""
+    if len(shape.parts) > 1:
+        return in_hull(shape.outline(), points_world)
+    return shape.signed_distance(points_world) <= 0.0
+
+
+def _bounds(shape: Shape) -> tuple[Array, Array]:
+    """Lowest and highest corner, (3,) each [m], of the world-aligned box around a shape."""
+    if isinstance(shape, Solid):
+        corners = shape.outline()
+        return corners.min(axis=0), corners.max(axis=0)
+    centre, reach = shape.T_world_object[:3, 3], shape.support(np.eye(3))
+    return centre - reach, centre + reach
 
 
 def mask_ious(
@@ -320,41 +307,26 @@ def assign(iou: Array, min_iou: float) -> list[tuple[int, int]]:
 
 
 def as_scene(graph: SupportGraph) -> TrueScene:
-    """Convert a graph of fitted shapes to a scene of solids, with vertices named by their ids."""
+    """Take a graph of fitted shapes as the truth, with vertices named by their ids."""
     surface = graph.support_surface
     return TrueScene(
         vertices=tuple(o.id for o in graph.objects),
         edges=frozenset(s.pair for s in graph.supports),
-        objects=tuple(_solid(o.id, o.shape) for o in graph.objects if o.role == "object"),
+        objects={o.id: o.shape for o in graph.objects if o.role == "object"},
         table=None if surface is None else surface.id,
-        table_top=None if surface is None else _top_height(surface.shape),
+        table_top=_top_height(graph),
     )
 
 
-def _top_height(shape: Shape) -> float:
-    """Height [m] of the middle of a shape's top; of a box, of its most level upper face."""
-    T_world_object = shape.T_world_object
+def _top_height(graph: SupportGraph) -> float:
+    """Height [m] of the middle of the support surface's top; of a box, of its most level upper face."""
+    if graph.support_surface is None:
+        return math.nan
+    shape = graph.support_surface.shape
+    height, rise = shape.T_world_object[2, 3], np.abs(shape.T_world_object[2, :3])
     if isinstance(shape, Box):
-        rise = np.abs(T_world_object[2, :3])
-        up = int(np.argmax(rise))
-        return float(T_world_object[2, 3] + rise[up] * shape.extents[up] / 2.0)
-    return float(T_world_object[2, 3] + shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
-
-
-def _solid(name: str, shape: Shape) -> TrueObject:
-    if len(shape.parts) > 1:
-        # Hollow objects count with their inside, here as in the ground truth.
-        corners = shape.outline()
-        return TrueObject(
-            name, partial(in_hull, corners), np.stack([corners.min(axis=0), corners.max(axis=0)])
-        )
-    reach = shape.support(np.eye(3))
-    centre = shape.T_world_object[:3, 3]
-    return TrueObject(
-        name,
-        lambda points_world: shape.signed_distance(points_world) <= 0.0,
-        np.stack([centre - reach, centre + reach]),
-    )
+        return float(height + rise.max() * shape.extents[np.argmax(rise)] / 2.0)
+    return float(height + shape.support(np.array([[0.0, 0.0, 1.0]]))[0])
 
 
 def _ratios(right: int, claimed: int, true: int) -> tuple[float, float]:

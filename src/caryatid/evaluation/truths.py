@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from caryatid.config import EvaluationConfig
 from caryatid.errors import InputError
-from caryatid.evaluation.scores import Score, TrueObject, TrueScene, score, score_masks
+from caryatid.evaluation.scores import Score, TrueScene, score, score_masks
 from caryatid.io.bop import read_recording
 from caryatid.io.datasets import find_sample
-from caryatid.simulation import world
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, load_scene
 from caryatid.simulation.truth import GroundTruth, ground_truth, read_truth
-from caryatid.simulation.world import SimulatedScene
+from caryatid.simulation.world import SimulatedScene, table_centre, true_shapes
 from caryatid.steps import read_run
 
 
 def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None = None) -> TrueScene:
-    """Build the truth of a simulated scene: its solids, and edges from gt.json.
+    """Build the truth of a simulated scene: its shapes, and edges from gt.json.
 
     Args:
         scene: The scene.
@@ -38,13 +34,10 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
     if strange := [name for name in truth.vertices if name not in labels]:
         why = f"gt.json names '{strange[0]}', which is not a body of the scene"
         raise InputError(scene.source, why, f"the bodies are {', '.join(labels)}")
-    solids = [(name, labels[name]) for name in truth.vertices if name != scene.table]
-    objects = tuple(
-        TrueObject(name, partial(world.contains, scene, label), np.stack(world.bounds(scene, label)))
-        for name, label in solids
-    )
+    shapes = true_shapes(scene)
+    objects = {name: shapes[labels[name]] for name in truth.vertices if name != scene.table}
     table = scene.table if scene.table in truth.vertices else None
-    height = float(world.table_centre(scene)[2])
+    height = float(table_centre(scene)[2])
     return TrueScene(truth.vertices, frozenset(truth.pairs), objects, table, height)
 
 

@@ -192,9 +192,8 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
     geoms = np.empty(lengths.size, dtype=np.int32)
     depth = np.empty(lengths.size)
     normals_world = np.empty((lengths.size, 3))
-    visible = np.array(
-        [1, 1, 1, 0, 1, 1], dtype=np.uint8
-    )  # the fourth of MuJoCo's six groups is for collisions only
+    # The fourth of MuJoCo's six groups is for collisions only.
+    visible = np.array([1, 1, 1, 0, 1, 1], dtype=np.uint8)
     mujoco.mj_multiRay(
         scene.model, scene.data, T_world_camera[:3, 3], rays_world.ravel(), visible, 1, -1, geoms, depth,
         normals_world.reshape(-1), lengths.size, sensor.far * float(lengths.max()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Literal
 
@@ -45,9 +46,7 @@ GAP = 0.002
 CLOSE = 0.0005
 """Distance of touching objects before they settle [m]: far below what a camera can see."""
 TRIES = 10
-"""Attempts to set down an object that falls off, rolls away or upsets others; then the one before it is
-removed again as well.
-"""
+"""Failed attempts to set down an object after which the one before it is removed too."""
 
 _Drop = tuple[Body, bool]
 """A solid where it is dropped, and whether it should stay on another one."""
@@ -89,13 +88,14 @@ def generate(
     if seed < 0:
         raise InputError(name, f"seed {seed} is negative", "give 0 or more")
     rng = np.random.default_rng([list(SIZES).index(kind), size, seed])
-    plans = {"pile": _pile, "dense": _dense, "packed": _packed, "house": _house, "blocks": _blocks}
+    plans: dict[GeneratedKind, Callable[[np.random.Generator, int], _Plan]] = {
+        "pile": partial(_stacked, make=_upright, margin=0.06),
+        "dense": _dense,
+        "packed": _packed,
+        "house": partial(_stacked, make=thing, margin=0.12),
+        "blocks": _blocks,
+    }
     return _set_down(name, size, plans[kind](rng, size), physics or PhysicsConfig())
-
-
-def _pile(rng: np.random.Generator, size: int) -> _Plan:
-    """Seven in ten objects are set down on another one, the others anywhere on the table."""
-    return _stacked(rng, _upright, 0.06)
 
 
 def _dense(rng: np.random.Generator, size: int) -> _Plan:
@@ -137,11 +137,6 @@ def _packed(rng: np.random.Generator, size: int) -> _Plan:
     return _Plan(draw)
 
 
-def _house(rng: np.random.Generator, size: int) -> _Plan:
-    """Seven in ten objects are set down on another one, or in it, the others anywhere on the table."""
-    return _stacked(rng, thing, 0.12)
-
-
 def _blocks(rng: np.random.Generator, size: int) -> _Plan:
     """Equal boxes side by side and in layers, with one orientation."""
     extents = rng.uniform((0.04, 0.04, 0.04), (0.07, 0.1, 0.08))
@@ -162,7 +157,9 @@ def _blocks(rng: np.random.Generator, size: int) -> _Plan:
     return _Plan(draw)
 
 
-def _stacked(rng: np.random.Generator, make: Callable[[np.random.Generator], Shape], margin: float) -> _Plan:
+def _stacked(
+    rng: np.random.Generator, size: int, make: Callable[[np.random.Generator], Shape], margin: float
+) -> _Plan:
     """Seven in ten shapes are set down on another one, the others on the table, a margin [m] off its edge."""
 
     def draw(scene: SimulatedScene | None) -> _Drop:
@@ -356,23 +353,19 @@ def thing(rng: np.random.Generator) -> Shape:
 
 
 def _tray(rng: np.random.Generator) -> Shape:
-    x, y, z = rng.uniform((0.2, 0.26, 0.03), (0.27, 0.36, 0.06))
-    return _hollow_box(x, y, z)
+    return _hollow_box(*rng.uniform((0.2, 0.26, 0.03), (0.27, 0.36, 0.06)))
 
 
 def _open_box(rng: np.random.Generator) -> Shape:
-    x, y, z = rng.uniform((0.11, 0.13, 0.07), (0.15, 0.2, 0.11))
-    return _hollow_box(x, y, z)
+    return _hollow_box(*rng.uniform((0.11, 0.13, 0.07), (0.15, 0.2, 0.11)))
 
 
 def _hollow_box(x: float, y: float, z: float) -> Shape:
     """Four walls and a floor."""
     block = _hull([[a * x / 2.0, b * y / 2.0, c * z] for a in (-1, 1) for b in (-1, 1) for c in (0, 1)])
-    axes = np.eye(3)
-    planes = [(axes[2], WALL)]
-    for axis, length in ((0, x), (1, y)):
-        planes += [(sign * axes[axis], WALL - length / 2.0) for sign in (-1.0, 1.0)]
-    return Solid.of(hollowed(block, planes))
+    along_x, along_y, up = np.eye(3)
+    walls = [(s * axis, WALL - size / 2.0) for axis, size in ((along_x, x), (along_y, y)) for s in (-1, 1)]
+    return Solid.of(hollowed(block, [(up, WALL), *walls]))
 
 
 def _bowl(rng: np.random.Generator) -> Shape:

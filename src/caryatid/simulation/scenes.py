@@ -9,7 +9,6 @@ from difflib import get_close_matches
 from math import prod
 from os import PathLike, fspath
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final, cast
 from xml.etree import ElementTree
 
@@ -29,63 +28,61 @@ from caryatid.simulation.world import (
     sphere,
 )
 
-DESIGNED: Final = MappingProxyType[str, tuple[Body, ...]](
-    {
-        "tower": (
-            box((0.14, 0.14, 0.08), at=(0.0, 0.0, 0.04)),
-            cylinder(0.05, 0.09, at=(0.0, 0.005, 0.125)),
-            box((0.09, 0.08, 0.06), at=(0.005, 0.0, 0.2), turn=(0.0, 0.0, 30.0)),
-            cylinder(0.03, 0.07, at=(0.0, 0.0, 0.265)),
-            sphere(0.035, at=(-0.12, 0.18, 0.035)),
-        ),
-        "bridge": (
-            box((0.07, 0.08, 0.12), at=(0.0, -0.13, 0.06)),
-            cylinder(0.04, 0.12, at=(0.0, 0.13, 0.06)),
-            box((0.1, 0.36, 0.025), at=(0.0, 0.0, 0.1325)),
-            box((0.08, 0.08, 0.08), at=(0.0, 0.02, 0.185), turn=(0.0, 0.0, 20.0)),
-            sphere(0.035, at=(0.02, 0.0, 0.035)),
-        ),
-        "counterweight": (
-            box((0.11, 0.1, 0.1), at=(0.0, 0.0, 0.05)),
-            box((0.07, 0.38, 0.02), at=(0.0, -0.13, 0.11), density=500.0),
-            cylinder(0.04, 0.08, at=(0.0, 0.012, 0.16), density=3000.0),
-            box((0.06, 0.06, 0.05), at=(0.02, -0.26, 0.025)),
-        ),
-        "leaning_plank": (
-            box((0.1, 0.14, 0.28), at=(0.05, 0.0, 0.14), density=1200.0, friction=0.1),
-            box((0.02, 0.09, 0.24), at=(-0.039, 0.0, 0.1215), turn=(0.0, 14.0, 0.0), friction=0.1),
-            cylinder(0.035, 0.1, at=(-0.03, 0.2, 0.05)),
-            box((0.05, 0.05, 0.05), at=(-0.03, 0.2, 0.125)),
-        ),
-        "hidden_stack": (
-            box((0.09, 0.3, 0.26), at=(-0.13, 0.0, 0.13)),
-            box((0.12, 0.12, 0.06), at=(0.04, -0.02, 0.03)),
-            box((0.09, 0.1, 0.05), at=(0.04, -0.02, 0.085)),
-            cylinder(0.03, 0.08, at=(0.045, -0.02, 0.15)),
-            sphere(0.04, at=(0.06, 0.13, 0.04)),
-        ),
-        "shelf": (
-            cylinder(0.035, 0.13, at=(0.0, -0.16, 0.065)),
-            cylinder(0.035, 0.13, at=(0.0, 0.16, 0.065)),
-            box((0.16, 0.42, 0.02), at=(0.0, 0.0, 0.14)),
-            box((0.07, 0.09, 0.06), at=(0.01, 0.0, 0.03)),
-            sphere(0.03, at=(0.01, 0.0, 0.09)),
-            box((0.09, 0.07, 0.1), at=(0.0, -0.08, 0.2)),
-            cylinder(0.03, 0.06, at=(0.0, 0.1, 0.18)),
-        ),
-        "clutter": (
-            box((0.17, 0.22, 0.1), at=(0.07, 0.02, 0.05)),
-            box((0.1, 0.13, 0.06), at=(0.07, -0.01, 0.13)),
-            cylinder(0.034, 0.12, at=(0.07, -0.02, 0.22)),
-            box((0.07, 0.18, 0.2), at=(-0.11, 0.14, 0.1)),
-            cylinder(0.04, 0.14, at=(-0.07, -0.19, 0.07)),
-            box((0.07, 0.07, 0.14), at=(0.07, -0.19, 0.07)),
-            box((0.22, 0.06, 0.03), at=(0.0, -0.19, 0.155)),
-            sphere(0.04, at=(0.2, 0.23, 0.04)),
-            box((0.08, 0.1, 0.05), at=(-0.11, 0.14, 0.225), turn=(0.0, 0.0, 15.0)),
-        ),
-    }
-)
+DESIGNED: Final[Mapping[str, tuple[Body, ...]]] = {
+    "tower": (
+        box((0.14, 0.14, 0.08), at=(0.0, 0.0, 0.04)),
+        cylinder(0.05, 0.09, at=(0.0, 0.005, 0.125)),
+        box((0.09, 0.08, 0.06), at=(0.005, 0.0, 0.2), turn=(0.0, 0.0, 30.0)),
+        cylinder(0.03, 0.07, at=(0.0, 0.0, 0.265)),
+        sphere(0.035, at=(-0.12, 0.18, 0.035)),
+    ),
+    "bridge": (
+        box((0.07, 0.08, 0.12), at=(0.0, -0.13, 0.06)),
+        cylinder(0.04, 0.12, at=(0.0, 0.13, 0.06)),
+        box((0.1, 0.36, 0.025), at=(0.0, 0.0, 0.1325)),
+        box((0.08, 0.08, 0.08), at=(0.0, 0.02, 0.185), turn=(0.0, 0.0, 20.0)),
+        sphere(0.035, at=(0.02, 0.0, 0.035)),
+    ),
+    "counterweight": (
+        box((0.11, 0.1, 0.1), at=(0.0, 0.0, 0.05)),
+        box((0.07, 0.38, 0.02), at=(0.0, -0.13, 0.11), density=500.0),
+        cylinder(0.04, 0.08, at=(0.0, 0.012, 0.16), density=3000.0),
+        box((0.06, 0.06, 0.05), at=(0.02, -0.26, 0.025)),
+    ),
+    "leaning_plank": (
+        box((0.1, 0.14, 0.28), at=(0.05, 0.0, 0.14), density=1200.0, friction=0.1),
+        box((0.02, 0.09, 0.24), at=(-0.039, 0.0, 0.1215), turn=(0.0, 14.0, 0.0), friction=0.1),
+        cylinder(0.035, 0.1, at=(-0.03, 0.2, 0.05)),
+        box((0.05, 0.05, 0.05), at=(-0.03, 0.2, 0.125)),
+    ),
+    "hidden_stack": (
+        box((0.09, 0.3, 0.26), at=(-0.13, 0.0, 0.13)),
+        box((0.12, 0.12, 0.06), at=(0.04, -0.02, 0.03)),
+        box((0.09, 0.1, 0.05), at=(0.04, -0.02, 0.085)),
+        cylinder(0.03, 0.08, at=(0.045, -0.02, 0.15)),
+        sphere(0.04, at=(0.06, 0.13, 0.04)),
+    ),
+    "shelf": (
+        cylinder(0.035, 0.13, at=(0.0, -0.16, 0.065)),
+        cylinder(0.035, 0.13, at=(0.0, 0.16, 0.065)),
+        box((0.16, 0.42, 0.02), at=(0.0, 0.0, 0.14)),
+        box((0.07, 0.09, 0.06), at=(0.01, 0.0, 0.03)),
+        sphere(0.03, at=(0.01, 0.0, 0.09)),
+        box((0.09, 0.07, 0.1), at=(0.0, -0.08, 0.2)),
+        cylinder(0.03, 0.06, at=(0.0, 0.1, 0.18)),
+    ),
+    "clutter": (
+        box((0.17, 0.22, 0.1), at=(0.07, 0.02, 0.05)),
+        box((0.1, 0.13, 0.06), at=(0.07, -0.01, 0.13)),
+        cylinder(0.034, 0.12, at=(0.07, -0.02, 0.22)),
+        box((0.07, 0.18, 0.2), at=(-0.11, 0.14, 0.1)),
+        cylinder(0.04, 0.14, at=(-0.07, -0.19, 0.07)),
+        box((0.07, 0.07, 0.14), at=(0.07, -0.19, 0.07)),
+        box((0.22, 0.06, 0.03), at=(0.0, -0.19, 0.155)),
+        sphere(0.04, at=(0.2, 0.23, 0.04)),
+        box((0.08, 0.1, 0.05), at=(-0.11, 0.14, 0.225), turn=(0.0, 0.0, 15.0)),
+    ),
+}
 """Bodies of each designed scene, by name; heights are above the table top."""
 
 DESCRIPTIONS: Final[Mapping[str, str]] = {
@@ -104,7 +101,6 @@ DESCRIPTIONS: Final[Mapping[str, str]] = {
 }
 """Descriptions of the designed scenes and of the generated kinds."""
 
-
 SCENE_FILE = "scene.xml"
 """Name of the MJCF file in a scene folder."""
 
@@ -112,10 +108,10 @@ TRUTH_FILE = "gt.json"
 """Name of the ground truth beside it."""
 
 _COPIES = ("replicate", "composite", "flexcomp")
-_SIZED: Final[Mapping[str, tuple[str, ...]]] = MappingProxyType(
-    {"hfield": ("nrow", "ncol"), "texture": ("width", "height")} | dict.fromkeys(_COPIES, ("count",))
-)
-"""Elements of MJCF that may take much memory → attributes that say how much."""
+_SIZED: Final[Mapping[str, tuple[str, ...]]] = {
+    "hfield": ("nrow", "ncol"), "texture": ("width", "height"), **dict.fromkeys(_COPIES, ("count",))
+}  # fmt: skip
+"""Elements of MJCF that may take much memory → the attributes that say how much."""
 
 _GENERATED = re.compile(r"(pile|dense|packed|house|blocks)-(\d+)-(\d+)")
 

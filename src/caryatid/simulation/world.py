@@ -16,7 +16,7 @@ from caryatid.config import PhysicsConfig
 from caryatid.errors import InputError
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Cylinder, Shape, Sphere, fibonacci_sphere
-from caryatid.geometry.solids import Polytope, Solid, in_hull
+from caryatid.geometry.solids import Polytope, Solid
 from caryatid.geometry.transforms import Array
 from caryatid.sensing.views import SUPPORT_LABEL
 
@@ -373,30 +373,6 @@ def add_body(
         added.add_geom(type=kind, meshname=mesh, **matter)
 
 
-def contains(scene: SimulatedScene, label: int, points_world: Array) -> NDArray[np.bool_]:
-    """Which points lie inside an object's true solid.
-
-    Primitives are exact, and meshes are the convex hulls they collide as. An object of several colliding
-    geoms is their common convex hull: a hollow object counts with its inside.
-
-    Args:
-        scene: The scene.
-        label: The object, or 0 for the table.
-        points_world: (N, 3) [m].
-
-    Returns:
-        (N,) bool.
-    """
-    geoms = _solid_geoms(scene, label)
-    if len(geoms) > 1:
-        return in_hull(np.concatenate([_outline(scene, geom) for geom in geoms]), points_world)
-    shape = _primitive(scene, geoms[0])
-    if shape is not None:
-        return shape.signed_distance(points_world) <= 0.0
-    T_geom_world = transforms.invert(_geom_pose(scene, geoms[0]))
-    return _inside_geom(scene.model, geoms[0], transforms.transform(T_geom_world, points_world))
-
-
 def _outline(scene: SimulatedScene, geom: int) -> Array:
     """Points (N, 3) [m] whose convex hull is a geom, to 1 % if it is round."""
     shape, model, size = _primitive(scene, geom), scene.model, scene.model.geom_size[geom]
@@ -409,9 +385,14 @@ def _outline(scene: SimulatedScene, geom: int) -> Array:
         case _GEOM.mjGEOM_CAPSULE:
             points = ball * size[0] + np.sign(ball[:, 2:]) * (0.0, 0.0, size[1])
         case _GEOM.mjGEOM_MESH:
-            points = _mesh_vertices(model, geom)
-        case _:
-            raise _unsupported(model, geom)
+            first = model.mesh_vertadr[model.geom_dataid[geom]]
+            points = model.mesh_vert[first : first + model.mesh_vertnum[model.geom_dataid[geom]]].astype(
+                float
+            )
+        case kind:
+            body = model.body(model.geom_bodyid[geom]).name
+            reason = f"a {_GEOM(kind).name.removeprefix('mjGEOM_').lower()} geom is not a solid shape"
+            raise InputError(f"body '{body}'", reason, "use primitives or meshes")
     return transforms.transform(_geom_pose(scene, geom), points)
 
 
@@ -486,51 +467,14 @@ def _geom_box(scene: SimulatedScene, geom: int) -> Box:
     return Box(T_world_geom @ transforms.rigid(np.eye(3), centre), 2.0 * half)
 
 
-def _inside_geom(model: Any, geom: int, points: Array) -> NDArray[np.bool_]:
-    """Test points (N, 3) in the frame of a geom that is none of our shapes."""
-    size = model.geom_size[geom]
-    match model.geom_type[geom]:
-        case _GEOM.mjGEOM_ELLIPSOID:
-            return np.linalg.norm(points / size, axis=-1) <= 1.0
-        case _GEOM.mjGEOM_CAPSULE:
-            along = np.clip(points[:, 2], -size[1], size[1])
-            return np.linalg.norm(points - along[:, None] * (0.0, 0.0, 1.0), axis=-1) <= size[0]
-        case _GEOM.mjGEOM_MESH:
-            return in_hull(_mesh_vertices(model, geom), points)
-    raise _unsupported(model, geom)
-
-
 def _span(scene: SimulatedScene, geom: int) -> tuple[Array, Array]:
     """Lowest and highest corner, (3,) each [m], of the world-aligned box around a geom."""
-    model, T_world_geom = scene.model, _geom_pose(scene, geom)
-    R, centre, size = T_world_geom[:3, :3], T_world_geom[:3, 3], model.geom_size[geom]
-    axis = np.abs(R[:, 2])
-    match model.geom_type[geom]:
-        case _GEOM.mjGEOM_BOX:
-            reach = np.abs(R) @ size
-        case _GEOM.mjGEOM_SPHERE:
-            reach = np.full(3, size[0])
-        case _GEOM.mjGEOM_ELLIPSOID:
-            reach = np.linalg.norm(R * size, axis=1)
-        case _GEOM.mjGEOM_CYLINDER:
-            reach = size[1] * axis + size[0] * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
-        case _GEOM.mjGEOM_CAPSULE:
-            reach = size[1] * axis + size[0]
-        case _GEOM.mjGEOM_MESH:
-            corners = transforms.transform(T_world_geom, _mesh_vertices(model, geom))
-            return corners.min(axis=0), corners.max(axis=0)
-        case _:
-            raise _unsupported(model, geom)
+    shape = _primitive(scene, geom)
+    if shape is None:
+        corners = _outline(scene, geom)
+        return corners.min(axis=0), corners.max(axis=0)
+    centre, reach = shape.T_world_object[:3, 3], shape.support(np.eye(3))
+    if isinstance(shape, Cylinder):  # as `support` to the last digit but one, and seeds keep their scenes
+        axis = np.abs(shape.T_world_object[:3, 2])
+        reach = shape.height / 2.0 * axis + shape.radius * np.sqrt(np.clip(1.0 - axis**2, 0.0, None))
     return centre - reach, centre + reach
-
-
-def _mesh_vertices(model: Any, geom: int) -> Array:
-    mesh = model.geom_dataid[geom]
-    first = model.mesh_vertadr[mesh]
-    return model.mesh_vert[first : first + model.mesh_vertnum[mesh]].astype(np.float64)
-
-
-def _unsupported(model: Any, geom: int) -> InputError:
-    body = model.body(model.geom_bodyid[geom]).name
-    kind = _GEOM(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-    return InputError(f"body '{body}'", f"a {kind} geom is not a solid shape", "use primitives or meshes")
