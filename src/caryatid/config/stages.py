@@ -57,7 +57,7 @@ class CloudConfig:
     max_depth: Positive = 3.0
     """Readings beyond this are dropped [m]; the paper's working range."""
     min_depth: NotNegative = 0.1
-    """Readings nearer than this are the robot's own hand [m]; what a sensor cannot measure it leaves out."""
+    """Nearer readings are the robot's own hand [m]; below any sensor's range."""
     normal_window: Count = 7
     """Largest side of the square window of the local planes [px]; 7 × 7 reduce the noise to a quarter."""
     normal_size: Positive = 0.02
@@ -71,9 +71,7 @@ class CloudConfig:
     voxel: Positive = 0.005
     """Spacing of an object's points, pooled over views [m]; about the noise of one reading at 1.5 m."""
     depth: Count = 5
-    """Points kept in a voxel once more than twice as many views have shown it [1]; their mean has less than
-    half the noise of one.
-    """
+    """Points kept in a voxel that over twice as many views have shown [1]; their mean has half the noise."""
     neighbours: Count = 16
     """Neighbours from which a normal of an unorganised cloud is estimated [1]."""
 
@@ -89,9 +87,9 @@ class SurfaceConfig:
     max_deviation: Angle = 25.0
     """How far a point's normal may lean from its plane's [deg]; 3σ of normals from depth."""
     gap: Positive = 0.3
-    """Parts of one plane further apart than this are two surfaces [m]; shadows of objects are narrower."""
+    """Parts of one plane farther apart than this are two surfaces [m]; shadows of objects are narrower."""
     min_area: NotNegative = 0.05
-    """Minimum visible area of a table [m²]; more than most objects' tops."""
+    """Minimum visible area of a table [m²]; larger than the top of most objects."""
     storey: NotNegative = 0.6
     """A plane that has a table this far above it is the floor [m]; lower ones are tops of objects."""
     min_points: Count = 200
@@ -131,9 +129,8 @@ class RegistrationConfig:
     max_rotation: Angle = 5.0
     """A larger turn is refused [deg]."""
     common: Share = 0.25
-    """Minimum share of what an unregistered view shows around the table that lies where earlier views saw
-    something [1]; with right poses a third does, even from the other side, with wrong ones a fifth.
-    """
+    """Minimum share of an unregistered view's points around the table that lie where earlier views saw
+    something [1]: a third with the right pose, even from the other side; a fifth with a wrong one."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -143,25 +140,19 @@ class SegmentationConfig:
     stride: Count = 2
     """Pixels between samples of the organised image; 2 keeps 6 mm at 1.5 m."""
     margin: NotNegative = 0.05
-    """Points further than this outside the support surface's outline belong to no object on it [m]."""
+    """Points farther than this outside the support surface's outline belong to no object on it [m]."""
     edge_jump: Positive = 0.006
-    """A sample further than this from its neighbour's plane is another surface's [m], at 1 m and times z²."""
+    """A sample farther than this from its neighbour's plane is on another surface [m], at 1 m; times z²."""
     surfel: Positive = 0.015
     """Size of the patches whose edges are judged convex or concave [m]; four times the noise at 1.5 m."""
     crease: NotNegative = 4.0
-    """Length that a turn of the normal by 90° adds to a path on the surface [surfels]; surfels end at
-    edges.
-    """
+    """Length that a turn of the normal by 90° adds to a path on the surface [surfels]."""
     step: NotNegative = 0.0035
-    """Height of one surfel over its neighbour's plane beyond which they are two layers [m]; 2σ after
-    smoothing.
-    """
+    """Surfels higher than this over their neighbour's plane are another layer [m]; 2σ after smoothing."""
     reach: Positive = 0.012
-    """Points of an unorganised cloud further apart are not joined [m]; twice the usual thinning."""
+    """Points of an unorganised cloud farther apart are not joined [m]; twice the usual spacing."""
     concavity: Angle = 15.0
-    """Angle between normals beyond which a concave edge separates two surfaces [deg]; LCCP's 10, plus
-    noise.
-    """
+    """A concave edge separates two surfaces beyond this angle between normals [deg]; LCCP's 10 plus noise."""
     rise: NotNegative = 0.01
     """Height over the tangent plane of another place of a segment from which the pair is concave [m]."""
     min_size: Count = 40
@@ -265,7 +256,7 @@ class ExplanationConfig:
     spacing: Positive = 0.008
     """Spacing the points are thinned to [m]; a third of the patch that shares one error."""
     reach: Positive = 0.03
-    """Objects further apart are never merged [m]; the width of an occluder's shadow."""
+    """Objects farther apart are never merged [m]; the width of an occluder's shadow."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -275,9 +266,7 @@ class CompletionConfig:
     enabled: bool = True
     """Whether unseen sides are extended."""
     max_tilt: Angle = 30.0
-    """An unseen side that faces down within this angle may be extended [deg]; sides that rest on something
-    face down.
-    """
+    """An unseen side within this angle of facing down may be extended [deg]; only these rest on something."""
     step: Positive = 0.01
     """Step of the extension [m]; a voxel."""
     overlap: NotNegative = 0.004
@@ -307,7 +296,7 @@ class SupportConfig:
     margin_sigma: NotNegative = 2.0
     """The same in standard deviations of the gap, if larger [1]; misses one contact in forty."""
     max_margin: NotNegative = 0.01
-    """Shapes further apart are not in contact, however uncertain they are [m]."""
+    """Shapes farther apart are not in contact, however uncertain they are [m]."""
     reach: NotNegative = 0.012
     """Gap up to which a contact is assumed where an object would tip without it [m]; 2.5σ of the gap."""
     gentle_tilt: Angle = 25.0
@@ -321,10 +310,8 @@ class SupportConfig:
     overhang: NotNegative = 0.003
     """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
     stability: Literal["area", "balance"] = "balance"
-    """With `area`, the paper's, an object is unstable by r_s of eq. 1 over its contact points, and
-    everything on it may hold it; with `balance` also by its centre of mass, and only what weighs against its
-    tipping does.
-    """
+    """When an object is unstable: by r_s of eq. 1 over its contact points (`area`, the paper's; all that is
+    on it may hold it), or also by its centre of mass (`balance`; only what counters its tipping holds it)."""
     draws: Count = 12
     """Scenes drawn by the fits' uncertainty, for probabilities [1]: a share is right to 0.14 near a half."""
     force_share: Share = 0.03
@@ -340,8 +327,7 @@ class SupportConfig:
     touch: Positive = 0.0005
     """Standard deviation of the gap of two shapes in contact [m]; round edges, soft surfaces."""
     max_drop: NotNegative = 0.04
-    """How far below an unsupported object its supporter may lie, hidden gap between them [m]; with 0
-    it stays unsupported."""
+    """Maximum hidden gap between an unsupported object and its supporter [m]; with 0 it stays unsupported."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -355,9 +341,9 @@ class FusionConfig:
     masks: MaskIdentity = "scene"
     """The number of a mask names an object in all views (`scene`), or a segment of one view (`per-view`)."""
     max_distance: NotNegative = 0.05
-    """Centres further apart are two objects [m], plus half the smaller object's size."""
+    """Centres farther apart, plus half the smaller object's size, are two objects [m]."""
     max_angle: Angle = 20.0
-    """Axes further apart are two orientations [deg], up to the shape's symmetry."""
+    """Axes at a larger angle are two orientations [deg], up to the shape's symmetry."""
     max_ratio: Factor = 1.6
     """Sorted extents that differ by more than this factor [1] are two objects."""
     settled: NotNegative = 0.005
@@ -413,13 +399,10 @@ class ActiveVisionConfig:
     inhibition: NotNegative = 1.0
     """Depth of the negative bump at every visited view [1]; 0 is no inhibition of return."""
     path_cost: Literal["angle", "path", "none"] = "path"
-    """h of eq. 3: sin(α/2), the path over the floor in sphere diameters, or nothing; the path length halves
-    the distance travelled.
-    """
+    """h of eq. 3: sin(α/2), the path in sphere diameters (it halves the distance travelled), or nothing."""
     stop: Literal["gain", "unchanged"] = "gain"
-    """The loop ends when no view is expected to show more than its path costs: when c = s − h of planner
-    `support` is at most 0 everywhere. Or, as in the paper, after a view that does not modify the graph.
-    """
+    """The loop ends when no view is expected to show more than its path costs (c = s − h of planner `support`
+    is at most 0 everywhere), or, as in the paper, after a view that does not change the graph."""
     max_views: Count = 10
     """Maximum number of views, including the first; the paper's."""
     look_directions: Count = 1200
@@ -463,9 +446,8 @@ class ArmConfig:
     base_yaw: Azimuth = 0.0
     """Where the x axis of its base points, from the world's x towards y [deg]; 0 is over the table."""
     radius: Lengths = (0.4, 1.0)
-    """Smallest and largest view sphere tried [m]: nearer, the camera meets objects on the table; farther, a
-    common arm does not reach. Equal values fix the radius.
-    """
+    """Smallest and largest view sphere tried [m]; nearer, the camera meets objects on the table; farther, a
+    common arm does not reach. Equal values fix the radius."""
     radius_views: Count = 400
     """Views tried on each sphere to choose among the spheres [1]; about 10° apart."""
     sphere_points: Count = 4000
@@ -579,8 +561,7 @@ class RecordingConfig:
     """Which images and frames become views."""
 
     max_pixels: Count = 16_000_000
-    """Maximum number of pixels of an image, wherever it comes from [1]; several times what depth cameras
-    have, and it bounds memory."""
+    """Maximum number of pixels of any image [1]; bounds memory, at several times a depth camera's."""
     max_views: Count = 30
     """Maximum number of views [1]; those farthest apart are kept. A table is known after 5 to 10."""
     min_distance: Positive = 0.10
@@ -590,24 +571,20 @@ class RecordingConfig:
     sharp_window: NotNegative = 0.5
     """A frame's sharpness is compared with that of frames within this [s]; they show nearly the same."""
     sharp_share: Share = 0.7
-    """Minimum sharpness, as a share of the sharpest within the window [1]; a camera at rest varies by 10
-    %.
-    """
+    """Minimum sharpness, as a share of the sharpest within the window [1]; it varies by 10 % at rest."""
     colour_gap: NotNegative = 0.02
     """Colour belongs to a depth image when it was taken within this [s]; just over half of 1/30 s."""
     pose_gap: Positive = 0.2
     """Maximum time between two poses that are interpolated [s]; robots send 10 a second."""
     min_readings: Likelihood = 0.1
-    """Minimum share of pixels with a depth reading [1]; a camera too near, or pointed at the sky, has
-    fewer.
-    """
+    """Minimum share of pixels with a depth reading [1]; a camera too close to a surface has fewer."""
     far: Annotated[float, Field(gt=0, le=65)] = 10.0
     """Readings farther away than this are left out [m]; beyond what RGB-D cameras measure."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class ExportConfig:
-    """Data that other programs need and a scene model lacks."""
+    """Data that other programs need and the scene model lacks."""
 
     density: Positive = 600.0
     """Density of objects [kg/m³]; that of the simulated scenes, wood or a filled carton."""
@@ -624,9 +601,9 @@ class SessionConfig:
     max_bytes: Count = 100_000_000
     """Maximum size of a file [bytes]; larger than any camera's image."""
     max_sessions: Count = 1000
-    """Maximum number of sessions of a service [1]; a folder of each stays until it is removed by hand."""
+    """Maximum number of sessions of a service [1]; their folders stay until removed by hand."""
     min_free: NotNegative = 1e9
-    """Free disk space below which a service accepts nothing new [bytes]; other programs write there too."""
+    """With less free disk space, a service accepts nothing new [bytes]; other programs write there too."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -648,9 +625,8 @@ class RehearsalConfig:
     """Lifts simulated on the extracted shapes before they are done."""
 
     draws: Count = 8
-    """Scenes that a lift is rehearsed in [1]: the shapes as extracted, and others equally likely given their
-    uncertainty; a risk of a third shows in one of eight with 96 %.
-    """
+    """Scenes in which a lift is rehearsed [1]: the extracted shapes, and draws from their uncertainty. With
+    eight, a risk of a third shows in at least one with 96 %."""
     risk: Share = 0.0
     """Probability of moving another object up to which a lift is safe [1]: no rehearsal shows any."""
     max_objects: Count = 300
