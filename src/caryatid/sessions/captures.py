@@ -25,18 +25,12 @@ from caryatid.sensing.views import View
 REMEDY: Final = "take this view and all later ones out of the session's folder"
 """Remedy for a damaged view."""
 
-
 _FILES: Final = {
     "depth": (DEPTH_MODES, "a 16-bit grey PNG"),
     "rgb": (("RGB", "RGBA", "L", "LA", "P"), "a colour PNG or JPEG"),
     "labels": (MASK_MODES[1:], "a grey PNG"),
 }
-_ARRAYS: Final[dict[str, tuple[type[np.generic], tuple[int, ...], str]]] = {
-    "depth": (np.floating, (), "(H, W) of floats in metres"),
-    "rgb": (np.uint8, (3,), "(H, W, 3) of uint8"),
-    "labels": (np.integer, (), "(H, W) of whole numbers"),
-    "normals": (np.floating, (3,), "(H, W, 3) of floats"),
-}
+_IMAGES: Final = ("depth", "rgb", "labels", "normals")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -87,8 +81,7 @@ class Capture:
     def of(cls, view: View) -> Capture:
         """Return the capture that decodes to exactly this view."""
         arrays = (view.depth, view.rgb, view.labels, view.normals_camera)
-        named = zip(("depth", "rgb", "labels", "normals"), arrays, strict=True)
-        images = {key: npy(array) for key, array in named if array is not None}
+        images = {key: npy(array) for key, array in zip(_IMAGES, arrays, strict=True) if array is not None}
         camera = CameraRecord(view.K, view.T_world_camera, name=view.name, labels_are=view.labels_are)
         return cls(images, camera)
 
@@ -118,7 +111,7 @@ class Capture:
             InputError: Something is missing, or is not what was written.
         """
         record = CameraRecord.read(folder / "camera.json")
-        images = {file.stem: _read(file) for file in folder.iterdir() if file.stem in _ARRAYS}
+        images = {file.stem: _read(file) for file in folder.iterdir() if file.stem in _IMAGES}
         capture = cls(images, record)
         if capture.record.digest != record.digest:
             raise InputError(folder, "is not what was written there", REMEDY)
@@ -154,29 +147,19 @@ class Capture:
             key: _decoded(key, content, f"{camera.name}: {key}", max_pixels)
             for key, content in self.images.items()
         }
-        depth = decoded["depth"]
-        if depth.dtype.kind in "iu":
+        depth, (rgb, labels, normals_camera) = decoded["depth"], map(decoded.get, _IMAGES[1:])
+        if _suffix(self.images["depth"]) == ".png":
             depth = (depth.astype(np.float64) * (camera.depth_scale / 1000.0)).astype(np.float32)
-        rgb, labels, normals_camera = (decoded.get(key) for key in ("rgb", "labels", "normals"))
-        return View(
-            depth,
-            camera.K,
-            camera.T_world_camera,
-            rgb,
-            labels,
-            normals_camera,
-            camera.name,
-            camera.labels_are,
-        )
+        T_world_camera, name = camera.T_world_camera, camera.name
+        return View(depth, camera.K, T_world_camera, rgb, labels, normals_camera, name, camera.labels_are)
 
 
 def _decoded(key: str, content: bytes, name: str, max_pixels: int) -> NDArray[Any]:
     if key in _FILES and _suffix(content) != ".npy":
         return decode_image(content, name, *_FILES[key], max_pixels)
     array = read_npy(content, name)
-    kind, channels, wanted = _ARRAYS[key]
-    if not np.issubdtype(array.dtype, kind) or array.ndim < 2 or array.shape[2:] != channels:
-        raise InputError(name, f"is {array.shape} of {array.dtype}", f"give {wanted}")
+    if array.ndim < 2 or (key == "depth" and array.dtype.kind != "f"):
+        raise InputError(name, f"is {array.shape} of {array.dtype}", "give (H, W), depth as floats in metres")
     if array.shape[0] * array.shape[1] > max_pixels:
         reason = f"has shape {array.shape}, {max_pixels} pixels are allowed"
         raise InputError(name, reason, "give a smaller image, or raise recording.max_pixels")
