@@ -22,19 +22,9 @@ _HOMES = {
 }
 
 __all__ = [
-    "Dataset",
-    "Frame",
-    "OpenOptions",
-    "graph_from_json",
-    "graph_text",
-    "graph_to_json",
-    "import_recording",
-    "open_dataset",
-    "read_graph",
-    "read_recording",
-    "read_stored_cloud",
-    "write_recording",
-]
+    "Dataset", "Frame", "OpenOptions", "graph_from_json", "graph_text", "graph_to_json", "import_recording",
+    "open_dataset", "read_graph", "read_recording", "read_stored_cloud", "write_recording",
+]  # fmt: skip
 
 if not TYPE_CHECKING:
     __getattr__ = imported_late(__name__, _HOMES)

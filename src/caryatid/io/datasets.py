@@ -7,7 +7,7 @@ An input format is a module or object with two functions, `recognises(path)` and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -29,7 +29,6 @@ ENTRY_POINTS: Final = "caryatid.datasets"
 NO_COLOUR: Final = "no colour image of that time"
 NO_POSE: Final = "no pose"
 """Reasons why a frame of a video does not become a view."""
-
 
 SAMPLES: Final = Path(__file__).parents[1] / "samples"
 """Folder of the samples in the package."""
@@ -55,7 +54,7 @@ class Frame:
         load: Decodes it. Raises `caryatid.io.images.BrokenImageError` if other frames may be whole, and
             another `InputError` if it does not fit the dataset.
         T_world_camera: Camera pose (4, 4), or None if unknown.
-        time: Time of the image [ns]; 0 if that does not matter.
+        time: Time of the image [ns]; 0 if it has none.
         has_labels: Whether its view has labels.
     """
 
@@ -104,9 +103,6 @@ class Dataset(Sequence[View]):
             return [frame.load() for frame in self.frames[index]]
         return self.frames[index].load()
 
-    def __iter__(self) -> Iterator[View]:
-        return (frame.load() for frame in self.frames)
-
     @property
     def has_poses(self) -> bool:
         """Every frame has a pose."""
@@ -137,7 +133,7 @@ class OpenOptions:
         depth: Topic of a bag's depth images, registered to colour if there is any.
         info: Topic of the depth images' camera.
         rgb: Topic of colour images, or None.
-        world: Frame of a bag to be the world: level, z up; None without poses.
+        world: Frame of a bag that is the world, level with z up; None takes no poses.
         camera_file: Camera of a TUM RGB-D folder, or None for the published ones.
     """
 
@@ -173,9 +169,8 @@ def open_dataset(
         raise InputError(path, "there is no such file or folder", "give a recording")
     known = format_of(path)
     if known is None:
-        remedy = (
-            "give a BOP scene folder, a bag (.bag, .mcap, .db3, or a folder with metadata.yaml), or a TUM "
-        )
-        raise InputError(path, "has an unknown format", remedy + "RGB-D folder with depth.txt")
+        bags = "a bag (.bag, .mcap, .db3, or a folder with metadata.yaml)"
+        remedy = f"give a BOP scene folder, {bags}, or a TUM RGB-D folder with depth.txt"
+        raise InputError(path, "has an unknown format", remedy)
     dataset: Dataset = known.open_dataset(path, config or RecordingConfig(), options or OpenOptions())
     return dataset

@@ -140,11 +140,8 @@ class OnnxMasks:
         height, width = self._size or view.depth.shape
         given = {"image": _resized(view.rgb, height, width).transpose(2, 0, 1)[None] / np.float32(255.0)}
         if "xyz" in self._inputs:
-            rows, columns = (
-                np.arange(n) * m // n for n, m in zip((height, width), view.depth.shape, strict=True)
-            )
             xyz = view.points_camera.astype(np.float32)
-            given["xyz"] = xyz[rows][:, columns].transpose(2, 0, 1)[None]
+            given["xyz"] = xyz[_pixels((height, width), view.depth.shape)].transpose(2, 0, 1)[None]
         if "boxes" in self._inputs:
             scale = np.array([width, height] * 2) / np.array([*view.depth.shape[::-1]] * 2)
             given["boxes"] = (self._prompts(view) * scale).astype(np.float32)
@@ -160,10 +157,7 @@ class OnnxMasks:
         if masks.ndim == 3 and len(masks) == 0:
             return replace(view, labels=np.zeros(view.depth.shape, dtype=np.int32), labels_are="segments")
         if masks.ndim == 3 and masks.shape[1:] != view.depth.shape:
-            rows, columns = (
-                np.arange(n) * m // n for n, m in zip(view.depth.shape, masks.shape[1:], strict=True)
-            )
-            masks = masks[:, rows][:, :, columns]
+            masks = np.stack([mask[_pixels(view.depth.shape, mask.shape)] for mask in masks])
         scores = np.asarray(results[1]).ravel() if len(results) > 1 else None
         return replace(view, labels=labels_from_masks(masks, scores), labels_are="segments")
 
@@ -177,6 +171,11 @@ class OnnxMasks:
             rows, columns = np.nonzero(labels == label)
             boxes.append((columns.min(), rows.min(), columns.max() + 1, rows.max() + 1))
         return np.array(boxes, dtype=np.float64).reshape(-1, 4)
+
+
+def _pixels(size: tuple[int, ...], of: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
+    """Rows and columns that make an image of a size (H, W) of one of another, by nearest neighbours."""
+    return np.ix_(*(np.arange(n) * m // n for n, m in zip(size, of, strict=True)))
 
 
 def _resized(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all: written beside their final place, renamed when done."""
+"""Files and folders that appear whole or not at all: written beside their final place and then renamed."""
 
 from __future__ import annotations
 
@@ -15,28 +15,26 @@ from typing import Self
 from caryatid.errors import InputError
 
 PARTIAL, REPLACED = ".partial-", "-replaced"
-"""Prefix of staged files and folders, and suffix of those being replaced; a killed process leaves them
-behind.
-"""
+"""Prefix of staged files and folders, suffix of those being replaced; a killed process leaves them."""
 
 
 class StagedFolder:
     """A staged folder, to be used in a `with` block.
 
-    Everything is written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place; what
-    is written later goes there at once, file by file. Leaving the block without `publish` removes what was
-    written, and parent folders made for it.
+    Files are written into a hidden sibling `.partial-NAME-…`, which `publish` renames to its place. Files
+    written later go straight there. Leaving the block without `publish` removes the files written, and parent
+    folders made for them.
 
     Args:
         folder: The folder's final place.
-        replaces: Which files of an existing folder may be replaced, by their paths in it; a folder with
-            others does not change. None replaces no file.
+        replaces: Returns the paths of the files in an existing folder that may be replaced; a folder with
+            any other file does not change. None replaces no file.
         durable: Wait until every file, and the folder itself, is on disk.
-        goes_on: The folder is in its place already, and what is written is added to it.
+        goes_on: The folder is already in its place, and files are added to it.
 
     Attributes:
         folder: The folder's final place.
-        published: It is in its place.
+        published: Whether it is in its place.
         written: Paths of the files written so far.
 
     Raises:
@@ -129,9 +127,9 @@ class StagedFolder:
     def _check_place(self) -> None:
         if not os.path.lexists(self._place):
             return
-        remedy = "give a new folder" + (
-            "; only one written by caryatid is replaced" if self._replaces else ""
-        )
+        remedy = "give a new folder"
+        if self._replaces:
+            remedy += "; caryatid replaces only folders that it wrote"
         if not self._place.is_dir():
             raise InputError(self.folder, "already exists and is not a folder", remedy)
         own = self._replaces(self._place) if self._replaces else ()
@@ -167,7 +165,7 @@ def write_file(path: Path, content: bytes, *, durable: bool = False) -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder in one step; after this returns, it cannot reappear.
+    """Remove a folder in one step; when this returns, the removal is on disk.
 
     Raises:
         InputError: The disk cannot be written.
@@ -180,10 +178,10 @@ def remove_folder(folder: Path) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file; once this returns it will not come back.
+    """Remove a file; when this returns, the removal is on disk.
 
     Raises:
-        InputError: The disk refuses.
+        InputError: The disk cannot be written.
     """
     with write_errors(path):
         path.unlink()
@@ -235,9 +233,7 @@ def write_errors(path: Path) -> Iterator[None]:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file, or the names in a folder, are on disk, if the system supports it."""
-    if os.name == "nt":
-        return
+    """Wait until a file, or the names in a folder, are on disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -268,11 +264,10 @@ def _recover(place: Path) -> None:
 def _runs(process: int) -> bool:
     """Whether a process may still run; false only if it certainly does not."""
     try:
-        if os.name == "posix":
-            os.kill(process, 0)
+        os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except OSError:
+    except PermissionError:  # it is another user's
         return True
     return True
 
