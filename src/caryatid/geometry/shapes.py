@@ -161,11 +161,14 @@ class Shape(Pictured):
     def lines(self, eye_world: Array) -> list[Array]:
         """Lines (M, 3) [m] that draw the shape: edges, rims, and the silhouette seen from a point (3,)."""
         eye = transforms.transform(transforms.invert(self.T_world_object), eye_world)
-        return [transforms.transform(self.T_world_object, line) for line in self._drawn(eye)]
+        drawn = self._drawn(eye)
+        points_world = transforms.transform(self.T_world_object, np.concatenate(drawn))
+        return np.split(points_world, np.cumsum([len(line) for line in drawn])[:-1])
 
     def _drawn(self, eye: Array) -> list[Array]:
         """What `lines` are in the object's frame."""
-        return [np.linspace(a, b, 33) for a, b in self._edges(eye)]
+        start, end = np.swapaxes(self._edges(eye), 0, 1)
+        return [*np.linspace(start, end, 33, axis=1)]
 
     def creases(self) -> Array:
         """Ends (E, 2, 3) [m] of the edges sharper than 30°."""

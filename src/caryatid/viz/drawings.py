@@ -72,37 +72,41 @@ class Projection:
         return Tag(float(x), float(y), item.id, object_colour(item.label))
 
 
-Stroke = tuple[Array, dict[str, Any]]
-"""Lines as a picture shows them (N, 2) [px], with NaN between them, and how they are drawn."""
+Strokes = Sequence[dict[str, Any]]
+"""Lines as a picture shows them: arguments of matplotlib's `LineCollection`, in the order of drawing."""
 
 
-def _strokes(objects: Sequence[SceneObject], projection: Projection) -> list[Stroke]:
+def _strokes(objects: Sequence[SceneObject], projection: Projection) -> Strokes:
     """Lines of shapes, the support surface first: strong on a dark rim, thin and faint where hidden."""
     from scipy.ndimage import median_filter
 
-    strokes: list[Stroke] = []
+    whole, seen, colour, width = [], [], [], []
     for item in sorted(objects, key=lambda o: o.role != "support_surface"):
         lines = item.shape.lines(projection.T_world_camera[:3, 3])
         pixels, z = projection.project(np.concatenate(lines))
         hidden = median_filter(projection.hidden(pixels, z), size=5, mode="nearest")
         ends = np.cumsum([len(line) for line in lines])[:-1]
-        seen = np.insert(np.where(hidden[:, None], np.nan, pixels), ends, np.nan, axis=0)
-        width, rim = (1.2, 0.3) if item.role == "support_surface" else (2.2, 0.55)
-        look = {
-            "color": object_colour(item.label),
-            "gid": f"shapes|{item.id}, {item.shape.kind}",
-            "zorder": 5.0,
-        }
-        strokes += [
-            (np.insert(pixels, ends, np.nan, axis=0), look | {"linewidth": 1.0, "alpha": 0.6}),
-            (seen, look | {"linewidth": width + 1.4, "color": DARK, "alpha": rim}),
-            (seen, look | {"linewidth": width}),
-        ]
-    return strokes
+        whole.append(np.insert(pixels, ends, np.nan, axis=0))
+        seen.append(np.insert(np.where(hidden[:, None], np.nan, pixels), ends, np.nan, axis=0))
+        colour.append(object_colour(item.label))
+        width.append(1.2 if item.role == "support_surface" else 2.2)
+    return [
+        {"segments": whole, "colors": colour, "linewidths": 1.0, "alpha": 0.6},
+        {"segments": seen, "colors": DARK, "linewidths": np.add(width, 1.4), "alpha": 0.5},
+        {"segments": seen, "colors": colour, "linewidths": width},
+    ]
+
+
+def _put_strokes(axes: Axes, strokes: Strokes) -> None:
+    from matplotlib.collections import LineCollection
+
+    for stroke in strokes:
+        lines = LineCollection(**stroke, capstyle="round", zorder=5.0, gid="shapes|")
+        axes.add_collection(lines, autolim=False)
 
 
 def draw_layers(
-    name: str, layers: Sequence[NDArray[np.uint8]], strokes: Sequence[Stroke] = (), tags: Sequence[Tag] = ()
+    name: str, layers: Sequence[NDArray[np.uint8]], strokes: Strokes = (), tags: Sequence[Tag] = ()
 ) -> Picture:
     """Draw images (H, W, C) of one size above each other, shapes over them, and names on top."""
     height, width = layers[0].shape[:2]
@@ -110,8 +114,7 @@ def draw_layers(
     def draw(axes: Axes) -> None:
         for layer in layers:
             put_raster(axes, layer, 0.0, 0.0, width, height)
-        for lines, look in strokes:
-            axes.plot(*lines.T, **look)
+        _put_strokes(axes, strokes)
         put_tags(axes, tags, 15.0)
 
     return Picture(name, width, height, draw)
@@ -149,7 +152,7 @@ def draw_image(
         v, u = np.nonzero(labels == item.label)
         if len(u):
             tags.append(Tag(float(np.median(u)), float(np.median(v)), item.id, object_colour(item.label)))
-    strokes: list[Stroke] = []
+    strokes: Strokes = ()
     if shapes and view.T_world_camera is not None:
         K = np.array([[scale, 0.0, -scale * left], [0.0, scale, -scale * top], [0.0, 0.0, 1.0]]) @ view.K
         projection = Projection(view.T_world_camera, K, resized(view.depth))
@@ -308,8 +311,7 @@ def draw_stands(steps: Sequence[Step]) -> Picture:
     def draw(axes: Axes) -> None:
         from matplotlib.patches import Circle, Wedge
 
-        for lines, stroke in strokes:
-            axes.plot(*lines.T, **stroke)
+        _put_strokes(axes, strokes)
         for way in ways:
             if len(way) > 1:
                 axes.plot(*pixels(way).T, color=VISITED, linewidth=1.6, zorder=6.0)
@@ -351,26 +353,27 @@ def draw_sphere(step: Step) -> Picture:
     saliency, dots = _painted(step)
     strokes = _strokes(step.graph.objects, above)
     points = () if decision is None else sorted(decision.points_of_interest, key=lambda p: p.saliency)
+    feet = above.project(np.reshape([p.position_world for p in points], (-1, 3)))[0]
+    rays = np.stack([feet, places(np.array([p.direction for p in points]))], axis=1)
     look: dict[str, Any] = {"fontsize": 11.0, "color": SOFT, "ha": "center"}
     rim: dict[str, Any] = {"markeredgecolor": DARK, "markeredgewidth": 1.0}
 
     def draw(axes: Axes) -> None:
+        from matplotlib.collections import LineCollection
         from matplotlib.patches import Circle
 
         put_raster(axes, saliency, side / 2.0 - radius, side / 2.0 - radius, 2.0 * radius, 2.0 * radius)
-        for lines, stroke in strokes:
-            axes.plot(*lines.T, **stroke)
+        _put_strokes(axes, strokes)
         for name, elevation in (("y", 0.0), ("30°", 30.0), ("60°", 60.0)):
             wide = radius * np.cos(np.deg2rad(elevation))
             axes.add_patch(Circle((side / 2.0, side / 2.0), wide, fill=False, color=SOFT, linestyle=":"))
             axes.text(side / 2.0, side / 2.0 - wide - 5.0, name, **look)
         axes.text(side / 2.0 + radius + 10.0, side / 2.0 + 4.0, "x", **look)
-        for point in points:
-            ends = np.concatenate([above.project(point.position_world[None])[0], places(point.direction)])
+        axes.add_collection(LineCollection([*rays], colors=DARK, alpha=0.4, linewidths=1.0, zorder=5.5))
+        for point, ray in zip(points, rays, strict=True):
             title = f"{' – '.join(point.subject)}: saliency {point.saliency:.2f}; {point.why}"
             colour = colours.saliency_colour(point.saliency)
-            axes.plot(*ends.T, color=DARK, alpha=0.4, linewidth=1.0, zorder=5.5)
-            axes.plot(*ends[1], "o", markersize=8.0, color=colour, zorder=6.0, gid=f"point|{title}", **rim)
+            axes.plot(*ray[1], "o", markersize=8.0, color=colour, zorder=6.0, gid=f"point|{title}", **rim)
         axes.plot(*places(dots).T, "o", markersize=6.4, color="white", zorder=6.5, **rim)
         axes.plot(*places(step.visited).T, "o-", markersize=7.0, color=VISITED, linewidth=1.4, zorder=6.5)
         tags = [

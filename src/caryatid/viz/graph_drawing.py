@@ -145,7 +145,7 @@ def draw_graph(
         mark = marks.get(support.pair, "")
         words.append(mark if mark == "missing" else f"{mark}{kind}{support.belief:.2f}")
     plates = np.array([[7.4 * len(word) + 4.0, 16.0] for word in words]).reshape(-1, 2)
-    plates_at = keep_apart(np.reshape(notes, (-1, 2)), plates, (width, height))
+    plates_at = keep_apart(np.reshape(notes, (-1, 2)), plates, np.array([width, height]))
 
     def draw(axes: Axes) -> None:
         for support, points, word, place in zip(graph.supports, edges, words, plates_at, strict=True):
@@ -191,7 +191,7 @@ def _put_edge(axes: Axes, support: Support, points: Array, word: str, place: Arr
         path=curve, arrowstyle="-|>,head_length=0.5,head_width=0.22", mutation_scale=20.0, color=colour,
         linewidth=width, linestyle="-" if solid else (0, (3.5, 2.6)), gid=f"{kind}|{title}",
     )  # fmt: skip
-    axes.add_patch(arrow)
+    axes.add_artist(arrow)
     plate = {"facecolor": PANEL, "edgecolor": "none", "pad": 0.8}
     axes.text(
         place[0], place[1], word, color=colour, fontsize=12.0, ha="center", va="center_baseline", bbox=plate

@@ -80,11 +80,11 @@ class Picture:
         unit = where[2] * figure.get_size_inches()[0] * 72.0 / self.width
         if unit == 1.0:
             return
-        artists = [*axes.texts, *axes.lines, *axes.patches]
+        artists = [*axes.texts, *axes.lines, *axes.patches, *axes.collections]
         for artist in (*artists, *(part for inset in axes.child_axes for part in inset.findobj())):
             for size in ("fontsize", "linewidth", "markersize", "markeredgewidth", "mutation_scale"):
                 if hasattr(artist, f"set_{size}"):
-                    getattr(artist, f"set_{size}")(unit * getattr(artist, f"get_{size}")())
+                    getattr(artist, f"set_{size}")(np.multiply(unit, getattr(artist, f"get_{size}")()))
 
 
 @contextmanager
@@ -161,22 +161,39 @@ class Tag(NamedTuple):
 
 
 def put_tags(axes: Axes, tags: Sequence[Tag], size: float) -> None:
-    """Write tags, letters `size` [px] high, moved until they cover neither each other nor the edge."""
-    anchors = np.array([[tag.x, tag.y] for tag in tags]).reshape(-1, 2)
-    plates = np.array([[(0.62 * len(tag.text) + 0.7) * size, 1.45 * size] for tag in tags]).reshape(-1, 2)
-    centres = keep_apart(anchors, plates + 2.0, (axes.get_xlim()[1], axes.get_ylim()[0]))
-    for tag, anchor, centre in zip(tags, anchors, centres, strict=True):
-        if np.hypot(*(anchor - centre)) > 1.45 * size:
-            axes.plot(*np.array([anchor, centre]).T, color="white", linewidth=1.4, zorder=7.0, gid="shapes|")
-        look: dict[str, Any] = {"alpha": 0.6 if tag.faint else 1.0, "gid": "shapes|"}
-        plate = {"boxstyle": "round,pad=0.22", "facecolor": tag.colour, "edgecolor": "white"} | look
+    """Write tags, moved until they cover neither each other nor the edge.
+
+    Letters are `size` [px] high, or lower where the tags would otherwise fill more than a sixth of the axes;
+    below 6 px they could not be read and are left out.
+    """
+    from matplotlib.collections import LineCollection
+
+    room = np.array([axes.get_xlim()[1], axes.get_ylim()[0]])
+    anchors = np.array([tag[:2] for tag in tags]).reshape(-1, 2)
+    plates = np.array([[0.62 * len(tag.text) + 1.0, 1.45] for tag in tags]).reshape(-1, 2)  # [letters]
+    size = min(size, float(np.sqrt(room.prod() / 6.0 / max(plates.prod(axis=1).sum(), 1.0))))
+    if size < 6.0 or not tags:
+        return
+    centres = keep_apart(anchors, size * plates + 2.0, room)
+    moved = np.hypot(*(anchors - centres).T) > 1.45 * size
+    half = np.maximum(0.5 * size * (plates[:, :1] - plates[:, 1:]), 0.1) * (1.0, 0.0)
+    pills = np.stack([centres - half, centres + half], axis=1)
+    alpha = [0.6 if tag.faint else 1.0 for tag in tags]
+    for lines, look in (
+        (np.stack([anchors, centres], axis=1)[moved], {"colors": "white", "linewidths": 1.4}),
+        (pills, {"colors": "white", "linewidths": 1.45 * size, "alpha": alpha}),
+        (pills, {"colors": [tag.colour for tag in tags], "linewidths": 1.3 * size, "alpha": alpha}),
+    ):
+        collection = LineCollection([*lines], capstyle="round", zorder=7.0, gid="shapes|", **look)
+        axes.add_collection(collection, autolim=False)
+    for tag, centre in zip(tags, centres, strict=True):
         axes.text(
             centre[0], centre[1], tag.text, color=ink_on(tag.colour), fontsize=size, fontweight="bold",
-            ha="center", va="center_baseline", bbox=plate, zorder=8.0, **look,
+            ha="center", va="center_baseline", zorder=8.0, gid="shapes|",
         )  # fmt: skip
 
 
-def keep_apart(anchors: Array, sizes: Array, room: tuple[float, float]) -> Array:
+def keep_apart(anchors: Array, sizes: Array, room: Array) -> Array:
     """Move the centres (N, 2) of plates of `sizes` (N, 2) as little as it takes for none to overlap.
 
     Plates that overlap are pushed apart along the axis on which they overlap least, for 200 rounds at most.
@@ -184,19 +201,22 @@ def keep_apart(anchors: Array, sizes: Array, room: tuple[float, float]) -> Array
     Args:
         anchors: Where the plates belong (N, 2) [px].
         sizes: Their widths and heights (N, 2) [px].
-        room: Width and height of where they may be [px].
+        room: Width and height (2,) of where they may be [px].
     """
+    from scipy.spatial import KDTree
+
     low = sizes / 2.0
-    high = np.maximum(np.asarray(room) - low, low)
+    high = np.maximum(room - low, low)
     centres = np.clip(anchors, low, high)
-    order = np.sign(np.arange(len(centres))[:, None] - np.arange(len(centres)))[..., None]
-    for _ in range(200):
-        gap = centres[:, None] - centres
-        overlap = (sizes[:, None] + sizes) / 2.0 - np.abs(gap)
-        least = overlap == overlap.min(axis=-1, keepdims=True)
-        pushed = least & (order != 0) & (overlap > 1e-6).all(axis=-1, keepdims=True)
+    for _ in range(200 if len(centres) else 0):
+        a, b = KDTree(centres / sizes.max(axis=0)).query_pairs(1.0, np.inf, output_type="ndarray").T
+        gap = centres[a] - centres[b]
+        overlap = low[a] + low[b] - np.abs(gap)
+        pushed = (overlap == overlap.min(axis=1, keepdims=True)) & (overlap > 1e-6).all(axis=1, keepdims=True)
         if not pushed.any():
             break
-        away = np.where(gap == 0.0, order, np.sign(gap))
-        centres = np.clip(centres + 0.5 * (pushed * overlap * away).sum(axis=1), low, high)
+        push = 0.5 * pushed * overlap * np.where(gap == 0.0, -1.0, np.sign(gap))
+        np.add.at(centres, a, push)
+        np.add.at(centres, b, -push)
+        centres = np.clip(centres, low, high)
     return centres

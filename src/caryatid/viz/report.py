@@ -302,15 +302,13 @@ def _figures(step: Step, width: int) -> list[Figure]:
         figures.append(Figure("What the camera saw", picture, caption))
     picture = draw_graph(graph)
     figures.append(Figure("What supports what", picture, SUPPORTS, share=1 if picture.width > WIDE else 2))
-    azimuth = _first_azimuth(step)
     caption = (
         f"{len(cloud):,} points fused so far in their objects' colours, with the fitted shapes. Pale: the "
         "inside of a surface whose other side has not been seen."
     )
-    for turn, side in ((0.0, "from the first view's side"), (np.pi, "from the opposite side")):
-        figures.append(Figure(f"The cloud {side}", draw_cloud(cloud, graph, azimuth + turn), caption, 3))
+    figures.append(Figure("The fused cloud", draw_cloud(cloud, graph, _first_azimuth(step)), caption))
     if step.candidates is not None or step.decision is not None:
-        figures.append(Figure("Where to look next", draw_sphere(step), _sphere_caption(step), 3))
+        figures.append(Figure("Where to look next", draw_sphere(step), _sphere_caption(step)))
     return figures
 
 
