@@ -1,7 +1,7 @@
 """What clearing a table by looking, taking and looking again harms, and how many views it takes.
 
     python benchmarks/clear.py [SCENES…] --hands 1
-    python benchmarks/clear.py --suite heaps --goals 2
+    python benchmarks/clear.py dense-10-301 --goals 2
 
 Each scene is cleared in physics: the true objects are lifted, and what is disturbed counts. A scene is
 unharmed where no lift moved another object by more than 2 cm or 15°, and cleared where nothing is left. With
@@ -11,6 +11,7 @@ scene, breadth first, among the objects that stand in one another's way.
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -18,13 +19,13 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import pandas as pd
 import tyro
-from measures import Spread, print_table, run_main
+from measures import OnScenes, run_main
 from rich.console import Console
 
-from caryatid.benchmark.episodes import family, open_scene
+from caryatid.benchmark.episodes import open_scene
 from caryatid.benchmark.suites import DENSE, HEAPED
-from caryatid.config import Config, NoiseModel, SegmentationMethod
-from caryatid.config.settings import changed_settings, read_settings
+from caryatid.config import Config, SegmentationMethod
+from caryatid.config.settings import read_settings
 from caryatid.exploration import Explorer
 from caryatid.geometry.transforms import Array
 from caryatid.graph import TakeStep
@@ -32,11 +33,11 @@ from caryatid.manipulation.clearing import clear
 from caryatid.manipulation.dismantling import SimulatedHands, Taken
 from caryatid.simulation.lifting import Lifting
 from caryatid.simulation.setup import make_simulation
-from caryatid.simulation.world import SimulatedScene, poses_of
+from caryatid.simulation.world import SimulatedScene, poses_of, strayed
 
 
 @dataclass(frozen=True)
-class Args(Spread):
+class Args(OnScenes):
     """Clear scenes in physics."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*HEAPED, *DENSE)
@@ -47,36 +48,35 @@ class Args(Spread):
     """Objects to reach in each scene, one by one; 0 = take everything."""
     segmentation: SegmentationMethod = "labels"
     """Where segments come from."""
-    noise: NoiseModel = "carmine"
-    """Noise of the simulated camera."""
-    seed: int = 0
-    """Seed of the noise and of the choice of goals."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Settings, e.g. `--set rehearsal.draws=16`."""
+    still: bool = False
+    """Lift in physics without creep, which else moves some piles by up to 3 mm/s with nothing lifted."""
 
 
 def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
     """Clear one scene, or reach each goal in it: a row for each."""
     name, args = task
     scene, _ = open_scene(name)
-    if not args.goals:
-        return [cleared(name, scene, args, None)]
-    rng = np.random.default_rng([args.seed, args.scenes.index(name)])
-    chosen = rng.choice(list(scene.object_bodies), min(args.goals, len(scene.object_bodies)), replace=False)
-    return [cleared(name, scene, args, label) for label in chosen.tolist()]
+    if args.still:
+        scene.spec.option.noslip_iterations = 5
+    chosen = args.drawn(name, list(scene.object_bodies), args.goals) if args.goals else [None]
+    rows = [cleared(name, scene, args, label) for label in chosen]
+    print(*rows, sep="\n", file=sys.stderr, flush=True)
+    return rows
 
 
 def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> dict[str, Any]:
     """Clear a scene, or reach the body with a label."""
-    base = changed_settings(Config(), {"active": {"max_views": 100}, "rehearsal": {"risk": 0.02}}, "clear")
-    config = read_settings(None, args.set, base)
+    config = read_settings(None, args.set)
     simulation = make_simulation(scene, config, noise=args.noise, seed=args.seed)
     known: dict[str, Any] = {"segmentation": args.segmentation, "seed": args.seed, "config": config}
     explorer = Explorer(simulation.camera, simulation.robot, **known)
-    hands, done = SimulatedHands(scene, config), list[Taken]()
+    hands, done, alone = SimulatedHands(scene, config), list[Taken](), list[bool]()
 
     def take(step: TakeStep) -> bool:
+        before = hands.state
         done.append(hands.take(step, hands.bodies(explorer.scene.graph)))
+        if not done[-1].ok:
+            alone.append(moves_alone(scene, before, done[-1], config))
         simulation.camera.scene = hands.scene
         return done[-1].body is not None
 
@@ -85,12 +85,21 @@ def cleared(name: str, scene: SimulatedScene, args: Args, goal: int | None) -> d
     lifted = [t for t in done if t.body is not None]
     harm = [f"{t.step.object_id}: {', '.join(t.disturbed)}" for t in lifted if not t.ok]
     row = {"scene": name, "objects": len(scene.object_bodies), "lifts": len(lifted), "views": len(steps)}
-    row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "harm": harm, "stop": steps[-1].stop}
+    row |= {"missed": len(done) - len(lifted), "harmed": len(harm), "alone": sum(alone), "harm": harm}
+    row |= {"stop": steps[-1].stop}
     if goal is None:
         return row | {"cleared": float(not hands.left)}
     body = scene.object_bodies[goal]
     row |= {"goal": f"o{goal}", "cleared": float(any(t.body == body for t in lifted))}
     return row | {"fewest": fewest(scene, body, config) if row["cleared"] else 0}
+
+
+def moves_alone(scene: SimulatedScene, before: Array, taken: Taken, config: Config) -> bool:
+    """Whether all that a lift disturbed moves as far in the same time with nothing lifted."""
+    names = list(scene.object_bodies.values())
+    after = Lifting(scene.spec, names).rest(before, (), 0.25 * len(taken.film))
+    moved = strayed(before, after, config.lift.moved, config.lift.turned)
+    return {n for n, m in zip(names, moved, strict=True) if m} >= set(taken.disturbed)
 
 
 def fewest(scene: SimulatedScene, goal: str, config: Config) -> int:
@@ -122,6 +131,7 @@ def summary(rows: pd.DataFrame) -> dict[str, float]:
     found = {"runs": len(rows), "unharmed": unharmed.mean(), "cleared": rows["cleared"].mean()}
     found |= {"both": (unharmed & (rows["cleared"] == 1.0)).mean()}
     found |= {"lifts unharmed": 1.0 - rows["harmed"].sum() / rows["lifts"].sum()}
+    found |= {"harmful lifts": rows["harmed"].sum(), "of these, harm without a lift": rows["alone"].sum()}
     found |= {"views per lift": rows["views"].sum() / rows["lifts"].sum(), "missed": rows["missed"].sum()}
     if "fewest" in rows:
         known = rows[(rows["cleared"] == 1.0) & (rows["fewest"] > 0)]
@@ -132,17 +142,10 @@ def summary(rows: pd.DataFrame) -> dict[str, float]:
 
 def main() -> int:
     """Run the measurement."""
-    args = tyro.cli(Args)
-    rows = [row for part in args.each(measure, [(scene, args) for scene in args.scenes]) for row in part]
-    frame = pd.DataFrame(rows)
-    groups = {str(name): group for name, group in frame.groupby(frame["scene"].map(family))} | {"all": frame}
-    shown = pd.DataFrame({name: summary(group) for name, group in groups.items()})
-    console = Console(width=160)
-    print_table(shown.round(3).rename_axis("scenes").reset_index(), console)
-    for row in rows:
+    args, console = tyro.cli(Args), Console(width=160)
+    for row in args.show(measure, summary, console):
         if row["harmed"] or not row["cleared"]:
             console.print(f"{row['scene']}: {row['harm']}; {row['stop']}")
-    args.write(rows)
     return 0
 
 

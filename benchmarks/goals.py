@@ -17,12 +17,12 @@ from typing import Annotated, Any
 import numpy as np
 import pandas as pd
 import tyro
-from measures import Spread, print_table, run_main
+from measures import OnScenes, run_main
 from rich.console import Console
 
-from caryatid.benchmark.episodes import family, open_scene
+from caryatid.benchmark.episodes import open_scene
 from caryatid.benchmark.suites import DENSE
-from caryatid.config import NoiseModel, PhysicsConfig
+from caryatid.config import PhysicsConfig
 from caryatid.config.settings import read_settings
 from caryatid.evaluation.scores import TrueScene
 from caryatid.exploration import explore
@@ -38,7 +38,7 @@ PILES = tuple(f"pile-{6 + k}-{901 + k}" for k in range(16))
 
 
 @dataclass(frozen=True)
-class Args(Spread):
+class Args(OnScenes):
     """Explore with and without a goal."""
 
     scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = (*DENSE, *PILES)
@@ -49,12 +49,6 @@ class Args(Spread):
     """Probability from which it is known what moves."""
     planner: str = "support"
     """Planner of the views."""
-    noise: NoiseModel = "carmine"
-    """Noise of the simulated camera."""
-    seed: int = 0
-    """Seed of the noise and of the choice of goals."""
-    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """Settings, e.g. `--set active.effort=0.1`."""
 
 
 def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
@@ -73,8 +67,7 @@ def measure(task: tuple[str, Args]) -> list[dict[str, Any]]:
 
     views, graph = explored(None)
     lifting, rows = Lifting(scene.spec, names), []
-    rng = np.random.default_rng([args.seed, args.scenes.index(name)])
-    for label in rng.choice(list(bodies), min(args.goals, len(bodies)), replace=False).tolist():
+    for label in args.drawn(name, list(bodies), args.goals):
         taken = {bodies[k] for k in displaced_without(scene, label, PhysicsConfig())}
         lift = lifting.lift(poses_of(scene), names.index(bodies[label]), config.lift)
         lifted = {names[k] for k in np.flatnonzero(lift.disturbed)}
@@ -119,13 +112,7 @@ def summary(rows: pd.DataFrame) -> dict[str, float]:
 
 def main() -> int:
     """Run the measurement."""
-    args = tyro.cli(Args)
-    parts = args.each(measure, [(scene, args) for scene in args.scenes])
-    rows = pd.DataFrame([row for part in parts for row in part])
-    groups = {str(name): group for name, group in rows.groupby(rows["scene"].map(family))} | {"all": rows}
-    shown = pd.DataFrame({name: summary(group) for name, group in groups.items()})
-    print_table(shown.round(3).rename_axis("scenes").reset_index(), Console(width=160))
-    args.write(rows.to_dict("records"))
+    tyro.cli(Args).show(measure, summary, Console(width=160))
     return 0
 
 

@@ -10,11 +10,15 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
+import numpy as np
 import pandas as pd
+import tyro
 from rich.console import Console
 
+from caryatid.benchmark.episodes import family
+from caryatid.config import NoiseModel
 from caryatid.errors import CaryatidError
 
 T = TypeVar("T")
@@ -57,6 +61,41 @@ class Spread:
         """Write the rows where asked to."""
         if self.out is not None:
             self.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class OnScenes(Spread):
+    """Options of a benchmark that explores simulated scenes, some of them for goals."""
+
+    scenes: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """Names of built-in scenes, or scene folders."""
+    noise: NoiseModel = "carmine"
+    """Noise of the simulated camera."""
+    seed: int = 0
+    """Seed of the noise and of the choice of goals."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Settings, e.g. `--set active.effort=0.1`."""
+
+    def drawn(self, name: str, labels: Sequence[int], goals: int) -> list[int]:
+        """Labels of the goals in one of the scenes."""
+        rng = np.random.default_rng([self.seed, self.scenes.index(name)])
+        chosen: list[int] = rng.choice(labels, min(goals, len(labels)), replace=False).tolist()
+        return chosen
+
+    def show(
+        self,
+        measure: Callable[[tuple[str, Any]], list[dict[str, Any]]],
+        summary: Callable[[pd.DataFrame], dict[str, float]],
+        console: Console,
+    ) -> list[dict[str, Any]]:
+        """Measure every scene, print a summary of each family, and return all rows."""
+        rows = [row for part in self.each(measure, [(name, self) for name in self.scenes]) for row in part]
+        frame = pd.DataFrame(rows)
+        groups = {str(name): group for name, group in frame.groupby(frame["scene"].map(family))}
+        shown = pd.DataFrame({name: summary(group) for name, group in (groups | {"all": frame}).items()})
+        print_table(shown.round(3).rename_axis("scenes").reset_index(), console)
+        self.write(rows)
+        return rows
 
 
 @dataclass(frozen=True)

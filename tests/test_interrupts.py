@@ -110,7 +110,7 @@ def test_an_interrupted_clearing_says_how_it_goes_on(tmp_path):
 def test_what_reads_only_ends_at_once_and_leaves_nothing(tmp_path, scene_file):
     assert run_command("explore", scene_file, "--out", tmp_path / "run", "--views", 1, *SMALL, "--quiet") == 0
     before = sorted(tmp_path.rglob("*"))
-    command = Command("order", tmp_path / "run", "--set", "rehearsal.draws=20000")
+    command = Command("order", tmp_path / "run", "--set", "rehearsal.draws=20000", "--risk", 0.00003)
     while not any("mujoco" in each.path for each in psutil.Process(command._process.pid).memory_maps()):
         time.sleep(0.1)
     time.sleep(1.0)

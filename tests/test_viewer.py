@@ -23,12 +23,12 @@ from caryatid.errors import PlanningError
 from caryatid.exploration import explore
 from caryatid.geometry import transforms
 from caryatid.geometry.shapes import Box, Sphere
-from caryatid.graph import Support, SupportGraph, TakeStep
+from caryatid.graph import Support, SupportGraph
 from caryatid.io.graph_json import graph_text
 from caryatid.sources import open_source
 from caryatid.steps import read_run
 from caryatid.viewer.drawing import BY_HAND, LAYERS, SPACING, reduced, visible_points
-from caryatid.viewer.loop import LoopPage, candidate_under, taken_apart
+from caryatid.viewer.loop import LoopPage, candidate_under
 from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
 from caryatid.viz.colours import object_colour, rgb
 
@@ -280,20 +280,26 @@ def test_a_ray_points_at_the_view_it_first_meets(step):
 
 
 @pytest.mark.parametrize("simulated", [True, False])
-def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(step, opening, settings, simulated):
-    source = opening(settings)
+def test_what_is_taken_is_gone_and_what_moves_leaves_no_points(loop, monkeypatch, simulated):
+    loop.turn()
+    (step,), shown = loop.steps, []
+    monkeypatch.setattr(loop, "stage", shown.append)
     if not simulated:
-        source = replace(source, truth=None)
-    order = [TakeStep(name, (), True, 0.0, "why") for name in ("o2", "o1")]
-    pictures = list(taken_apart(step, order, source, settings))
+        loop.source = replace(loop.source, camera=None)
+    loop._running.set()
+    said = loop.clear()
+    assert said == "finished: " + (
+        "nothing is left; o1 taken; nothing disturbed" if simulated else "a safe order"
+    )
     rising = next(
-        p for p, _ in pictures if p.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
+        s for s in shown if s and s.graph["o2"].centre_world[2] > step.graph["o2"].centre_world[2] + 0.01
     )
     assert step.graph["o2"].label not in rising.cloud.labels
     assert step.graph["o1"].label in rising.cloud.labels
     assert {s.pair for s in rising.graph.supports} == {("o0", "o1")}
-    assert [o.id for o in pictures[-1][0].graph.objects] == ["o0"]
-    assert [text for _, text in pictures if text] == ["1 of 2 taken: o2", "2 of 2 taken: o1"]
+    last = loop.steps[-1] if simulated else shown[-1]
+    assert [o.id for o in last.graph.objects] == ["o0"]
+    assert [s.lift.object_id for s in loop.steps if s.lift] == (["o2", "o1"] if simulated else [])
 
 
 # The page
@@ -575,10 +581,10 @@ def test_a_view_is_chosen_by_hand(page, tab):
 
 
 @pytest.mark.slow
-def test_everything_is_taken_away_in_a_safe_order(page, tab):
+def test_everything_is_taken_away(page, tab):
     page.describe("o2")
-    tab.press("dismantle")
-    tab.wait_for_text("finished: a safe order; 2 of 2 taken")
+    tab.press("clear")
+    tab.wait_for_text("finished: nothing is left; o1 taken")
     tab.wait_for_node("/shapes/o1", there=False)
     tab.wait_for_node("/shapes/o2", there=False)
     tab.wait_for_text("has been taken away")

@@ -27,7 +27,7 @@ from caryatid.evaluation.scores import score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.geometry import transforms
 from caryatid.graph import Support, SupportGraph
-from caryatid.manipulation.dismantling import bodies_of, dismantle
+from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import PlanningState
 from caryatid.planning.planners import make_planner
@@ -142,7 +142,8 @@ def concepts() -> dict[str, Image.Image]:
     paper = replace(first, decision=make_planner("attention").plan(state, np.random.default_rng(0)))
     order = plan_order(last.graph, config)
     bodies = bodies_of(last.graph, true_scene_from_simulation(scene, ground_truth(scene)))
-    taken = list(dismantle(scene, order.steps, bodies, config))
+    hands = SimulatedHands(scene, config)
+    taken = [hands.take(lift, bodies) for lift in order.steps]
     supports = last.graph.supports
     lifts = [draw_lift(scene, t, last.graph, views[0].pose, config) for t in taken if t.body is not None]
     pages: dict[str, tuple[Sequence[Titled], int, int]] = {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from caryatid.config import Config, SegmentationMethod
+from caryatid.config import ActiveVisionConfig, Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError, check_type
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
@@ -384,11 +384,10 @@ def explore(
     explorer = Explorer(camera, robot, planner=planner, goal=goal, until=until, **known)
     while True:
         step = explorer.look()
-        if step.index + 1 < explorer.scene.config.active.max_views:
+        reason = used_up(step.index + 1, explorer.scene.config.active)
+        if reason is None:
             step = explorer.plan()
             reason = explorer.reason_to_stop() if early_stop and step.stop is None else None
-        else:
-            reason = _used_up(step.index + 1)
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
         if step.stop is not None and goal is not None and all(o.id != goal for o in step.graph.objects):
@@ -408,10 +407,7 @@ def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decisi
         planner: The planner that chose the next view.
         decision: Its choice.
     """
-    views = len(state.visited)
-    if views >= state.config.max_views:
-        return _used_up(views)
-    if views == 1:
+    if len(state.visited) == 1:
         return None
     if state.config.stop == "unchanged":
         return None if changed else "the last view changed nothing"
@@ -420,8 +416,9 @@ def reason_to_stop(state: PlanningState, changed: bool, planner: Planner, decisi
     return "no view is expected to show more than its path costs" if decision.score <= 0.0 else None
 
 
-def _used_up(views: int) -> str:
-    return f"{views} views were asked for"
+def used_up(views: int, config: ActiveVisionConfig) -> str | None:
+    """Say that no more than so many views were asked for, or None."""
+    return f"{views} views were asked for" if views >= config.max_views else None
 
 
 def next_best_view(

@@ -214,7 +214,7 @@ class TakeStep:
         object_id: Its id.
         hold: Ids of the objects that the other hand holds meanwhile.
         safe: The risk is no higher than `rehearsal.risk`.
-        risk: Probability that another object moves: the share of the rehearsals in which one did [1].
+        risk: Probability that another object moves, from the share of the rehearsals in which one did [1].
         why: The reason for the step, for a person to read.
     """
 

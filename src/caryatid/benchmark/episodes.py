@@ -22,7 +22,7 @@ from caryatid.evaluation.scores import Score, TrueScene, score
 from caryatid.evaluation.truths import true_scene_from_simulation
 from caryatid.exploration import explore
 from caryatid.graph import SupportGraph, TakeStep
-from caryatid.manipulation.dismantling import bodies_of, dismantle
+from caryatid.manipulation.dismantling import SimulatedHands, bodies_of
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.planners import offered
 from caryatid.simulation.scenes import SCENE_FILE, TRUTH_FILE, is_builtin, list_scenes, load_scene
@@ -205,7 +205,8 @@ def _take_apart(
     height = dict(zip(scene.object_bodies.values(), poses_of(scene)[:, 2], strict=True))
     missed = sorted(set(height) - {bodies[s.object_id] for s in steps}, key=lambda b: -height[b])
     steps += [TakeStep(body, (), False, 1.0, "not extracted") for body in missed]
-    ok = [taken.ok for taken in dismantle(scene, steps, bodies | {b: b for b in missed}, config)]
+    hands, known = SimulatedHands(scene, config), bodies | {b: b for b in missed}
+    ok = [hands.take(step, known).ok for step in steps]
     return {"unharmed": float(all(ok)), "lifts": float(np.mean(ok))}
 
 

@@ -31,11 +31,11 @@ def shown(metavar: str | None = None, default: object = "") -> object:
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
-def default_of(setting: str) -> object:
+def default_of(setting: str, metavar: str | None = None) -> object:
     """An option for a setting, such as `active.max_views`, whose default applies when it is left out."""
     from caryatid.config import Config
 
-    return shown(default=attrgetter(setting)(Config()))
+    return shown(metavar, attrgetter(setting)(Config()))
 
 
 def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:

@@ -107,8 +107,8 @@ class OrderCommand(options.Command):
     """Find a safe order in which to remove everything, or to reach one object.
 
     Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others equally
-    likely. The share of rehearsals in which nothing else moves is the probability given with it. If no order
-    is safe, the output gives the least risky one and names the objects in each other's way.
+    likely. They give the probability that nothing else moves. If no order is safe, the output gives the least
+    risky one and names the objects in each other's way.
 
     To try:
       caryatid order run
@@ -123,7 +123,7 @@ class OrderCommand(options.Command):
     """Reach this object only, and remove no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
-    risk: Annotated[float | None, options.shown("P", "0")] = None
+    risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
     """Accept lifts that move another object with at most this probability."""
 
     def __call__(self) -> None:

@@ -281,21 +281,17 @@ class Clear(options.ExploringCommand):
     """Reach this object only, and remove no more than necessary."""
     hands: Literal[1, 2] = 2
     """With 2, another hand may hold one object while the first lifts one."""
-    risk: Annotated[float | None, options.shown("P", "0.02")] = None
+    risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
     """Remove only objects that move another one with at most this probability."""
-    views: Annotated[options.OptionalCount, options.shown(default=100)] = None
-    """Maximum number of views, including the first."""
+    views: Annotated[options.OptionalCount, options.default_of("active.max_views")] = None
+    """Maximum number of views before each lift."""
     no_report: options.Flag = False
     """Leave out report.html."""
 
     def config(self) -> Config:
         """All settings."""
-        from caryatid.config.settings import changed_settings, preset
-
-        own = {"active": {"max_views": 100}, "rehearsal": {"risk": 0.02}}
         given = {"active.max_views": self.views, "rehearsal.risk": self.risk}
-        base = changed_settings(preset(self.settings.preset), own, "clear")
-        return self.settings.read(given, base, takes_views=True)
+        return self.settings.read(given, takes_views=True)
 
     def __call__(self) -> None:
         import numpy as np

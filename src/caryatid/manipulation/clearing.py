@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
-from caryatid.exploration import Explorer, Step
+from caryatid.exploration import Explorer, Step, used_up
 from caryatid.graph import TakeStep
-from caryatid.manipulation.order import next_lift
+from caryatid.manipulation.order import plan_order
 
 MISSES = 2
 """Maximum number of lifts in a row that remove nothing [1]: the model is then wrong."""
@@ -25,8 +25,9 @@ def clear(
     """Look until the next lift is safe, lift, look again, until nothing or nothing safe is left.
 
     A lift is safe if no other object moves with a higher probability than `config.rehearsal.risk`, as in
-    `plan_order`. It is done when no view is expected to show more of what it depends on than its path costs.
-    After each lift the robot looks again, and so notices what slid or fell.
+    `plan_order`. It is done when no view is expected to show more of what it depends on than its path costs,
+    or after `config.active.max_views` views since the previous lift. After each lift the robot looks again,
+    and so notices what slid or fell.
 
     Args:
         explorer: Has a camera and a robot, and no goal.
@@ -42,16 +43,18 @@ def clear(
     Raises:
         CaryatidError: A view cannot be used.
     """
-    missed = 0
+    views = missed = 0
     for step in past:
         _repeat(explorer, step)
+        views = 0 if step.lift is not None else views + 1
     while explorer.step is None or explorer.step.decision is not None:
         if explorer.step is not None:
             explorer.go()
-        step = explorer.look()
-        lift, reason = _lift(explorer, goal, hands, threads)
+        explorer.look()
+        views += 1
+        lift, reason = _lift(explorer, goal, hands, threads, views)
         if lift is not None:
-            missed = 0 if take(lift) else missed + 1
+            views, missed = 0, 0 if take(lift) else missed + 1
             explorer.scene.removed(lift.object_id)
             explorer.goal = goal
             explorer.plan()
@@ -59,7 +62,8 @@ def clear(
                 reason = f"{goal} is taken"
             elif missed == MISSES:
                 reason = f"nothing was there to take, {MISSES} times in a row"
-        step = replace(explorer.step or step, lift=lift)
+        assert explorer.step is not None
+        step = replace(explorer.step, lift=lift)
         if reason is not None:
             step = replace(step, candidates=None, decision=None, stop=reason)
         explorer.step = step
@@ -67,7 +71,7 @@ def clear(
 
 
 def _lift(
-    explorer: Explorer, goal: str | None, hands: int, threads: int
+    explorer: Explorer, goal: str | None, hands: int, threads: int, views: int
 ) -> tuple[TakeStep | None, str | None]:
     """The object to remove now, or None to look again; and why this is the last view, or None."""
     scene = explorer.scene
@@ -76,18 +80,18 @@ def _lift(
         return None, "nothing is left"
     lift = None
     if goal is None or goal in ids:
-        lift = next_lift(scene.graph, scene.config, goal=goal, hands=hands, seed=scene.seed, threads=threads)
+        order = plan_order(
+            scene.graph, scene.config, goal=goal, hands=hands, steps=1, seed=scene.seed, threads=threads
+        )
+        lift = order.steps[0]
     explorer.goal = lift.object_id if lift is not None and lift.safe else goal
     explorer.plan()
-    reason = explorer.reason_to_stop()
-    used_up = scene.views >= scene.config.active.max_views
+    reason = used_up(views, scene.config.active) or explorer.reason_to_stop()
     if reason is None:
         return None, None
     if lift is None:
         return None, f"{reason}; {goal} has not been found"
-    if lift.safe:
-        return lift, reason if used_up else None
-    return None, reason if used_up else f"no lift is safe: {lift.why}"
+    return (lift, None) if lift.safe else (None, f"no lift is safe: {lift.why}")
 
 
 def _repeat(explorer: Explorer, step: Step) -> None:

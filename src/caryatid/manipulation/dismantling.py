@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -59,25 +59,6 @@ def bodies_of(graph: SupportGraph, truth: TrueScene) -> dict[str, str]:
     return {i: body for i, body in found.matches.items() if table is None or i != table.id}
 
 
-def dismantle(
-    scene: SimulatedScene, steps: Sequence[TakeStep], bodies: Mapping[str, str], config: Config
-) -> Iterator[Taken]:
-    """Carry out the steps of an order one after the other, even if some fail.
-
-    Args:
-        scene: The scene in physics; it is not changed.
-        steps: The steps of the order.
-        bodies: Body that each extracted object represents, by id.
-        config: How objects are lifted, and what counts as harm.
-
-    Yields:
-        The result of each step.
-    """
-    hands = SimulatedHands(scene, config)
-    for step in steps:
-        yield hands.take(step, bodies)
-
-
 class SimulatedHands:
     """Hands that remove objects in physics, one after the other.
 
@@ -86,13 +67,14 @@ class SimulatedHands:
         config: How objects are lifted, and what counts as harm.
 
     Attributes:
+        names: Names (N) of the scene's objects.
         state: Current state (N, 7) of the scene's objects; removed ones are far above.
     """
 
     def __init__(self, scene: SimulatedScene, config: Config) -> None:
         self._scene, self._config = scene, config
-        self._names = list(scene.object_bodies.values())
-        self._lifting = Lifting(scene.spec, self._names)
+        self.names = list(scene.object_bodies.values())
+        self._lifting = Lifting(scene.spec, self.names)
         self.state = poses_of(scene)
 
     @property
@@ -103,7 +85,7 @@ class SimulatedHands:
     @property
     def left(self) -> list[str]:
         """Names of the bodies that have not been taken."""
-        return [n for n, z in zip(self._names, self.state[:, 2], strict=True) if z < ASIDE / 2.0]
+        return [n for n, z in zip(self.names, self.state[:, 2], strict=True) if z < ASIDE / 2.0]
 
     def bodies(self, graph: SupportGraph) -> dict[str, str]:
         """Body that each extracted object represents now, as `bodies_of`."""
@@ -119,9 +101,9 @@ class SimulatedHands:
         body, left = bodies.get(step.object_id), self.left
         held = tuple(bodies[i] for i in step.hold if bodies.get(i) in left)
         if body not in left:
-            return Taken(step, None, held, (), np.zeros((0, len(self._names), 7)), bodies)
-        index, also = self._names.index(body), [self._names.index(h) for h in held]
+            return Taken(step, None, held, (), np.zeros((0, len(self.names), 7)), bodies)
+        index, also = self.names.index(body), [self.names.index(h) for h in held]
         lift = self._lifting.lift(self.state, index, self._config.lift, held=also)
         self.state = lift.film[-1]
-        disturbed = tuple(np.array(self._names)[lift.disturbed].tolist())
+        disturbed = tuple(np.array(self.names)[lift.disturbed].tolist())
         return Taken(step, body, held, disturbed, lift.film, bodies)

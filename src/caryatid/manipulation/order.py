@@ -4,6 +4,10 @@ Extracted shapes are not exactly at rest in physics, and friction and weights ar
 rehearsed in several scenes, drawn from the shapes' uncertainty, each of which first comes to rest. An object
 that does not, although the real one was seen at rest, has a wrong shape or rests on something unseen. It is
 held there, and the support graph alone says what it needs.
+
+The risk of a lift is the probability that the next scene drawn, such as the real one, shows harm. After n
+scenes with harm h in all, it is (h + ½) / (n + 1): the mean of a Beta distribution that begins as Jeffreys'
+prior, Beta(½, ½). Scenes are drawn until the risk is low enough, or can no longer become so.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from caryatid.config import Config, RehearsalConfig
+from caryatid.config import Config, LiftConfig
 from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.graph import SceneObject, SupportGraph, TakeStep
@@ -26,6 +30,9 @@ from caryatid.runtime.display import Pictured
 from caryatid.simulation.lifting import ASIDE, Lift, Lifting
 from caryatid.simulation.world import TABLE, Body, add_body, empty_spec, quaternion, strayed
 from caryatid.support.plausibility import drawn, reconcile
+
+BATCH = 8
+"""Scenes drawn at a time [1]; how many cores there are makes no difference."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +68,7 @@ def plan_order(
     *,
     goal: str | None = None,
     hands: int = 2,
+    steps: int | None = None,
     seed: int = 0,
     threads: int = 1,
 ) -> Order:
@@ -76,6 +84,7 @@ def plan_order(
         config: How lifts go, and how they are rehearsed.
         goal: Id of the object to reach; only objects that must go first are removed.
         hands: 2 if another hand can hold one object, else 1.
+        steps: Maximum number of steps; None = all.
         seed: Seed of the rehearsals.
         threads: Number of rehearsals at a time.
 
@@ -83,56 +92,33 @@ def plan_order(
         InputError: There is no support surface, no object, more than `rehearsal.max_objects` of them, or no
             such goal.
     """
-    config = config or Config()
-    rehearsal = _rehearsal(graph, config, goal, seed, threads)
-    steps: list[TakeStep] = []
-    refusal = ""
-    while (left := rehearsal.left()) and (goal is None or goal in left):
-        trial, tried = _next(graph, goal, hands, rehearsal)
-        if trial.risk > rehearsal.accepted and not refusal:
-            refusal = _refusal(trial, tried)
-        steps.append(_step(graph, trial, left, config.rehearsal))
-        rehearsal.take(trial)
-    return Order(tuple(steps), refusal)
-
-
-def next_lift(
-    graph: SupportGraph,
-    config: Config | None = None,
-    *,
-    goal: str | None = None,
-    hands: int = 2,
-    seed: int = 0,
-    threads: int = 1,
-) -> TakeStep:
-    """Find the first step of an order; arguments and errors are those of `plan_order`."""
-    config = config or Config()
-    rehearsal = _rehearsal(graph, config, goal, seed, threads)
-    trial, _ = _next(graph, goal, hands, rehearsal)
-    return _step(graph, trial, rehearsal.left(), config.rehearsal)
-
-
-def _rehearsal(graph: SupportGraph, config: Config, goal: str | None, seed: int, threads: int) -> _Rehearsal:
-    rehearsal = _Rehearsal(graph, config, np.random.default_rng(seed), threads=threads)
+    rehearsal = _Rehearsal(graph, config or Config(), seed, threads)
     if goal is not None and goal not in rehearsal.ids:
         raise InputError(goal, "is not an object of the graph", f"there are {', '.join(rehearsal.ids)}")
-    return rehearsal
+    found: list[TakeStep] = []
+    refusal = ""
+    while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):
+        wanted = (
+            _in_turn(graph, left, rehearsal) if goal is None else _on_the_way(graph, goal, left, rehearsal)
+        )
+        trial, tried = _safest(rehearsal, wanted, hands)
+        if trial.risk > rehearsal.accepted and not refusal:
+            refusal = _refusal(trial, tried)
+        found.append(_step(graph, trial, left, rehearsal.accepted))
+        rehearsal.take(trial)
+    return Order(tuple(found), refusal)
 
 
-def _next(
-    graph: SupportGraph, goal: str | None, hands: int, rehearsal: _Rehearsal
-) -> tuple[_Trial, list[_Trial]]:
-    """The next lift, and those tried before it."""
-    left = rehearsal.left()
-    wanted = _in_turn(graph, left) if goal is None else _on_the_way(graph, goal, left, rehearsal)
-    return _safest(rehearsal, wanted, hands)
+def _in_turn(graph: SupportGraph, left: Sequence[str], rehearsal: _Rehearsal) -> list[str]:
+    """The remaining objects; those that support nothing come first.
 
-
-def _in_turn(graph: SupportGraph, left: Sequence[str]) -> list[str]:
-    """The remaining objects; those that support nothing come first, the highest of them foremost."""
+    Among these come first the ones that do not stand in rehearsals, which any touch may topple, and then the
+    highest.
+    """
     carrying = {s.supporter for s in graph.supports if s.supported in left}
     height = {o.id: float(o.centre_world[2]) for o in graph.objects}
-    return sorted(left, key=lambda i: (i in carrying, -height[i], i))
+    restless = rehearsal.restless()
+    return sorted(left, key=lambda i: (i in carrying, -restless[i], -height[i], i))
 
 
 def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: _Rehearsal) -> list[str]:
@@ -142,7 +128,7 @@ def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: 
         trial = rehearsal.try_lift(object_id)
         if trial.risk <= rehearsal.accepted:
             return [object_id]
-        found += [i for i in _in_turn(graph, left) if i in trial.harmed and i not in found]
+        found += [i for i in _in_turn(graph, left, rehearsal) if i in trial.harmed and i not in found]
     return found
 
 
@@ -167,13 +153,13 @@ def _safest(rehearsal: _Rehearsal, wanted: Sequence[str], hands: int) -> tuple[_
     return best, tried
 
 
-def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], config: RehearsalConfig) -> TakeStep:
+def _step(graph: SupportGraph, trial: _Trial, left: Sequence[str], accepted: float) -> TakeStep:
     carried = [s.supported for s in graph.supports if s.supporter == trial.object_id and s.supported in left]
     what = f"supports {', '.join(carried)}" if carried else "supports nothing that is left"
     with_hold = f" while {', '.join(trial.hold)} is held" if trial.hold else ""
     worst = ", ".join(f"{i} with probability {share:.2f}" for i, share in trial.harmed.items())
-    why = f"it {what}; lifting it{with_hold} disturbed {worst or 'nothing'} in {config.draws} rehearsals"
-    return TakeStep(trial.object_id, trial.hold, trial.risk <= config.risk, trial.risk, why)
+    why = f"it {what}; lifting it{with_hold} disturbed {worst or 'nothing'} in {trial.rehearsals} rehearsals"
+    return TakeStep(trial.object_id, trial.hold, trial.risk <= accepted, trial.risk, why)
 
 
 def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
@@ -187,23 +173,21 @@ def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
     return f"no safe order: {cycle}; whichever goes first"
 
 
-@dataclass(frozen=True, eq=False, slots=True)
+@dataclass(frozen=True, slots=True)
 class _Trial:
-    """A lift rehearsed in every drawn scene: probability that others are disturbed, in all and each."""
+    """A rehearsed lift: probability that it does harm, and the shares of rehearsals that disturbed each."""
 
     object_id: str
     hold: tuple[str, ...]
+    rehearsals: int
     risk: float
     harmed: dict[str, float]
-    lifts: tuple[Lift, ...]
 
 
 class _Rehearsal:
-    """Scenes in which to try lifts, with the states of their objects after each removal."""
+    """Scenes in which to try lifts, drawn when they are needed."""
 
-    def __init__(
-        self, graph: SupportGraph, config: Config, rng: np.random.Generator, *, threads: int = 1
-    ) -> None:
+    def __init__(self, graph: SupportGraph, config: Config, seed: int, threads: int) -> None:
         if graph.support_surface is None:
             raise InputError("graph", "has no support surface", "extract one; lifts need a table")
         self.ids = tuple(o.id for o in graph.objects if o.role == "object")
@@ -215,60 +199,102 @@ class _Rehearsal:
                 f"has {len(self.ids)} objects, for which MuJoCo reserves about {reserved:.1f} GB a thread"
             )
             raise InputError("graph", reason, "raise rehearsal.max_objects, or give a part of the scene")
-        self._graph, self._config, self._threads = graph, config, threads
+        self._graph, self._config, self._seed, self._threads = graph, config, seed, threads
         self.accepted = config.rehearsal.risk
+        self._scenes: list[_DrawnScene] = []
         self._trials: dict[tuple[str, ...], _Trial] = {}
-        specs = [_drawn_scene(graph, number, config, rng) for number in range(config.rehearsal.draws)]
-        settled = self._each(lambda k: _settled(specs[k], self.ids, config))
-        self._liftings: list[Lifting] = [lifting for lifting, _, _ in settled]
-        # For D scenes with N objects: which do not stay in place (D, N), and all states (D, N, 7).
-        self._restless = np.stack([restless for _, restless, _ in settled])
-        self._states = np.stack([state for _, _, state in settled])
+        self._taken: list[_Trial] = []
 
     def left(self) -> list[str]:
         """Ids of the objects that have not been removed yet."""
-        return [i for i, height in zip(self.ids, self._states[0, :, 2], strict=True) if height < ASIDE / 2.0]
+        taken = {trial.object_id for trial in self._taken}
+        return [i for i in self.ids if i not in taken]
+
+    def restless(self) -> dict[str, float]:
+        """Shares of the first scenes in which each object does not stay in place, by id."""
+        found = self._each(slice(BATCH), lambda scene: scene.restless)
+        return dict(zip(self.ids, np.mean(found, axis=0).tolist(), strict=True))
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> _Trial:
-        """Lift an object in every scene while others are held; cached, and nothing changes."""
+        """Lift an object while others are held, in as many scenes as needed; cached, and nothing changes."""
         asked = (object_id, *sorted(hold))
         if asked not in self._trials:
-            index, held = self.ids.index(object_id), {self.ids.index(i) for i in hold}
-
-            def lift(k: int) -> Lift:
-                also = set(np.flatnonzero(self._restless[k]).tolist()) - {index}
-                state, how = self._states[k], self._config.lift
-                return self._liftings[k].lift(state, index, how, held=held | also, to_the_end=False)
-
-            lifts = self._each(lift)
-            # An object held in a scene because it does not stay there moves if it loses a support.
-            free = set(self.left()) - set(hold)
-            supports = [self._graph.support(object_id, i) if i in free else None for i in self.ids]
-            loses = np.array([0.0 if s is None else s.belief for s in supports])
-            harm = np.maximum(np.stack([lift.disturbed for lift in lifts]), self._restless * loses)
-            shares = zip(self.ids, harm.mean(axis=0).tolist(), strict=True)
-            harmed = {i: share for i, share in shares if share > 0.0}
-            risk = float(1.0 - np.prod(1.0 - harm, axis=1).mean())
-            self._trials[asked] = _Trial(object_id, tuple(hold), risk, harmed, tuple(lifts))
+            self._trials[asked] = self._tried(object_id, tuple(hold))
         return self._trials[asked]
+
+    def _tried(self, object_id: str, hold: tuple[str, ...]) -> _Trial:
+        # An object held in a scene because it does not stay there moves if it loses a support.
+        free = set(self.left()) - set(hold)
+        supports = [self._graph.support(object_id, i) if i in free else None for i in self.ids]
+        loses = np.array([0.0 if s is None else s.belief for s in supports])
+        index, held = self._indices(object_id, hold)
+        most, harm = self._config.rehearsal.draws, np.zeros((0, len(self.ids)))
+        while True:
+            found = self._each(slice(len(harm), len(harm) + BATCH), lambda s: s.lift(index, held))
+            harm = np.concatenate([harm, np.stack([np.maximum(d, r * loses) for d, r in found])])
+            harms = float((1.0 - np.prod(1.0 - harm, axis=1)).sum()) + 0.5
+            risk = harms / (len(harm) + 1.0)
+            if risk <= self.accepted or harms / (most + 1.0) > self.accepted or len(harm) == most:
+                break
+        shares = zip(self.ids, harm.mean(axis=0).tolist(), strict=True)
+        harmed = {i: share for i, share in shares if share > 0.0}
+        return _Trial(object_id, hold, len(harm), risk, harmed)
 
     def take(self, trial: _Trial) -> None:
         """Continue without an object whose lift was tried; others that moved are put back."""
-        index = self.ids.index(trial.object_id)
+        taken = self._indices(trial.object_id, trial.hold)
+        self._each(slice(None), lambda scene: scene.take(*taken))
+        self._taken.append(trial)
         self._trials.clear()
-        moved = np.array([lift.disturbed.any() for lift in trial.lifts])
-        stays = self._restless | moved[:, None]
-        after = np.stack([lift.film[-1] for lift in trial.lifts])
-        self._states = np.where(stays[..., None], self._states, after)
-        self._states[:, index, :3] = (0.0, 0.0, ASIDE + index)
 
-    def _each(self, do: Callable[[int], Any]) -> list[Any]:
-        """Do something for every scene, in order."""
+    def _indices(self, object_id: str, hold: Collection[str]) -> tuple[int, frozenset[int]]:
+        return self.ids.index(object_id), frozenset(self.ids.index(i) for i in hold)
+
+    def _draw(self, number: int) -> _DrawnScene:
+        scene = _DrawnScene(self._graph, self.ids, number, self._config, self._seed)
+        for trial in self._taken:
+            scene.take(*self._indices(trial.object_id, trial.hold))
+        return scene
+
+    def _each(self, numbers: slice, do: Callable[[_DrawnScene], Any]) -> list[Any]:
+        """Do something in these scenes, in order; those that are missing are drawn."""
         with ThreadPoolExecutor(self._threads) as pool:
-            return list(pool.map(do, range(self._config.rehearsal.draws)))
+            self._scenes += pool.map(
+                self._draw, range(len(self._scenes), min(numbers.stop or 0, self._config.rehearsal.draws))
+            )
+            return list(pool.map(do, self._scenes[numbers]))
 
 
-def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
+class _DrawnScene:
+    """The extracted shapes at rest or, for a number above 0, others as likely; and what is left of them."""
+
+    def __init__(
+        self, graph: SupportGraph, ids: Sequence[str], number: int, config: Config, seed: int
+    ) -> None:
+        self._config = config.lift
+        spec = _drawn_spec(graph, number, config, np.random.default_rng([seed, number]))
+        self._lifting, self.restless, self._state = _settled(spec, ids, config.lift)
+        self._lifts: dict[tuple[int, frozenset[int]], Lift] = {}
+
+    def lift(self, index: int, held: frozenset[int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Lift an object while others are held: which (N,) are disturbed, and which do not stay in place."""
+        if (index, held) not in self._lifts:
+            also = held | (set(np.flatnonzero(self.restless).tolist()) - {index})
+            self._lifts[index, held] = self._lifting.lift(
+                self._state, index, self._config, held=also, to_the_end=False
+            )
+        return self._lifts[index, held].disturbed, self.restless
+
+    def take(self, index: int, held: frozenset[int]) -> None:
+        """Continue without an object; others that moved are put back."""
+        disturbed, _ = self.lift(index, held)
+        stays = self.restless | disturbed.any()
+        self._state = np.where(stays[:, None], self._state, self._lifts[index, held].film[-1])
+        self._state[index, :3] = 0.0, 0.0, ASIDE + index
+        self._lifts.clear()
+
+
+def _drawn_spec(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
     """A `mujoco.MjSpec` of the extracted shapes or, for a number above 0, of others as likely."""
     objects = list(graph.objects)
     if number > 0:
@@ -282,6 +308,8 @@ def _drawn_scene(graph: SupportGraph, number: int, config: Config, rng: np.rando
     spec = empty_spec("rehearsal")
     # Twice MuJoCo's default time step, which the implicit integrator allows, for half the time.
     spec.option.timestep = 0.004
+    # Else contacts creep by up to 3 mm/s, and what was seen at rest falls within seconds.
+    spec.option.noslip_iterations = 5
     for o, friction, density in zip(objects, frictions, densities, strict=True):
         if o.role == "support_surface":
             _add_table(spec, o)
@@ -302,17 +330,20 @@ def _add_table(spec: Any, table: SceneObject) -> None:
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=half, friction=[0.1, 0.005, 0.001])
 
 
-def _settled(spec: Any, ids: Sequence[str], config: Config) -> tuple[Lifting, NDArray[np.bool_], Array]:
+def _settled(spec: Any, ids: Sequence[str], config: LiftConfig) -> tuple[Lifting, NDArray[np.bool_], Array]:
     """Let a scene come to rest: objects that move too far are put back and held, until no others do.
+
+    It is watched for as long as the highest lift takes, so that no lift is blamed for what moves by itself.
 
     Returns:
         The scene, which objects (N,) had to be held, and the state (N, 7) of all.
     """
     lifting = Lifting(spec, ids)
     seen, restless = lifting.start, np.zeros(len(ids), dtype=np.bool_)
+    seconds = lifting.longest(seen, config)
     while True:
-        state = lifting.rest(seen, np.flatnonzero(restless).tolist(), config.rehearsal.settling)
-        moved = strayed(seen, state, config.lift.moved, config.lift.turned) & ~restless
+        state = lifting.rest(seen, np.flatnonzero(restless).tolist(), seconds, config)
+        moved = strayed(seen, state, config.moved, config.turned) & ~restless
         if not moved.any():
             return lifting, restless, np.where(restless[:, None], seen, state)
         restless |= moved

@@ -32,7 +32,7 @@ from pydantic import Base64Bytes
 
 from caryatid.config import Config, SegmentationMethod
 from caryatid.errors import InputError, PlanningError
-from caryatid.exploration import given_candidates, next_best_view, reason_to_stop
+from caryatid.exploration import given_candidates, next_best_view, reason_to_stop, used_up
 from caryatid.geometry.transforms import Array, as_rigid
 from caryatid.graph import SupportGraph
 from caryatid.io.graph_json import graph_text, graph_to_json
@@ -419,7 +419,8 @@ class Session:
         state = PlanningState(
             self.scene.graph, sphere, self.scene.voxels, visited, reachable, self.scene.config.active
         )
-        stop = reason_to_stop(state, self.scene.changed, planner, decision)
+        stop = used_up(len(visited), state.config)
+        stop = stop or reason_to_stop(state, self.scene.changed, planner, decision)
         return NextView(self.views, decision, stop)
 
     def undo(self) -> int:

@@ -71,9 +71,28 @@ class Lifting:
         """State (N, 7) of the objects in the spec."""
         return np.asarray(self.model.qpos0[self._qpos])
 
-    def rest(self, state: Array, held: Collection[int], seconds: float) -> Array:
-        """State (N, 7) after some time [s] in which nothing is lifted and some objects are held."""
-        return self._after(self._data(state, held), 0.0, seconds)
+    def rest(
+        self, state: Array, held: Collection[int], seconds: float, limits: LiftConfig | None = None
+    ) -> Array:
+        """State (N, 7) after some time [s] in which nothing is lifted and some objects are held.
+
+        With limits, the time ends when all objects rest, or one moved or turned beyond the limits.
+        """
+        data = self._data(state, held)
+        if limits is None:
+            return self._after(data, 0.0, seconds)
+        after = state
+        for _ in range(int(np.ceil(seconds / 0.25))):
+            before, after = after, self._after(data, 0.0, 0.25)
+            if _still(before, after) or strayed(state, after, limits.moved, limits.turned).any():
+                break
+        return after
+
+    def longest(self, state: Array, config: LiftConfig) -> float:
+        """Maximum time [s] that a lift of any object takes in a state (N, 7), with the watch after it."""
+        data = self._data(state, ())
+        low, high = np.array([self._span(data, k) for k in range(len(state))]).T
+        return float(high.max() - low.min() + 0.02) / config.speed + config.watch
 
     def lift(
         self,
@@ -104,8 +123,7 @@ class Lifting:
             for _ in range(segments):
                 film.append(self._after(data, speed, seconds / segments, index))
                 disturbed |= watched & strayed(state, film[-1], config.moved, config.turned)
-                # Contacts creep by up to 0.2 mm or 0.2°.
-                at_rest = speed == 0.0 and not strayed(film[-2], film[-1], 2e-4, 0.2).any()
+                at_rest = speed == 0.0 and _still(film[-2], film[-1])
                 if not to_the_end and (at_rest or disturbed.any()):
                     return Lift(disturbed, np.array(film))
             if speed > 0.0:
@@ -160,6 +178,11 @@ class Lifting:
         middle = data.geom_xpos[geoms, 2] + np.einsum("gi,gi->g", R, boxes[:, :3])
         reach = np.einsum("gi,gi->g", np.abs(R), boxes[:, 3:])
         return float((middle - reach).min()), float((middle + reach).max())
+
+
+def _still(before: Array, after: Array) -> bool:
+    """Whether objects rest in two states a quarter of a second apart; contacts creep by 0.2 mm or 0.2°."""
+    return not strayed(before, after, 2e-4, 0.2).any()
 
 
 def _with_hands(spec: Any, bodies: Sequence[str]) -> Any:

@@ -1,10 +1,10 @@
-"""A page that controls an exploration: turn by turn, with any planner and fusion, up to dismantling."""
+"""A page that controls an exploration: turn by turn, with any planner and fusion, until it is cleared."""
 
 from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from threading import Event
@@ -17,18 +17,18 @@ from caryatid.config import Config, FusionMethod, SegmentationMethod
 from caryatid.errors import CaryatidError, PlanningError, in_one_line
 from caryatid.evaluation.oracle import planner_for
 from caryatid.evaluation.scores import score
-from caryatid.exploration import Explorer, Step
+from caryatid.exploration import Explorer, Step, used_up
 from caryatid.geometry import transforms
 from caryatid.geometry.transforms import Array
 from caryatid.graph import TakeStep
-from caryatid.manipulation.dismantling import bodies_of, dismantle
+from caryatid.manipulation.clearing import clear
+from caryatid.manipulation.dismantling import SimulatedHands, Taken
 from caryatid.manipulation.order import plan_order
 from caryatid.planning.decision import Decision
 from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 from caryatid.runtime.parallel import cores
 from caryatid.simulation.camera import SimulatedCamera
 from caryatid.simulation.lifting import ASIDE
-from caryatid.simulation.world import SimulatedScene, poses_of
 from caryatid.viewer.page import Page
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class LoopPage(Page):
                 f1 = score(step.graph, truth, np.random.default_rng(0)).f1
         self._planned, self.ended = step.decision, step.stop
         self.add(step, f1)
-        return explorer.reason_to_stop()
+        return used_up(len(self.steps), self._config.active) or explorer.reason_to_stop()
 
     def use_planner(self, name: str) -> str:
         """Let another planner choose, already the next view; return what to say about it.
@@ -165,20 +165,56 @@ class LoopPage(Page):
         """Show the newest step with another next view."""
         self.add(step, self.scores[step.index])
 
-    def dismantle(self) -> str:
-        """Find a safe order and play it: in physics where there is a simulation, else as the order says."""
-        newest, config, said = self.steps[-1], self._config, ""
+    def clear(self) -> str:
+        """Clear the table in physics, as `clear` does; of a recording, show the lifts of a safe order."""
+        explorer, config, camera = self._explorer, self._config, self.source.camera
+        if not isinstance(camera, SimulatedCamera):
+            return self._show_order(self.steps[-1], config)
+        hands, said = SimulatedHands(camera.scene, config), ""
+        film: list[Step] = []
+        self.source = replace(self.source, truth=None)  # It is that of the scene as it was.
+
+        def take(lift: TakeStep) -> bool:
+            nonlocal said
+            step, before = explorer.step, hands.state
+            assert step is not None
+            taken = hands.take(lift, hands.bodies(step.graph))
+            film.extend(_without(step, (), lift.object_id, T) for T in _moves(taken, hands.names, before))
+            camera.scene = hands.scene
+            said = f"{lift.object_id} taken; {', '.join(taken.disturbed) or 'nothing'} disturbed"
+            return taken.body is not None
+
+        steps = clear(explorer, take, threads=cores())
+        while self._running.is_set():
+            with self.working:
+                step = next(steps, None)
+            if step is None:
+                return f"finished: {self.ended}; {said}"
+            self._show(film)
+            film.clear()
+            self.stage(None)
+            self.add(step)
+            self.say(said)
+            self.ended = step.stop
+        return "paused"
+
+    def _show_order(self, step: Step, config: Config) -> str:
         with self.working:
-            order = plan_order(newest.graph, config, seed=self._options["seed"], threads=cores())
-        for step, done in taken_apart(newest, order.steps, self.source, config):
+            order = plan_order(step.graph, config, seed=self._options["seed"], threads=cores())
+        rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
+        gone: set[str] = set()
+        for lift in order.steps:
             if not self._running.is_set():
                 return "paused"
-            self.stage(step)
-            if done:
-                said = done
-                self.say(said)
+            self._show(_without(step, gone, lift.object_id, {lift.object_id: T}) for T in rising)
+            gone.add(lift.object_id)
+            self.stage(_without(step, gone, lift.object_id, {}))
+        return f"finished: {order.refusal or 'a safe order'}"
+
+    def _show(self, film: Iterable[Step]) -> None:
+        for picture in film:
+            self.stage(picture)
             time.sleep(0.12)  # Each picture of a lift stands for so long [s].
-        return f"finished: {order.refusal or 'a safe order'}; {said}"
 
     def start(self) -> None:
         """Take the first view, or the next, in the page's own thread."""
@@ -210,13 +246,13 @@ class LoopPage(Page):
             )
             hint = "Then click the view sphere: the view you point at is taken next"
             by_hand = gui.add_checkbox("choose the next view by hand", False, hint=hint)
-            hint = "Find a safe order to take everything away, and play it"
-            self._dismantle = gui.add_button("dismantle", hint=hint)
+            hint = "Look until a lift is safe, take the object, look again, until nothing is left"
+            self._clear = gui.add_button("clear", hint=hint)
         self._choices = planner, fusion
         self._next.on_click(lambda _: self.start())
         self._go.on_click(lambda _: self._keep_doing("running", self._run))
         self._pause.on_click(lambda _: self._running.clear())
-        self._dismantle.on_click(lambda _: self._keep_doing("rehearsing lifts", self.dismantle))
+        self._clear.on_click(lambda _: self._keep_doing("clearing", self.clear))
         planner.on_update(lambda _: self._do("planning again", lambda: self.use_planner(planner.value)))
         fusion.on_update(
             lambda _: self._do("taking the same views again", lambda: self.use_fusion(fusion.value))
@@ -250,7 +286,8 @@ class LoopPage(Page):
         self.say(text)
         self._next.disabled = self._go.disabled = busy or self.ended is not None
         self._pause.disabled = not busy
-        self._dismantle.disabled = busy or not self.steps
+        simulated = isinstance(self.source.camera, SimulatedCamera)
+        self._clear.disabled = busy or not self.steps or (simulated and self.ended is not None)
         for choice in self._choices:
             choice.disabled = busy
 
@@ -311,62 +348,17 @@ def candidate_under(
     return int(np.argmin(np.where(hit & (along < along[hit].min() + sphere.radius / 2.0), aside, np.inf)))
 
 
-# An order of removal played, picture by picture
+# A lift, picture by picture
 
 
-def taken_apart(
-    step: Step, order: Sequence[TakeStep], source: Source, config: Config
-) -> Iterator[tuple[Step, str]]:
-    """Play an order: in physics where the source is simulated, else as the order says.
-
-    Shapes that have moved leave their points behind, and so their points are not shown.
-
-    Args:
-        step: What is known.
-        order: What to take.
-        source: What was explored.
-        config: How lifts go.
-
-    Yields:
-        Several pictures of each lift, with what came of it where it is done, else an empty text.
-    """
-    gone: set[str] = set()
-    camera, lifts = source.camera, _lifts_as_ordered(order)
-    if isinstance(camera, SimulatedCamera) and source.truth is not None:
-        lifts = _lifts_in_physics(camera.scene, order, bodies_of(step.graph, source.truth), config)
-    for number, (taken, moves, disturbed) in enumerate(lifts, start=1):
-        for T_world_world in moves:
-            yield _without(step, gone, taken, T_world_world), ""
-        gone.add(taken)
-        harm = f", {', '.join(disturbed)} disturbed" if disturbed else ""
-        text = f"{number} of {len(order)} taken: {taken}{harm}"
-        yield _without(step, gone, taken, moves[-1] if moves else {}), text
-
-
-Lift = tuple[str, list[dict[str, Array]], tuple[str, ...]]
-"""What is taken, how far each object has moved (4, 4) by id in each picture, and what was disturbed."""
-
-
-def _lifts_in_physics(
-    scene: SimulatedScene, order: Sequence[TakeStep], bodies: Mapping[str, str], config: Config
-) -> Iterator[Lift]:
-    """Take the scene apart in physics; the extracted shapes move as the bodies they stand for do."""
-    names = list(scene.object_bodies.values())
-    began = transforms.invert(_transforms(poses_of(scene)))
-    for taken in dismantle(scene, order, bodies, config):
-        film = taken.film
-        if taken.body is not None:
-            film = film[film[:, names.index(taken.body), 2] < ASIDE / 2.0]
-        moves = [_transforms(state) @ began for state in film]
-        moves_by_id = [{i: T[names.index(body)] for i, body in bodies.items()} for T in moves]
-        yield taken.step.object_id, moves_by_id, taken.disturbed
-
-
-def _lifts_as_ordered(order: Sequence[TakeStep]) -> Iterator[Lift]:
-    """Take objects straight up by half a metre, where there is no physics to ask."""
-    rising = [transforms.rigid(np.eye(3), (0.0, 0.0, height)) for height in np.linspace(0.0, 0.5, 8)[1:]]
-    for taken in order:
-        yield taken.object_id, [{taken.object_id: T} for T in rising], ()
+def _moves(taken: Taken, names: Sequence[str], before: Array) -> list[dict[str, Array]]:
+    """How far the extracted shapes move with the bodies they stand for, until the lifted one is put aside."""
+    film = taken.film
+    if taken.body is not None:
+        film = film[film[:, names.index(taken.body), 2] < ASIDE / 2.0]
+    began = transforms.invert(_transforms(before))
+    moves = [_transforms(state) @ began for state in film]
+    return [{i: T[names.index(body)] for i, body in taken.bodies.items()} for T in moves]
 
 
 def _transforms(state: Array) -> Array:
@@ -376,8 +368,11 @@ def _transforms(state: Array) -> Array:
     )
 
 
-def _without(step: Step, gone: set[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:
-    """A step as it looks while an object is being lifted and others are gone."""
+def _without(step: Step, gone: Collection[str], lifted: str, T_world_world: Mapping[str, Array]) -> Step:
+    """A step as it looks while an object is being lifted and others are gone.
+
+    Shapes that have moved leave their points behind, and so their points are not shown.
+    """
     graph, cloud, still = step.graph, step.cloud, np.eye(4)
     objects = tuple(
         replace(o, shape=o.shape.moved(T_world_world.get(o.id, still)))
@@ -390,7 +385,7 @@ def _without(step: Step, gone: set[str], lifted: str, T_world_world: Mapping[str
         if not {s.supporter, s.supported} & {lifted, *gone}
     )
     moved = {i for i, T in T_world_world.items() if np.abs(T - still).max() > 2e-3}
-    away = [o.label for o in graph.objects if o.id in gone | moved]
+    away = [o.label for o in graph.objects if o.id in {*gone, *moved}]
     if away and cloud.labels is not None:
         cloud = cloud.select(~np.isin(cloud.labels, away))
     shown = replace(graph, objects=objects, supports=supports)
