@@ -7,7 +7,7 @@ import json
 import platform
 import zipfile
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -37,8 +37,8 @@ AGAIN: Final = "run caryatid again"
 """Remedy for a broken file of a run."""
 PACKAGES = ("caryatid", "mujoco", "numpy", "scipy", "numba", "shapely")
 """Packages whose versions run.json records."""
-PARTS = {"cloud": Cloud, "sphere": ViewSphere, "view": View, "candidates": Candidates, "decision": Decision}
-"""The parts of a step that hold arrays."""
+PARTS = (View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture, RobotPose, Change, TakeStep)
+"""Classes that a step is made of."""
 
 
 class RunWriter(StagedFolder):
@@ -326,31 +326,31 @@ def _summary(step: Step) -> dict[str, Any]:
 
 
 def _encoded(step: Step) -> bytes:
-    """Content of step.npz: arrays are members named `part.field`, the rest is in the member `document`."""
-    arrays: dict[str, NDArray[Any]] = {"labels": step.labels, "visited": step.visited}
-    names = ("index", "name", "timings", "angle_travelled", "path_travelled", "stop")
-    document: dict[str, Any] = {name: getattr(step, name) for name in names}
-    for part, kind in PARTS.items():
-        others: dict[str, Any] = {}
-        for key, name in _names(part, kind).items():
-            value = getattr(getattr(step, part), name, None)
-            if isinstance(value, np.ndarray):
-                arrays[key] = value
-            elif value is not None:
-                others[name] = value
-        if part == "decision" and others:
-            document[part] = others
-        elif part != "view":
-            document |= {f"{part}.{name}": value for name, value in others.items()}
-    for name in ("cloud.points", "cloud.normals"):
-        arrays[name] = arrays[name].astype(np.float32)
-    if step.robot is not None:
-        document["robot"] = step.robot
-    if step.changes:
-        document["changes"] = step.changes
-    if step.lift is not None:
-        document["lift"] = step.lift
-    arrays["document"] = np.frombuffer(json.dumps(document, default=_plain).encode(), dtype=np.uint8)
+    """Content of step.npz: a step as JSON in the member `document`, and each larger array as a member."""
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def encoded(value: Any, path: str) -> Any:
+        match value:
+            case np.ndarray() if 0 < value.size <= 16 and value.dtype == np.float64:
+                return {"$array": value.tolist()}
+            case np.ndarray():
+                arrays[path] = value
+                return {"$array": path}
+            case np.generic():
+                return value.item()
+            case Mapping():
+                return {key: encoded(item, f"{path}.{key}") for key, item in value.items()}
+            case tuple():
+                return [encoded(item, f"{path}.{number}") for number, item in enumerate(value)]
+        if isinstance(value, PARTS):
+            members = {f.name: getattr(value, f.name) for f in fields(value) if f.init}
+            return {"$kind": type(value).__name__} | encoded(members, path)
+        return value
+
+    step = _with_cloud(step, np.float32)
+    names = [f.name for f in fields(step) if f.name != "graph"]
+    document = json.dumps({name: encoded(getattr(step, name), name) for name in names})
+    arrays["document"] = np.frombuffer(document.encode(), dtype=np.uint8)
     buffer = io.BytesIO()
     # Higher levels of compression take longer and save little.
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
@@ -366,47 +366,33 @@ def _read_step(folder: Path) -> Step:
     with read_errors(path, remedy):
         content = path.read_bytes()
     try:
-        stored: dict[str, Any] = dict(np.load(io.BytesIO(content), allow_pickle=False))
-        stored |= json.loads(stored.pop("document").tobytes())
-        return _decoded(stored | {"graph": read_graph(folder / "graph.json")})
+        arrays = dict(np.load(io.BytesIO(content), allow_pickle=False))
+        document = json.loads(arrays.pop("document").tobytes())
+        step = Step(**_decoded(document, arrays), graph=read_graph(folder / "graph.json"))
+        return _with_cloud(step, np.float64)
     except Exception as error:  # a damaged archive raises almost anything
         raise InputError(path, f"is not a step of a run ({' '.join(str(error).split())})", remedy) from error
 
 
-def _decoded(stored: dict[str, Any]) -> Step:
-    """The step with its graph and the content of step.npz."""
-    for name in ("cloud.points", "cloud.normals"):
-        stored[name] = stored[name].astype(np.float64)
-    if "view.depth" in stored:
-        stored["view.name"] = stored["name"]
-    for name, value in stored.get("decision", {}).items():
-        stored[f"decision.{name}"] = value
-        if name == "points_of_interest":
-            points = (_with_arrays(point) | {"subject": tuple(point["subject"])} for point in value)
-            stored[f"decision.{name}"] = tuple(PointOfInterest(**point) for point in points)
-        elif name == "waypoints":
-            stored[f"decision.{name}"] = tuple(Posture(**_with_arrays(posture)) for posture in value)
-    for part, kind in PARTS.items():
-        given = {name: stored.pop(key) for key, name in _names(part, kind).items() if key in stored}
-        stored[part] = kind(**given) if given else None
-    if "robot" in stored:
-        posture = Posture(**_with_arrays(stored["robot"]["posture"]))
-        stored["robot"] = RobotPose(**_with_arrays(stored["robot"]) | {"posture": posture})
-    stored["changes"] = tuple(Change(**change) for change in stored.get("changes", ()))
-    if "lift" in stored:
-        stored["lift"] = TakeStep(**stored["lift"] | {"hold": tuple(stored["lift"]["hold"])})
-    return Step(**stored)
+def _decoded(value: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """Rebuild what `_encoded` wrote."""
+    match value:
+        case {"$array": str(name)}:
+            return arrays[name]
+        case {"$array": numbers}:
+            return np.array(numbers)
+        case {"$kind": kind, **members}:
+            (part,) = (part for part in PARTS if part.__name__ == kind)
+            return part(**_decoded(members, arrays))
+        case dict():
+            return {key: _decoded(item, arrays) for key, item in value.items()}
+        case list():
+            return tuple(_decoded(item, arrays) for item in value)
+    return value
 
 
-def _names(part: str, kind: Any) -> dict[str, str]:
-    """Keys of a part in step.npz, and their fields."""
-    return {f"{part}.{f.name.removesuffix('_world')}": f.name for f in fields(kind) if f.init}
-
-
-def _plain(value: Any) -> Any:
-    """Convert what JSON does not know: arrays, NumPy's scalars and dataclasses."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else asdict(value)
-
-
-def _with_arrays(given: dict[str, Any]) -> dict[str, Any]:
-    return {key: np.array(value) if isinstance(value, list) else value for key, value in given.items()}
+def _with_cloud(step: Step, dtype: type[np.floating[Any]]) -> Step:
+    """The step with points and normals of another precision."""
+    cloud = step.cloud
+    points_world, normals_world = cloud.points_world.astype(dtype), cloud.normals_world.astype(dtype)
+    return replace(step, cloud=replace(cloud, points_world=points_world, normals_world=normals_world))
