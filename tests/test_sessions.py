@@ -165,7 +165,7 @@ def test_undo_goes_back_view_by_view(begun, views, graph_after):
         for left in (2, 1, 0):
             assert session.undo() == left
             assert graph_text(session.graph) == graph_after(*range(left))
-        with pytest.raises(SessionConflictError, match="no views to take back"):
+        with pytest.raises(SessionConflictError, match="no views to remove"):
             session.undo()
         for number, view in enumerate(reversed(views)):
             assert session.add(view).number == number
@@ -336,7 +336,7 @@ def test_a_second_writer_is_refused_and_a_reader_is_not(begun, views):
         with Session.open(begun, read_only=True) as reader:
             assert graph_text(reader.graph) == graph_text(session.graph)
             for change in (reader.undo, lambda: reader.add(views[2])):
-                with pytest.raises(InputError, match="read only"):
+                with pytest.raises(InputError, match="read-only"):
                     change()
         session.add(views[2])
     with Session.open(begun) as session:

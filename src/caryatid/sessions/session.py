@@ -3,10 +3,10 @@
     DIR/session.json           settings, seed, planner and robot
     DIR/views/NNNNNN/          one view: its images, and camera.json; the record
     DIR/reports/NNNNNN.json    an object that the robot took away or moved, after so many views
-    DIR/state/NNNNNN.pickle    the scene after so many views and reports; a cache, which may go at any time
+    DIR/state/NNNNNN.pickle    the scene after so many views and reports; a cache, which may be deleted
     DIR/lock                   locked by the process that writes
 
-A view's folder appears whole, once it is on the disk, by a rename, and goes by one; so does a report.
+A rename adds a view's folder, complete and on disk, and a rename removes it; the same goes for a report.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import json
 import pickle
 from base64 import b64encode
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from os import PathLike
@@ -69,7 +69,7 @@ KNOWN: Final = {
     ("numpy._core.multiarray", "scalar"),
     ("numpy._core.numeric", "_frombuffer"),
 }
-"""What a snapshot may name besides classes of caryatid, so that a session from elsewhere runs no code."""
+"""What a snapshot may contain besides classes of caryatid, so that a session from elsewhere runs no code."""
 
 
 class SessionConflictError(InputError):
@@ -164,7 +164,7 @@ class Moved:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Report:
-    """What the robot said it did to an object.
+    """What the robot reports it did to an object.
 
     Attributes:
         object: Its id.
@@ -180,8 +180,8 @@ class Report:
         """Return the content of its file."""
         return (json.dumps(asdict(self), default=np.ndarray.tolist) + "\n").encode()
 
-    def tell(self, scene: Scene) -> None:
-        """Let a scene know.
+    def apply(self, scene: Scene) -> None:
+        """Update a scene with it.
 
         Raises:
             InputError: It has no such object.
@@ -199,9 +199,8 @@ Event = CameraRecord | Report
 class Session:
     """A scene model in a folder; `begin` or `open` one.
 
-    A view that has been added stays, whatever happens to this process, the machine or its power: it is on
-    the disk before `add` returns; so is a report before `take` does. There is one writer at a time; others
-    may read meanwhile.
+    A view is on disk before `add` returns, and a report before `take` returns, so no crash or power failure
+    loses it. There is one writer at a time; others may read meanwhile.
 
     Attributes:
         path: The folder.
@@ -260,20 +259,20 @@ class Session:
             folder.mkdir(parents=True, exist_ok=True)
             taken = any(p.name not in ("views", "lock") and p.name[0] != "." for p in folder.iterdir())
         path = folder / "session.json"
-        lock = None if taken else _locked(folder / "lock")
-        try:
-            if lock is None or path.exists():
-                reason = "already holds a session or other files"
-                raise SessionConflictError(folder, reason, "use that session, or give a new folder")
+        conflict = "already holds a session or other files", "use that session, or give a new folder"
+        if taken:
+            raise SessionConflictError(folder, *conflict)
+        with ExitStack() as failure:
+            lock = failure.enter_context(_locked(folder / "lock"))
+            if path.exists():
+                raise SessionConflictError(folder, *conflict)
             with write_errors(folder):
                 (folder / "views").mkdir(exist_ok=True)
             write_file(path, beginning.to_json().encode(), durable=True)
             sync(folder.resolve().parent)
-            return cls(folder, beginning, lock)
-        except BaseException:
-            if lock is not None:
-                lock.release()
-            raise
+            session = cls(folder, beginning, lock)
+            failure.pop_all()
+            return session
 
     @classmethod
     def open(cls, path: str | PathLike[str], *, read_only: bool = False) -> Session:
@@ -289,13 +288,12 @@ class Session:
         """
         folder = Path(path)
         beginning = Beginning.read(folder / "session.json")
-        lock = None if read_only else _locked(folder / "lock")
-        try:
-            return cls(folder, beginning, lock)
-        except BaseException:
-            if lock is not None:
-                lock.release()
-            raise
+        if read_only:
+            return cls(folder, beginning, None)
+        with ExitStack() as failure:
+            session = cls(folder, beginning, failure.enter_context(_locked(folder / "lock")))
+            failure.pop_all()
+            return session
 
     def __enter__(self) -> Self:
         return self
@@ -304,7 +302,7 @@ class Session:
         self.close()
 
     def close(self) -> None:
-        """Let others write."""
+        """Release the lock, so that others may write."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None
@@ -324,7 +322,7 @@ class Session:
         return self.scene.graph
 
     def add(self, view: View | Capture, number: int | None = None) -> Added:
-        """Add a view; when this returns, it is on the disk.
+        """Add a view; when this returns, it is on disk.
 
         Args:
             view: A view, or one that is not decoded yet. Only the first one may lack a pose.
@@ -358,11 +356,11 @@ class Session:
         return self._added()
 
     def take(self, object_id: str, T: ArrayLike | None = None) -> SupportGraph:
-        """Report that the robot took an object away, or moved it; when this returns, that is on the disk.
+        """Report that the robot took an object away or moved it; when this returns, the report is on disk.
 
         Args:
             object_id: Id of the object.
-            T: Rigid transform (4, 4) of the world that moved it; None = it is gone.
+            T: Rigid transform (4, 4) of the world that moved it; None = it was taken away.
 
         Returns:
             The graph without it, or with it where it is now.
@@ -373,7 +371,7 @@ class Session:
         self._check_writable()
         report = Report(object_id, self.views, None if T is None else as_rigid(T, "T"))
         scene = self.scene.copy()
-        report.tell(scene)
+        report.apply(scene)
         graph_text(scene.graph)
         with write_errors(self.path):
             (self.path / "reports").mkdir(exist_ok=True)
@@ -383,7 +381,7 @@ class Session:
         return self.graph
 
     def _keep(self, event: Event, scene: Scene) -> None:
-        """Go on with a scene that knows of an event, which is on the disk."""
+        """Continue with a scene that was updated with an event, which is on disk."""
         self._events.append(event)
         self.scene = scene
         self._write_snapshot(scene, self._events)
@@ -434,7 +432,7 @@ class Session:
         """
         self._check_writable()
         if not self._events:
-            raise SessionConflictError(self.path, "has no views to take back", "add one first")
+            raise SessionConflictError(self.path, "has no views to remove", "add one first")
         left = self._events[:-1]
         scene = self._after(left)
         if isinstance(self._events[-1], Report):
@@ -452,7 +450,7 @@ class Session:
 
     def _check_writable(self) -> None:
         if self._lock is None:
-            raise InputError(self.path, "is closed, or open to be read only", "open it again to change it")
+            raise InputError(self.path, "is closed or read-only", "open it again to change it")
 
     def _check_alike(self, view: View) -> None:
         """Refuse a view without labels or with unexpected ones, or of another camera than the first's."""
@@ -489,7 +487,7 @@ class Session:
         remedy = "take this report and all later ones out of the session's folder"
         reports = [parse_json(Report, read_json(path, remedy), path, remedy) for path in files]
         events: list[Event] = []
-        # What another process reports of views that it has added meanwhile is left to the next reader.
+        # Reports of views that another process has just added are left to the next reader.
         for number in range(len(records) + 1):
             events += [report for report in reports if report.after == number]
             events += records[number : number + 1]
@@ -509,7 +507,7 @@ class Session:
         scene = scene or Scene(b.settings, segmentation=b.segmentation, seed=b.seed)
         for number, event in enumerate(events[done:], start=done):
             if isinstance(event, Report):
-                event.tell(scene)
+                event.apply(scene)
             else:
                 scene.update(self._decoded(_given(scene)))
             if self._lock is not None:
@@ -567,7 +565,7 @@ def _locked(path: Path) -> FileLock:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Makes nothing but arrays and objects of caryatid."""
+    """Restores only arrays and objects of caryatid."""
 
     def find_class(self, module: str, name: str) -> Any:
         known = (module, name) in KNOWN
