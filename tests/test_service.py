@@ -178,7 +178,7 @@ NOT_BEGUN = (
     ({"name": "b", "settings": {"voxels": {"size": 1e-6}}}, 422, "voxels"),
     ({"name": "b", "settings": {"active": {"sphere_points": 10**6}}}, 422, "sphere_points"),
     ({"name": "b", "settings": {"fit": {"hypotheses": 10**20}}}, 422, "fit.hypotheses"),
-    ({"name": "b", "settings": {"robot": {"cell": 1e-5}}}, 422, "more than tenfold away"),
+    ({"name": "b", "settings": {"robot": {"cell": 1e-5}}}, 422, "by more than a factor of ten"),
     ({"name": "b", "settings": {"recording": {"max_pixels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "settings": {"voxels": {"max_voxels": 10**9}}}, 422, "a limit of the service"),
     ({"name": "b", "seed": -1}, 422, "seed"),
@@ -316,7 +316,7 @@ def test_a_port_that_is_taken_is_said_in_one_line(tmp_path, capsys):
         port = taken.getsockname()[1]
         assert run_command("serve", tmp_path / "s", "--port", port) == 1
     said = capsys.readouterr().err
-    assert said.startswith(f"error: 127.0.0.1:{port}: cannot be listened at (address already in use")
+    assert said.startswith(f"error: 127.0.0.1:{port}: cannot listen there (address already in use")
     assert said.count("\n") == 1
 
 

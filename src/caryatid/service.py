@@ -1,7 +1,7 @@
-"""Sessions over HTTP, for robot software that lives elsewhere: `caryatid serve`.
+"""Sessions over HTTP, for robot software elsewhere: `caryatid serve`.
 
-One thread works on the sessions, one request after the other. A view uses all cores in compiled loops, and
-not every threading layer of numba allows two threads at once, so more threads would gain nothing.
+One thread handles the requests in turn. A view already uses all cores in compiled loops, and not every
+threading layer of numba allows two threads at once, so more threads would gain nothing.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ from caryatid.sessions.session import Added, SessionConflictError
 
 
 class FullError(CaryatidError):
-    """Too many requests are waiting."""
+    """The service takes nothing more at present."""
 
 
 class MissingError(CaryatidError):
-    """There is no session of that name."""
+    """There is no session of this name."""
 
 
 STATUS: dict[type[Exception], int] = {
@@ -61,17 +61,17 @@ STATUS: dict[type[Exception], int] = {
     OSError: 503,
     MemoryError: 503,
 }
-"""Status of each error; 422, the input cannot be used, for all others."""
+"""Status of each error; all others are 422: the input cannot be used."""
 
 PATIENCE = 30.0
-"""Time that a request's body may take to arrive [s]: 16 MB at half a megabyte per second."""
+"""Maximum time for a request's body to arrive [s]: 16 MB at half a megabyte per second."""
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]{0,63}$")]
 SessionName = Annotated[Name, PathParameter(description="Name of the session")]
 
 
 class Document(BaseModel):
-    """A JSON object with these keys only."""
+    """A JSON object with no other keys."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -85,9 +85,9 @@ class Problem(Document):
 class SessionOptions(Document):
     """Options of a new session."""
 
-    name: Name = Field(description="Its name")
+    name: Name = Field(description="Name of the session")
     segmentation: SegmentationMethod | None = Field(
-        None, description="Where segments come from; null = labels where the first view has them"
+        None, description="Source of segments; null = labels if the first view has them"
     )
     seed: int = Field(0, ge=0, le=2**63 - 1, description="Seed of every random choice")
     planner: str = Field("support", description="Planner of the next view")
@@ -111,9 +111,9 @@ class SessionAnswer(SessionOptions):
 
 
 class NewView(Document):
-    """A view; its images are files in base64."""
+    """A view, with its images as files in base64."""
 
-    camera: CameraRecord = Field(description="Where it was taken, and with what")
+    camera: CameraRecord = Field(description="Camera and pose of the view")
     depth: Base64Bytes = Field(description="16-bit PNG, or .npy (H, W) of floats in metres; 0 = no reading")
     rgb: Base64Bytes | None = Field(None, description="PNG, JPEG, or .npy (H, W, 3) of uint8")
     labels: Base64Bytes | None = Field(
@@ -122,7 +122,7 @@ class NewView(Document):
     number: int | None = Field(
         None,
         ge=0,
-        description="Expected number of the view, from 0; a view that is already there is not added again",
+        description="Expected number of the view, from 0; the last view is not added a second time",
     )
 
     def capture(self) -> Capture:
@@ -141,21 +141,21 @@ class ViewAnswer(Document):
     T_world_camera: list[list[float]] | None = Field(
         description="Pose [m] after registration, or null while the view waits"
     )
-    note: str | None = Field(description="That the view waits for one that shows the table top, or null")
+    note: str | None = Field(description="Why the view is waiting, or null")
     graph: dict[str, Any] = Field(description="graph.json")
 
 
 class NewReport(Document):
-    """What the robot did to an object: T (4, 4) moved it, or it is gone."""
+    """What the robot did to an object."""
 
     object: str = Field(description="Its id")
     T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = Field(
-        None, description="Rigid transform (4, 4) of the world [m] that moved it; null = it was taken"
+        None, description="Rigid transform (4, 4) of the world [m] that moved it; null = it was taken away"
     )
 
 
 class Known(Document):
-    """What is known after a change."""
+    """The session after a change."""
 
     views: int = Field(description="Number of views")
     graph: dict[str, Any] = Field(description="graph.json")
@@ -173,7 +173,7 @@ class Waypoint(Document):
 
     platform: list[float] = Field(description="x, y, yaw [m, m, rad]")
     camera_height: float = Field(description="Over the floor [m]")
-    gaze: Gaze = Field(description="How the head turns")
+    gaze: Gaze = Field(description="Direction of the head")
     joints: list[float] | None = Field(description="Joint positions of an arm, or null if unknown")
 
 
@@ -183,12 +183,12 @@ class NextAnswer(Document):
     view: int = Field(description="Number of the next view, from 0")
     T_world_camera: list[list[float]] = Field(description="Pose [m], OpenCV camera frame, world z up")
     candidate: int = Field(description="Index among the candidates")
-    platform: list[float] | None = Field(description="x, y, yaw [m, rad]; null with candidates")
+    platform: list[float] | None = Field(description="x, y, yaw [m, m, rad]; null with candidates")
     camera_height: float | None = Field(description="Over the floor [m]; null with candidates")
-    gaze: Gaze | None = Field(description="How the head turns; null with candidates")
+    gaze: Gaze | None = Field(description="Direction of the head; null with candidates")
     joints: list[float] | None = Field(description="Joint positions of an arm, or null if unknown")
     waypoints: list[Waypoint] = Field(
-        description="The way there, from where the robot is; straight in between; empty with candidates"
+        description="Postures on the way there, with straight lines in between; empty with candidates"
     )
     expected_gain: float = Field(description="Saliency s of eq. 3")
     cost: float = Field(description="Cost h of the path, eq. 3")
@@ -198,13 +198,13 @@ class NextAnswer(Document):
 
 
 class SessionPool:
-    """The sessions in one folder. Threads other than the pool's own call only `do`.
+    """The sessions in one folder. Call only `do` from threads other than the pool's own.
 
     Args:
-        folder: Holds the sessions, each in a folder of its name.
+        folder: Folder of the sessions; each has a subfolder of its name.
         config: Settings of new sessions.
-        open_sessions: Maximum number kept open; beyond it, the least recently used one is closed.
-        waiting: Maximum number of requests waiting, including the one in work.
+        open_sessions: Maximum number kept open; the least recently used one is closed first.
+        waiting: Maximum number of requests, waiting or in work.
     """
 
     def __init__(self, folder: Path, config: Config, open_sessions: int, waiting: int) -> None:
@@ -219,18 +219,18 @@ class SessionPool:
         self._worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="sessions")
 
     async def __aexit__(self, *error: object) -> None:
-        """Finish the waiting requests, and close the sessions."""
+        """Finish the waiting requests and close the sessions."""
         self._worker.shutdown()
         self._close_all_but(0)
 
     async def do(self, work: Callable[[], Any]) -> Any:
-        """Run work on the sessions in the pool's thread, after all work that is waiting.
+        """Run work on the sessions in the pool's thread, after all earlier work.
 
         Raises:
             FullError: Too many requests are waiting.
         """
         if self._waiting >= self._max_waiting:
-            raise FullError(f"{self._waiting} requests wait already; try again")
+            raise FullError(f"{self._waiting} requests are already waiting; try again")
         self._waiting += 1
         try:
             return await asyncio.get_running_loop().run_in_executor(self._worker, work)
@@ -245,21 +245,21 @@ class SessionPool:
         """Begin a session; the options are those of `Session.begin`.
 
         Raises:
-            InputError: There is one of that name, or a setting is beyond what a client may ask for.
+            InputError: The name is taken, or a setting exceeds what a client may ask for.
             FullError: There are too many sessions, or the disk is full.
         """
         _check_limits(self.config, config)
         self._check_room()
         if len(self.names()) >= self.config.session.max_sessions:
-            reason = f"there are {self.config.session.max_sessions} sessions"
-            raise FullError(f"{reason}, the limit session.max_sessions of this service")
+            most = self.config.session.max_sessions
+            raise FullError(f"this service has {most} sessions, its limit session.max_sessions")
         return self._opened(name, Session.begin(self.folder / name, config, **options))
 
     def session(self, name: str) -> Session:
         """Return a session, opened from disk if needed.
 
         Raises:
-            MissingError: There is none of that name.
+            MissingError: There is no session of this name.
             SessionBusyError: Another process has it open.
         """
         if name in self._open:
@@ -302,7 +302,7 @@ PROBLEMS: dict[int | str, dict[str, Any]] = {
 """Answers to requests that fail, by their status."""
 
 BEARER = HTTPBearer(auto_error=False, description="The token the service was started with")
-"""Where requests carry their token."""
+"""How requests send their token."""
 
 
 def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: str = "127.0.0.1") -> FastAPI:
@@ -310,16 +310,16 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
 
     Args:
         pool: The sessions; started and stopped with the application.
-        token: Token that requests need; None = only this machine may connect, without one.
+        token: Token that requests must send; None = only this machine may connect.
         max_request: Maximum size of a request [bytes].
-        host: Address it listens at.
+        host: Address it listens on.
     """
     app = FastAPI(
         title="caryatid",
         summary="Sessions of active vision: views in, support graph and next view out",
         version=version("caryatid"),
         lifespan=lambda app: pool,
-        docs_url=None,  # they load scripts from elsewhere; /openapi.json says the same
+        docs_url=None,  # these pages load scripts from elsewhere; /openapi.json says the same
         redoc_url=None,
         max_body_size=max_request,
         responses=PROBLEMS,
@@ -327,7 +327,7 @@ def make_app(pool: SessionPool, *, token: str | None, max_request: int, host: st
     )
     app.add_middleware(Gate, token=token)
     if token is None:
-        # Refuse pages from elsewhere that a browser on this machine shows: they name another host.
+        # Refuse requests of foreign pages in a browser on this machine: they name another host.
         local = ["127.0.0.1", "localhost", "[::1]", host]
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=local)
     for kind in (CaryatidError, RequestValidationError, OSError, MemoryError):
@@ -382,7 +382,7 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.post("/sessions/{name}/reports", status_code=201, response_model=Known)
     @queued
     def report_change(name: SessionName, given: NewReport) -> Any:
-        """Report an object that was taken away or moved; when this answers, it is on the disk and stays."""
+        """Report an object that was taken away or moved; when this answers, the report is on disk."""
         session = pool.session(name)
         graph = session.take(given.object, given.T)
         return {"views": session.views, "graph": graph_to_json(graph)}
@@ -390,40 +390,40 @@ def _add_pages(app: FastAPI, pool: SessionPool) -> None:
     @app.delete("/sessions/{name}/views/last", response_model=Known)
     @queued
     def undo_view(name: SessionName) -> Any:
-        """Take the last view back, or the report after it."""
+        """Remove the last view, or the report after it."""
         session = pool.session(name)
         return {"views": session.undo(), "graph": graph_to_json(session.graph)}
 
     @app.get("/sessions/{name}/graph")
     @queued
-    def tell_graph(name: SessionName) -> dict[str, Any]:
+    def get_graph(name: SessionName) -> dict[str, Any]:
         """Return the support graph, graph.json."""
         return graph_to_json(pool.session(name).graph)
 
     @app.get("/sessions/{name}/next", response_model=NextAnswer)
     @queued
-    def tell_next(name: SessionName) -> Any:
+    def get_next_view(name: SessionName) -> Any:
         """Choose the next view for the session's robot."""
         return pool.session(name).next().to_json()
 
     @app.post("/sessions/{name}/next", response_model=NextAnswer)
     @queued
-    def choose_next(name: SessionName, given: Reachable) -> Any:
+    def choose_next_view(name: SessionName, given: Reachable) -> Any:
         """Choose the next view among those that your robot reaches."""
         return pool.session(name).next(given.T_world_camera, given.path_length).to_json()
 
 
 class Gate:
-    """Checks the token and limits the time of the body, before a request is read.
+    """Checks the token before a request is read, and limits the time for its body to arrive.
 
     Args:
         app: The application behind it.
-        token: Token that requests need, or None.
+        token: Token that requests must send, or None.
     """
 
     def __init__(self, app: ASGIApp, token: str | None) -> None:
         self._app = app
-        self._borne = None if token is None else f"Bearer {token}".encode()
+        self._bearer = None if token is None else f"Bearer {token}".encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Let a request through, or answer 401."""
@@ -431,7 +431,7 @@ class Gate:
             await self._app(scope, receive, send)
             return
         sent = dict(scope["headers"]).get(b"authorization", b"")
-        if self._borne is not None and not secrets.compare_digest(sent, self._borne):
+        if self._bearer is not None and not secrets.compare_digest(sent, self._bearer):
             problem = {"detail": "the token is missing or wrong"}
             await JSONResponse(problem, 401, {"WWW-Authenticate": "Bearer"})(scope, receive, send)
             return
@@ -448,32 +448,32 @@ class Gate:
 
 
 class PatientProtocol(H11Protocol):
-    """HTTP whose keep-alive time also limits the headers of a request, so that half requests end."""
+    """HTTP whose keep-alive time also limits the headers of a request, so that incomplete requests end."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for the first request."""
+        """Start the timer of the first request."""
         super().connection_made(transport)
         wait, close = self.timeout_keep_alive, self.timeout_keep_alive_handler
         self.timeout_keep_alive_task = self.loop.call_later(wait, close)
 
     def data_received(self, data: bytes) -> None:
-        """Receive bytes; the timer stops at a whole request, while uvicorn's own stops at any byte."""
+        """Receive bytes; the timer stops at a complete request, while uvicorn's own stops at any byte."""
         self.conn.receive_data(data)
         self.handle_events()
 
 
 def _check_limits(own: Config, asked: Config) -> None:
-    """Refuse settings of a client that lift the limits of the service, or are far from its own.
+    """Refuse a client's settings that lift the limits of the service or are far from its own.
 
     Raises:
-        InputError: A setting of the service itself is changed, or another more than tenfold.
+        InputError: A limit of the service is changed, or another setting by more than a factor of ten.
     """
     for stage, values in asdict(asked).items():
         for name, value in values.items():
             before = getattr(getattr(own, stage), name)
             if value == before:
                 continue
-            remedy = "leave it to those who run the service"
+            remedy = "only those who run the service can change it"
             if stage == "session" or name in ("max_voxels", "max_pixels"):
                 raise InputError(f"{stage}.{name}", "is a limit of the service", remedy)
             given, ours = np.ravel(value), np.ravel(before)
@@ -482,18 +482,18 @@ def _check_limits(own: Config, asked: Config) -> None:
             given, ours = np.abs(given), np.abs(ours)
             smallest, largest = ours[ours > 0].min() / 10.0, 10.0 * ours.max()
             if len(given) > 10 * len(ours) or ((given > 0) & ((given < smallest) | (given > largest))).any():
-                reason = f"is more than tenfold away from this service's {before}"
+                reason = f"differs from this service's {before} by more than a factor of ten"
                 raise InputError(f"{stage}.{name}", reason, remedy)
 
 
 async def _refuse(folder: Path, request: Request, error: Exception) -> Response:
-    """Say in one sentence what does not fit, without the data sent or the place of the sessions."""
+    """Answer with the error in one sentence, without the data sent or the path of the sessions."""
     status = next((code for kind, code in STATUS.items() if isinstance(error, kind)), 422)
     text = in_one_line(error)
     if isinstance(error, RequestValidationError):
         first = error.errors()[0]
         text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-    # Names in a request may hold half characters, which no answer can.
+    # Names in a request may hold lone surrogates, which an answer cannot.
     text = text.replace(f"{folder}/", "").replace(str(folder), "its folder")
     detail = " ".join(text.encode("utf-8", "replace").decode().splitlines())
     return JSONResponse({"detail": detail}, status, {"Retry-After": "1"} if status == 503 else None)
@@ -506,20 +506,24 @@ def check_token(host: str, token: str | None) -> None:
         InputError: There is none, or it is too short to be safe.
     """
     if token is not None and len(token) < 16:
-        raise InputError("--token", "has fewer than 16 characters", "give a longer one that nobody can guess")
+        raise InputError("--token", "has fewer than 16 characters", "give a longer one that is hard to guess")
     try:
         local = ipaddress.ip_address(host).is_loopback
     except ValueError:
         local = host == "localhost"
     if token is None and not local:
-        reason = f"{host} can be reached from elsewhere, and there is no token"
-        raise InputError("--host", reason, "set CARYATID_TOKEN, or serve at 127.0.0.1")
+        reason = f"{host} can be reached from other machines, and there is no token"
+        raise InputError("--host", reason, "set CARYATID_TOKEN, or serve on 127.0.0.1")
 
 
 def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], None]) -> None:
-    """Serve until Ctrl-C or SIGTERM, and answer all earlier requests; port 0 = any free one.
+    """Serve until Ctrl-C or SIGTERM, then answer all earlier requests.
 
-    `listening` is called with the address.
+    Args:
+        app: The application.
+        host: Address to listen on.
+        port: Port; 0 = any free one.
+        listening: Called with the address of the service.
 
     Raises:
         InputError: The address is taken.
@@ -528,22 +532,16 @@ def run_service(app: FastAPI, host: str, port: int, listening: Callable[[str], N
     try:
         listener = socket.create_server((host, port), family=family)
     except (OSError, OverflowError) as error:
-        reason = f"cannot be listened at ({(getattr(error, 'strerror', None) or str(error)).lower()})"
+        reason = f"cannot listen there ({(getattr(error, 'strerror', None) or str(error)).lower()})"
         raise InputError(f"{host}:{port}", reason, "choose another --port or --host") from None
-    server = uvicorn.Server(
-        uvicorn.Config(
-            app,
-            http=PatientProtocol,
-            log_level="warning",
-            access_log=False,
-            limit_concurrency=64,  # with the size of a request, this limits the memory in use
-        )
-    )
+    # With the maximum size of a request, the number of connections limits the memory in use.
+    limits: dict[str, Any] = {"http": PatientProtocol, "limit_concurrency": 64}
+    server = uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False, **limits))
 
     def stop(number: int, frame: object) -> None:
         server.should_exit = True
 
-    # The server handles signals itself while it runs, and passes them on when it has stopped.
+    # The server handles signals itself while it runs, and forwards them once it has stopped.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
     listening(f"http://{f'[{host}]' if ':' in host else host}:{listener.getsockname()[1]}")
