@@ -200,11 +200,14 @@ class Explorer:
             CaryatidError: As `look`.
         """
         watch = Stopwatch()
-        source = self._captured() if given is None else given
-        if self._masks is not None and isinstance(source, View):
-            source = self._masks(source)
+        if given is None:
+            if self._camera is None:
+                raise PlanningError("there is no camera; pass the view to look()")
+            given = self._camera.capture(self._moving().T_world_camera)
+        if self._masks is not None and isinstance(given, View):
+            given = self._masks(given)
         watch.lap("capture")
-        for taken in self.scene.updates(source):
+        for taken in self.scene.updates(given):
             self.step = self._step(taken, watch.laps["capture"])
             yield self.step
 
@@ -231,7 +234,7 @@ class Explorer:
         return Step(
             scene.views - 1, source.name, view, scene.labels, scene.graph, scene.cloud, sphere, visited,
             None, None, {"capture": captured} | scene.timings, angle, path, None,
-            None if robot is None else _robot_pose(robot, scene.config),
+            self._robot_pose(),
             tuple(change for change in scene.changes if change.view == scene.views - 1),
         )  # fmt: skip
 
@@ -327,14 +330,16 @@ class Explorer:
         path = self._moving().move_to(step.decision.T_world_camera)
         self.step = replace(step, path_travelled=step.path_travelled + path)
 
-    def _captured(self) -> View:
-        if self._camera is None:
-            raise PlanningError("there is no camera; hand the view to look()")
-        return self._camera.capture(self._moving().T_world_camera)
-
     def _state(self, candidates: Candidates) -> PlanningState:
         step = self._newest()
         return replace(_state(self.scene, step.sphere, step.visited, candidates), goal=self.goal)
+
+    def _robot_pose(self) -> RobotPose | None:
+        robot, footprint = self.robot, self.scene.config.robot.footprint
+        posture = None if robot is None else robot.solve(robot.T_world_camera)
+        if robot is None or not isinstance(posture, Posture):
+            return None
+        return RobotPose(posture, robot.T_world_camera, footprint, isinstance(robot, ArmRobot))
 
     def _moving(self) -> Robot:
         if self.robot is None:
@@ -518,10 +523,3 @@ def _state(scene: Scene, sphere: ViewSphere, visited: Array, candidates: Candida
     if scene.voxels is None:
         raise PlanningError("nothing has been seen yet; update the scene with a first view")
     return PlanningState(scene.graph, sphere, scene.voxels, visited, candidates, scene.config.active)
-
-
-def _robot_pose(robot: Robot, config: Config) -> RobotPose | None:
-    posture = robot.solve(robot.T_world_camera)
-    if not isinstance(posture, Posture):
-        return None
-    return RobotPose(posture, robot.T_world_camera, config.robot.footprint, isinstance(robot, ArmRobot))

@@ -145,7 +145,10 @@ class RunWriter(StagedFolder):
             self.write(path, content)
         self.files = {}
         # A kill may leave files of the next view that nothing refers to.
-        files = self.written | (_next_files(len(self._views)) if "unfinished" in more else set())
+        files, following = self.written, len(self._views)
+        if "unfinished" in more:
+            names = ("graph.json", "labels.png", "view.json", "step.npz")
+            files = files | {lift_file(following)} | {f"{_view_folder(following)}/{name}" for name in names}
         self.write("run.json", json_text(document | {"files": sorted(files)}).encode())
         self.publish()
 
@@ -278,12 +281,6 @@ def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
         return None
     record = read_json(folder / "run.json")
     return read_run(folder) if record.get("unfinished") and about.items() <= record.items() else None
-
-
-def _next_files(index: int) -> set[str]:
-    """Possible files of a view."""
-    names = ("graph.json", "labels.png", "view.json", "step.npz")
-    return {lift_file(index)} | {f"{_view_folder(index)}/{name}" for name in names}
 
 
 def lift_file(index: int) -> str:

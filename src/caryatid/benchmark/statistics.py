@@ -88,7 +88,10 @@ def _compare(
                 figures += _against(own, known[reference])
             if gap is not None and method not in gap and set(gap) <= set(known):
                 ends = (own, *(known[end] for end in gap))
-                closed = bootstrap([frame["f1"] for frame in ends], _gap_closed)
+                closed = bootstrap(
+                    [frame["f1"] for frame in ends],
+                    lambda f1, low, high: np.where(high == low, np.nan, (f1 - low) / (high - low)),
+                )
                 figures += _named([("gap", view) for view in own["f1"].columns], closed)
         yield from ((method, figure) for figure in figures)
 
@@ -230,11 +233,6 @@ def _sums(forecasts: Sequence[Sequence[float]]) -> Array:
     binned = [np.bincount(bins, of, BINS) for of in (np.ones(len(bins)), said, true)]
     squares = ((said - true) ** 2).sum(), ((by_certain - true) ** 2).sum()
     return np.concatenate([[len(table) - len(said), *squares], *binned])
-
-
-def _gap_closed(own: Array, low: Array, high: Array) -> Array:
-    """Share of the gap (…, V) between two methods' F1 that another one's closes."""
-    return np.where(high == low, np.nan, (own - low) / (high - low))
 
 
 def _paths(f1: Array, path: Array) -> Array:

@@ -92,7 +92,8 @@ class OraclePlanner:
         candidates = state.candidates
         tried = spread_out(candidates.directions, state.visited, self._config.oracle.candidates)
         tried = np.union1d(tried, SupportPlanner().plan(state, rng).index)
-        unseen = np.array([self._unseen_surface(candidates.T_world_camera[i]) for i in tried])
+        shown = [self._surface(candidates.T_world_camera[i]) for i in tried]
+        unseen = np.array([len(np.setdiff1d(cells, self._shown, assume_unique=True)) for cells in shown])
         # Best tie first: then the first of the highest F1 is chosen, and nothing beats F1 = 1.
         order = np.lexsort((tried, candidates.path_length[tried], -unseen))
         best, reached = int(order[0]), -1.0
@@ -135,11 +136,6 @@ class OraclePlanner:
 
     def _f1(self, graph: SupportGraph) -> float:
         return score(graph, self._truth, config=self._config.evaluation).f1
-
-    def _unseen_surface(self, T_world_camera: Array) -> int:
-        """Cells of true surface that become visible from there."""
-        cells = self._surface(T_world_camera)
-        return len(cells) - int(np.isin(cells, self._shown, assume_unique=True).sum())
 
     def _surface(self, T_world_camera: Array) -> NDArray[np.int64]:
         """Cells (N,) of the objects' true surface seen from there, each a number for object and place."""

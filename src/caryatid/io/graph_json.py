@@ -107,11 +107,16 @@ def graph_to_json(graph: SupportGraph) -> dict[str, Any]:
     Returns:
         Plain dicts, lists, texts and numbers.
     """
+    objects = []
+    for o in graph.objects:
+        item = {key.name: getattr(o, key.name, None) for key in fields(_Object)}
+        item |= {"shape": o.shape.kind, "T_world_object": o.shape.T_world_object, "size": o.shape.size}
+        objects.append({key: value for key, value in item.items() if value is not None})
     document: dict[str, Any] = {
         "format": "caryatid/graph",
         "version": 1,
         "frame": "world, z up, metres",
-        "objects": [_object_to_json(o) for o in graph.objects],
+        "objects": objects,
         "supports": [
             {key.removesuffix("_world"): value for key, value in asdict(s).items() if value is not None}
             for s in graph.supports
@@ -183,9 +188,3 @@ def read_graph(path: str | Path) -> SupportGraph:
         InputError: The file is missing, broken or not a graph; see `graph_from_json`.
     """
     return graph_from_json(read_json(Path(path)), Path(path))
-
-
-def _object_to_json(o: SceneObject) -> dict[str, Any]:
-    item = {key.name: getattr(o, key.name, None) for key in fields(_Object)}
-    item |= {"shape": o.shape.kind, "T_world_object": o.shape.T_world_object, "size": o.shape.size}
-    return {key: value for key, value in item.items() if value is not None}

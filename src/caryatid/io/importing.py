@@ -157,13 +157,16 @@ def choose_views(
     """
     if T_world_camera is None:
         return [int(np.argmax(sharpness))], dict(+Counter({SPARE: len(times) - 1}))
-    sharp = sharpness >= config.sharp_share * _most_around(times, sharpness, config.sharp_window)
+    first = np.searchsorted(times, times - config.sharp_window, side="left")
+    stop = np.searchsorted(times, times + config.sharp_window, side="right")
+    sharpest = [sharpness[a:b].max() for a, b in zip(first, stop, strict=True)]
+    sharp = sharpness >= config.sharp_share * np.array(sharpest)
     candidates = np.flatnonzero(sharp)
     chosen: list[int] = []
     free = np.ones(len(candidates), dtype=np.bool_)
     while free.any():
-        first = int(np.argmax(free))
-        soon = free & (times[candidates] <= times[candidates[first]] + config.sharp_window)
+        earliest = times[candidates[np.argmax(free)]]
+        soon = free & (times[candidates] <= earliest + config.sharp_window)
         best = candidates[soon][np.argmax(sharpness[candidates[soon]])]
         chosen.append(int(best))
         free &= _apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
@@ -210,13 +213,6 @@ def _turned(frame: Frame, T: Array) -> Frame:
 
     assert frame.T_world_camera is not None
     return replace(frame, load=load, T_world_camera=T @ frame.T_world_camera)
-
-
-def _most_around(times: Array, values: Array, window: float) -> Array:
-    """Largest value (N,) within `window` seconds of each time, either way."""
-    first = np.searchsorted(times, times - window, side="left")
-    stop = np.searchsorted(times, times + window, side="right")
-    return np.array([values[a:b].max() for a, b in zip(first, stop, strict=True)])
 
 
 def _apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig) -> Array:

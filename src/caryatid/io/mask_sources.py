@@ -138,7 +138,9 @@ class OnnxMasks:
         if view.rgb is None:
             raise InputError(view.name, "has no colour image, which the model needs", "record colour")
         height, width = self._size or view.depth.shape
-        given = {"image": _resized(view.rgb, height, width).transpose(2, 0, 1)[None] / np.float32(255.0)}
+        image = Image.fromarray(view.rgb).resize((width, height), Image.Resampling.BILINEAR)
+        rgb = np.asarray(image, dtype=np.float32) / np.float32(255.0)
+        given = {"image": rgb.transpose(2, 0, 1)[None]}
         if "xyz" in self._inputs:
             xyz = view.points_camera.astype(np.float32)
             given["xyz"] = xyz[_pixels((height, width), view.depth.shape)].transpose(2, 0, 1)[None]
@@ -176,10 +178,3 @@ class OnnxMasks:
 def _pixels(size: tuple[int, ...], of: tuple[int, ...]) -> tuple[NDArray[np.intp], ...]:
     """Rows and columns that make an image of a size (H, W) of one of another, by nearest neighbours."""
     return np.ix_(*(np.arange(n) * m // n for n, m in zip(size, of, strict=True)))
-
-
-def _resized(rgb: NDArray[np.uint8], height: int, width: int) -> NDArray[np.float32]:
-    image = Image.fromarray(rgb)
-    if rgb.shape[:2] != (height, width):
-        image = image.resize((width, height), Image.Resampling.BILINEAR)
-    return np.asarray(image, dtype=np.float32)

@@ -115,7 +115,10 @@ class Lifting:
         watched = state[:, 2] < ASIDE / 2.0
         watched[index] = False
         data = self._data(state, [*held, index])
-        lifted = self._rise(data, watched, index) / config.speed
+        # Up until the object's lowest point is 2 cm above all others.
+        low, _ = self._span(data, index)
+        tops = [self._span(data, int(k))[1] for k in np.flatnonzero(watched)]
+        lifted = (max(max(tops, default=low) - low, 0.0) + 0.02) / config.speed
         disturbed = np.zeros(len(state), dtype=np.bool_)
         film: list[Array] = []
         for speed, seconds in ((config.speed, lifted), (0.0, config.watch)):
@@ -127,7 +130,10 @@ class Lifting:
                 if not to_the_end and (at_rest or disturbed.any()):
                     return Lift(disturbed, np.array(film))
             if speed > 0.0:
-                self._put_aside(data, index)
+                # Out of the way, at rest.
+                place = np.array([0.0, 0.0, ASIDE + index])
+                data.qpos[self._qpos[index, :3]] = data.mocap_pos[self._hand[index]] = place
+                data.qvel[self._qvel[index]] = 0.0
         return Lift(disturbed, np.array(film))
 
     def _data(self, state: Array, grasped: Collection[int]) -> Any:
@@ -140,12 +146,6 @@ class Lifting:
         data.eq_active[self._weld[[*grasped, *aside]]] = True
         mujoco.mj_kinematics(self.model, data)
         return data
-
-    def _put_aside(self, data: Any, index: int) -> None:
-        """Put an object out of the way, at rest; changes the data."""
-        place = np.array([0.0, 0.0, ASIDE + index])
-        data.qpos[self._qpos[index, :3]] = data.mocap_pos[self._hand[index]] = place
-        data.qvel[self._qvel[index]] = 0.0
 
     def _after(self, data: Any, speed: float, seconds: float, index: int = 0) -> Array:
         """Simulate for some time [s] while one hand goes up [m/s]; return the objects' new state."""
@@ -163,12 +163,6 @@ class Lifting:
         mujoco.mj_setState(model, data, states[0, -1], _STATE)
         data.mocap_pos[self._hand[index], 2] = path[0, -1, height]
         return np.array(data.qpos[self._qpos])
-
-    def _rise(self, data: Any, watched: NDArray[np.bool_], index: int) -> float:
-        """Height [m] at which an object's lowest point is 2 cm above all others."""
-        low, _ = self._span(data, index)
-        tops = [self._span(data, int(k))[1] for k in np.flatnonzero(watched)]
-        return max(max(tops, default=low) - low, 0.0) + 0.02
 
     def _span(self, data: Any, index: int) -> tuple[float, float]:
         """Heights [m] of an object's lowest and highest point: of the boxes around its geoms."""
