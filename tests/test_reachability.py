@@ -85,7 +85,7 @@ class TestReachabilityMap:
         (lambda joints: gantry(joints)[:-1], LIMITS, 10, r"returned shape \(0, 4, 4\)"),
         (lambda joints: 2.0 * gantry(joints), LIMITS, 10, "last row"),
         (lambda joints: gantry(joints) * np.array([-1.0, 1.0, 1.0, 1.0]), LIMITS, 10, "not a rotation"),
-        (lambda joints: np.full((len(joints), 4, 4), np.nan), LIMITS, 10, "no posture possible"),
+        (lambda joints: np.full((len(joints), 4, 4), np.nan), LIMITS, 10, "NaN for every posture"),
     ],
 )
 def test_what_cannot_be_sampled_is_refused(forward, limits, count, message):

@@ -1,4 +1,4 @@
-"""Robots that carry the camera: `find_robot` finds their makers by name."""
+"""Robots that carry the camera, found by name with `find_robot`."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ HUMANOID = "humanoid"
 """The robot of the paper, and the default."""
 
 ARM = "arm:"
-"""Prefix of a name that continues with the file of a map."""
+"""Prefix of a name that ends with the file of a reachability map."""
 
 ENTRY_POINTS = "caryatid.robots"
-"""Group under which other packages offer robots: callables that make one for `Surroundings`."""
+"""Group of entry points of other packages' robots: callables that make one for `Surroundings`."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -63,7 +63,7 @@ RobotMaker = Callable[[Surroundings], Robot]
 
 
 def offered() -> dict[str, EntryPoint]:
-    """Robots of other packages by name; a name of ours stays ours."""
+    """Robots of other packages by name; they cannot replace the humanoid."""
     return {r.name: r for r in entry_points(group=ENTRY_POINTS) if r.name != HUMANOID}
 
 
@@ -75,7 +75,7 @@ def find_robot(name: str) -> RobotMaker:
             another package offers.
 
     Raises:
-        InputError: There is none of this name, its file is bad, or its module cannot be imported.
+        InputError: There is no such robot, its file is broken, or its module cannot be imported.
     """
     if name == HUMANOID:
         from caryatid.robots.humanoid import HumanoidRobot
@@ -97,7 +97,7 @@ def find_robot(name: str) -> RobotMaker:
     try:
         maker: RobotMaker = point.load()
     except (ImportError, AttributeError, ValueError) as error:
-        remedy = "give module:callable of Python's path"
+        remedy = "give a module:callable that Python can import"
         raise InputError("robot", f"'{point.value}' cannot be imported ({error})", remedy) from None
     return maker
 

@@ -1,4 +1,4 @@
-"""An arm with a camera in its hand: which views of its sphere the hand reaches, and with which roll."""
+"""An arm with a camera in its hand: the views of its sphere that it reaches, and their rolls."""
 
 from __future__ import annotations
 
@@ -37,20 +37,19 @@ REASONS = (
 """Why a view is refused; the first that applies counts."""
 
 UNCONFIRMED = "the arm cannot go there on a closer look"
-"""Why a view that seemed within reach is refused."""
+"""Why `confirm` refuses a view."""
 
 RADIUS_SHARE = 0.65
-"""Share of the views within reach on the best of these spheres that is enough for a larger one [1]; from
-farther away a view shows more of the table, and the nearest spheres show too little of it.
-"""
+"""A larger sphere is taken with at least this share of the most views that any sphere has in reach [1]: from
+farther away, a view shows more of the table."""
 
 
 class ArmRobot(SimulatedRobot, OwnViews):
     """A fixed arm, in simulation or as the model of a real one.
 
-    The views of its sphere look at the centre. Each is tried level first and then rolled about the optical
-    axis, nearest to level first, because a rolled image shows the same and a wrist seldom holds a camera
-    level everywhere; the candidate is the pose with the first roll that the hand reaches.
+    The views of its sphere look at the centre. Each is tried level and then with increasing roll about the
+    optical axis, because a rolled image shows the same and few wrists hold a camera level everywhere. The
+    candidate has the first roll that the hand reaches.
 
     The path to a view is the straight line between the camera's positions. Between two views of one sphere
     that is its diameter times sin(α/2), α the angle at the centre: the cost of eq. 3 of the paper.
@@ -58,15 +57,14 @@ class ArmRobot(SimulatedRobot, OwnViews):
     For a real arm: inherit, move the arm in `move_to`, and then call `move_to` of this class.
 
     Args:
-        reachable: Which poses the hand can bring the camera to, in the frame of the arm's base: your own
-            inverse kinematics, or a `ReachabilityMap`. It need not consider the table.
-        T_world_base: Where the base is (4, 4).
+        reachable: Which camera poses the hand reaches, in the frame of the arm's base: your own inverse
+            kinematics, or a `ReachabilityMap`. It need not consider the table.
+        T_world_base: Pose of the base (4, 4).
         config: Radii to choose among, rolls, clearance over the table.
-        confirm: Says whether the arm can go to one pose (4, 4) in the frame of the base. It is called for a
-            chosen view, and if it says no, another one is chosen: for slow but exact inverse kinematics, or
-            a motion planner, behind a coarse map. Instead of yes it may return the joint positions (J,),
-            which the waypoints then hold, and instead of no None; `reachable` has none. Without it,
-            `reachable` decides.
+        confirm: Says whether the arm can go to one pose (4, 4) in the frame of the base, for exact inverse
+            kinematics or a motion planner behind a coarse map. It is called for a chosen view; on False or
+            None another one is chosen. Instead of True it may return the joint positions (J,), which the
+            waypoints then hold. Without it, `reachable` decides.
         centre_world: Centre (3,) of its view sphere [m], or None for the middle of the table top.
         furniture: Walls that block views, or None.
         T_world_camera: Camera pose (4, 4), or None before the first move, which has path length 0.
@@ -101,21 +99,20 @@ class ArmRobot(SimulatedRobot, OwnViews):
     def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
         """Choose the largest radius with about as many views within reach as any other.
 
-        The points of the sphere are spread evenly in the frame of the base, so the arm has the same views
-        wherever it and its table stand.
+        Its points are spread evenly in the frame of the base, so the arm has the same views wherever it
+        stands with its table.
         """
         centre = proposed.centre_world if self._centre is None else self._centre
         if self._sphere is None or not np.array_equal(self._sphere.centre_world, centre):
-            self._sphere = self._sphere_around(
-                centre, self._radius_around(centre), self._config.sphere_points
-            )
+            radius, count = self._radius_around(centre), self._config.sphere_points
+            self._sphere = self._sphere_around(centre, radius, count)
         return self._sphere
 
     def solve(self, T_world_camera: Array) -> Posture | Unreachable:
-        """Return the arm's posture with its camera at a pose (4, 4), with its roll, or why there is none.
+        """Return the arm's posture with its camera at a pose (4, 4), roll included, or why there is none.
 
-        The platform of the posture is the base; its yaw and pitch are where the camera looks. Joint
-        positions are known if `confirm` gave them.
+        The platform of the posture is the base; its yaw and pitch are the camera's. Joint positions are known
+        if `confirm` returned them.
         """
         T = transforms.as_rigid(T_world_camera, "T_world_camera")
         if not self._reaches(T[None])[0]:
@@ -146,7 +143,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return views.from_elsewhere(straight_lengths(self._T_world_camera, views.T_world_camera))
 
     def confirm(self, T_world_camera: Array) -> Unreachable | None:
-        """Check in detail whether the arm can go to a candidate (4, 4); None = it can."""
+        """Ask `confirm` whether the arm can go to a candidate (4, 4); None = it can."""
         if self._confirm is None:
             return None
         answer = self._confirm(transforms.invert(self.T_world_base) @ T_world_camera)
@@ -157,7 +154,7 @@ class ArmRobot(SimulatedRobot, OwnViews):
         return None
 
     def _posture_of(self, T_world_camera: Array) -> Posture:
-        """The posture at a pose (4, 4), with the joint positions `confirm` gave for it last."""
+        """The posture at a pose (4, 4), with the joint positions that `confirm` last returned for it."""
         base_yaw = float(np.arctan2(*self.T_world_base[[1, 0], 0]))
         posture = posture_at(T_world_camera, np.array([*self.T_world_base[:2, 3], base_yaw]))
         T_confirmed, joints = self._confirmed
@@ -207,9 +204,6 @@ class ArmRobot(SimulatedRobot, OwnViews):
         """Ask which poses (N, 4, 4) the hand reaches (N,)."""
         answer = np.asarray(self._reachable(transforms.invert(self.T_world_base) @ T_world_camera))
         if answer.shape != (len(T_world_camera),) or answer.dtype != np.bool_:
-            raise InputError(
-                "reachable",
-                f"returned {answer.dtype} of shape {answer.shape} for {len(T_world_camera)} poses",
-                f"return bool of shape ({len(T_world_camera)},)",
-            )
+            reason = f"returned {answer.dtype} of shape {answer.shape} for {len(T_world_camera)} poses"
+            raise InputError("reachable", reason, f"return bool of shape ({len(T_world_camera)},)")
         return answer

@@ -1,4 +1,4 @@
-"""The robot's floor: where its platform may stand, path lengths, and what walls hide."""
+"""The robot's floor: where its platform may stand, path lengths, and walls that block views."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from caryatid.geometry.transforms import Array
 from caryatid.support.stability import ground_outline
 
 STEP = 0.02
-"""Anything on the floor lower than this is not an obstacle to the platform [m]."""
+"""Anything lower than this on the floor is not an obstacle to the platform [m]."""
 
 TABLE_MARGIN = 0.1
-"""Furniture this near to the view sphere's centre is the table, not a wall in the line of sight [m]."""
+"""Furniture this close to the view sphere's centre is the table, not a wall in the line of sight [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class FloorGrid:
     """A grid over the floor, indexed [row along y, column along x].
 
     Attributes:
-        free: Cells (H, W) in which the platform's centre may be anywhere: its footprint meets no obstacle.
+        free: Cells (H, W) where the platform's footprint meets no obstacle, wherever in the cell it stands.
         origin_world: Corner (2,) of cell [0, 0], x and y [m].
         cell: Edge of a cell [m].
         furniture: Static boxes, for lines of sight.
@@ -119,7 +119,7 @@ class FloorGrid:
         return FloorPaths(self, start, int(cell), first_leg + between)
 
     def hidden(self, eyes_world: Array, target_world: Array) -> NDArray[np.bool_]:
-        """Test which eyes (N, 3) [m] have furniture between themselves and a target (3,) [m]."""
+        """Which eyes (N, 3) [m] have furniture between them and a target (3,) [m]."""
         blocked = np.zeros(len(eyes_world), dtype=np.bool_)
         ray_world = target_world - eyes_world
         length = np.linalg.norm(ray_world, axis=-1)
@@ -174,7 +174,7 @@ class FloorPaths:
     to_centres: Array
 
     def lengths(self, points_world: Array) -> Array:
-        """Length (N,) [m] of the path to each of some points (N, 2+): straight within the first cell."""
+        """Path length (N,) [m] to each point (N, 2+); straight within the first cell."""
         points = points_world[:, :2]
         cells, _ = self.grid.cells(points)
         last_leg = np.linalg.norm(points - self.grid.centres(cells), axis=-1)
@@ -182,7 +182,7 @@ class FloorPaths:
         return np.where(cells == self.cell, straight, self.to_centres[cells] + last_leg)
 
     def corners(self, point_world: Array) -> Array:
-        """Corners (C, 2) [m] of the path to a point (2+,), with both ends; few among equal paths."""
+        """Corners (C, 2) [m] of the path to a point (2+,), with both ends; a path of few corners."""
         end_world = point_world[None, :2]
         (cell,), _ = self.grid.cells(end_world)
         if cell == self.cell:

@@ -1,4 +1,4 @@
-"""Which camera poses a humanoid can reach, its postures there, and the path lengths."""
+"""A humanoid: the camera poses it reaches, its postures there, and path lengths."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
     def waypoints(self, T_world_camera: Array) -> tuple[Posture, ...]:
         """Return its way to a pose (4, 4): corners of the shortest path, turning and lifting evenly.
 
-        The platform's straight lines between them are as long as the path.
+        The straight lines between the platform's places are as long as the path.
 
         Raises:
             PlanningError: The pose cannot be reached.
@@ -115,7 +115,7 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         return float(np.linalg.norm(np.diff(driven, axis=0), axis=-1).sum())
 
     def _reach(self, T_world_camera: Array) -> tuple[Indices, Array, Array, Array]:
-        """Find how to stand for poses (N, 4, 4), trying head yaws from straight ahead outwards.
+        """Find how to stand for poses (N, 4, 4); head yaws are tried from straight ahead outwards.
 
         Returns:
             Index of the reason or −1 (N,), platform (N, 3), head yaw (N,) and head pitch (N,).
@@ -155,16 +155,16 @@ class HumanoidRobot(SimulatedRobot, OwnViews):
         return code, platform_world, yaws[best], pitch
 
     def _standing(self, eyes_world: Array, yaw: Array) -> Indices:
-        """How well (N,) the platform stands with a yaw (N,), from 0 outside the floor to 3."""
+        """How well (N,) the platform stands with a yaw (N,): 0 off the floor, 1 in an obstacle, 2 cut off."""
         cell, inside = self._floor.cells(eyes_world[:, :2] - self._forward(yaw))
         free = self._floor.free.ravel()[cell] & inside
         return inside.astype(np.intp) + free + (free & self._reached[cell])
 
     def _forward(self, yaw: Array) -> Array:
-        """How far (N, 2) [m] the camera stands before the platform's centre with a yaw (N,)."""
+        """Offset (N, 2) [m] of the camera from the platform's centre with a yaw (N,)."""
         return self._config.camera_forward * np.stack([np.cos(yaw), np.sin(yaw)], axis=-1)
 
 
 def _wrapped(angle: Array) -> Array:
-    """Angles (...) [rad] as from −π to π."""
+    """Angles (...) [rad] wrapped to [−π, π)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi

@@ -1,4 +1,4 @@
-"""The `Robot` protocol, its answers, and a base of simulated robots."""
+"""The `Robot` protocol, and a base class of simulated robots."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Unreachable:
-    """No posture.
+    """A pose that the robot cannot reach.
 
     Attributes:
-        reason: Why, for a person to read.
+        reason: Why, in words for people.
     """
 
     reason: str
 
 
 class Robot(Protocol):
-    """Carries the camera; a robot with views of its own is an `OwnViews` too."""
+    """Carries the camera. A robot that chooses its own views also inherits `OwnViews`."""
 
     @property
     def T_world_camera(self) -> Array:
@@ -62,7 +62,7 @@ class OwnViews:
     def view_sphere(self, proposed: ViewSphere) -> ViewSphere:
         """Return the sphere of this robot's views: radius, centre and points.
 
-        Equal arguments give the same sphere, and so does its own answer as the argument.
+        Equal arguments give the same sphere. Its own result as the argument gives that result again.
 
         Args:
             proposed: The sphere of the settings around the middle of the table top.
@@ -76,7 +76,7 @@ class OwnViews:
     def waypoints(self, T_world_camera: Array) -> Sequence[Posture]:
         """Return the postures on the way to a pose (4, 4), with both ends and straight lines in between.
 
-        None at all = only the posture there is known, from `solve`.
+        An empty sequence = only the posture at the pose is known, from `solve`.
         """
         return ()
 
@@ -95,7 +95,7 @@ class SimulatedRobot(Robot):
             PlanningError: It has no pose yet.
         """
         if self._T_world_camera is None:
-            raise PlanningError("the robot is nowhere yet; move it to a first view")
+            raise PlanningError("the robot has no pose yet; move it to a first view")
         return self._T_world_camera
 
     def _posture_at(self, T_world_camera: Array) -> Posture:
@@ -110,7 +110,7 @@ class SimulatedRobot(Robot):
         return posture
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
-        """Take a posture of `solve`; return the path length [m] from the previous one."""
+        """Move to a posture from `solve`; return the path length [m] from the previous one."""
         return float(straight_lengths(self._T_world_camera, T_world_camera))
 
     def move_to(self, T_world_camera: Array) -> float:
@@ -161,7 +161,7 @@ def waypoints_of(robot: Robot | None, T_world_camera: Array) -> tuple[Posture, .
     """Postures of a robot on the way to a pose (4, 4); only the posture there if it gives no others."""
     if robot is None:
         return ()
-    if isinstance(robot, OwnViews) and (told := robot.waypoints(T_world_camera)):
-        return tuple(told)
+    if isinstance(robot, OwnViews) and (waypoints := robot.waypoints(T_world_camera)):
+        return tuple(waypoints)
     posture = robot.solve(T_world_camera)
     return (posture,) if isinstance(posture, Posture) else ()

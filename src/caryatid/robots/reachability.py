@@ -1,4 +1,4 @@
-"""Reachability of an arm's camera: a map of positions, directions and rolls, sampled from its joints."""
+"""Reachability of an arm's camera: a map of positions, directions and rolls, sampled over its joints."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ REMEDY = "sample it again and write it with write_reachability"
 class ReachabilityMap:
     """Cells, directions and rolls in which an arm can hold its camera.
 
-    A cell and a direction have one byte, and each of its bits is an eighth of a turn about the optical axis.
-    A pose is reached if its own roll is.
+    Each cell and direction has one byte, whose bits are eighths of a turn about the optical axis. A pose is
+    reached if the bit of its roll is set.
 
     Attributes:
         reached: Rolls (X, Y, Z, D) uint8 by cell and by the nearest of D directions all over the sphere.
         origin_base: Lowest corner (3,) of the cells in the frame of the base [m].
         cell: Edge of a cell [m].
-        fresh: Share of the last tenth of the samples that were the first in their cell and direction [1];
-            about this share of the arm's reach is missing in the map.
+        fresh: Share of the last tenth of the samples that were the first in their cell and direction [1]:
+            about the share of the arm's reach that the map lacks.
     """
 
     reached: NDArray[np.uint8]
@@ -66,7 +66,7 @@ def sample_reachability(
     rng: np.random.Generator,
     config: ArmConfig | None = None,
 ) -> ReachabilityMap:
-    """Map the reach of an arm's camera, from postures drawn evenly between the limits of its joints.
+    """Map the reach of an arm's camera from postures drawn uniformly between its joint limits.
 
     Args:
         forward: Forward kinematics up to the camera's optical frame (x right, y down, z forward): with the
@@ -97,7 +97,7 @@ def sample_reachability(
         held.append(np.column_stack([cells, *bins.of(T_base_camera)]))
     places, early = np.concatenate(held), sum(map(len, held[:-1]))
     if len(places) == 0:
-        raise InputError("forward", "holds no posture possible, all are NaN", "check it and the limits")
+        raise InputError("forward", "returns NaN for every posture", "check it and the limits")
     low = np.append(places[:, :3].min(axis=0), 0)
     bits = places[:, 4].astype(np.uint8)
     shape = places[:, :3].max(axis=0) + 1 - low[:3]
@@ -125,14 +125,14 @@ def read_reachability(path: str | os.PathLike[str]) -> ReachabilityMap:
     """Read a map.
 
     Raises:
-        InputError: The file is missing, damaged, something else, or from another version.
+        InputError: The file is missing, damaged, not a map, or of another version.
     """
     file = Path(path)
     with read_errors(file, REMEDY):
         content = file.read_bytes()
     try:
         held = dict(np.load(io.BytesIO(content), allow_pickle=False))
-    except Exception as error:  # a damaged archive makes NumPy raise one of half a dozen kinds
+    except Exception as error:  # NumPy raises many kinds of error for a damaged archive
         raise InputError(file, f"is not a readable .npz: {error}", REMEDY) from None
     if str(held.get("format")) != FORMAT:
         raise InputError(file, f"is not a reachability map, its format is not '{FORMAT}'", REMEDY)
@@ -171,12 +171,11 @@ class _Bins:
 
 
 def _checked_poses(T_base_camera: ArrayLike, count: int) -> Array:
-    """Poses (M, 4, 4) of the postures that are possible."""
+    """Poses (M, 4, 4) of the possible postures."""
     poses = np.asarray(T_base_camera, dtype=np.float64)
     if poses.shape != (count, 4, 4):
-        raise InputError(
-            "forward", f"returned shape {poses.shape} for {count} postures", f"return ({count}, 4, 4)"
-        )
+        reason = f"returned shape {poses.shape} for {count} postures"
+        raise InputError("forward", reason, f"return ({count}, 4, 4)")
     poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     R = poses[:, :3, :3]
     skewed = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2)) + 2.0 * (np.linalg.det(R) < 0.0)

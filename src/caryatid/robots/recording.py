@@ -30,7 +30,7 @@ class RecordingRobot(SimulatedRobot):
         self._used: list[int | None] = [0]
 
     def _index_of(self, T_world_camera: Array) -> int | None:
-        """Which recorded view has this pose (4, 4) to 1 mm and 1 mrad; of several the first not used yet."""
+        """Recorded view with this pose (4, 4), to 1 mm and 1 mrad; of several, the first unused one."""
         same = np.flatnonzero(np.abs(self._recorded - T_world_camera).max(axis=(1, 2)) <= 1e-3).tolist()
         return min(same, key=lambda i: (i in self._used, i), default=None)
 
@@ -56,7 +56,7 @@ class RecordingRobot(SimulatedRobot):
         return Candidates(poses, sphere.direction_of(poses), lengths, rejected)
 
     def _go(self, posture: Posture, T_world_camera: Array) -> float:
-        """The straight distance to a recorded view [m], which is then used."""
+        """Mark a recorded view as used, and return the straight distance to it [m]."""
         self._used.append(self._index_of(T_world_camera))
         return super()._go(posture, T_world_camera)
 
@@ -73,9 +73,8 @@ class RecordingCamera:
 
     def __init__(self, recording: Dataset) -> None:
         if len(recording) > 1 and not recording.has_poses:
-            raise InputError(
-                recording.path, "has several frames without poses", "add cam_R_w2c and cam_t_w2c to each"
-            )
+            remedy = "add cam_R_w2c and cam_t_w2c to each"
+            raise InputError(recording.path, "has several frames without poses", remedy)
         self._recording = recording
 
     def capture(self, T_world_camera: Array) -> View:
