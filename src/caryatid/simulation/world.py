@@ -374,21 +374,19 @@ def add_body(
 
 
 def _outline(scene: SimulatedScene, geom: int) -> Array:
-    """Points (N, 3) [m] whose convex hull is a geom, to 1 % if it is round."""
+    """Points (N, 3) [m] whose convex hull is a geom; a round one to half a percent, with its volume."""
     shape, model, size = _primitive(scene, geom), scene.model, scene.model.geom_size[geom]
     if shape is not None:
         return shape.outline()
-    ball = fibonacci_sphere(400)
+    ball = 1.0048 * fibonacci_sphere(400)  # so that its convex hull has the volume of a ball of radius 1
     match model.geom_type[geom]:
         case _GEOM.mjGEOM_ELLIPSOID:
             points = ball * size
         case _GEOM.mjGEOM_CAPSULE:
             points = ball * size[0] + np.sign(ball[:, 2:]) * (0.0, 0.0, size[1])
         case _GEOM.mjGEOM_MESH:
-            first = model.mesh_vertadr[model.geom_dataid[geom]]
-            points = model.mesh_vert[first : first + model.mesh_vertnum[model.geom_dataid[geom]]].astype(
-                float
-            )
+            mesh = model.mesh(model.geom_dataid[geom])
+            points = model.mesh_vert[mesh.vertadr[0] :][: mesh.vertnum[0]].astype(np.float64)
         case kind:
             body = model.body(model.geom_bodyid[geom]).name
             reason = f"a {_GEOM(kind).name.removeprefix('mjGEOM_').lower()} geom is not a solid shape"
