@@ -97,7 +97,7 @@ def test_planners_take_the_place_of_the_methods_and_an_option_is_no_setting():
         ("random", "random", "pc+sg"),
         ("paper", "paper", "pc+sg"),
     ]
-    with pytest.raises(InputError, match=r"fusion\.method=pc: Every episode has its own; use --fusion"):
+    with pytest.raises(InputError, match=r"fusion\.method=pc: is set for each episode; use --fusion"):
         change_suite(suite, settings=["fusion.method=pc"])
 
 
@@ -113,9 +113,9 @@ def test_folders_of_scenes_are_found(tmp_path):
     assert before != content_of(folders[1])
     (tmp_path / "bridge" / "gt.json").unlink()
     assert content_of(folders[0]) != before
-    with pytest.raises(InputError, match=r"bridge: No gt\.json"):
+    with pytest.raises(InputError, match=r"bridge: has no gt\.json"):
         find_scenes([str(tmp_path)])
-    with pytest.raises(InputError, match=r"Neither a built-in scene nor a folder; give .* tower"):
+    with pytest.raises(InputError, match=r"is neither a built-in scene nor a folder; give .* tower"):
         find_scenes(["castle"])
 
 
@@ -144,7 +144,7 @@ def test_what_is_added_comes_back_and_only_what_is_missing_is_asked_for(tmp_path
         assert store.plan("smoke", twice) == [m.episode for m in members]
         store.add(members[0].episode, Outcome((row(1, 0.1 + 0.2),)))
         store.add(members[1].episode, Outcome((), "no luck"))
-        with pytest.raises(InputError, match="another run is under way; wait for its end"):
+        with pytest.raises(InputError, match="another run is writing to it; wait until it ends"):
             ResultStore(path, "code")
         with ResultStore(path) as reading:
             assert list(reading.suites) == ["smoke"]

@@ -1,4 +1,4 @@
-"""One episode: a scene is explored and every view scored; and the choice of scenes."""
+"""One episode: a scene is explored and every view is scored."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ OrderName = Literal["", "one hand", "two hands", "highest first", "random", "tru
 """Orders of removal; the empty name removes nothing."""
 ORDERS: tuple[OrderName, ...] = tuple(name for name in get_args(OrderName) if name)
 REMOVAL_VIEWS = (1, 3, 5, 10)
-"""Views after which a scene is taken apart, from the scene model at the time."""
+"""Views after which a scene is taken apart, by the scene model at that time."""
 
 Row = dict[str, Any]
 """What was measured after one view: `view` (from 1), `MEASURES`, `counts`, and `forecasts` of its `Score`."""
@@ -46,13 +46,13 @@ probabilities [1]."""
 TIMES = ("planning_seconds", "perception_seconds")
 """Time to choose this view, and from the view to the fused graph [s]; they differ from run to run."""
 MEASURES = (*SCORES, "angle", "path", *TIMES, "unharmed", "lifts")
-"""Scores; travelled on the view sphere [rad] and over the floor [m]; times; and of scenes taken apart whether
+"""Scores; angle on the view sphere [rad] and path length [m]; times; and, for scenes taken apart, whether
 nothing was disturbed (1 or 0) and the share of lifts that disturbed nothing [1]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One run of the loop: with a fingerprint of the code, everything that determines its figures.
+    """One run of the loop: everything that, with the code, determines its figures.
 
     Attributes:
         scene: Name of a built-in scene, or a scene folder.
@@ -83,7 +83,7 @@ class Episode:
     order: OrderName = ""
 
     def key(self, fingerprint: str) -> str:
-        """Digest of the episode and of the code that runs it, wherever a scene's folder lies."""
+        """Digest of the episode and of the code that runs it; a scene's folder counts by its content."""
         known = asdict(self) | ({"scene": ""} if self.content else {})
         return hashlib.sha256(json.dumps([fingerprint, known], sort_keys=True).encode()).hexdigest()
 
@@ -99,7 +99,7 @@ class Outcome:
 def run_episode(episode: Episode) -> Outcome:
     """Run an episode; any error is part of the outcome.
 
-    Unreachable views repeat the last row, because the graph does not change.
+    An episode that ends early repeats its last row, because the graph no longer changes.
     """
     try:
         return Outcome(tuple(_rows(episode)))
@@ -108,7 +108,7 @@ def run_episode(episode: Episode) -> Outcome:
 
 
 def settings_of(episode: Episode) -> Config:
-    """The configuration an episode is run with.
+    """The configuration of an episode.
 
     Raises:
         InputError: A setting does not exist or its value is not valid.
@@ -118,7 +118,7 @@ def settings_of(episode: Episode) -> Config:
 
 
 def find_scenes(sources: Iterable[str]) -> list[str]:
-    """Resolve built-in names, scene folders and folders of scene folders to names and folders, each once.
+    """Resolve built-in names, scene folders and folders of scene folders, each scene once.
 
     Raises:
         InputError: A source is none of these, or a folder holds no scene with its ground truth.
@@ -131,14 +131,14 @@ def find_scenes(sources: Iterable[str]) -> list[str]:
             continue
         if not folder.is_dir():
             remedy = f"give a folder of scenes, or one of {', '.join(list_scenes())}"
-            raise InputError(source, "Neither a built-in scene nor a folder", remedy)
-        scenes = sorted(
-            {f.parent for pattern in (SCENE_FILE, f"*/{SCENE_FILE}") for f in folder.glob(pattern)}
-        )
+            raise InputError(source, "is neither a built-in scene nor a folder", remedy)
+        scenes = sorted(file.parent for file in (*folder.glob(SCENE_FILE), *folder.glob(f"*/{SCENE_FILE}")))
         if not scenes:
-            raise InputError(source, f"No {SCENE_FILE} in it", "give a scene folder or a folder of them")
+            raise InputError(
+                source, f"has no {SCENE_FILE}", "give a scene folder, or a folder of scene folders"
+            )
         if missing := [scene for scene in scenes if not (scene / TRUTH_FILE).is_file()]:
-            raise InputError(missing[0], f"No {TRUTH_FILE} in it", "write the ground truth")
+            raise InputError(missing[0], f"has no {TRUTH_FILE}", "write the ground truth")
         found += map(str, scenes)
     return list(dict.fromkeys(found))
 
@@ -175,13 +175,13 @@ def family(scene: str) -> str:
 
 @lru_cache(maxsize=8)
 def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene]:
-    """Load a scene and its ground truth; cached, because the episodes of a scene run one after the other.
+    """Load a scene and its ground truth; cached, because the episodes of a scene follow each other.
 
     Raises:
         InputError: It cannot be loaded, or its files have another digest than `content`.
     """
     if content and Path(scene).is_dir() and content_of(scene) != content:
-        raise InputError(scene, "its files are not those this run was planned with", "start again")
+        raise InputError(scene, "its files have changed since the run was planned", "start again")
     simulated = load_scene(scene)
     return simulated, true_scene_from_simulation(simulated)
 
@@ -189,7 +189,7 @@ def open_scene(scene: str, content: str = "") -> tuple[SimulatedScene, TrueScene
 def _take_apart(
     scene: SimulatedScene, graph: SupportGraph, truth: TrueScene, order: OrderName, config: Config, seed: int
 ) -> dict[str, float]:
-    """Whether taking a scene apart harms nothing; unextracted objects go last, the highest first."""
+    """Whether taking a scene apart disturbs nothing; unextracted objects go last, highest first."""
     bodies = bodies_of(graph, truth)
     objects = [o for o in graph.objects if o.role == "object"]
     if objects and order in ("one hand", "two hands"):
@@ -241,7 +241,7 @@ def _rows(episode: Episode) -> list[Row]:
 
 
 def _by_graph(ids: Sequence[str], edges: frozenset[tuple[str, str]], bodies: Mapping[str, str]) -> list[str]:
-    """Ids (the highest first) reordered so that objects without remaining loads go first."""
+    """Ids, highest first, reordered so that objects that carry nothing go first."""
     left, done = list(ids), []
     while left:
         carrying = {i for i in left for k in left if (bodies.get(i), bodies.get(k)) in edges}

@@ -1,4 +1,4 @@
-"""The benchmark's figures, drawn from a suite's summary: the same bytes every time."""
+"""The benchmark's figures, drawn from a suite's summary; the same summary gives the same bytes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STYLE = {
     "axes.grid": True, "grid.color": "#e3e6e8", "svg.fonttype": "none", "text.parse_math": False,
     "lines.markersize": 5.0, "legend.frameon": False,
 }  # fmt: skip
-"""matplotlib's settings that differ from its defaults; what users set for themselves has no effect."""
+"""matplotlib settings that differ from its defaults; a user's own settings have no effect."""
 
 Curves = dict[str, "pd.DataFrame"]
 """Label of a method → value, low and high by view."""
@@ -30,7 +30,7 @@ Curves = dict[str, "pd.DataFrame"]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Figure:
-    """A figure: name of its file without a suffix, its caption, and the function that draws it."""
+    """A figure: name of its file without suffix, caption, height [in], and the function that draws it."""
 
     name: str
     caption: str
@@ -50,7 +50,7 @@ class Figure:
 
 
 def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) -> Iterator[Figure]:
-    """Draw the methods under one condition in all its scenes or those of one family.
+    """Draw the methods under one condition, in all scenes or in those of one family.
 
     Args:
         group: Its rows of a suite's summary.
@@ -65,7 +65,7 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
         caption = f"{heading} after each view: mean over {scenes}, with intervals."
         yield _figure(f"{measure} over views {family}", caption, 14, partial(_lines, curves, None, heading))
     if curves and path and measure == "f1":
-        caption = f"{heading} over the path travelled, a mark for each view: mean over {scenes}."
+        caption = f"{heading} over path length, with a mark for each view: mean over {scenes}."
         yield _figure(f"f1 over path {family}", caption, 14, partial(_lines, curves, path, heading))
     if differences := curves_of(group, f"{measure} difference"):
         label = f"{heading} minus that of {reference}"
@@ -76,15 +76,13 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
     shown = {view: curve for view, curve in panels.items() if curve is not None}
     if shown and not family:
         numbers = {view: curves_of(group, f"supports {view}")[reference] for view in shown}
-        caption = (
-            f"Reliability of {reference}: the share of supports with about this probability that is true, "
-            "with intervals. The larger a mark, the more supports. On the line probabilities are right."
-        )
+        caption = f"Reliability of {reference}: share of supports of a probability that are true, with "
+        caption += "intervals. A larger mark stands for more supports. On the line, probabilities are right."
         yield _figure("reliability", caption, 6, partial(_reliability, shown, numbers))
 
 
 def draw_conditions(summary: pd.DataFrame, measure: str, heading: str) -> Figure:
-    """Draw a measure under each condition, the methods below each other."""
+    """Draw a measure under each condition, one method below the other."""
     curves = {
         f"{condition}: {method}": curve
         for condition, group in conditions_of(summary)
@@ -111,12 +109,12 @@ def _figure(name: str, caption: str, rows: int, plot: Callable[[Any], None]) -> 
 
 
 def _lines(curves: Curves, path: Curves | None, label: str, figure: Any) -> None:
-    """Plot a line for each curve, over the views or over the path up to each."""
+    """Plot a line for each curve, over views or path length."""
     axes = figure.subplots()
     for index, (method, curve) in enumerate(curves.items()):
         turn, place = divmod(index, len(COLOURS))
         look = {"color": COLOURS[place], "marker": MARKERS[place], "linestyle": DASHES[turn % len(DASHES)]}
-        # Side by side, so that intervals at the same view do not hide each other.
+        # Side by side, so that intervals of one view do not hide each other.
         at = curve.index + 0.4 * ((index + 0.5) / len(curves) - 0.5)
         errors = {"yerr": _interval(curve)}
         if path is not None:
@@ -129,7 +127,7 @@ def _lines(curves: Curves, path: Curves | None, label: str, figure: Any) -> None
 
 
 def _rows(curves: Curves, label: str, figure: Any, *, zero: bool = False) -> None:
-    """Plot a panel for each of the last views a table has, a row for each curve."""
+    """Plot a panel for up to four views, with a row for each curve."""
     last = max(curve.index.max() for curve in curves.values())
     views = sorted({view for view in (2, 3, 5, 10, last) if view <= last})[-4:]
     panels = figure.subplots(1, len(views), sharex=True, sharey=True, squeeze=False)[0]
@@ -148,7 +146,7 @@ def _rows(curves: Curves, label: str, figure: Any, *, zero: bool = False) -> Non
 
 
 def _reliability(curves: dict[int, pd.DataFrame], numbers: dict[int, pd.DataFrame], figure: Any) -> None:
-    """Plot a panel for each view: share that is true over probability."""
+    """Plot a panel for each view: share of true supports over probability."""
     panels = figure.subplots(1, len(curves), sharex=True, sharey=True, squeeze=False)[0]
     for panel, (view, curve) in zip(panels, curves.items(), strict=True):
         number = numbers[view]["value"]
@@ -158,7 +156,7 @@ def _reliability(curves: dict[int, pd.DataFrame], numbers: dict[int, pd.DataFram
         panel.scatter(curve.index, curve["value"], 12.0 + 100.0 * number / number.sum(), zorder=3, **look)
         panel.set_title(f"view {view}, {number.sum():,.0f} supports", fontsize=9.0)
         panel.set_aspect("equal")
-    panels[0].set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), ylabel="share that is true")
+    panels[0].set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), ylabel="share of true supports")
     figure.supxlabel("probability", fontsize=9.0)
 
 

@@ -1,4 +1,4 @@
-"""A benchmark's report: tables and figures of a suite's summary, as Markdown and as one HTML page of it."""
+"""A benchmark's report: tables and figures of its suites, as Markdown and as one HTML page."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Column = tuple[str, float]
-"""A quantity of the summary and its place."""
+"""A quantity of the summary and its view, threshold or quantile."""
 BY_VIEW = {"f1": "F1", "edge_f1": "F1 of edges", "mean_iou": "Mean IoU", "path": "Path [m]"}
 CALIBRATION = {
     "listed brier": "Brier score of the supports in the graph, all scenes together",
     "brier gain": "How much lower it is than with certain = 1, uncertain = 0.5",
     "calibration error": "Expected calibration error of the supports in the graph",
-    "pooled brier": "Brier score with the true supports that the graph lacks",
+    "pooled brier": "Brier score including the true supports that the graph lacks",
 }
-"""How good probabilities are: quantities with a column for each view, and their headings."""
+"""Quality of probabilities: quantities with a column for each view, and their headings."""
 REMOVAL = {"unharmed": "Scenes taken apart without harm", "lifts": "Lifts without harm"}
 """Measures with a column for each view, and their headings."""
 COUNTS = {("scenes", 0.0): "scenes", ("episodes", 0.0): "episodes", ("failed", 0.0): "failed"}
@@ -55,26 +55,26 @@ TIMES = {
 }
 DIGITS = dict.fromkeys(("path", "median path", "mean path", "path ratio", "gap"), 2)
 DIGITS |= dict.fromkeys(("median views", *(name for name, _ in (*COUNTS, *PAIRED))), 0)
-"""Digits after the point of quantities that have not three."""
+"""Decimals of quantities that do not have three."""
 NOTES = (
     "Means are over scenes; the seeds of a scene are averaged first. In brackets: the {confidence:g} % "
     "interval of the percentile bootstrap over scenes, {resamples:,} resamples; a single scene has none. "
-    "Failed episodes are counted and listed, and are in no mean. An episode that ends before its last "
-    "view keeps what it had.",
-    "Differences are paired: a method minus the one it is compared with, over the scenes and seeds both "
-    "have. Bold: the interval excludes 0.",
-    "Until F1 reaches a threshold: the share of the episodes that ever reach it; the median over all "
-    "episodes of the first view that does, and of the path up to there. An episode that never does counts "
-    "as longer than any other, so the median is “not reached” where half of them do not. “Mean curve” is "
-    "where the curve of mean F1 over mean path first reaches it, straight between views; an end of its "
-    "interval is “not reached” where that many resamples do not reach it.",
-    "F1 along the path: the area under F1 over the path travelled, divided by its length. F1 holds until "
-    "the next view. The length is the median of the methods' mean paths; where an episode ends before, "
-    "its last F1 holds.",
-    "Probabilities are of supports whose ends are both true objects, those of all scenes together. The Brier "
-    "score is the mean of (p − true)², 0 is perfect; a support that the graph lacks has p = 0. The expected "
-    "calibration error is the distance between mean probability and share that is true in each of {bins} "
-    "equal bins of probability, weighted by how many are in it.",
+    "Failed episodes are counted and listed, and enter no mean. An episode that ends early keeps its last "
+    "scores.",
+    "Differences are paired: a method minus the reference, over the scenes and seeds of both. Bold: the "
+    "interval excludes 0.",
+    "Until F1 reaches a threshold: the share of episodes that reach it; the median over all episodes of the "
+    "first view that reaches it, and of the path up to there. An episode that never reaches it counts as "
+    "longer than any other, so the median is “not reached” if half of them never do. “Mean curve” is where "
+    "the curve of mean F1 over mean path first reaches it, with straight lines between views; an end of its "
+    "interval is “not reached” if that many resamples do not reach it.",
+    "F1 along the path: the area under F1 over path length, divided by the length. F1 holds until the next "
+    "view. The length is the median of the methods' mean path lengths; an episode that ends before keeps "
+    "its last F1.",
+    "Probabilities are those of supports between true objects, in all scenes together. The Brier score is "
+    "the mean of (p − true)²; 0 is perfect; a support that the graph lacks has p = 0. The expected "
+    "calibration error is the mean difference between probability and share of true supports in {bins} "
+    "equal bins of probability, weighted by the number of supports in each.",
 )
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -92,7 +92,7 @@ img {{ width: min(100%, 620px); background: #fff; }}
 
 @dataclass(frozen=True, eq=False, slots=True)
 class SuiteResult:
-    """Data of one suite without its episodes, for tables and figures.
+    """Data of one suite for tables and figures, without its episodes.
 
     Attributes:
         name: Of the suite.
@@ -115,7 +115,7 @@ class SuiteResult:
     summary: pd.DataFrame
 
     def f1(self) -> dict[str, dict[str, list[float]]]:
-        """Mean F1 after each view of each method under each condition."""
+        """Mean F1 after each view, by condition and method."""
         return {
             condition: {name: own["value"].tolist() for name, own in curves_of(rows, "f1").items()}
             for condition, rows in conditions_of(self.summary)
@@ -240,7 +240,7 @@ def read_results(path: Path) -> tuple[list[SuiteResult], dict[str, str]]:
 
 
 def _write_page(results: Sequence[SuiteResult], about: dict[str, str], folder: Path, command: str) -> None:
-    """Write `index.html`, which loads nothing from elsewhere, and each suite's figures as SVG and PNG."""
+    """Write `index.html`, which needs no other file, and each suite's figures as SVG and PNG."""
     from markdown_it import MarkdownIt
 
     def keep(suite: str, figure: Figure) -> str:
@@ -301,7 +301,7 @@ def _suite(result: SuiteResult) -> Iterator[str | Figure]:
     )
     if result.planned > result.episodes:
         missing = count_of(result.planned - result.episodes, "episode")
-        yield f"Not finished: {missing} of {result.planned:,} to be run."
+        yield f"Not finished: {missing} of {result.planned:,} remain."
     if conditions > 1:
         yield draw_conditions(summary, main, heading)
     for (condition, family), group in summary.groupby(["condition", "family"], sort=False):
@@ -330,12 +330,12 @@ def _tables(group: pd.DataFrame, measures: Mapping[str, str], reference: str) ->
         return {(quantity, view): f"view {view:.0f}" for view in views}
 
     tables: dict[str, Mapping[Column, str]] = {
-        f"{heading}: mean and interval after so many views": by_view(measure) | COUNTS
+        f"{heading} after each view: mean and interval": by_view(measure) | COUNTS
         for measure, heading in measures.items()
     }
     title = f"{measures[main]} minus that of {reference}, paired"
     tables[title] = by_view(f"{main} difference") | PAIRED
-    tables["Share of the gap that is closed"] = by_view("gap")
+    tables["Share of the gap closed"] = by_view("gap")
     if not group["family"].iloc[0]:
         tables |= {heading: by_view(quantity) for quantity, heading in CALIBRATION.items()}
     if main == "f1":
@@ -358,7 +358,7 @@ def _table(title: str, head: Sequence[str], lines: Iterable[Sequence[str]]) -> s
 
 
 def _text(quantity: str, value: float, low: float, high: float) -> str:
-    """A figure with its interval, in the digits of its quantity; bold is a difference that is not 0."""
+    """A value with its interval, in the decimals of its quantity; bold if it is a difference other than 0."""
     if quantity in ("planning", "perception"):
         return f"{1e3 * value:.3g} ms" if value < 0.9995 else f"{value:.3g} s"
     if quantity == "share":

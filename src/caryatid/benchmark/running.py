@@ -48,10 +48,8 @@ def run_locally(episodes: Sequence[Episode], jobs: int) -> Outcomes:
         for future in as_completed(futures):
             yield futures.pop(future), future.result()
     except BrokenExecutor:
-        raise CaryatidError(
-            "a process was killed, perhaps for want of memory; what is done is kept: "
-            "start again, with fewer --jobs"
-        ) from None
+        reason = "a process was killed, perhaps for lack of memory; finished episodes are kept"
+        raise CaryatidError(f"{reason}: start again, with fewer --jobs") from None
     except BaseException:
         for process in set(active_children()) - others:
             process.terminate()
@@ -71,28 +69,28 @@ def run_on_cluster(
     Args:
         episodes: What to run.
         address: Of the scheduler.
-        tell: Receives a line if there are no workers.
-        patience: How long the scheduler may take to answer [s].
+        tell: Called with a line of text if there are no workers.
+        patience: Maximum time for the scheduler to answer [s].
 
     Raises:
         InputError: No scheduler answers.
-        CaryatidError: The scheduler is gone, or a worker has other code.
+        CaryatidError: The scheduler has gone, or a worker has other code.
     """
     code = fingerprint()
     with connect(address, patience) as client:
         pool = client.get_executor(pure=False)
         futures = {}
-        for episode in episodes:  # workers have other current folders
+        for episode in episodes:  # workers have other working directories
             placed = replace(episode, scene=os.path.abspath(episode.scene)) if episode.content else episode
             futures[pool.submit(run_on_worker, placed, code)] = episode
         if not client.nthreads():
-            tell(f"no workers; waiting for some: dask worker {address} --nthreads 1 --nworkers N")
+            tell(f"no workers; start some: dask worker {address} --nthreads 1 --nworkers N")
         for future in as_completed(futures):
             yield futures.pop(future), _cluster_outcome(future, address)
 
 
 def connect(address: str, patience: float = 10.0) -> Client:
-    """Connect to a scheduler of dask.distributed that answers within a time [s].
+    """Connect to a scheduler of dask.distributed, which must answer within `patience` [s].
 
     Raises:
         InputError: No scheduler answers.
@@ -103,7 +101,7 @@ def connect(address: str, patience: float = 10.0) -> Client:
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)  # errors are reported here
 
     async def greet() -> None:
-        """Fail soon, while a client would keep trying."""
+        """Fail at once, where a client would keep trying."""
         secrets = Security().get_connection_args("client")
         connection = open_connection(address, patience, **secrets)
         await (await asyncio.wait_for(connection, patience)).close()
@@ -137,10 +135,8 @@ def run_on_worker(episode: Episode, code: str) -> Outcome:
     if fingerprint() != code:
         raise _other_code(fingerprint())
     if plugin_of(episode.planner) != episode.plugin:
-        raise CaryatidError(
-            f"a worker has not the same package that offers the planner {episode.planner}; "
-            "install it there and start the worker again"
-        )
+        reason = f"a worker lacks the package of planner {episode.planner}, or has another version of it"
+        raise CaryatidError(f"{reason}; install it there and start the worker again")
     with _one_at_a_time:
         set_num_threads(1)
         return one_blas_thread(run_episode)(episode)
@@ -153,22 +149,19 @@ def _cluster_outcome(future: Future[Outcome], address: str) -> Outcome:
         return future.result()
     except KilledWorker as error:
         died = error.allowed_failures + 1
-        return Outcome((), f"{died} workers died running it, perhaps for want of memory")
+        return Outcome((), f"{died} workers died running it, perhaps for lack of memory")
     except CaryatidError:
         raise
     except (CancelledError, OSError):
-        raise CaryatidError(
-            f"the scheduler at {address} is gone; what is done is kept: start again"
-        ) from None
+        reason = f"the scheduler at {address} has gone; finished episodes are kept"
+        raise CaryatidError(f"{reason}: start again") from None
     except Exception as error:
         raise _other_code(f"{type(error).__name__}: {error}") from None
 
 
 def _other_code(found: str) -> CaryatidError:
-    return CaryatidError(
-        f"a worker runs other code ({found}) than this process ({fingerprint()}); "
-        "install the same caryatid and the same libraries there and start it again"
-    )
+    reason = f"a worker runs other code ({found}) than this process ({fingerprint()})"
+    return CaryatidError(f"{reason}; install the same caryatid and libraries there and start it again")
 
 
 def _end_with_parent() -> None:
@@ -185,11 +178,11 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back while processes are started; they never receive it, so they end quietly.
+    """Delay Ctrl-C while processes are started; the processes never receive it, so they end quietly.
 
-    The mask is what the processes inherit. It does not hold Ctrl-C back here, where another thread may take
-    it and half-started processes would be left behind: the handler does. Where Ctrl-C is ignored, as in the
-    background of a shell, it stays so.
+    They inherit the mask. Here the handler delays Ctrl-C, because another thread might receive it despite the
+    mask, and half-started processes would be left behind. An ignored Ctrl-C, as in the background of a shell,
+    stays ignored.
     """
     if current_thread() is not main_thread() or signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         yield

@@ -1,7 +1,7 @@
 """Statistics of a suite: means over scenes with intervals, paired differences, path to a threshold.
 
-Scenes are what is sampled: the seeds of a scene are averaged first, and the percentile bootstrap (Efron and
-Tibshirani 1993, chapter 13) draws scenes. A failed episode is counted, and is in no mean. An episode that
+Scenes are the sampled units: the seeds of a scene are averaged first, and the percentile bootstrap (Efron and
+Tibshirani 1993, chapter 13) draws scenes. Failed episodes are counted and enter no mean. An episode that
 never reaches a threshold counts as longer than any other.
 """
 
@@ -24,9 +24,9 @@ RESAMPLES = 2000
 CONFIDENCE = 0.95
 """Probability with which an interval covers the true mean [1]."""
 THRESHOLDS = (0.94, 0.90)
-"""F1 for which views and path length are reported [1]; the paper's, and one nearly all methods reach."""
+"""F1 up to which views and path length are reported [1]; the paper's, and one that most methods reach."""
 BINS = 10
-"""Equal bins of probability, of the reliability diagram and the expected calibration error [1]."""
+"""Equal bins of probability in the reliability diagram and the expected calibration error [1]."""
 COLUMNS = ("condition", "family", "method", "quantity", "at", "value", "low", "high")
 """Columns of a summary. `family` is empty for all scenes; `at` is the view, threshold or quantile."""
 CURVE = ["f1", "path"]
@@ -41,8 +41,8 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
     Args:
         table: A row per view and failed episode, as `ResultStore.table` returns it.
         reference: Method the others are compared with.
-        gap: Two methods, such as random choice and the oracle; `gap` is the share of their gap in F1 that
-            each other method closes.
+        gap: Two methods, such as random choice and the oracle; `gap` is the share of the difference of their
+            F1 that each other method gains.
 
     Returns:
         One row per figure with the columns `COLUMNS`. Quantities: every measure (`at`: view), `MEASURE
@@ -71,7 +71,7 @@ def summarise(table: pd.DataFrame, *, reference: str, gap: tuple[str, str] | Non
 def _compare(
     group: pd.DataFrame, reference: str, gap: tuple[str, str] | None
 ) -> Iterator[tuple[str, Statistic]]:
-    """Figures of each method in a group of episodes that can be compared."""
+    """Figures of each method in a group of comparable episodes."""
     done = group[group["error"].isna()]
     wide = done.pivot(index=["method", "scene", "seed"], columns="view", values=list(MEASURES)).astype(float)
     known = {str(method): own.droplevel("method") for method, own in wide.groupby("method")}
@@ -100,8 +100,9 @@ def bootstrap(frames: Sequence[pd.DataFrame], figures: Callable[..., Array]) -> 
     """Figures of means over scenes, with percentile bootstrap intervals.
 
     Args:
-        frames: By scene and seed, with the same number C of columns each; what all of them have counts.
-        figures: Makes figures (..., F) of the frames' means (..., C); infinite if a threshold is not reached.
+        frames: By scene and seed, with the same number C of columns; only rows in all of them count.
+        figures: Returns figures (..., F) for the frames' means (..., C); infinite if a threshold is not
+            reached.
 
     Returns:
         Value, lower and upper end of each figure (F, 3); no ends (NaN) for a single scene, no figures for

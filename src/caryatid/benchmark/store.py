@@ -1,4 +1,4 @@
-"""Results on disk: one JSON line per finished episode, appended and synced; and the code that made them."""
+"""Results on disk: one JSON line per finished episode, appended and synced, and the code behind them."""
 
 from __future__ import annotations
 
@@ -64,15 +64,15 @@ class _Done:
 
 
 class ResultStore:
-    """Planned and finished episodes. A line is either whole or, torn by a kill, ignored.
+    """Planned and finished episodes. A line that a kill left incomplete is ignored.
 
     Args:
         path: File of JSON lines; created by a writer.
-        fingerprint: Of the code that adds episodes; None only reads. There is one writer at a time.
+        fingerprint: Of the code that adds episodes; None only reads. Only one writer is admitted.
         about: Further facts about code and machine, kept if the file is new.
 
     Raises:
-        InputError: The file is missing or not a result file, other code made it, or another run is under way.
+        InputError: The file is missing, not a result file or made by other code, or another run is writing.
     """
 
     def __init__(
@@ -164,9 +164,8 @@ class ResultStore:
             self._lock.acquire()
             self._file = self.path.open("ab")
         except Timeout:
-            raise InputError(
-                self.path, "another run is under way", "wait for its end, or choose another --out"
-            ) from None
+            remedy = "wait until it ends, or choose another --out"
+            raise InputError(self.path, "another run is writing to it", remedy) from None
         except OSError as error:
             raise InputError(self.path, f"cannot be opened ({error})", "choose another folder") from None
 
@@ -197,11 +196,8 @@ class ResultStore:
             self.about = about
         elif self.about.get("format") != FORMAT or self.about["fingerprint"] != about["fingerprint"]:
             names = " ".join(self.about[n] for n in ("version", "commit", "fingerprint") if n in self.about)
-            raise InputError(
-                self.path,
-                f"was made by other code ({names}), whose figures do not compare with this one's",
-                "choose another --out; leave --suite out to draw what it holds",
-            )
+            reason = f"was made by other code ({names}), whose figures are not comparable"
+            raise InputError(self.path, reason, "choose another --out, or draw it as it is without --suite")
 
     def _append(self, line: dict[str, Any]) -> None:
         assert self._file is not None, "this store was opened for reading"
@@ -222,7 +218,7 @@ def import_pandas() -> Any:
 
 
 def collect_provenance() -> dict[str, str]:
-    """Code and machine: version, commit, libraries, processor; nothing about the user or place."""
+    """Code and machine: version, commit, libraries and processor, but nothing about the user."""
     package = Path(__file__).parents[1]
     tracked = _git(package, "ls-files", "__init__.py")
     processors = Path("/proc/cpuinfo")
@@ -242,7 +238,7 @@ def collect_provenance() -> dict[str, str]:
 def describe_provenance(about: Mapping[str, str]) -> str:
     """Code and machine in one sentence."""
     known = defaultdict(lambda: "unknown", about)
-    changed = ", with changes that are in no commit" if about.get("dirty") == "True" else ""
+    changed = ", with uncommitted changes" if about.get("dirty") == "True" else ""
     return (
         f"caryatid {known['version']}, commit {known['commit'][:12]}{changed}, on {known['processor']}, "
         f"{known['cores']} cores, {known['platform']}, Python {known['python']}; {about.get('libraries', '')}"

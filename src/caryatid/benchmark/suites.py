@@ -16,7 +16,7 @@ from caryatid.planning.planners import VOLUMETRIC
 
 
 def _generated(kind: str, smallest: int, largest: int, seed: int, count: int) -> tuple[str, ...]:
-    """Names of generated scenes from a seed on, with sizes that cycle from the smallest to the largest."""
+    """Names of generated scenes with rising seeds, and sizes that cycle from the smallest to the largest."""
     return tuple(f"{kind}-{smallest + i % (largest - smallest + 1)}-{seed + i}" for i in range(count))
 
 
@@ -132,7 +132,7 @@ def change_suite(
     options = {"fusion.method": "--fusion", "active.max_views": "--views"}
     for setting in settings:
         if option := options.get(setting.partition("=")[0].strip()):
-            raise InputError(f"--set {setting}", "Every episode has its own", f"use {option}")
+            raise InputError(f"--set {setting}", "is set for each episode", f"use {option}")
     read_settings(None, settings)
     conditions = {
         ", ".join((label, *settings)): {**given, "settings": (*given.get("settings", ()), *settings)}
@@ -264,7 +264,7 @@ _ALL = (
     ),
     Suite(
         "planners",
-        "Who finds the support graph with the fewest views, where views differ: in dense heaps.",
+        "Which planner finds the support graph with the fewest views, in dense heaps.",
         {**_planners(*_PLANNERS), **_planners(*VOLUMETRIC, **_FREE)},
         DENSE,
         reference="random",
@@ -272,7 +272,7 @@ _ALL = (
     ),
     Suite(
         "path",
-        "How far one has to go in dense heaps until the support graph is good.",
+        "How long the path is until the support graph is good, in dense heaps.",
         {**_planners("support", "random", "ring"), **_planners("proximity-count", **_FREE)},
         DENSE,
         views=10,
@@ -292,8 +292,8 @@ _ALL = (
     ),
     Suite(
         "poses",
-        "What fusing points, graphs or both makes of views whose poses are taken as they come.",
-        {**_FUSED, **{f"{label}, poses as they come": {**own, **_GIVEN} for label, own in _FUSED.items()}},
+        "Fusing points, graphs or both, with poses as reported and with registration.",
+        {**_FUSED, **{f"{label}, poses as reported": {**own, **_GIVEN} for label, own in _FUSED.items()}},
         MIXED,
         seeds=1,
         views=10,
@@ -308,7 +308,7 @@ _ALL = (
     ),
     Suite(
         "house",
-        "What is found of trays, bowls, mugs, bottles and the like, with labels and without.",
+        "Household objects such as trays, bowls, mugs and bottles, with labels and without.",
         _planners("support"),
         _generated("house", 4, 12, 501, 30),
         {LABELS: {}, **_AUTO},
@@ -316,7 +316,7 @@ _ALL = (
     ),
     Suite(
         "easy",
-        "What automatic segments find of piles of 4 to 20 and of equal boxes in rows, walls and pyramids.",
+        "Automatic segments of piles of 4 to 20, and of equal boxes in rows, walls and pyramids.",
         _planners("support"),
         _generated("pile", 4, 20, 800, 60) + _generated("blocks", 2, 10, 800, 40),
         _AUTO,
@@ -324,7 +324,7 @@ _ALL = (
     ),
     Suite(
         "heaps",
-        "What automatic segments find of dense heaps, over ten views.",
+        "Automatic segments of dense heaps, over ten views.",
         _planners("support"),
         _generated("dense", 10, 25, 700, 32),
         _AUTO,
@@ -333,7 +333,7 @@ _ALL = (
     ),
     Suite(
         "dismantle",
-        "Whether piles come apart without harm by what is known of them after 1, 3, 5 and 10 views.",
+        "Whether piles can be taken apart without harm after 1, 3, 5 and 10 views.",
         {order: {"order": order} for order in ORDERS},
         (*DESIGNED, *HEAPED),
         seeds=1,
@@ -342,7 +342,7 @@ _ALL = (
     ),
     Suite(
         "full",
-        "Everything against everything: for a cluster.",
+        "Every planner with every fusion under every condition; for a cluster.",
         {
             f"{planner} {label}": {"planner": planner, **own}
             for planner, (label, own) in product(_PLANNERS, _FUSED.items())
