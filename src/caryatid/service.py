@@ -146,7 +146,7 @@ class ViewAnswer(Document):
 
 
 class NewReport(Document):
-    """What the robot did to an object."""
+    """What the robot did to an object: T (4, 4) moved it, or without T it was taken away."""
 
     object: str = Field(description="Its id")
     T: Annotated[Array, Numbers(4, 4, rigid=True)] | None = Field(
