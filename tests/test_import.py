@@ -92,7 +92,7 @@ def test_without_a_world_a_single_frame_without_a_pose_is_taken(tmp_path, views,
     assert len(recording) == 1
     assert not recording.has_poses
     told = capsys.readouterr().err
-    assert "no --tf FRAME: poses are not known, a single frame is taken" in told
+    assert "no --tf FRAME: poses are unknown, so a single frame is taken" in told
     options = ("--out", tmp_path / "run", "--quiet", "--no-report")
     assert run_command("extract", tmp_path / "out", *options) == 0
 
@@ -210,7 +210,11 @@ def test_dark_blurred_and_equal_frames_are_counted(tmp_path, views, capsys):
     bag = bag_of(tmp_path, [views[0], dark, views[0], grey, views[2]])
     options = ("--set", "recording.sharp_window=1.5")
     document = summary(tmp_path, capsys, bag, *ALL, *options)
-    assert document["skipped"] == {"hardly any depth": 1, "seen from where another view is": 1, "blurred": 1}
+    assert document["skipped"] == {
+        "too few depth readings": 1,
+        "same viewpoint as another view": 1,
+        "blurred": 1,
+    }
     assert [view["frame"] for view in document["views"]] == [0, 4]
 
 
@@ -239,9 +243,9 @@ def test_a_broken_image_is_left_out(tmp_path, views, capsys):
         ((*TOPICS, "--rgb", "/tf"), "--rgb: '/tf' holds tf2_msgs/msg/TFMessage, not images"),
         ((*TOPICS, "--tf", "earth"), "no frame 'earth' in its transforms; there are base, map, optical"),
         ((*TOPICS, "--camera", "x.json"), "--camera: is for TUM RGB-D folders"),
-        ((*TOPICS, "--set", "recording.min_readings=0.999"), "of its 3 depth images is usable: 3 hardly any"),
+        ((*TOPICS, "--set", "recording.min_readings=0.999"), "of its 3 depth images is usable: 3 too few"),
         ((*TOPICS, "--rgb", RGB, "--set", "recording.colour_gap=0.001"), "3 no colour image of that time"),
-        ((*TOPICS, "--tf", WORLD, "--set", "recording.pose_gap=0.01"), "3 no pose; record its poses"),
+        ((*TOPICS, "--tf", WORLD, "--set", "recording.pose_gap=0.01"), "3 no pose; record poses"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_the_bag_is_said(tmp_path, views, unfit, options, said):
@@ -351,7 +355,7 @@ def test_a_folder_that_is_broken(tmp_path, views, unfit, change, said):
 
 def test_a_camera_that_is_not_known_or_does_not_fit(tmp_path, views, unfit):
     folder = tum_folder(tmp_path, views)
-    unfit(folder, says="name holds none of freiburg1, freiburg2, freiburg3")
+    unfit(folder, says="name contains none of freiburg1, freiburg2, freiburg3")
     (tmp_path / "camera.json").write_text('{"fx": 500, "fy": 500, "cx": 320}')
     unfit(folder, "--camera", tmp_path / "camera.json", says="the key 'cy' is missing")
     unfit(tum_folder(tmp_path, views, "freiburg1"), says="its images (640×480 pixels")
@@ -376,7 +380,7 @@ def test_where_views_do_not_agree_on_a_table_nothing_is_written(tmp_path, views,
         T = transforms.rigid(transforms.rotation_from_vector((0.8 * n, 0.3 * n, 0.0)), (n, 0.0, 0.0))
         turned.append(replace(view, T_world_camera=T @ view.pose))
     options = ("--camera", camera_file(tmp_path, views[0].K), "--level")
-    unfit(tum_folder(tmp_path, turned), *options, says="1 of 3 views agree on where up is")
+    unfit(tum_folder(tmp_path, turned), *options, says="1 of 3 views agree on which way is up")
 
 
 # Which frames become views
@@ -390,13 +394,13 @@ def poses(positions):
 def test_of_too_many_views_those_farthest_apart_stay():
     along = poses([*np.linspace(0.0, 2.0, 11), 10.0, 20.0])
     chosen = choose_views(np.arange(13) * 1.0, np.ones(13), along, RecordingConfig(max_views=3))
-    assert chosen == ([0, 11, 12], {"more than are wanted": 10})
+    assert chosen == ([0, 11, 12], {"more than max_views": 10})
 
 
 def test_of_frames_from_one_place_the_sharpest_is_chosen_and_blurred_ones_never():
     sharpness = np.where(np.arange(10) == 6, 1.2, 1.0)
     chosen = choose_views(np.arange(10) / 30.0, sharpness, poses(np.zeros(10)), RecordingConfig())
-    assert chosen == ([6], {"seen from where another view is": 9})
+    assert chosen == ([6], {"same viewpoint as another view": 9})
     times, sharpness = np.arange(40) * 0.1, np.where(np.arange(40) % 3 == 0, 10.0, 5.0)
     kept, others = choose_views(times, sharpness, poses(times), RecordingConfig())
     assert len(kept) > 8

@@ -126,7 +126,7 @@ def test_what_gives_no_masks_is_refused(tmp_path, channels, capsys):
     with pytest.raises(InputError, match="has no masks of"):
         mask_source(str(tmp_path), Config())(view)
     (tmp_path / "bad.onnx").write_bytes(b"no model")
-    for name, said in (("bad.onnx", "onnxruntime reads"), ("none.onnx", "is missing")):
+    for name, said in (("bad.onnx", "onnxruntime can read"), ("none.onnx", "is missing")):
         with pytest.raises(InputError, match=said):
             mask_source(f"onnx:{tmp_path / name}", Config())
     add = helper.make_node("Greater", ["picture", "image"], ["masks"])

@@ -46,7 +46,7 @@ _CONFIG_HEADER: Final = struct.Struct("<iff")
 
 
 def recognises(path: Path) -> bool:
-    """Whether a path looks like a bag."""
+    """Whether a path is a bag, by its name."""
     return path.suffix in SUFFIXES if path.is_file() else (path / "metadata.yaml").is_file()
 
 
@@ -59,11 +59,11 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
         options: The topics.
 
     Raises:
-        InputError: `rosbags` is not installed; the bag is damaged, empty, lacks a topic or a frame, or its
+        InputError: `rosbags` is not installed; the bag is damaged, empty, or lacks a topic or frame; or its
             images do not fit each other.
     """
     if options.camera_file is not None:
-        raise InputError("--camera", "is for TUM RGB-D folders", "a bag has its camera in --info TOPIC")
+        raise InputError("--camera", "is for TUM RGB-D folders", "give a bag's camera with --info TOPIC")
     bag = _Bag(path)
     depth_topic = bag.require("--depth", options.depth, "images")
     info_topic = bag.require("--info", options.info, "cameras")
@@ -74,7 +74,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     colours = None if rgb_topic is None else bag.images(rgb_topic, colour)
     pose_at, notes = None, []
     if options.world is None:
-        notes.append("no --tf FRAME: poses are not known, a single frame is taken")
+        notes.append("no --tf FRAME: poses are unknown, so a single frame is taken")
     else:
         tree = _read_transforms(bag, config.pose_gap)
         for frame in dict.fromkeys([options.world, *(depth.frame for depth in depths)]):
@@ -83,7 +83,7 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
                 raise InputError(path, f"there is no frame '{frame}' in its transforms", known)
         pose_at = partial(tree.between, options.world)
     if distorts:
-        notes.append("the lens distorts, and a pinhole is assumed: give rectified topics, unless these are")
+        notes.append("the lens distorts, but a pinhole camera is assumed: give rectified topics")
     return make_video(path, depths, colours, cameras, pose_at, config, notes)
 
 
@@ -153,7 +153,7 @@ class _Bag:
         for _, _, message in self.messages([topic], received, received + 1):
             if _stamp(message.header, received) == time:
                 return decode(message, f"{self.path}: {topic}")
-        raise InputError(self.path, "has been changed while it was read", "import it again")
+        raise InputError(self.path, "changed while it was read", "import it again")
 
 
 def _read_cameras(bag: _Bag, topic: str) -> tuple[list[TimedCamera], bool]:
@@ -168,7 +168,7 @@ def _read_cameras(bag: _Bag, topic: str) -> tuple[list[TimedCamera], bool]:
         cameras.append(TimedCamera(source, time, frame, K, size))
         distorts = distorts or bool(np.any(D))
     if not cameras:
-        raise InputError(bag.path, f"'{topic}' holds no message", "record the camera's info too")
+        raise InputError(bag.path, f"'{topic}' holds no message", "record the camera info too")
     return cameras, distorts
 
 
@@ -252,7 +252,7 @@ def _pixels(message: Any, kind: str, channels: int, source: str) -> NDArray[Any]
 
 @contextmanager
 def _damage(path: Path) -> Iterator[None]:
-    """Turn any exception of the library on damaged data into one sentence."""
+    """Turn any exception of the library about damaged data into one sentence."""
     try:
         yield
     except CaryatidError:

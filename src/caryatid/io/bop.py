@@ -61,8 +61,8 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
 def read_recording(folder: str | Path, config: RecordingConfig | None = None) -> Dataset:
     """Read a BOP scene folder: `scene_camera.json`, `depth/`, and where they exist `rgb/` and `mask_visib/`.
 
-    Cameras, poses and the table of masks are checked here, images when a view is loaded. A rotation that
-    has drifted from orthonormal by less than 0.02 is replaced by the nearest rotation.
+    Cameras, poses and the table of masks are checked here, images when a view is loaded. A rotation matrix
+    that is orthonormal to 0.02 is replaced by the nearest rotation.
 
     Args:
         folder: The scene folder, or `sample-recording`. Lengths in it are millimetres.
@@ -93,8 +93,8 @@ def read_recording(folder: str | Path, config: RecordingConfig | None = None) ->
     without = [f.number for f in frames if f.T_world_camera is None]
     if len(frames) > 1 and without:
         reason = f"{len(without)} of {len(frames)} frames have no pose (cam_R_w2c, cam_t_w2c)"
-        reason += f", the first is frame {without[0]}"
-        raise InputError(path, reason, "several frames need poses; without them give a single frame")
+        reason += f"; the first is frame {without[0]}"
+        raise InputError(path, reason, "add poses, or give a single frame")
     return Dataset(folder, frames)
 
 
@@ -105,7 +105,7 @@ def write_recording(folder: str | Path, views: Iterable[View]) -> None:
     0.4 mm and so on.
 
     Args:
-        folder: Where; must not exist, or be empty.
+        folder: The folder; must not exist, or be empty.
         views: In frame order. Labels become one mask each and `obj_id` = label.
 
     Raises:
@@ -219,7 +219,7 @@ def _read_masks(folder: Path, known: set[int]) -> dict[int, Masks]:
         labels = [mask.obj_id for mask in masks]
         for twice in {label for label in labels if labels.count(label) > 1}:
             reason = f"two masks have obj_id {twice}"
-            raise InputError(source, reason, "number each object of the scene by itself")
+            raise InputError(source, reason, "give each object of the scene its own number")
         names = (f"{frame:06d}_{index:06d}.png" for index in range(len(labels)))
         table[frame] = tuple((mask_folder / name, label) for name, label in zip(names, labels, strict=True))
     expected = {image for masks_of_frame in table.values() for image, _ in masks_of_frame}

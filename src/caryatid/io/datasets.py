@@ -1,7 +1,7 @@
 """Datasets: sequences of frames in any format, decoded one by one.
 
 An input format is a module or object with two functions, `recognises(path)` and
-`open_dataset(path, config, options)`. Those of other packages are found by their entry points in the group
+`open_dataset(path, config, options)`. Other packages offer formats as entry points of the group
 `caryatid.datasets`.
 """
 
@@ -25,7 +25,7 @@ from caryatid.sensing.views import View
 BUILT_IN: Final = ("bop", "tum", "bags")
 """Modules of `caryatid.io` that are formats, in the order in which they are tried."""
 ENTRY_POINTS: Final = "caryatid.datasets"
-"""Group under which other packages offer formats."""
+"""Group of the entry points of other packages' formats."""
 NO_COLOUR: Final = "no colour image of that time"
 NO_POSE: Final = "no pose"
 """Reasons why a frame of a video does not become a view."""
@@ -51,8 +51,8 @@ class Frame:
     Attributes:
         name: Name of the view it becomes.
         number: Its number in the dataset.
-        load: Decodes it. Raises `caryatid.io.images.BrokenImageError` if other frames may be whole, and
-            another `InputError` if it does not fit the dataset.
+        load: Decodes it. Raises `caryatid.io.images.BrokenImageError` if its image is broken, which others
+            may not be, and another `InputError` if it does not fit the dataset.
         T_world_camera: Camera pose (4, 4), or None if unknown.
         time: Time of the image [ns]; 0 if it has none.
         has_labels: Whether its view has labels.
@@ -86,7 +86,7 @@ class Dataset(Sequence[View]):
         frames: The frames, in order.
         skipped: Number of others that cannot become views, by reason.
         notes: Notes for the user.
-        is_video: Whether neighbouring frames show nearly the same, so a few of them should be chosen.
+        is_video: Whether neighbouring frames show nearly the same, so that a few should be chosen.
     """
 
     path: Path

@@ -1,4 +1,4 @@
-"""Image files and stored arrays, decoded strictly."""
+"""Images and stored arrays, decoded strictly."""
 
 from __future__ import annotations
 
@@ -20,15 +20,13 @@ DEPTH_MODES: Final = ("I;16", "I;16B", "I")
 MASK_MODES: Final = ("1", "L", "P", "I;16", "I;16B", "I")
 """Pillow modes of depth images, and of masks."""
 MAX_PIXELS: Final = RecordingConfig().max_pixels
-"""Maximum number of pixels of an image without settings."""
-_BAD_BYTES: Final = (SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error)
-"""Exceptions of Pillow for a broken image, …"""
-_TOO_LARGE: Final = (Image.DecompressionBombError, Image.DecompressionBombWarning)
-"""… and for one that claims to be larger than any camera's."""
+"""Default of the maximum number of pixels."""
+_BAD_BYTES: Final = (OSError, SyntaxError, ValueError, EOFError, IndexError, struct.error, zlib.error)
+"""Exceptions of Pillow for a broken image."""
 
 
 class BrokenImageError(InputError):
-    """An image that cannot be decoded; others of its recording may be whole."""
+    """An image that cannot be decoded; other images of its recording may be intact."""
 
 
 def read_depth(path: Path, depth_scale: float, max_pixels: int = MAX_PIXELS) -> NDArray[np.float32]:
@@ -49,7 +47,7 @@ def read_depth(path: Path, depth_scale: float, max_pixels: int = MAX_PIXELS) -> 
 
 
 def read_units(image: Path | bytes, name: str = "", max_pixels: int = MAX_PIXELS) -> NDArray[np.int32]:
-    """Read a 16-bit grey PNG (H, W), a file or its content, as it is: depth in units of its own, or labels.
+    """Read the values (H, W) of a 16-bit grey PNG, a file or its content: depth in its own units, or labels.
 
     Raises:
         InputError: Missing, truncated, too large or not 16 bit.
@@ -68,9 +66,9 @@ def decode_image(
 
     Args:
         image: A file, or its content.
-        name: What to call content in errors.
-        modes: Pillow modes allowed; None allows all.
-        what: What the image ought to be, for the error about another mode.
+        name: Name of the content in errors.
+        modes: Allowed Pillow modes; None allows all.
+        what: Description of the expected image, for the error about its mode.
         max_pixels: Maximum number of pixels; a larger image is not decoded.
 
     Raises:
@@ -95,12 +93,12 @@ def decode_image(
                 return np.array(opened.convert("RGB") if modes is None or "RGB" in modes else opened)
     except FileNotFoundError:
         raise BrokenImageError(source, "the file is missing", remedy) from None
-    except _TOO_LARGE:
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning):
         reason = f"has more than {Image.MAX_IMAGE_PIXELS} pixels"
         raise BrokenImageError(source, reason, "give a smaller image") from None
     except UnidentifiedImageError as error:
         raise BrokenImageError(source, "is not an image", remedy) from error
-    except (*_BAD_BYTES, OSError) as error:
+    except _BAD_BYTES as error:
         raise BrokenImageError(source, f"the image is truncated or broken ({error})", remedy) from error
 
 
@@ -123,7 +121,7 @@ def read_npy(array: Path | bytes, name: str = "") -> NDArray[Any]:
     try:
         content = array.read_bytes() if isinstance(array, Path) else array
         return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
-    except Exception as error:  # NumPy reads the header as Python, so a damaged one raises almost anything
+    except Exception as error:  # NumPy parses the header as Python, so a damaged one raises almost anything
         reason = f"is not a valid .npy ({' '.join(str(error).split())})"
         raise InputError(source, reason, "save it with numpy.save") from None
 

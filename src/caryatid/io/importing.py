@@ -1,4 +1,4 @@
-"""Import of a robot's log: a recording of a few good views, as a scene folder in the BOP format."""
+"""Import of a robot's log: a few good views, written as a scene folder in the BOP format."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from caryatid.segmentation.observation import level_transform
 from caryatid.sensing.views import View
 
 BROKEN: Final = "broken"
-DARK: Final = "hardly any depth"
-SPARE: Final = "more than are wanted"
+DARK: Final = "too few depth readings"
+SPARE: Final = "more than max_views"
 """Reasons why a frame does not become a view."""
 _REMEDIES: Final[Mapping[str, str]] = {
-    NO_COLOUR: "leave colour out, or allow more with --set recording.colour_gap=SECONDS",
-    NO_POSE: "record its poses all the time, or allow more with --set recording.pose_gap=SECONDS",
-    DARK: "allow less with --set recording.min_readings=SHARE",
+    NO_COLOUR: "leave colour out, or allow longer gaps with --set recording.colour_gap=SECONDS",
+    NO_POSE: "record poses throughout, or allow longer gaps with --set recording.pose_gap=SECONDS",
+    DARK: "allow fewer with --set recording.min_readings=SHARE",
 }
 """Remedies if no frame is usable, by reason."""
 _UP: Final = np.array([0.0, 0.0, 1.0])
@@ -52,15 +52,15 @@ def import_recording(
         source: A bag, a TUM RGB-D folder, or another dataset that `open_dataset` recognises.
         out: Folder to write; must not exist, or be empty. It appears whole or not at all.
         options: Topics of a bag, and the camera of a TUM RGB-D folder.
-        level: Turn the world so that the table is level: for poses whose z axis does not point up.
-        config: When frames are sharp and different, maximum number of views, and how a table is found.
+        level: Turn the world so that the table is level, for poses whose z axis does not point up.
+        config: Which frames are sharp and different, the maximum number of views, and how to find a table.
 
     Returns:
         The source with the frames that became views.
 
     Raises:
-        InputError: The recording is damaged or does not fit the options, no frame of it can become a view,
-            there is no table to level the world by, or `out` cannot be written.
+        InputError: The recording is damaged or does not fit the options, no frame can become a view, no table
+            is found to level the world, or `out` cannot be written.
     """
     config = config or Config()
     dataset = open_dataset(source, config.recording, options)
@@ -77,10 +77,10 @@ def levelled(dataset: Dataset, config: Config) -> Dataset:
 
     Args:
         dataset: The frames.
-        config: How a table is found.
+        config: How to find a table.
 
     Raises:
-        InputError: There is no table to level the world by.
+        InputError: No table is found to level the world.
     """
     if not dataset.has_poses:
         return dataset
@@ -94,15 +94,15 @@ def levelled(dataset: Dataset, config: Config) -> Dataset:
 def choose_frames(dataset: Dataset, config: RecordingConfig) -> Dataset:
     """Choose sharp frames of a dataset, each from another viewpoint.
 
-    Sharpness is the variance of the Laplacian of the brightness. Without colour the share of pixels with a
-    reading takes its place: a depth camera in motion loses them at edges.
+    Sharpness is the variance of the Laplacian of the brightness. Without colour it is the share of pixels
+    with a reading, because a moving depth camera loses readings at edges.
 
     Args:
         dataset: The frames.
-        config: When frames are sharp and viewpoints different, and the maximum number of frames.
+        config: Which frames are sharp and which viewpoints different, and the maximum number of frames.
 
     Returns:
-        The dataset with the chosen frames, in the order of time; the others count as skipped.
+        The dataset with the chosen frames, ordered by time; the others count as skipped.
 
     Raises:
         InputError: No frame can become a view.
@@ -143,17 +143,17 @@ def choose_views(
 ) -> tuple[list[int], dict[str, int]]:
     """Choose frames that are sharp for their time and have different viewpoints.
 
-    In the order of time, the sharpest frame of the next moments is chosen whose viewpoint differs from all
-    chosen ones. If there are too many, those farthest from each other stay.
+    Going through time, the sharpest of the next frames is chosen whose viewpoint differs from all chosen
+    ones. If there are too many, those farthest from each other stay.
 
     Args:
-        times: Times of the frames (N,) [s], rising; N > 0.
+        times: Times of the frames (N,) [s], ascending; N > 0.
         sharpness: Their sharpness (N,); only ratios count.
-        T_world_camera: Their poses (N, 4, 4); None if unknown: then a single frame is chosen.
-        config: When frames are sharp, and how far apart viewpoints are.
+        T_world_camera: Their poses (N, 4, 4). None if unknown; a single frame is then chosen.
+        config: Which frames are sharp, and how far apart viewpoints are.
 
     Returns:
-        Indices of the chosen frames in the order of time, and the number of others by reason.
+        Indices of the chosen frames, ascending, and the number of others by reason.
     """
     if T_world_camera is None:
         return [int(np.argmax(sharpness))], dict(+Counter({SPARE: len(times) - 1}))
@@ -172,7 +172,7 @@ def choose_views(
         free &= _apart(T_world_camera[candidates], T_world_camera[best], config) > 1.0
     kept = _farthest(T_world_camera[chosen], config)
     others = Counter({"blurred": len(times) - len(candidates), SPARE: len(chosen) - len(kept)})
-    others["seen from where another view is"] = len(candidates) - len(chosen)
+    others["same viewpoint as another view"] = len(candidates) - len(chosen)
     return sorted(chosen[i] for i in kept), dict(+others)
 
 
@@ -182,10 +182,10 @@ def reasons(skipped: Mapping[str, int]) -> str:
 
 
 def _level_rotation(dataset: Dataset, config: Config) -> Array:
-    """Find the smallest turn of the world about its origin (4, 4) that makes the table of a dataset level.
+    """Find the smallest rotation of the world about its origin (4, 4) that makes the table level.
 
-    Each view votes for the up direction as if it had no pose, by the largest plane that faces its camera and
-    has the rest of the scene in front of it. The direction nearest to all the others wins.
+    Each view votes for the up direction as if it had no pose, by the largest plane that faces its camera with
+    the rest of the scene in front. The direction nearest to all others wins.
     """
     rng, found = np.random.default_rng(0), []
     for view in dataset:
@@ -193,13 +193,13 @@ def _level_rotation(dataset: Dataset, config: Config) -> Array:
             T_level_camera = level_transform(replace(view, T_world_camera=None), config, rng)
             found.append(transforms.rotate(view.pose, T_level_camera[2, :3]))
     if not found:
-        raise InputError(dataset.path, "no view shows a table to level the world by", "leave --level out")
+        raise InputError(dataset.path, "no view shows a table, which --level needs", "leave --level out")
     ups = np.stack(found)
     between = transforms.angle_between(ups[:, None], ups[None])
     near = between[int(np.argmin(between.sum(axis=1)))] <= np.deg2rad(config.surface.max_tilt)
     if 2 * int(near.sum()) < len(ups):
-        reason = f"only {int(near.sum())} of {len(ups)} views agree on where up is"
-        raise InputError(dataset.path, reason, "leave --level out, and give a world that is level")
+        reason = f"only {int(near.sum())} of {len(ups)} views agree on which way is up"
+        raise InputError(dataset.path, reason, "leave --level out, and give poses in a level world")
     turn, _ = Rotation.align_vectors(_UP[None], ups[near].mean(axis=0)[None])
     return transforms.rigid(turn.as_matrix(), np.zeros(3))
 
@@ -223,7 +223,7 @@ def _apart(T_world_camera: Array, T_world_other: Array, config: RecordingConfig)
 
 
 def _farthest(T_world_camera: Array, config: RecordingConfig) -> list[int]:
-    """Indices of the wanted number of poses: the first, then always the one farthest from those before."""
+    """Indices of up to `max_views` poses: the first, then always the one farthest from those chosen."""
     kept = [0]
     gap = _apart(T_world_camera, T_world_camera[0], config)
     while len(kept) < min(config.max_views, len(T_world_camera)):

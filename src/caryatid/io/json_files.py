@@ -1,4 +1,4 @@
-"""JSON read strictly and written so that the same content gives the same bytes."""
+"""JSON, read strictly and written so that the same content gives the same bytes."""
 
 from __future__ import annotations
 

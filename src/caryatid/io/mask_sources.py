@@ -1,4 +1,4 @@
-"""Masks from another program or a learned segmenter, and masks of pixels to ignore."""
+"""Masks from another program or a learned segmenter, and masks of ignored pixels."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from caryatid.sensing.masks import labels_from_masks
 from caryatid.sensing.views import SUPPORT_LABEL, View
 
 MaskSource = Callable[[View], View]
-"""Adds masks of its objects to a view, as segments of that view alone."""
+"""Adds masks to a view, as segments of that view alone."""
 
 ONNX: Final = "onnx:"
-"""Prefix of a mask source that continues with the file of a model."""
+"""Prefix of a mask source that ends with the file of a model."""
 
 
 def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
@@ -36,8 +36,8 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
         seed: Seed of the segments that a model may use as prompts.
 
     Raises:
-        InputError: There is no such file or folder, the model is not one of instance masks, or onnxruntime is
-            not installed.
+        InputError: There is no such file or folder, the model does not return instance masks, or onnxruntime
+            is not installed.
     """
     if name.startswith(ONNX):
         return OnnxMasks(Path(name.removeprefix(ONNX)), config, seed)
@@ -48,7 +48,7 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
 
 
 def with_stored_masks(folder: Path, view: View, max_pixels: int) -> View:
-    """Return a view with the masks of the file of its name: a label image `NAME.png`, or `NAME.npy`.
+    """Return a view with masks from the file named after it: a label image `NAME.png`, or `NAME.npy`.
 
     Args:
         folder: Holds the files.
@@ -114,7 +114,7 @@ class OnnxMasks:
         try:
             self._session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
         except Exception as error:  # onnxruntime's own exceptions have no common base
-            reason = f"is not a model that onnxruntime reads ({' '.join(str(error).split())})"
+            reason = f"is not a model that onnxruntime can read ({' '.join(str(error).split())})"
             raise InputError(path, reason, "export it again") from None
         self._path, self._config, self._seed = path, config, seed
         inputs = {i.name: i for i in self._session.get_inputs()}

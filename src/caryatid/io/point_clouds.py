@@ -1,4 +1,4 @@
-"""Clouds from PCD and PLY files: finite points with normals, labels and colours if the file has them."""
+"""Clouds from PCD and PLY files: finite points, with normals, labels and colours where the file has them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class StoredCloud:
         normals: (N, 3) as stored, or None.
         labels: Object number of each point (N,), 0 = nothing, or None.
         rgb: (N, 3) uint8, or None.
-        viewpoint: Where the sensor was (3,) [m]; the origin if the file does not say.
+        viewpoint: Position of the sensor (3,) [m]; the origin if the file does not say.
         name: The file.
     """
 
@@ -47,11 +47,11 @@ class StoredCloud:
 
     @property
     def kept(self) -> NDArray[np.bool_]:
-        """Which points (N,) are readings: finite, and not in the sensor's own centre."""
+        """Which points (N,) are readings: finite, and not at the sensor's own centre."""
         return np.isfinite(self.points).all(axis=1) & (self.points != self.viewpoint).any(axis=1)
 
     def spread(self, values: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Give every stored point (N,) the value of its reading (M,); 0 without a reading."""
+        """Spread values of the readings (M,) over all stored points (N,); 0 without a reading."""
         kept = self.kept
         result = np.zeros(len(kept), dtype=np.int32)
         result[kept] = values
@@ -89,12 +89,12 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
 
     Args:
         path: A file that ends in .pcd or .ply, or `sample-cloud`.
-        label_divisor: The object number is the field `label` divided by this, rounded down. Sets that number
-            the parts of objects, as mOSD does with object = label // 10, need 10.
+        label_divisor: The object number is the field `label` divided by this, rounded down. Data sets that
+            number parts of objects need it: mOSD has object = label // 10.
 
     Raises:
-        InputError: The file is missing, of another kind or broken, its header is wrong, it holds no
-            readings, or its labels are not object numbers.
+        InputError: The file is missing, of another kind or broken, its header is wrong, it has no readings,
+            or its labels are not object numbers.
     """
     path = find_sample(path)
     parse = {".pcd": _parse_pcd, ".ply": _parse_ply}.get(path.suffix.lower())
@@ -108,7 +108,7 @@ def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:
         if points is None or any(columns[axis].dtype.kind != "f" for axis in "xyz"):
             raise ValueError("there are no fields x y z of floating point numbers")
     except Exception as error:
-        reason = f"is broken, or the header lies: {_reason(error)}"
+        reason = f"is broken, or its header is wrong: {_reason(error)}"
         raise InputError(path, reason, "export the cloud again") from error
     normals = _triple(columns, "normal_x normal_y normal_z", "nx ny nz")
     labels = _labels(columns, label_divisor, path)
@@ -173,7 +173,7 @@ def _parse_ply(content: bytes) -> tuple[Columns, Array]:
 
 
 def _reason(error: Exception) -> str:
-    """One line of what a library says."""
+    """A library's error in one line."""
     if hasattr(error, "errors"):
         first = error.errors()[0]
         return f"{str(first['loc'][0]).upper()}: {first['msg'].lower()}"
@@ -196,7 +196,7 @@ def _labels(columns: Columns, divisor: int, path: Path) -> NDArray[np.int32] | N
     raw = columns["label"].astype(np.float64)
     labels = raw // divisor
     if not ((raw >= 0.0) & (raw == np.floor(raw)) & (labels < SUPPORT_LABEL)).all():
-        reason = f"the field label holds other than whole numbers from 0 to {divisor * SUPPORT_LABEL - 1}"
+        reason = f"its labels are not all whole numbers from 0 to {divisor * SUPPORT_LABEL - 1}"
         raise InputError(path, reason, "number objects from 1")
     return labels.astype(np.int32)
 

@@ -71,12 +71,12 @@ def open_dataset(path: Path, config: RecordingConfig, options: OpenOptions) -> D
     if (path / "groundtruth.txt").is_file():
         pose_at = partial(_read_poses(path / "groundtruth.txt", config.pose_gap).between, _WORLD)
     else:
-        notes.append("no groundtruth.txt: poses are not known, a single frame is taken")
+        notes.append("no groundtruth.txt: poses are unknown, so a single frame is taken")
     return make_video(path, depths, colours, [camera], pose_at, config, notes)
 
 
 def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, tuple[int, int] | None, str]:
-    """The camera that a file describes or the data set publishes, its size [px] if known, and a note."""
+    """The camera from a file or as published, its image size [px] if known, and a note."""
     if camera_file is not None:
         document = read_json(camera_file, "give fx, fy, cx, cy [px] and depth_scale [mm]")
         return parse_json(_CameraFile, document, camera_file), None, f"camera: {camera_file}"
@@ -86,7 +86,7 @@ def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, t
             return _CameraFile(fx, fy, cx, cy), (640, 480), note
     raise InputError(
         folder,
-        f"the camera is not known: the folder's name holds none of {', '.join(PUBLISHED)}",
+        f"the camera is unknown: the folder's name contains none of {', '.join(PUBLISHED)}",
         'give --camera FILE.json with {"fx": …, "fy": …, "cx": …, "cy": …}',
     )
 
@@ -127,4 +127,4 @@ def _read_rows(path: Path, columns: int) -> list[tuple[int, list[str]]]:
 
 
 def _broken(path: Path, reason: str) -> InputError:
-    return InputError(path, reason, "take the file as the data set has it")
+    return InputError(path, reason, "use the file as the data set provides it")

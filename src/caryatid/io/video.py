@@ -1,4 +1,4 @@
-"""Depth images in the order of time, each with the colour, camera and pose of its moment."""
+"""Depth images ordered by time, each with the colour, camera and pose of its time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TimedImage:
     """An image that is not decoded yet.
 
     Attributes:
-        name: What to call it.
+        name: Its name.
         time: When it was taken [ns].
         frame: Frame of its camera.
         decode: Returns depth (H, W) [m], or colour (H, W, 3). Raises `InputError` on failure.
@@ -50,7 +50,7 @@ class TimedCamera:
     """The pinhole camera at a time.
 
     Attributes:
-        name: What to call it in errors.
+        name: Its name in errors.
         time: When [ns].
         frame: Its frame.
         K: Pinhole matrix (3, 3) [px].
@@ -88,7 +88,7 @@ def make_video(
         notes: Notes for the user.
 
     Returns:
-        The complete frames in the order of time, and the number of others by reason.
+        The complete frames, ordered by time, and the number of others by reason.
     """
     frames, skipped = [], Counter[str]()
     by_time = attrgetter("time")
@@ -127,7 +127,7 @@ def _load(
     T_world_camera: Array | None,
     far: float,
 ) -> View:
-    """Decode a depth image and its colour; both must fit each other and the camera."""
+    """Decode a depth image and its colour, which must fit each other and the camera."""
     metres = depth.decode()
     size = metres.shape[::-1]
     shown = _described(size, depth.frame)
@@ -151,9 +151,9 @@ def _described(size: tuple[int, ...], frame: str) -> str:
 
 @dataclass
 class _Link:
-    """Where one frame was over time: times [ns], parents, and poses as translation and quaternion, w last.
+    """Poses of one frame over time: times [ns], parents, and translations with quaternions, w last.
 
-    Compact, because robots may send for hours.
+    Compact, because robots may record for hours.
     """
 
     times: array[int] = field(default_factory=lambda: array("q"))
@@ -162,7 +162,7 @@ class _Link:
 
     @cached_property
     def in_order(self) -> tuple[NDArray[np.int64], list[str], Array]:
-        """Rising times, with parents and poses (N, 7); the last of equal times counts."""
+        """Ascending times, with parents and poses (N, 7); the last of equal times counts."""
         times, last = np.unique(np.array(self.times)[::-1], return_index=True)
         order = len(self.times) - 1 - last
         return times, [self.parents[i] for i in order], np.array(self.numbers).reshape(-1, 7)[order]
@@ -194,9 +194,9 @@ class TransformTree:
             parent: Frame the pose is given in.
             child: Frame whose pose it is.
             time: When [ns].
-            pose: Translation [m] and quaternion, w last, of any length but 0: seven numbers for which
-                `is_pose` holds.
-            fixed: It holds for all times, unless there are poses of single times.
+            pose: Translation [m] and quaternion, w last, of any length but 0: seven numbers that fulfil
+                `is_pose`.
+            fixed: Whether it holds at all times, unless there are poses with times.
         """
         if fixed:
             rotation = Rotation.from_quat(pose[3:]).as_matrix()
@@ -222,7 +222,7 @@ class TransformTree:
         return None
 
     def _upwards(self, frame: str, time: int) -> Iterator[tuple[str, Array]]:
-        """The frame and those above it, each with the pose of `frame` in it, as far as known."""
+        """The frame and its known ancestors, each with the pose of `frame` in it."""
         T_up_frame = np.eye(4)
         met: set[str] = set()
         while frame not in met:
@@ -253,5 +253,5 @@ class TransformTree:
 
 
 def is_pose(numbers: Sequence[float]) -> bool:
-    """Whether numbers are a translation and a quaternion: seven, none huge, no quaternion of length 0."""
+    """Whether numbers are a translation and a quaternion: seven, none huge, and no zero quaternion."""
     return len(numbers) == 7 and all(abs(n) <= 1e9 for n in numbers) and hypot(*numbers[3:]) > 1e-6
