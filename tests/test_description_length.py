@@ -321,6 +321,17 @@ def test_two_things_that_share_no_axis_are_no_compound():
         assert best_compound(first.joined(other), CONFIG, apart).shape is None
 
 
+def test_a_plate_costs_by_the_space_seen_free_in_it():
+    """Two strips side by side, seen from above: a clamp is no plate where the camera looked between them."""
+    points, normals, _ = points_of([box((0.0, y, 0.035), (0.2, 0.03, 0.01)) for y in (-0.1, 0.1)])
+    above = normals[:, 2] > 0.9
+    strips = gather(Cloud(points[above], normals[above]))
+    plate = box((0.0, 0.0, 0.036), (0.2, 0.23, 0.008))
+    between = seen_free(lambda p: (np.abs(p[:, 1]) < 0.08) & (np.abs(p[:, 0]) < 0.1) & (p[:, 2] > 0.0))
+    assert best_explanation([plate], strips, COSTS).shape is plate
+    assert best_explanation([plate], replace(strips, voxels=between), COSTS).shape is None
+
+
 def test_a_compound_costs_by_the_space_seen_free_in_it():
     """A ring that would hold two plates side by side is not there between them."""
     plates = [visible(cylinder((x, 0.0, 0.01), 0.06, 0.02)) for x in (-0.1, 0.1)]

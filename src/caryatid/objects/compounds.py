@@ -284,17 +284,19 @@ class OpenBox:
 
     def free(self, voxels: VoxelMap) -> int:
         """Number of voxels seen free that it fills, with free ones on either side."""
-        size, count = voxels.config.size, 0
-        for slab in self.slabs:
-            axes = [_middles(n) - 0.5 for n in slab.extents / size]
-            local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * slab.extents
-            # The seen part of a surface may lie in the voxel beside it.
-            beside = 0.5 * size * np.eye(3)[slab.extents.argmin()]
-            free = np.ones(len(local), dtype=np.bool_)
-            for off in (-beside, 0.0, beside):
-                free &= voxels.empty_at(transforms.transform(slab.T_world_object, local + off))
-            count += int(np.count_nonzero(free))
-        return count
+        return sum(free_in_slab(slab, voxels) for slab in self.slabs)
+
+
+def free_in_slab(slab: Box, voxels: VoxelMap) -> int:
+    """Number of voxels seen free that a thin box fills, with free ones on either side."""
+    axes = [_middles(n) - 0.5 for n in slab.extents / voxels.config.size]
+    local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * slab.extents
+    # The seen part of a surface may lie in the voxel beside it.
+    beside = 0.5 * voxels.config.size * np.eye(3)[slab.extents.argmin()]
+    free = np.ones(len(local), dtype=np.bool_)
+    for off in (-beside, 0.0, beside):
+        free &= voxels.empty_at(transforms.transform(slab.T_world_object, local + off))
+    return int(np.count_nonzero(free))
 
 
 def _open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[OpenBox]:

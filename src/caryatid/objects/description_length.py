@@ -13,7 +13,7 @@ from caryatid.config import Config, ExplanationConfig, FitConfig
 from caryatid.fitting.primitives import candidates, free_inside
 from caryatid.geometry.shapes import Box, Shape
 from caryatid.geometry.transforms import Array
-from caryatid.objects.compounds import Compound, compounds, shape_costs
+from caryatid.objects.compounds import Compound, compounds, free_in_slab, shape_costs
 from caryatid.segmentation.segments import PLAIN, colour_shares
 from caryatid.sensing.voxel_map import VoxelMap
 
@@ -162,6 +162,8 @@ def _cost(
         return cost + config.free_cost * shape.free(evidence.voxels)
     # A surface voxel may be half free.
     inset = max(1.2 * evidence.voxels.config.size, 3.0 * evidence.noise)
+    if isinstance(shape, Box) and shape.extents.min() <= 2.0 * inset:
+        return cost + config.free_cost * free_in_slab(shape, evidence.voxels)
     return cost + config.free_cost * free_inside(shape, evidence.voxels, inset)[1]
 
 
