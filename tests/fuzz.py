@@ -28,7 +28,7 @@ import numpy as np
 import pytest
 from arms import SLIDES, gantry
 from bag_files import DEPTH, INFO, RGB, WORLD, write_bag, write_tum
-from conftest import SMALL_SENSOR, npy, pcd_text, run_command, write_view_files
+from conftest import SMALL, SMALL_SENSOR, npy, pcd_text, run_command, write_view_files
 from hypothesis import HealthCheck, given, note
 from hypothesis import settings as limits
 from hypothesis import strategies as st
@@ -71,19 +71,11 @@ WORDS = (
     "..",
     "../x",
     "/",
-    "x" * 5000,
     "é",
     "<b>&\"'",
+    "x" * 5000,
 )
 VALUES = (None, True, False, [], {}, [[]], [1, "a"], {"a": 1})
-
-
-def deep(levels: int) -> list:
-    """Lists in lists."""
-    made: list = []
-    for _ in range(levels):
-        made = [made]
-    return made
 
 
 @contextmanager
@@ -183,10 +175,8 @@ def damaged_bytes(content, rng):
     """Bytes cut off, changed, taken out or put in."""
     changed = bytearray(content)
     for _ in range(rng.randint(1, 4)):
-        start = min(
-            int(rng.expovariate(1 / 60)) if rng.random() < 0.5 else rng.randrange(len(changed) + 1),
-            len(changed),
-        )
+        near = rng.random() < 0.5
+        start = min(int(rng.expovariate(1 / 60)), len(changed)) if near else rng.randrange(len(changed) + 1)
         how = rng.randrange(6)
         if how == 0:
             del changed[start:]
@@ -195,9 +185,8 @@ def damaged_bytes(content, rng):
         elif how == 2:
             changed[start:start] = rng.randbytes(rng.choice((1, 4, 100)))
         elif how == 3:
-            changed[start : start + 4] = rng.choice(
-                (b"\xff\xff\xff\x7f", b"\0\0\0\0", b"\xff" * 4, b"\0\0\0\x80")
-            )
+            ends = (b"\xff\xff\xff\x7f", b"\0\0\0\0", b"\xff" * 4, b"\0\0\0\x80")
+            changed[start : start + 4] = rng.choice(ends)
         else:
             changed[start : start + 1] = rng.randbytes(1)
     return bytes(changed)
@@ -220,10 +209,8 @@ def damaged_png(content, rng):
         width, height = (rng.choice((0, 1, 159, 8000, 9000, 2**31 - 1)) for _ in range(2))
         chunks[0] = (b"IHDR", struct.pack(">II", width, height) + chunks[0][1][8:])
     elif how == 3:
-        chunks[0] = (
-            b"IHDR",
-            chunks[0][1][:8] + bytes([rng.choice((1, 2, 8, 16)), rng.choice((0, 2, 3, 4, 6)), 0, 0, 0]),
-        )
+        form = bytes([rng.choice((1, 2, 8, 16)), rng.choice((0, 2, 3, 4, 6)), 0, 0, 0])
+        chunks[0] = (b"IHDR", chunks[0][1][:8] + form)
     else:
         chunks[which] = (chunks[which][0], damaged_bytes(chunks[which][1], rng))
     packed = (struct.pack(">I", len(d)) + n + d + struct.pack(">I", zlib.crc32(n + d)) for n, d in chunks)
@@ -482,9 +469,8 @@ def test_settings_at_work(whole, views, rng):
         changed[stage][name] = rng.choice((scaled, rng.choice(NUMBERS), hostile_value(rng)))
         note(f"{stage}.{name} = {changed[stage][name]!r}")
     with hostile():
-        scene = Scene(
-            changed_settings(Config(), changed, "settings"), segmentation=rng.choice((None, "auto"))
-        )
+        settings = changed_settings(Config(), changed, "settings")
+        scene = Scene(settings, segmentation=rng.choice((None, "auto")))
         for view in views[:2]:
             scene.update(view)
         assert graph_text(scene.graph)
@@ -503,19 +489,10 @@ def client(tmp_path_factory, views):
 
 @cases(600)
 def test_requests(client, views, rng):
-    page, document = rng.choice(
-        (
-            ("/sessions/a/views", body(views[1])),
-            (
-                "/sessions/a/next",
-                {"T_world_camera": [v.pose.tolist() for v in views], "path_length": [0.0, 1.0, 2.0]},
-            ),
-            (
-                "/sessions",
-                {"name": "b", "seed": 1, "settings": {"fit": {"hypotheses": 3}}, "planner": "support"},
-            ),
-        )
-    )
+    reach = {"T_world_camera": [v.pose.tolist() for v in views], "path_length": [0.0, 1.0, 2.0]}
+    options = {"name": "b", "seed": 1, "settings": {"fit": {"hypotheses": 3}}, "planner": "support"}
+    requests = {"/sessions/a/views": body(views[1]), "/sessions/a/next": reach, "/sessions": options}
+    page, document = rng.choice([*requests.items()])
     if rng.random() < 0.3 and "depth" in document:
         key = rng.choice(("depth", "labels"))
         content = base64.b64decode(document[key])
@@ -552,11 +529,8 @@ def test_commands(whole, tmp_path_factory, capsys, rng):
     )  # fmt: skip
     command, source, folder = words
     out = tmp_path_factory.mktemp("out") / "run"
-    small = [
-        f"--set=sensor.{k}={v}" for k, v in asdict(SMALL_SENSOR).items() if k in ("width", "height", "focal")
-    ]
     options = {
-        "explore": ["--out", out, "--no-report", "--views", "2", *small],
+        "explore": ["--out", out, "--no-report", "--views", "2", *SMALL],
         "extract": ["--out", out, "--no-report"],
         "order": ["--set=rehearsal.draws=1"],
     }.get(command, [])

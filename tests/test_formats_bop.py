@@ -127,12 +127,6 @@ def test_images_of_another_size_or_kind_are_refused(folder, name, image, said):
     refused(folder, name, said)
 
 
-def test_colour_of_another_size_is_refused(folder):
-    Image.new("RGB", (32, 24)).save(folder / "rgb/000001.png")
-    with pytest.raises(InputError, match="scene/000001: rgb is 32×24, depth is 64×48"):
-        list(read_recording(folder))
-
-
 def test_an_empty_mask_is_an_object_out_of_sight(folder):
     Image.new("L", (64, 48)).save(folder / "mask_visib/000000_000001.png")
     assert set(np.unique(read_recording(folder)[0].labels)) == {0, 7}

@@ -32,12 +32,8 @@ def tree_with(*links, gap=1.0):
 def test_chains_up_and_down_the_tree_multiply(seed):
     rng = np.random.default_rng(seed)
     A, B, C, D = (random_pose(rng) for _ in range(4))
-    tree = tree_with(
-        ("map", "odom", NOW, A),
-        ("odom", "base", NOW, B),
-        ("base", "eye", 0, C, True),
-        ("odom", "hand", NOW, D),
-    )
+    links = ("map", "odom", NOW, A), ("odom", "base", NOW, B), ("odom", "hand", NOW, D)
+    tree = tree_with(*links, ("base", "eye", 0, C, True))
     assert np.allclose(tree.between("map", "eye", NOW), A @ B @ C)
     assert np.allclose(tree.between("eye", "map", NOW), np.linalg.inv(A @ B @ C))
     assert np.allclose(tree.between("hand", "eye", NOW), np.linalg.inv(D) @ B @ C)
@@ -105,7 +101,5 @@ def test_numbers_that_are_no_rotation_make_no_pose(q):
 def test_a_quaternion_need_not_have_length_one():
     tree = TransformTree(1.0)
     tree.add("map", "eye", NOW, (1.0, 1.0, 1.0, 0.0, 0.0, 2.0, 2.0))
-    T = tree.between("map", "eye", NOW)
-    assert np.allclose(
-        T, transforms.rigid(transforms.rotation_from_vector((0.0, 0.0, np.pi / 2)), np.ones(3))
-    )
+    turn = transforms.rotation_from_vector((0.0, 0.0, np.pi / 2))
+    assert np.allclose(tree.between("map", "eye", NOW), transforms.rigid(turn, np.ones(3)))
