@@ -173,8 +173,8 @@ WEIGHT = '<inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>'
     [
         ('name="table"', 'name="desk"', "has no body 'table'"),
         ("<freejoint/>", "", "has no objects"),
-        ("</mujoco>", "", "Not an MJCF file"),
-        (TWO_ON_A_TABLE, "a table with two cups", "Not an MJCF file"),
+        ("</mujoco>", "", "is not an MJCF file"),
+        (TWO_ON_A_TABLE, "a table with two cups", "is not an MJCF file"),
         ('size="0.035 0.05"', 'size="-1 0.05"', "MuJoCo refuses it"),
         ('size="0.4 0.5 0.35"/>', 'size="0.4 0.5 0.35"/><freejoint/>', "'table' can move"),
         ('type="cylinder" size="0.035 0.05"', 'type="mesh" mesh="lost"', "lost"),

@@ -250,7 +250,7 @@ def test_generated_names_repeat_byte_for_byte(name: str):
 
 @pytest.mark.parametrize("name", ["pile-0-1", "pile-99-1", "dense-3-1", "dense-26-0", "packed-1-0"])
 def test_sizes_and_seeds_out_of_range_are_refused(name: str):
-    with pytest.raises(InputError, match=r"ask for \d+ to \d+"):
+    with pytest.raises(InputError, match=r"give \d+ to \d+"):
         load_scene(name)
     with pytest.raises(InputError, match="negative"):
         generate("pile", 3, -1)

@@ -1,8 +1,7 @@
-"""The planner that knows the ground truth, an upper bound for planners that think one view ahead.
+"""The planner that knows the ground truth: an upper bound for planners that look one view ahead.
 
 It tries candidates in simulation, each on a copy of the scene model, and chooses the one with the highest
-score afterwards. No other planner may use the ground truth, so it is not among
-`caryatid.planning.planners.BUILT_IN`.
+score. No other planner may use the ground truth, so it is not in `caryatid.planning.planners.BUILT_IN`.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from caryatid.simulation.camera import SimulatedCamera, pixel_rays, render
 
 
 class _WatchedCamera:
-    """A camera that remembers pose (4, 4) and view of each capture since the last query."""
+    """A camera that records the pose (4, 4) and view of each capture."""
 
     def __init__(self, camera: SimulatedCamera) -> None:
         self.taken: list[tuple[Array, View]] = []
@@ -40,16 +39,15 @@ class _WatchedCamera:
 
 
 class OraclePlanner:
-    """Chooses the candidate that raises F1, vertices and edges together, most.
+    """Chooses the candidate with the highest F1, of vertices and edges together, after its view.
 
-    Among equal ones it chooses the one that shows most true surface for the first time, then the shorter
-    path, then the first. True surface is counted in cells as large as the map's voxels, object by object:
-    cells in which a ray of a camera without noise meets the object. The views tried are spread evenly over
-    the candidates, away from the views so far; the one the default planner would choose is tried too, so
-    that no step of that planner can be better.
+    Among equal ones it prefers the one that shows most true surface for the first time, then the shortest
+    path, then the first. True surface is counted, for each object, in cells of the map's voxel size that a
+    ray of a noise-free camera hits. The views tried are spread evenly over the candidates, away from earlier
+    views. The default planner's choice is tried too, so that no step of that planner can be better.
 
-    It serves one exploration. Its predictions are exact: it knows the noise of the next view, and explores
-    with the same configuration, segmentation and seed.
+    It serves one exploration. Its predictions are exact, because it knows the noise of the next view and uses
+    the same configuration, segmentation and seed.
 
     Args:
         camera: Camera of the scene. Explore with the attribute `camera` instead.
@@ -94,10 +92,10 @@ class OraclePlanner:
         tried = np.union1d(tried, SupportPlanner().plan(state, rng).index)
         shown = [self._surface(candidates.T_world_camera[i]) for i in tried]
         unseen = np.array([len(np.setdiff1d(cells, self._shown, assume_unique=True)) for cells in shown])
-        # Best tie first: then the first of the highest F1 is chosen, and nothing beats F1 = 1.
+        # Ordered by the tie-breakers, so that the first candidate with the highest F1 wins.
         order = np.lexsort((tried, candidates.path_length[tried], -unseen))
         best, reached = int(order[0]), -1.0
-        equal = 1e-9  # scores are ratios of small whole numbers
+        equal = 1e-9  # scores are ratios of small integers
         for k in order:
             f1 = self._f1_after(candidates.T_world_camera[tried[k]])
             if f1 > reached + equal:
@@ -108,7 +106,7 @@ class OraclePlanner:
         cost = float(path_cost(state)[index])
         area, now = float(unseen[best]) * self._config.voxels.size**2, self._f1(self._scene.graph)
         why = f"F1 goes from {now:.2f} to {reached:.2f}, the best of {len(tried)} views; "
-        why += f"{1e4 * area:.0f} cm² of surface come into sight"
+        why += f"{1e4 * area:.0f} cm² of surface become visible"
         return Decision(candidates.T_world_camera[index], index, reached, cost, reached - cost, why)
 
     def _catch_up(self, state: PlanningState) -> None:
@@ -122,7 +120,7 @@ class OraclePlanner:
             raise InputError(
                 f"planner {ORACLE}",
                 "its views and settings are not those of this exploration",
-                "hand its camera to explore(), with the same configuration, segmentation and seed",
+                "pass its camera to explore(), with the same configuration, segmentation and seed",
             )
 
     def _f1_after(self, T_world_camera: Array) -> float:
@@ -138,7 +136,7 @@ class OraclePlanner:
         return score(graph, self._truth, config=self._config.evaluation).f1
 
     def _surface(self, T_world_camera: Array) -> NDArray[np.int64]:
-        """Cells (N,) of the objects' true surface seen from there, each a number for object and place."""
+        """Cells (N,) of the objects' true surface seen from there, each a number of object and place."""
         config, camera = self._config.oracle, self._simulated
         K = np.diag([1.0 / config.stride, 1.0 / config.stride, 1.0]) @ camera.K
         width, height = camera.sensor.width // config.stride, camera.sensor.height // config.stride
@@ -166,10 +164,10 @@ def planner_for(
     segmentation: SegmentationMethod | None,
     seed: int,
 ) -> tuple[Planner, Camera]:
-    """Make a planner by its name, also `oracle` if the truth is known, and the camera to explore with.
+    """Make a planner by its name, including `oracle` in simulation, and the camera to explore with.
 
     Raises:
-        InputError: There is no such planner, or it is the oracle and nothing is simulated.
+        InputError: There is no such planner, or it is the oracle without a simulation.
     """
     if name != ORACLE or truth is None or not isinstance(camera, SimulatedCamera):
         return make_planner(name), camera

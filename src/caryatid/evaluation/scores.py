@@ -43,12 +43,12 @@ class TrueScene:
 
 
 class Forecast(NamedTuple):
-    """The probability of a support in a graph, and whether it is true.
+    """The probability of a support, and whether the support is true.
 
     Attributes:
         probability: Probability of the support; 0 if the graph lacks it [1].
-        by_certain: The same by `certain` alone: 1, and 0.5 if uncertain [1].
-        true: It is in the truth.
+        by_certain: Probability from `certain` alone: 1 if certain, 0.5 if not [1].
+        true: Whether the support is in the ground truth.
     """
 
     probability: float
@@ -60,7 +60,7 @@ class Forecast(NamedTuple):
 class Score:
     """Scores of a graph against the ground truth.
 
-    A ratio with denominator 0 is 1 if there was nothing to find either, and 0 otherwise.
+    A ratio with denominator 0 is 1 if there is nothing to find either, and 0 otherwise.
 
     Attributes:
         precision: Eq. 4, vertices and edges together [1].
@@ -76,11 +76,11 @@ class Score:
             falls from 1; 1 is perfect [1].
         matches: Extracted vertex → its true vertex.
         ious: IoU of each matched object [1].
-        forecasts: Those of each support in the graph with both ends matched, and, with probability 0, of
-            each true one between matched vertices that the graph lacks. Supports of unmatched vertices say
-            nothing about probabilities; they count in precision and recall.
-        wrong: Extracted supports that are not in the truth.
-        missing: True supports that were not extracted; matched ends have their extracted names.
+        forecasts: One for each support in the graph between matched vertices, and one with probability 0 for
+            each true support between matched vertices that the graph lacks. Supports of unmatched vertices
+            count in precision and recall only.
+        wrong: Extracted supports that are not in the ground truth.
+        missing: True supports that were not extracted, by the extracted names of matched vertices.
         unfound: True vertices that are not matched.
     """
 
@@ -124,8 +124,8 @@ def score(
 ) -> Score:
     """Score a graph of fitted shapes against true ones.
 
-    Every edge of the graph counts, also uncertain ones: a wrong guess costs precision. An edge is
-    true when both its ends are matched and the directed pair is in the truth, whatever its kind.
+    Every edge of the graph counts, uncertain ones too: a wrong guess costs precision. An edge is true if both
+    ends are matched and the directed pair is in the ground truth, whatever its kind.
 
     Args:
         graph: The extracted graph, in the world frame of the truth.
@@ -218,13 +218,13 @@ def _matched(
 def average_precision(forecasts: Sequence[Forecast]) -> float:
     """Sum of precision times gain in recall, as the probability threshold falls from 1 to above 0.
 
-    Equal probabilities are one step. A support with probability 0 is never found.
+    Equal probabilities form one step. A support with probability 0 is never found.
 
     Args:
         forecasts: The forecasts of supports.
 
     Returns:
-        In [0, 1]; 1 if there is nothing to find and nothing found, 0 if only false ones are found.
+        In [0, 1]; 1 if there is nothing to find and nothing is found, 0 if only false ones are found.
     """
     said, _, true = np.array(forecasts, dtype=np.float64).reshape(-1, 3).T
     order = np.argsort(-said, kind="stable")[: np.count_nonzero(said)]

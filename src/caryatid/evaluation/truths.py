@@ -20,11 +20,11 @@ def true_scene_from_simulation(scene: SimulatedScene, truth: GroundTruth | None 
 
     Args:
         scene: The scene.
-        truth: Content of gt.json; None = read it beside the scene's file, or derive it from physics without
-            one.
+        truth: Content of gt.json; None = read it from beside the scene's file, or without one derive it from
+            physics.
 
     Raises:
-        InputError: The truth names a body the scene does not have.
+        InputError: The truth names a body that the scene lacks.
     """
     if truth is None:
         file = Path(scene.source).parent / TRUTH_FILE
@@ -48,8 +48,8 @@ def evaluate_run(
 
     Args:
         run_folder: A run.
-        truth: Name of a built-in scene, an MJCF file or scene folder, with `gt.json` beside it or else scored
-            against physics; or a recording with masks and `gt.json`. None = the run's own source.
+        truth: A built-in scene; an MJCF file or scene folder, with `gt.json` beside it or else compared with
+            physics; or a recording with masks and `gt.json`. None = the run's own source.
         config: Minimum IoU, tolerance of the table's height, points per pair.
 
     Raises:
@@ -72,9 +72,9 @@ def evaluate_run(
             for n, view in enumerate(run.views, 1)
         ]
     else:
-        why = (
-            "is neither a scene nor a recording" if folder.exists() else "there is no such scene or recording"
-        )
+        why = "there is no such scene or recording"
+        if folder.exists():
+            why = "is neither a scene nor a recording"
         remedy = "give a scene (scene.xml), or a recording with scene_camera.json and gt.json"
         raise InputError(source, why, remedy)
     return tuple(scores)

@@ -27,8 +27,8 @@ def axial_sigma(depth: Array, config: NoiseConfig) -> Array:
 def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np.random.Generator) -> Array:
     """Add the sensor's noise to a perfect depth image.
 
-    No return outside the range, from surfaces seen at a grazing angle, and beside depth edges; Gaussian noise
-    along the optical axis; then rounding to equal steps of 1/z.
+    There is no return outside the range, from surfaces at a grazing angle, and beside depth edges. Gaussian
+    noise is added along the optical axis, and the result is rounded to equal steps of 1/z.
 
     Args:
         depth: True depth (H, W) [m], 0 = nothing there.
@@ -49,7 +49,7 @@ def add_depth_noise(depth: Array, incidence: Array, config: NoiseConfig, rng: np
 
 
 def _depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
-    """Pixels (H, W) on either side of a step of more than `jump` [m] to one of their four neighbours."""
+    """Pixels (H, W) on either side of a step of more than `jump` [m] to a direct neighbour."""
     edges = np.zeros(depth.shape, dtype=bool)
     for pixels, values in ((edges, depth), (edges.T, depth.T)):
         step = np.abs(np.diff(values, axis=0)) > jump
@@ -59,7 +59,7 @@ def _depth_edges(depth: Array, jump: float) -> NDArray[np.bool_]:
 
 
 def misregister(T_world_camera: Array, config: NoiseConfig, rng: np.random.Generator) -> Array:
-    """Return the reported pose (4, 4): shifted, and turned about the camera's centre.
+    """Return the reported pose (4, 4): the true one, shifted and turned about the camera's centre.
 
     The shift is Gaussian with σ = `config.translation` along each axis; the turn is about an axis drawn
     uniformly, by a Gaussian angle with σ = `config.rotation`.
@@ -99,7 +99,7 @@ class SimulatedCamera:
     """A depth camera anywhere in a simulated scene.
 
     The first capture is the reference for registration, so its pose is exact: the error is between views.
-    Each capture draws its noise from its own stream, made of the seed and its number, so a run is
+    Each capture draws its noise from its own stream, given by the seed and its number, so a run is
     reproducible whatever else draws random numbers.
 
     Args:
@@ -108,12 +108,12 @@ class SimulatedCamera:
         noise_config: Parameters of the noise.
         rng: Source of the seed of all captures.
         sensor: Image size, focal length and light.
-        around: Returns a scene with the body of the robot that holds the camera at a pose (4, 4), which the
-            camera may see, or None if no robot can stand there. None = the camera floats.
+        around: Returns the scene with the body of the robot that holds the camera at a pose (4, 4), or None
+            if no robot can stand there. None = the camera floats.
 
     Attributes:
         scene: The scene; another state of the same scene may replace it.
-        captures: Number of views so far, which decides the noise of the next one.
+        captures: Number of views so far, which determines the noise of the next one.
 
     Raises:
         InputError: The noise model is not one of the two.
@@ -140,7 +140,7 @@ class SimulatedCamera:
         self._around = around
 
     def fork(self) -> SimulatedCamera:
-        """Return a copy with the same noise in its next captures; this one does not change."""
+        """Return an independent copy whose next captures have the same noise."""
         return copy.copy(self)
 
     def capture(self, T_world_camera: Array) -> View:

@@ -1,4 +1,4 @@
-"""Random scenes by size and seed: piles, heaps between screens, packed objects, household objects, blocks."""
+"""Random scenes: piles, heaps between screens, packed objects, household objects and blocks."""
 
 from __future__ import annotations
 
@@ -44,17 +44,17 @@ SIZES: dict[GeneratedKind, tuple[int, int]] = {
 GAP = 0.002
 """Height above the support from which an object is dropped [m]."""
 CLOSE = 0.0005
-"""Distance of touching objects before they settle [m]: far below what a camera can see."""
+"""Distance of touching objects before they settle [m]; far below a camera's resolution."""
 TRIES = 10
 """Failed attempts to set down an object after which the one before it is removed too."""
 
 _Drop = tuple[Body, bool]
-"""A solid where it is dropped, and whether it should stay on another one."""
+"""A body where it is dropped, and whether it must stay on another one."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Plan:
-    """Setup of a scene: the drawing of each object, initial solids, size of the table [m], walls."""
+    """Setup of a scene: function that draws each object, screens, size of the table [m], and walls."""
 
     draw: Callable[[SimulatedScene | None], _Drop]
     screens: tuple[Body, ...] = ()
@@ -65,26 +65,26 @@ class _Plan:
 def generate(
     kind: GeneratedKind, size: int, seed: int, physics: PhysicsConfig | None = None
 ) -> SimulatedScene:
-    """Set down random objects one by one, each when all are at rest.
+    """Set down random objects one by one, each once all others are at rest.
 
-    A `pile` has most of them on earlier ones, `dense` heaps them between tall free screens with walls that
-    close part of the circle for a robot, `packed` pushes them together until they touch. All these use
-    primitives; `house` has trays, bowls, mugs, plates, books and the like on and in each other; `blocks` are
-    equal boxes in a row, a wall or a pyramid with gaps of 0 to 15 mm.
+    A `pile` has most of them on earlier ones. `dense` heaps them between tall free screens, with walls that
+    block part of the robot's way around. `packed` pushes them together until they touch. All these use
+    primitives. `house` has trays, bowls, mugs, plates, books and the like on and in each other. `blocks` are
+    equal boxes in a row, a wall or a pyramid, with gaps of 0 to 15 mm.
 
     Args:
         kind: Kind of scene.
         size: Number of objects, including screens.
         seed: Seed; the same kind, size and seed give the same scene.
-        physics: When an object is at rest.
+        physics: When an object counts as at rest.
 
     Raises:
-        InputError: The size or the seed is out of range, or an object does not stay in place.
+        InputError: The size or seed is out of range, or an object does not stay in place.
     """
     name = f"{kind}-{size}-{seed}"
     least, most = SIZES[kind]
     if not least <= size <= most:
-        raise InputError(name, f"{size} objects cannot be set up", f"ask for {least} to {most}")
+        raise InputError(name, f"{size} objects are out of range", f"give {least} to {most}")
     if seed < 0:
         raise InputError(name, f"seed {seed} is negative", "give 0 or more")
     rng = np.random.default_rng([list(SIZES).index(kind), size, seed])
@@ -99,7 +99,7 @@ def generate(
 
 
 def _dense(rng: np.random.Generator, size: int) -> _Plan:
-    """Three in ten objects of the heap are dropped in any attitude, the others upright."""
+    """Three in ten objects of the heap are dropped in a random orientation, the others upright."""
     radius = 0.12 * max(1.0, np.sqrt(size / 16))
     screens = _screens(rng)
     sides: tuple[Side, ...] = ("+x", "+y", "-y")
@@ -208,10 +208,10 @@ def _set_down(name: str, size: int, plan: _Plan, physics: PhysicsConfig) -> Simu
 
 
 def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: PhysicsConfig) -> bool:
-    """Whether all objects are at rest on or over the table, and the firm ones, the first, about in place.
+    """Whether all objects rest on the table or each other, with the firm ones, the first, about in place.
 
-    An object with its middle within a centimetre of the table's edge counts as fallen; none may reach higher
-    than 36 cm over the table. Setting another one down may shift the firm ones by 4 cm.
+    An object whose middle is within a centimetre of the table's edge counts as fallen; none may reach higher
+    than 36 cm above the table. Setting down another one may shift the firm ones by up to 4 cm.
     """
     shapes = true_shapes(scene)
     half = np.array(plan.table) / 2.0 - 0.01
@@ -235,7 +235,7 @@ def _stands(scene: SimulatedScene, firm: Sequence[Body], plan: _Plan, physics: P
 
 
 def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
-    """Put a shape at the origin a little above the objects below a place (2,) [m], by their boxes."""
+    """Put a shape from the origin just above the boxes around the objects at a place (2,) [m]."""
     over = shape.moved(transforms.rigid(np.eye(3), (*xy, 0.0)))
     tops = [TABLE_HEIGHT]
     if scene is not None:
@@ -246,7 +246,7 @@ def _let_go(shape: Shape, xy: Array, scene: SimulatedScene | None) -> Body:
 
 
 def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -> Body:
-    """Put a shape at the origin over one of the scene's objects, off its middle by 0.3 of its half extent."""
+    """Put a shape from the origin over a random object, up to 0.3 of its half extents off its middle."""
     below = list(true_shapes(scene).values())[int(rng.integers(len(scene.object_bodies)))]
     reach = 0.3 * below.support(np.eye(3))[:2]
     xy = below.T_world_object[:2, 3] + reach * rng.uniform(-1.0, 1.0, size=2)
@@ -254,7 +254,7 @@ def _on_another(rng: np.random.Generator, shape: Shape, scene: SimulatedScene) -
 
 
 def _overlap(shape: Shape, other: Shape) -> bool:
-    """Whether the level boxes around two shapes overlap seen from above."""
+    """Whether the level boxes around two shapes overlap, seen from above."""
     apart = np.abs(shape.T_world_object[:2, 3] - other.T_world_object[:2, 3])
     return bool((apart < (shape.support(np.eye(3)) + other.support(np.eye(3)))[:2]).all())
 
@@ -284,7 +284,7 @@ def _shape(rng: np.random.Generator, R: Array) -> Shape:
 
 
 def _screens(rng: np.random.Generator) -> list[Body]:
-    """Two to four thin boxes, taller than most of a heap, around it, with their broad sides to the middle."""
+    """Two to four thin boxes around a heap, taller than most of it, with broad sides facing the middle."""
     count = int(rng.integers(2, 5))
     step = 2.0 * np.pi / count
     azimuths = rng.uniform(-np.pi, np.pi) + step * (np.arange(count) + rng.uniform(-0.2, 0.2, size=count))
@@ -308,7 +308,7 @@ def _turned(shape: Shape, turn: Array) -> Shape:
 
 
 def _pushed(shape: Shape, outward_world: Array, others: Sequence[Shape]) -> Shape:
-    """Push a shape over the table from outside towards the middle until it touches another.
+    """Push a shape over the table from outside towards the middle, until it touches another one.
 
     Before they settle, `CLOSE` stays between them.
     """

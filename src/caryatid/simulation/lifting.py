@@ -1,7 +1,7 @@
 """Objects lifted, held and removed in MuJoCo, and the effect on the others.
 
-A grasp is a weld to a body that moves as commanded (a mocap body), one per object: the lifted object follows
-it straight up at constant speed, and held objects stay in place.
+A grasp is a weld to a body that moves as commanded (a mocap body), one per object. A lifted object follows it
+straight up at constant speed; held objects stay in place.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from caryatid.geometry.transforms import Array
 from caryatid.simulation.world import mujoco_warnings_ignored, strayed
 
 ASIDE = 50.0
-"""Height at which a lifted object is put away [m]; nothing meets it there."""
+"""Height at which lifted objects are put [m], out of the way."""
 
 HAND = "caryatid-hand-"
 """Prefix of the names of the grasping bodies."""
@@ -36,8 +36,8 @@ class Lift:
     """Result of a lift.
 
     Attributes:
-        disturbed: Which objects (N,) moved or turned beyond the limits, without lifted and removed ones.
-        film: States (T, N, 7) on the way, one per quarter of a second; the last one is the final state.
+        disturbed: Which objects (N,) moved or turned beyond the limits, except lifted and removed ones.
+        film: States (T, N, 7) during the lift, one per quarter of a second; the last one is the final state.
     """
 
     disturbed: NDArray[np.bool_]
@@ -47,8 +47,8 @@ class Lift:
 class Lifting:
     """A table in physics whose objects can be lifted one by one.
 
-    States are arrays (N, 7): position [m] and quaternion (w first) of each object, at rest. Nothing is kept
-    between calls, so several threads may lift at once.
+    States are arrays (N, 7): position [m] and quaternion (w first) of each object, at rest. Calls share no
+    data, so several threads may lift at once.
 
     Args:
         spec: `mujoco.MjSpec` with free bodies; it is copied.
@@ -110,7 +110,7 @@ class Lifting:
             index: Index of the object.
             config: Parameters of the lift, and what counts as harm.
             held: Objects that are held in place meanwhile.
-            to_the_end: False stops as soon as one is disturbed, and observes only while something moves.
+            to_the_end: False stops as soon as an object is disturbed or all are at rest.
         """
         watched = state[:, 2] < ASIDE / 2.0
         watched[index] = False
@@ -148,7 +148,7 @@ class Lifting:
         return data
 
     def _after(self, data: Any, speed: float, seconds: float, index: int = 0) -> Array:
-        """Simulate for some time [s] while one hand goes up [m/s]; return the objects' new state."""
+        """Simulate for some time [s] while one hand rises [m/s]; return the objects' new state."""
         model = self.model
         steps = max(1, round(seconds / model.opt.timestep))
         told = np.empty(mujoco.mj_stateSize(model, _GRASPS))

@@ -119,8 +119,8 @@ _GENERATED = re.compile(r"(pile|dense|packed|house|blocks)-(\d+)-(\d+)")
 def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None) -> SimulatedScene:
     """Load a scene and let it come to rest.
 
-    Built-in names come before files: a designed scene (`tower`, `bridge`, …), or KIND-SIZE-SEED for a
-    generated one of the kinds of `generate`, such as `pile-8-3`. For a folder of that name, use `./tower`.
+    Built-in names come before files: a designed scene (`tower`, `bridge`, …), or KIND-SIZE-SEED for a scene
+    from `generate`, such as `pile-8-3`. For a folder of such a name, write `./tower`.
 
     Args:
         source: A built-in name, an MJCF file, or a folder with a `scene.xml`.
@@ -143,26 +143,26 @@ def load_scene(source: str | PathLike[str], config: PhysicsConfig | None = None)
             remedy = f"did you mean {meant[0]}? `caryatid scenes` lists all"
         raise InputError(path, "no such file or scene", remedy)
     if not path.is_file():
-        raise InputError(path, "Not a file", "give an MJCF file")
+        raise InputError(path, "is not a file", "give an MJCF file")
     _check_sizes(path, config or PhysicsConfig())
     try:
         with mujoco_warnings_ignored():
             spec = mujoco.MjSpec.from_file(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise InputError(path, f"Not an MJCF file ({reason})", "correct the XML") from None
+        raise InputError(path, f"is not an MJCF file ({reason})", "correct the XML") from None
     name = path.resolve().parent.name if path.name == SCENE_FILE else path.stem
     return scene_from_spec(spec, name or path.stem, str(path), config)
 
 
 def _check_sizes(path: Path, config: PhysicsConfig) -> None:
-    """Refuse a file that would exhaust memory, before MuJoCo expands it on reading.
+    """Refuse a file that would exhaust memory when MuJoCo expands it.
 
     Raises:
         InputError: An element makes too many copies, or a height field or texture is too large.
     """
     copies = [1.0]
-    # MuJoCo itself refuses bad XML and numbers, with the line.
+    # MuJoCo itself refuses bad XML and numbers, and names the line.
     with suppress(ElementTree.ParseError, ValueError, OSError):
         for event, element in ElementTree.iterparse(path, ("start", "end")):
             if event == "end":

@@ -1,4 +1,4 @@
-"""A simulated robot with its body and its camera in front of a scene, ready to explore."""
+"""A simulated robot with body and camera in front of a scene, ready to explore."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ PLATFORM, MAST, NECK = 0.3, 0.04, 0.15
 class HumanoidBody:
     """A platform and a mast that the torso lift extends, in a copy of a scene.
 
-    It pushes nothing. The head is left out, because it is behind the camera.
+    It collides with nothing. The head is left out, because it is behind the camera.
 
     Args:
         scene: The scene; it does not change.
-        robot: Gives the posture for a camera pose.
+        robot: Finds the posture for a camera pose.
         config: Its footprint and heights.
 
     Attributes:
-        scene: The copy, with the body at its last place.
+        scene: The copy, with the body where it was last placed.
     """
 
     def __init__(self, scene: SimulatedScene, robot: HumanoidRobot, config: RobotConfig) -> None:
@@ -63,7 +63,7 @@ class HumanoidBody:
         mujoco.mj_kinematics(model, data)
 
     def around(self, scene: SimulatedScene, T_world_camera: Array) -> SimulatedScene | None:
-        """A state of the scene with the body that holds a camera (4, 4), or None if it cannot stand there."""
+        """The scene with the body that holds a camera at a pose (4, 4), or None if it cannot stand there."""
         posture = self._robot.solve(T_world_camera)
         if not isinstance(posture, Posture):
             return None
@@ -93,7 +93,7 @@ def make_simulation(
     seed: int,
     robot: RobotMaker | str = HUMANOID,
 ) -> Simulation:
-    """Put a robot in front of the table, at its home view, with the furniture on its floor map.
+    """Put a robot at its home view in front of the table, with the furniture on its floor map.
 
     Args:
         scene: The scene in physics.

@@ -1,4 +1,4 @@
-"""The true support graph by physics: contact forces, and what moves when an object is removed."""
+"""The true support graph from physics: contact forces, and what moves when an object is removed."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class TrueEdge:
     """An edge of gt.json.
 
     Attributes:
-        supporter: Name of the body that holds.
-        supported: Name of the body that is held.
+        supporter: Name of the supporting body.
+        supported: Name of the supported body.
         kind: Kind of the support.
     """
 
@@ -40,8 +40,8 @@ class GroundTruth:
     """Content of gt.json.
 
     Attributes:
-        vertices: Body names, the table first.
-        edges: Supports, sorted by the order of the vertices: supporter first, then supported.
+        vertices: Names of the bodies, the table first.
+        edges: Supports, sorted by supporter and then supported, in the order of the vertices.
     """
 
     vertices: tuple[str, ...]
@@ -56,13 +56,13 @@ class GroundTruth:
 def ground_truth(scene: SimulatedScene, config: PhysicsConfig | None = None) -> GroundTruth:
     """Derive the support graph from physics.
 
-    A supports B `bottom-up` when the mean contact force of A on B has an upward part above 3 % of B's weight.
-    Each object A is then removed for a second. A also supports a B in contact with it that moves by more
-    than 1 cm or 8° and that A does not hold from below: `top-down` if A presses on B, `lean` if the force
-    between them is mostly horizontal.
+    A supports B `bottom-up` if the upward part of the mean contact force of A on B exceeds 3 % of B's weight.
+    Each object A is then removed for a second. A also supports an object B in contact with it that moves by
+    more than 1 cm or 8° without it: `top-down` if A presses on B, `lean` if the force between them is mostly
+    horizontal.
 
     Args:
-        scene: A settled scene; its state is not changed.
+        scene: A settled scene; its state does not change.
         config: The thresholds.
     """
     config = config or PhysicsConfig()

@@ -1,4 +1,4 @@
-"""Calls everything that uses compiled kernels, on small images, so that they are compiled beforehand."""
+"""Calls everything that uses compiled kernels, on small images, so that they are compiled in advance."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def warm_up(number: int) -> None:
     """Fit shapes, explore with and without fits and given segments, use all planners, and take a point cloud.
 
     Args:
-        number: Which of these comes first, from behind; the others follow in turn. To fit takes nearly as
-            long to compile as all else, and what explores without fits does not wait for it.
+        number: Decides which of these comes first; the others follow in turn. Fitting takes nearly as long to
+            compile as all the rest, so another process begins with what needs no fits.
     """
     parts = [_explore_without_fits, _explore_by_colour_and_depth, _explore_with_labels, _fit]
     for n in range(len(parts)):
@@ -62,7 +62,7 @@ def _explore_with_labels() -> None:
 def _explore(
     name: str, segmentation: SegmentationMethod, min_points: int = 12
 ) -> tuple[Config, Simulation, list[Step]]:
-    """Explore with a quarter of the usual image; fewer points are not fitted."""
+    """Explore with a quarter of the usual image size, fitting objects with at least `min_points`."""
     config = Config(
         sensor=SensorConfig(width=160, height=120, focal=131.25),
         active=replace(Config().active, sphere_points=400, max_views=3),

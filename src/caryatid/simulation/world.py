@@ -30,19 +30,19 @@ TABLE = "table"
 class SimulatedScene:
     """A settled table-top scene in physics.
 
-    The model and its state belong to MuJoCo, which changes states in place: nothing in caryatid steps `data`
-    of a loaded scene; simulations use a copy (`state_of`).
+    MuJoCo changes states in place, so nothing in caryatid steps the `data` of a loaded scene; simulations use
+    a copy (`state_of`).
 
     Attributes:
         model: The compiled MuJoCo model.
         data: Its state, at rest, with positions and contacts computed.
         spec: The specification of the model.
         name: Short name of the scene.
-        source: File or built-in name it came from, for messages.
+        source: Its file or built-in name, for messages.
         object_bodies: Body name of each object by its label 1…n, in the order of the bodies.
         table: Body name of the support surface.
         geom_labels: Label (G,) of the object each geom belongs to, 0 for the table and everything else.
-        at_rest: Whether nothing moved when settling ended.
+        at_rest: Whether nothing moved any more when settling ended.
     """
 
     model: Any
@@ -60,7 +60,7 @@ class SimulatedScene:
         return int(self.model.body(self.object_bodies[label] if label else self.table).id)
 
     def geoms(self, label: int) -> list[int]:
-        """Geoms of the object with this label, or of the table with 0, bodies welded to it included."""
+        """Geoms of the object with this label, or of the table with 0, including bodies welded to it."""
         inside = np.isin(self.model.geom_bodyid, _subtree(self.model, self.body_id(label)))
         return np.flatnonzero(inside if label == 0 else self.geom_labels == label).tolist()
 
@@ -77,10 +77,10 @@ def scene_from_spec(
         name: Short name of the scene.
         source: File or built-in name, for messages.
         config: When an object is at rest.
-        least: Minimum time to simulate [s], for poses that were only designed.
+        least: Minimum time to simulate [s], for poses that were designed and not simulated.
 
     Raises:
-        InputError: It does not compile, has no static body `table`, no object, or its simulation is unstable.
+        InputError: It does not compile, lacks a static body `table` or objects, or is unstable.
     """
     try:
         with mujoco_warnings_ignored():
@@ -98,13 +98,13 @@ def scene_from_spec(
     if table < 0:
         raise InputError(source, f"has no body '{TABLE}'", f"name the static support surface '{TABLE}'")
     if model.body_weldid[table] != 0:
-        raise InputError(source, f"body '{TABLE}' can move", "take out its joints: the surface is static")
+        raise InputError(source, f"body '{TABLE}' can move", "remove its joints: the surface is static")
     if not np.isin(model.geom_bodyid, _subtree(model, table)).any():
         raise InputError(source, f"body '{TABLE}' has no geom", "give the table a top")
     if not free:
         raise InputError(source, "has no objects", "every object is a body with a free joint")
     if len(free) >= SUPPORT_LABEL:
-        raise InputError(source, f"has {len(free)} objects", f"fewer than {SUPPORT_LABEL} can be told apart")
+        raise InputError(source, f"has {len(free)} objects", f"at most {SUPPORT_LABEL - 1} are supported")
     names = {label: str(model.body(body).name) for label, body in enumerate(free, start=1)}
     if "" in names.values():
         raise InputError(source, "an object has no name", "name every body with a free joint")
@@ -120,9 +120,9 @@ def scene_from_spec(
 
 
 def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least: float) -> bool:
-    """Simulate until nothing moves, and say whether that was in time; changes the data.
+    """Simulate until nothing moves, and return whether that was in time; changes the data.
 
-    A state at rest stays exactly as it is, unless a minimum time `least` [s] is simulated.
+    A state at rest does not change, unless a minimum time `least` [s] is simulated.
     """
     window = max(1, round(config.rest_window / model.opt.timestep))
     kinds = mujoco.mjtWarning
@@ -137,9 +137,8 @@ def _settle(model: Any, data: Any, source: str, config: PhysicsConfig, *, least:
             mujoco.mj_step(model, data, nstep=window)
             mujoco.mj_forward(model, data)
             if any(data.warning[int(kind)].number for kind in blown_up):
-                raise InputError(
-                    source, "its simulation is unstable", "shorten the time step or mend overlapping bodies"
-                )
+                remedy = "shorten the time step, or separate overlapping bodies"
+                raise InputError(source, "its simulation is unstable", remedy)
             if not strayed(poses, body_poses(data), config.rest_distance, config.rest_angle).any():
                 data.qpos[:] = before
                 at_rest = True
@@ -157,7 +156,7 @@ def body_poses(data: Any) -> Array:
 
 
 def strayed(before: Array, after: Array, moved: float, turned: float) -> NDArray[np.bool_]:
-    """Which (N,) of poses (N, 7), positions and quaternions, moved [m] or turned [deg] beyond limits."""
+    """Which (N,) of poses (N, 7), positions and quaternions, moved or turned beyond limits [m, deg]."""
     cosine = np.abs(np.einsum("ni,ni->n", before[:, 3:], after[:, 3:]))
     angle = 2.0 * np.arccos(np.clip(cosine, 0.0, 1.0))
     return (np.linalg.norm(after[:, :3] - before[:, :3], axis=1) > moved) | (angle > np.deg2rad(turned))
@@ -202,7 +201,7 @@ def _subtree(model: Any, body: int) -> list[int]:
 
 @contextmanager
 def mujoco_warnings_ignored() -> Iterator[None]:
-    """Keep MuJoCo from printing and from writing a log file; the state counts its warnings."""
+    """Keep MuJoCo from printing and from writing a log file; a state counts its warnings."""
     handler = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
     try:
@@ -218,7 +217,7 @@ TABLE_SIZE = (0.6, 0.9)
 """Depth (along world x, towards the robot) and width (along y) of the usual table top [m]."""
 
 Side = Literal["+x", "+y", "-y"]
-"""Possible places of walls; the robot comes from -x."""
+"""Possible sides of walls; the robot comes from -x."""
 
 Vector = tuple[float, float, float]
 
@@ -261,7 +260,7 @@ def sphere(radius: float, at: Vector) -> Body:
 
 
 def empty_spec(name: str) -> Any:
-    """An empty `mujoco.MjSpec`, with a solver under which stacks stand and slide little."""
+    """An empty `mujoco.MjSpec` with a solver that keeps stacks standing."""
     spec = mujoco.MjSpec()
     spec.modelname = name
     spec.option.impratio = 10.0
@@ -317,7 +316,7 @@ def build_spec(
 
 def palette(index: int) -> tuple[float, float, float, float]:
     """Colour of the object with this number; neighbours in number differ widely in hue."""
-    hue = (0.02 + index * 0.618034) % 1.0  # steps by the golden ratio stay apart
+    hue = (0.02 + index * 0.618034) % 1.0  # multiples of the golden ratio stay apart
     value = (0.88, 0.7, 0.55)[(index // 7) % 3]
     return (*colorsys.hsv_to_rgb(hue, 0.75, value), 1.0)
 
@@ -401,7 +400,7 @@ def bounds(scene: SimulatedScene, label: int) -> tuple[Array, Array]:
 
 
 def true_shapes(scene: SimulatedScene) -> dict[int, Shape]:
-    """Shape of every object, by label: a box, cylinder or sphere, or else a solid of its geoms."""
+    """Shape of every object by label: a box, a cylinder, a sphere, or a solid of its geoms."""
     return {label: _true_shape(scene, label) for label in scene.object_bodies}
 
 
@@ -419,14 +418,14 @@ def _true_shape(scene: SimulatedScene, label: int) -> Shape:
 
 
 def static_boxes(scene: SimulatedScene) -> tuple[Box, ...]:
-    """Oriented boxes around the geoms of no object, the table's first; planes are not obstacles."""
+    """Oriented boxes around all geoms that belong to no object, the table's first; planes are left out."""
     flat = (int(_GEOM.mjGEOM_PLANE), int(_GEOM.mjGEOM_HFIELD))
     geoms = dict.fromkeys([*scene.geoms(0), *np.flatnonzero(scene.geom_labels == 0).tolist()])
     return tuple(_geom_box(scene, g) for g in geoms if int(scene.model.geom_type[g]) not in flat)
 
 
 def table_centre(scene: SimulatedScene) -> Array:
-    """Middle (3,) [m] of the table's upper face, world frame: that of the geom with the largest one."""
+    """Middle (3,) [m] of the table's largest upper face, world frame."""
     faces = []
     for box in (_geom_box(scene, g) for g in scene.geoms(0)):
         R, half = box.T_world_object[:3, :3], box.extents / 2.0
