@@ -170,7 +170,7 @@ def test_views_may_be_handed_in_without_camera_or_robot():
 
 
 def test_masks_that_would_not_be_used_are_refused():
-    with pytest.raises(InputError, match="segmentation auto uses none"):
+    with pytest.raises(InputError, match="are not used by segmentation auto"):
         Explorer(masks=lambda view: view, segmentation="auto")
 
 

@@ -124,7 +124,7 @@ def test_an_interrupted_run_is_kept_with_the_views_done(tmp_path, monkeypatch):
 
 def test_labels_beyond_16_bits_are_refused(tmp_path):
     for bad in (-1, 65536):
-        with pytest.raises(InputError, match="labels leave"), writer(tmp_path / "RUN") as run:
+        with pytest.raises(InputError, match="labels are not all within"), writer(tmp_path / "RUN") as run:
             run.add(step(labels=np.full((2, 2), bad)))
     assert list(tmp_path.iterdir()) == []
 

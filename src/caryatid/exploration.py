@@ -32,9 +32,7 @@ from caryatid.sensing.views import Camera, Cloud, View
 UNTIL = 0.95
 """Default probability at which the effects of removing the goal count as known [1]."""
 ATTEMPTS = 20
-"""Refusals by the robot in one step before the loop stops [1]; a coarse map is wrong about every tenth
-view.
-"""
+"""Refusals by the robot in one step before the loop stops [1]; a coarse map is wrong in one of ten views."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -61,8 +59,8 @@ class Step(Pictured):
     Attributes:
         index: Number of the view, from 0.
         name: Name of the view or cloud.
-        view: The view, or None for a cloud. Its pose is the one the camera reported; without one, or without
-            a robot, it is the one found by registration.
+        view: The view, or None for a cloud. Its pose is the reported one, or the registered one if there is
+            none, or no robot.
         labels: Label image (H, W) of the view, or labels (N,) of a cloud.
         graph: The fused graph after this view.
         cloud: All points so far, thinned, with labels.
@@ -72,8 +70,7 @@ class Step(Pictured):
         decision: The next view, or None if the loop stops.
         timings: Seconds of each stage.
         angle_travelled: Sum of the angles between consecutive views at the sphere's centre [rad].
-        path_travelled: Path length of the robot [m]: of a platform over the floor, of an arm's hand. Without
-            a robot, of the camera.
+        path_travelled: Path length [m] of a platform or of an arm's hand; without a robot, of the camera.
         stop: Why this is the last step, or None.
         robot: How the robot holds its camera, or None if unknown.
         changes: Changes of objects since the previous view, seen or reported.
@@ -117,10 +114,10 @@ class Explorer:
         segmentation: `labels`, `auto`, or None to use labels where views have them.
         seed: Seed of every random choice.
         masks: Source of masks, or None to use those of the views.
-        goal: Id of an object to remove. Planner `support` then looks at what its removal depends on, and the
-            loop stops when that is known. No view need have shown it yet.
-        until: Probability [1], above 0.5, at which a support counts as known, or with a goal whether an
-            object moves. The loop stops when all are known. None = 0.95 with a goal, otherwise never.
+        goal: Id of an object to remove, even if no view has shown it yet. Planner `support` then looks at
+            what its removal depends on, and the loop stops when that is known.
+        until: Probability [1], above 0.5, at which a support counts as known; with a goal, whether an object
+            moves. The loop stops when all are known. None = 0.95 with a goal, otherwise never.
 
     Attributes:
         scene: The scene model.
@@ -129,8 +126,7 @@ class Explorer:
         step: The newest step, or None before the first view.
 
     Raises:
-        InputError: There is no such planner, masks are given but would not be used, or `until` is out of
-            range.
+        InputError: There is no such planner, the masks would not be used, or `until` is out of range.
     """
 
     def __init__(
@@ -152,11 +148,10 @@ class Explorer:
         if robot is not None:
             check_type("robot", robot, "candidates", "give a Robot: an object with its methods")
         if until is not None and not 0.5 < until <= 1.0:
-            raise InputError(
-                "until", f"{until:g} is not above 0.5 and at most 1", "give a probability, such as 0.95"
-            )
+            reason = f"{until:g} is not above 0.5 and at most 1"
+            raise InputError("until", reason, "give a probability, such as 0.95")
         if masks is not None and segmentation == "auto":
-            raise InputError("masks", "are given, segmentation auto uses none", "leave one of the two out")
+            raise InputError("masks", "are not used by segmentation auto", "leave out one of the two")
         self.scene = Scene(config, segmentation=segmentation, seed=seed)
         self._masks = masks
         self.goal = goal
@@ -167,7 +162,7 @@ class Explorer:
         self.use_planner(planner)
 
     def use_planner(self, planner: Planner | str) -> None:
-        """Use another planner, or the one of this name, from now on.
+        """Use another planner, or its name, from now on.
 
         Raises:
             InputError: There is no such planner.
@@ -184,14 +179,14 @@ class Explorer:
             The new step, without candidates and decision.
 
         Raises:
-            NoSurfaceError: No support surface is known, and none seen. `scene` keeps a view with a pose.
+            NoSurfaceError: No support surface is known or visible. `scene` keeps a view that has a pose.
             CaryatidError: The view cannot be used, or there is neither a view nor a camera.
         """
         *_, step = self.looks(given)
         return step
 
     def looks(self, given: View | Cloud | None = None) -> Iterator[Step]:
-        """Look, and yield the steps of the views kept so far, then that of the new one.
+        """Look, and yield the steps of views kept so far, then that of the new one.
 
         Args:
             given: As of `look`.
@@ -212,7 +207,7 @@ class Explorer:
             yield self.step
 
     def _step(self, source: View | Cloud, captured: float) -> Step:
-        """The step of a view that has just become part of the scene, with its capture time [s]."""
+        """The step of the newest view of the scene, with its capture time [s]."""
         scene, robot, before = self.scene, self.robot, self.step
         assert scene.sphere is not None
         assert scene.labels is not None
@@ -239,7 +234,7 @@ class Explorer:
         )  # fmt: skip
 
     def plan(self) -> Step:
-        """Choose the next view. If the robot refuses one in its closer check, plan again among the others.
+        """Choose the next view; if the robot refuses it after a closer check, choose among the others.
 
         Returns:
             The newest step, with candidates and decision; if no view can be reached, `stop` says why.
@@ -273,7 +268,7 @@ class Explorer:
             return step.stop
         state = self._state(step.candidates)
         goal, until, config = self.goal, self._until, self.scene.config.support
-        # Without a goal, nothing checks whether the first view hides objects.
+        # Without a goal, nothing checks whether objects are hidden in the first view.
         asked = until if goal is not None or step.index > 0 else None
         if asked is not None and settled(state.graph, goal, asked, state.voxels, config):
             what = "every support" if goal is None else f"what moves without {goal}"
@@ -365,7 +360,7 @@ def explore(
     until: float | None = None,
     early_stop: bool = True,
 ) -> Iterator[Step]:
-    """Look around until no view is expected to show more than its path costs, or the views are used up.
+    """Look around until no view is expected to show more than its path costs, or `max_views` is reached.
 
     Args:
         camera: Takes the views.
@@ -377,7 +372,7 @@ def explore(
         masks: Source of masks, or None to use those of the views.
         goal: As of `Explorer`.
         until: As of `Explorer`.
-        early_stop: Stop before the views are used up, as `config.active.stop` and `until` say.
+        early_stop: Whether to stop before `max_views`, by `config.active.stop` and `until`.
 
     Yields:
         A step after each view.
@@ -441,18 +436,18 @@ def next_best_view(
         scene: Scene model of at least one view.
         robot: Robot that has to reach the view; None if `candidates` are given.
         visited: Unit directions (V, 3) of earlier views from the centre of the robot's view sphere, the
-            current one last; None = those of the scene, or where the robot is if they have no poses.
+            current one last; None = those of the scene, or the robot's if they have no poses.
         candidates: Camera poses (N, 4, 4) to choose from; None = those the robot reaches.
         path_length: Path length (N,) [m] to each of these poses; None = straight lines.
         planner: Planner, or its name.
 
     Returns:
-        The decision: `T_world_camera` is the view, `index` its place among the candidates, `waypoints` the
+        The decision: `T_world_camera` is the view, `index` its index among the candidates, `waypoints` the
         way there, `why` the reason.
 
     Raises:
         InputError: The candidates are not poses, or path lengths do not fit them.
-        PlanningError: No view is known yet, or none can be reached.
+        PlanningError: The scene has no view yet, or no view can be reached.
     """
     check_type("scene", scene, Scene, "give a Scene that has seen a view")
     if scene.sphere is None:
@@ -505,7 +500,7 @@ def given_candidates(
 def _decide(
     state: PlanningState, robot: Robot | None, planner: Planner, seed: int
 ) -> tuple[Decision, Candidates]:
-    """Return the decision, and the candidates without those the robot refused."""
+    """Return the decision, and the candidates that the robot has not refused."""
     rng = np.random.default_rng([seed, len(state.visited)])
     why = ""
     for _ in range(ATTEMPTS):

@@ -1,4 +1,4 @@
-"""Run folders: a folder for each step of a run, written whole or not at all, and read back."""
+"""Run folders, with a folder for each step of a run."""
 
 from __future__ import annotations
 
@@ -44,15 +44,15 @@ PARTS = (View, Cloud, ViewSphere, Candidates, Decision, PointOfInterest, Posture
 class RunWriter(StagedFolder):
     """Writes a run folder step by step in a `with` block; the folder appears at the end of the block.
 
-    Ctrl-C ends the block too and keeps the views so far. Any other error leaves nothing behind. An earlier
-    run folder is replaced only at the end of the block. A folder with any other file is never touched.
+    Ctrl-C also ends the block, and keeps the views so far. Any other error leaves nothing behind. An earlier
+    run folder is replaced only at the end of the block. A folder with other files is never changed.
 
     Args:
         folder: RUN.
         config: All settings.
         about: Further entries of run.json: command, source, seed, options.
-        stepwise: Publish the folder with the first view and add to it view by view, so that a kill keeps the
-            views so far. An unfinished run of this kind is continued.
+        stepwise: Publish the folder with the first view and add view by view, so that a kill keeps the views
+            so far. An unfinished run of this kind is continued.
 
     Attributes:
         past: The run that this one continues, or None.
@@ -76,7 +76,7 @@ class RunWriter(StagedFolder):
         if self.past is not None:
             told = self.past.record["steps"]
             self._views = [(t, v.graph, None) for t, v in zip(told, self.past.views, strict=True)]
-            # Of what is listed for the view that a kill prevented, nothing may be there.
+            # Files listed for a view that a kill prevented may be missing.
             self.written |= {name for name in self.past.record["files"] if (self._place / name).exists()}
 
     @property
@@ -87,7 +87,7 @@ class RunWriter(StagedFolder):
     def add(self, step: Step, score: Mapping[str, Any] | None = None) -> None:
         """Write the next view.
 
-        Points and normals of the cloud are rounded to float32; everything else is read back unchanged.
+        Points and normals of the cloud are rounded to float32; all else is read back unchanged.
 
         Args:
             step: The step of this view.
@@ -99,7 +99,7 @@ class RunWriter(StagedFolder):
         number = len(self._views)
         labels, folder = step.labels, _view_folder(number)
         if labels.size and not 0 <= labels.min() <= labels.max() <= SUPPORT_LABEL:
-            reason = f"labels leave 0…{SUPPORT_LABEL}"
+            reason = f"labels are not all within 0…{SUPPORT_LABEL}"
             raise InputError(step.name, reason, "number objects from 1, 0 = nothing")
         self.write(f"{folder}/graph.json", graph_text(step.graph).encode())
         if labels.ndim == 2:
@@ -144,7 +144,7 @@ class RunWriter(StagedFolder):
         for path, content in ({"graph.json": graph_text(graph).encode()} | self.files).items():
             self.write(path, content)
         self.files = {}
-        # A kill may leave files of the next view that nothing refers to.
+        # A kill may leave files of the next view, to which nothing refers.
         files, following = self.written, len(self._views)
         if "unfinished" in more:
             names = ("graph.json", "labels.png", "view.json", "step.npz")
@@ -155,7 +155,7 @@ class RunWriter(StagedFolder):
 
 @dataclass(frozen=True, eq=False, slots=True)
 class RunView:
-    """One view of a run.
+    """A view of a run.
 
     Attributes:
         name: The view's name, which identifies a recording's frame.
@@ -217,12 +217,12 @@ class _ViewFile:
 
 
 def read_run(folder: str | Path) -> Run:
-    """Read a run folder; label images are loaded on demand.
+    """Read a run folder; label images are read when needed.
 
     Raises:
         InputError: It is not a run folder, or a file in it is missing or broken.
     """
-    folder, remedy = Path(folder), "give the folder a run was written to with --out"
+    folder, remedy = Path(folder), "give a folder that a run was written to with --out"
     if not folder.is_dir():
         raise InputError(folder, "is not a folder", remedy)
     path = folder / "run.json"
@@ -241,14 +241,13 @@ def read_steps(run: Run) -> Iterator[Step]:
     if run.record["version"] == 1:
         ours = run.record.get("versions", {}).get("caryatid", "0.1.0")
         reason = f"was written by caryatid {ours}, which kept no views"
-        raise InputError(
-            run.folder, reason, "make the run again; order, evaluate and export need only its graph"
-        )
+        remedy = "repeat the run; order, evaluate and export need only its graph"
+        raise InputError(run.folder, reason, remedy)
     return (_read_step(view.folder) for view in run.views)
 
 
 def read_config(run: Run) -> Config:
-    """Return the settings a run was made with; settings that no longer exist are ignored.
+    """Return the settings of a run.
 
     Raises:
         InputError: The settings are not valid.
@@ -270,13 +269,13 @@ def _own_files(folder: Path) -> set[str]:
         return set()
     files = read_json(folder / "run.json").get("files")
     if files is None:
-        reason = "holds a run of an earlier caryatid, which does not say which files are its own"
+        reason = "holds a run of an earlier caryatid, which does not list its files"
         raise InputError(folder, reason, "move or delete the folder, or give a new one")
     return {"run.json", "report.html", *map(str, files)}
 
 
 def _unfinished(folder: Path, about: Mapping[str, Any]) -> Run | None:
-    """The unfinished run of the same command and settings in a folder, or None."""
+    """The unfinished run in a folder if it has the same command and settings, or None."""
     if not is_run(folder):
         return None
     record = read_json(folder / "run.json")

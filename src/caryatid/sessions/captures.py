@@ -1,4 +1,4 @@
-"""One view as it is received and stored: encoded images and their camera."""
+"""A view as received and stored: encoded images and their camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import read_errors
 from caryatid.sensing.views import View
 
-REMEDY: Final = "take this view and all later ones out of the session's folder"
+REMEDY: Final = "remove this view and all later ones from the session's folder"
 """Remedy for a damaged view."""
 
 _FILES: Final = {
@@ -42,8 +42,8 @@ class CameraRecord:
         T_world_camera: Camera pose (4, 4) [m]; OpenCV camera frame, world z up. The first view may lack one;
             its table then defines the world.
         depth_scale: Millimetres of one unit of a depth PNG.
-        name: What to call the view in messages.
-        labels_are: Whether a label is an object's in all views or a segment's in this view alone.
+        name: Name of the view in messages.
+        labels_are: Whether a label means an object in all views or a segment of this view.
         digest: Digest of camera and images; empty until the view is stored.
     """
 
@@ -99,7 +99,7 @@ class Capture:
         """
         images = {key: _read(path, config.max_bytes) for key, path in files.items() if path is not None}
         given = CameraRecord.read(
-            camera, "give K (3×3), and T_world_camera (4×4, in metres) for all views but the first"
+            camera, "give K (3×3), and T_world_camera (4×4, in metres) for all views after the first"
         )
         return cls(images, replace(given, name=str(files["depth"])))
 
@@ -108,13 +108,13 @@ class Capture:
         """Read the files of a stored view.
 
         Raises:
-            InputError: Something is missing, or is not what was written.
+            InputError: A file is missing or has changed.
         """
         record = CameraRecord.read(folder / "camera.json")
         images = {file.stem: _read(file) for file in folder.iterdir() if file.stem in _IMAGES}
         capture = cls(images, record)
         if capture.record.digest != record.digest:
-            raise InputError(folder, "is not what was written there", REMEDY)
+            raise InputError(folder, "has changed since it was written", REMEDY)
         return capture
 
     @property

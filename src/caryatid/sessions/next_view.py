@@ -27,7 +27,7 @@ class NextView:
 
     Attributes:
         number: Number of the next view, from 0.
-        decision: Pose, the way there, expected gain, cost, and why. Given candidates have no waypoints.
+        decision: Pose, waypoints (none with given candidates), expected gain, cost and reason.
         stop: Why another view may not pay, or None.
     """
 
@@ -56,7 +56,7 @@ class NextView:
 
 @dataclass(frozen=True, eq=False)
 class Reachable:
-    """Views that a robot says it reaches: candidates.json.
+    """Views that a robot can reach: candidates.json.
 
     Attributes:
         T_world_camera: Camera poses (N, 4, 4) [m]; OpenCV camera frame, world z up.
@@ -84,9 +84,9 @@ def table_floor(scene: Scene) -> FloorGrid:
 
 
 def reached_candidates(robot: Robot, T_world_camera: Array, sphere: ViewSphere) -> Candidates:
-    """What a robot reaches from its camera pose (4, 4), as held or without roll.
+    """The views that a robot reaches from its camera pose (4, 4), with or without its roll.
 
-    If it cannot stand there, paths are straight lines.
+    If it cannot hold that pose, paths are straight lines.
     """
     for T in (T_world_camera, transforms.look_at(T_world_camera[:3, 3], sphere.centre_world)):
         if isinstance(robot.solve(T), Posture):

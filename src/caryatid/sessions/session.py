@@ -326,13 +326,13 @@ class Session:
 
         Args:
             view: A view, or one that is not decoded yet. Only the first one may lack a pose.
-            number: Expected number of the view, from 0. The last view is not added a second time,
-                so a client that missed the answer can send it again. None = the next one.
+            number: Expected number of the view, from 0; None = the next one. The last view is not added a
+                second time, so a client that missed the answer can send it again.
 
         Raises:
             SessionConflictError: It would have another number.
-            InputError: The view cannot be used; the session is as it was.
-            PerceptionError: There are no readings in it; the session is as it was.
+            InputError: The view cannot be used; the session does not change.
+            PerceptionError: It has no readings; the session does not change.
         """
         self._check_writable()
         capture = Capture.of(view) if isinstance(view, View) else view
@@ -366,7 +366,7 @@ class Session:
             The graph without it, or with it where it is now.
 
         Raises:
-            InputError: There is no such object, or T is not a rigid transform; the session is as it was.
+            InputError: There is no such object, or T is not a rigid transform; the session does not change.
         """
         self._check_writable()
         report = Report(object_id, self.views, None if T is None else as_rigid(T, "T"))
@@ -390,8 +390,8 @@ class Session:
         """Choose where to look next.
 
         Args:
-            candidates: Camera poses (N, 4, 4) that can be reached; None = those the session's robot reaches,
-                on a floor with nothing but the table on it.
+            candidates: Camera poses (N, 4, 4) that can be reached; None = those that the session's robot
+                reaches on a floor with only the table.
             path_length: Path length (N,) [m] to each candidate; None = straight lines.
 
         Raises:
@@ -425,10 +425,10 @@ class Session:
         """Remove the last view, or the report after it.
 
         Returns:
-            How many views are left.
+            Number of views left.
 
         Raises:
-            InputError: There is none, or an earlier one is broken; the session is as it was.
+            InputError: There is none, or an earlier one is broken; the session does not change.
         """
         self._check_writable()
         if not self._events:
@@ -453,7 +453,7 @@ class Session:
             raise InputError(self.path, "is closed or read-only", "open it again to change it")
 
     def _check_alike(self, view: View) -> None:
-        """Refuse a view without labels or with unexpected ones, or of another camera than the first's."""
+        """Refuse a view whose labels or camera do not match those of the first view."""
         first, segmentation = self._first, self.beginning.segmentation
         if segmentation == "labels" and view.labels is None:
             remedy = "give a label image, or a session with --segmentation auto"
@@ -481,10 +481,10 @@ class Session:
         for found, place, what in ((folders, self._folder, "view"), (files, self._report, "report")):
             for number, path in enumerate(found):
                 if path != place(number):
-                    remedy = "put it back, or take the later ones out"
-                    raise InputError(path.parent, f"holds no {what} {number:06d}", remedy)
+                    remedy = "put it back, or remove the later ones"
+                    raise InputError(path.parent, f"has no {what} {number:06d}", remedy)
         records = [CameraRecord.read(folder / "camera.json") for folder in folders]
-        remedy = "take this report and all later ones out of the session's folder"
+        remedy = "remove this report and all later ones from the session's folder"
         reports = [parse_json(Report, read_json(path, remedy), path, remedy) for path in files]
         events: list[Event] = []
         # Reports of views that another process has just added are left to the next reader.
@@ -515,9 +515,9 @@ class Session:
         return scene
 
     def _read_snapshot(self, events: Sequence[Event]) -> tuple[int, Scene | None]:
-        """The newest scene that this code made of the first of these events, and their number."""
+        """The newest snapshot that this code made of the first of these events, and their number."""
         for number in range(len(events), 0, -1):
-            with suppress(Exception):  # whatever a damaged file leads to: the events are still there
+            with suppress(Exception):  # a damaged file may raise anything, and the events are still there
                 content = self._snapshot(number).read_bytes()
                 if content[:32] == self._seal(events[:number], content[32:]):
                     scene = _Unpickler(io.BytesIO(content[32:])).load()
@@ -527,7 +527,7 @@ class Session:
         return 0, None
 
     def _write_snapshot(self, scene: Scene, events: Sequence[Event]) -> None:
-        """Keep the scene of all events, and those of the seven before; a failure costs only time."""
+        """Keep the scene of all events and the seven before it; a failure costs only time."""
         with suppress(Exception):
             path = self._snapshot(len(events))
             path.parent.mkdir(exist_ok=True)
@@ -548,18 +548,18 @@ class Session:
 
 
 def _given(scene: Scene) -> int:
-    """How many views a scene was updated with."""
+    """Number of views that a scene was updated with."""
     return scene.views + len(scene.waiting)
 
 
 def _locked(path: Path) -> FileLock:
-    """Become the only writer, until the lock is released or this process ends."""
+    """Lock out other writers until the lock is released or this process ends."""
     lock = FileLock(path, timeout=0, thread_local=False)
     with write_errors(path):
         try:
             lock.acquire()
         except Timeout:
-            remedy = "wait until it is done, or stop it"
+            remedy = "wait until it has finished, or stop it"
             raise SessionBusyError(path.parent, "another writer has this session open", remedy) from None
     return lock
 
