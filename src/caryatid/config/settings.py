@@ -24,12 +24,12 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
     """Build the configuration from a file and flags.
 
     Args:
-        file: TOML, one table per stage: `[fit]`, `hypotheses = 200`. None = defaults.
-        flags: `fit.hypotheses=200`, each value as in TOML; quotes around words may be left out.
+        file: TOML with one table per stage: `[fit]`, `hypotheses = 200`. None = defaults.
+        flags: `fit.hypotheses=200`, with values as in TOML; quotes around words may be left out.
         base: Configuration to start from.
 
     Raises:
-        InputError: The file cannot be read, or a name or value is not valid; the message says what would be.
+        InputError: The file cannot be read, or a name or value is not valid; the error says what is.
     """
     config = base or Config()
     if file is not None:
@@ -88,7 +88,7 @@ def write_settings(config: Config) -> str:
 
 
 def _ranges(stage: Any) -> dict[str, str]:
-    """What each setting of a stage may be, in words; empty where anything of its type may."""
+    """Range of each setting of a stage in words; empty if it has none."""
     words = {
         "minimum": "at least",
         "exclusiveMinimum": "above",
@@ -120,11 +120,11 @@ def _parse_flag(flag: str) -> dict[str, Any]:
             return tomllib.loads(f"{name} = {text}")
         except tomllib.TOMLDecodeError:
             continue
-    raise InputError("--set", f"'{value}' is not TOML value", "write it as in TOML")
+    raise InputError("--set", f"'{value}' is not a TOML value", "write it as in TOML")
 
 
 def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -> InputError:
-    """The first fault, in one sentence."""
+    """The first error, in one sentence."""
     fault = error.errors(include_url=False, include_context=False)[0]
     if not fault["loc"]:
         return InputError(source, fault["msg"], "correct it, or see `caryatid config`")

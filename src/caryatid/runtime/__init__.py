@@ -1,4 +1,4 @@
-"""Compiled kernels, threads, the code that decides results, and late imports."""
+"""Compiled kernels, threads, the fingerprint of the code, and late imports."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 
 def imported_late(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[[str], Any]:
-    """The `__getattr__` (PEP 562) of a package that declares them to type checkers under `TYPE_CHECKING`.
+    """Make the `__getattr__` (PEP 562) of a package whose names are imported when first used.
 
     Args:
         package: Its `__name__`.
-        homes: Module of the package → names it holds.
+        homes: Module of the package → names in it.
     """
     module_of = {name: module for module, names in homes.items() for name in names}
 
@@ -27,20 +27,20 @@ def imported_late(package: str, homes: Mapping[str, Sequence[str]]) -> Callable[
 
 
 LIBRARIES = ("numpy", "scipy", "numba", "mujoco", "shapely")
-"""Libraries whose release may change a figure."""
+"""Libraries whose version may change a result."""
 
 BYSTANDERS = frozenset(
     {"benchmark", "cli", "exports.py", "service.py", "sessions", "sources.py", "viewer", "viz"}
 )
-"""Parts of caryatid that only pass on or show results, except the modules in `DECIDING`."""
+"""Parts of caryatid that only pass on or show results, except for the modules in `DECIDING`."""
 
 DECIDING = frozenset({"benchmark/episodes.py"})
-"""Modules in these parts that decide figures."""
+"""Modules in these parts that affect results."""
 
 
 @cache
 def fingerprint() -> str:
-    """Digest of the code and library releases that decide the result of an episode."""
+    """Digest of the code and library versions that determine the result of an episode."""
     import hashlib
     from importlib.metadata import version
 

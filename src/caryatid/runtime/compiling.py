@@ -1,10 +1,9 @@
-"""Kernels are compiled once after installation, by a few processes side by side, before the first view.
+"""Kernels are compiled once after installation, by a few processes in parallel, before the first view.
 
-numba compiles a kernel at its first call and keeps it on disk. So there is no list of kernels to maintain:
-the processes *warm up*. Each runs everything that calls kernels on small scenes
-(`caryatid.simulation.warm_up`), starting with a different part. While one of them compiles a kernel, the
-others wait for it, and then read it from disk. A kernel that no warm-up calls is compiled at its first call;
-only such a kernel needs an entry there.
+numba compiles a kernel at its first call and caches it on disk, so no list of kernels is needed: the
+processes *warm up*. Each calls everything that uses kernels, on small scenes (`caryatid.simulation.warm_up`),
+starting with a different part. While one of them compiles a kernel, the others wait for it and then read it
+from disk. A kernel that no warm-up calls is compiled at its first call; add such a call there.
 """
 
 from __future__ import annotations
@@ -47,10 +46,7 @@ sys.path.append(sys.argv[1])
 from caryatid.runtime.compiling import warm_up
 warm_up(sys.argv[2], int(sys.argv[3]))
 """
-"""The program of such a process; it ends with its parent.
-
-It looks for caryatid where its parent found it.
-"""
+"""The program of such a process. It ends with its parent, and imports caryatid from the same place."""
 
 
 def compile_kernels() -> None:
@@ -76,7 +72,7 @@ def compile_kernels() -> None:
             return
         log.info("compiling kernels, once after installation: about 20 seconds")
         for module in wanted.keys() - {name for name, digest in done.items() if wanted.get(name) == digest}:
-            # numba itself does not see that a kernel of another module, which this one calls, has changed.
+            # numba does not notice a change of a kernel in another module that this one calls.
             source = ROOT / f"{module.replace('.', '/')}.py"
             for index in cache_of(source.parent).glob(f"{source.stem}.*.nbi"):
                 index.unlink(missing_ok=True)
@@ -85,13 +81,13 @@ def compile_kernels() -> None:
 
 
 def warm_up(locks: str, number: int) -> None:
-    """Call all kernels; run in a process of its own.
+    """Call all kernels, in a process of its own.
 
     Args:
         locks: Folder of the locks by which the processes take turns.
         number: Number of the process, which decides where it starts.
     """
-    # A compiler makes many objects that last: looking for garbage among them is a tenth of its time.
+    # A compiler makes many long-lived objects; looking for garbage among them takes a tenth of its time.
     gc.set_threshold(200_000, 50, 100)
     _take_turns(Path(locks))
     call("warm-up", number)
@@ -102,23 +98,20 @@ def cache_of(folder: Path) -> Path:
     """Folder in which numba keeps the compiled kernels of the modules in a folder.
 
     Raises:
-        InputError: There is no folder that can be written to.
+        InputError: No such folder is writable.
     """
     names: dict[str, Any] = {}
     exec(compile("def nothing(): pass", str(folder / "__init__.py"), "exec"), names)
     try:
         return Path(njit(cache=True)(names["nothing"]).stats.cache_path)
     except RuntimeError:
-        raise InputError(
-            "NUMBA_CACHE_DIR",
-            "compiled kernels cannot be kept, no folder for them can be written to",
-            "set it to one that can",
-        ) from None
+        reason = "compiled kernels cannot be cached: no folder for them is writable"
+        raise InputError("NUMBA_CACHE_DIR", reason, "set it to a writable folder") from None
 
 
 def _run_processes(folder: Path) -> None:
     """Warm up in several processes that take turns by locks in a folder, and wait for them."""
-    # A killed process leaves the folder, and the next one takes it over.
+    # A killed process leaves the folder behind, and the next one replaces it.
     work, processes = folder / "compiling", list[subprocess.Popen[bytes]]()
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir()
@@ -149,9 +142,8 @@ def _run_processes(folder: Path) -> None:
 def _take_turns(folder: Path) -> None:
     """Let numba compile a kernel only if no other process does, and otherwise wait for the result.
 
-    This also makes writing to numba's cache exclusive: two processes that write the index of one kernel
-    would lose entries. A process waits only for kernels called by those it is compiling, so never in a
-    circle.
+    This also makes writing to numba's cache exclusive: two processes that write the index of one kernel would
+    lose entries. A process waits only for kernels that it is about to call, so there is no deadlock.
     """
     load, save = FunctionCache.load_overload, FunctionCache.save_overload
     locks: dict[str, FileLock] = {}

@@ -1,4 +1,4 @@
-"""Hooks by which values display themselves; the package fills them, so that no room imports one above it."""
+"""Hooks for functions of higher rooms, which the package registers, so that no room imports one above it."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Work on several cores: Python's threads call compiled kernels that release its lock.
+"""Work on several cores: Python threads call compiled kernels that release the GIL.
 
-numba's own parallel loop compiles everything it calls again, which can take many seconds.
-Here each piece of work is compiled once, and the loop needs no compiling. BLAS gets one thread: our matrices
-are small, and threads that wait for work cost more than they save.
+numba's own parallel loop compiles everything it calls once more, which can take many seconds. Here each
+kernel is compiled once, and the loop is not compiled. BLAS gets one thread, because our matrices are small
+and waiting threads cost more than they save.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ P = ParamSpec("P")
 Result = TypeVar("Result")
 
 kernel = partial(njit, cache=True, error_model="numpy", nogil=True, no_cfunc_wrapper=True)
-"""Decorator of kernels: kept on disk, run without Python's lock, not compiled for calls from C."""
+"""Decorator of kernels: cached on disk, run without the GIL, not compiled for calls from C."""
 inner = partial(kernel, no_cpython_wrapper=True)
-"""Decorator of kernels that only kernels call."""
+"""Decorator of kernels that only other kernels call."""
 
 SHARES = 16
 """Shares into which threads divide points, pixels or hypotheses [1]: enough for usual numbers of cores."""
@@ -35,7 +35,7 @@ SHARES = 16
 
 @cache
 def cores() -> int:
-    """Threads to use: CARYATID_THREADS, or the cores that affinity and control group allow."""
+    """Number of threads: CARYATID_THREADS, or the cores that affinity and control group allow."""
     asked = os.environ.get("CARYATID_THREADS", "")
     if asked.isdecimal() and int(asked) > 0:
         return int(asked)
@@ -58,13 +58,13 @@ def one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
-    """Call compiled work for each index from 0 to count − 1, on as many threads as numba uses.
+    """Call a kernel for each index from 0 to count − 1, on as many threads as numba uses.
 
-    The work for one index must not touch the data of another; then the result is the same on any number of
+    The call for one index must not change the data of another; the result is then the same on any number of
     threads.
 
     Args:
-        work: Kernel, called as `work(index, data)`; it must not raise. It is compiled without Python's lock.
+        work: Kernel, called as `work(index, data)` without the GIL; it must not raise.
         count: Number of indices.
         data: Arrays and numbers, best a `NamedTuple`; results are written to arrays among them.
     """
@@ -73,7 +73,7 @@ def for_each(work: Any, count: int, data: tuple[Any, ...]) -> None:
 
 
 def on_threads(task: Callable[[int], Result], count: int) -> list[Result]:
-    """Results of a task for each index from 0 to count − 1, found on as many threads as numba uses.
+    """Results of a task for each index from 0 to count − 1, on as many threads as numba uses.
 
     Args:
         task: Calls kernels compiled with `nogil=True`; it must not call `on_threads` itself.
