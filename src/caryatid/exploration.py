@@ -303,15 +303,9 @@ class Explorer:
         rated = step.decision.candidate_saliency
         saliency = 0.0 if rated is None else float(rated[index])
         cost = float(path_cost(self._state(step.candidates))[index])
-        return replace(
-            step.decision,
-            T_world_camera=step.candidates.T_world_camera[index],
-            index=index,
-            saliency=saliency,
-            cost=cost,
-            score=saliency - cost,
-            why="chosen by hand",
-        )
+        T_world_camera, score = step.candidates.T_world_camera[index], saliency - cost
+        decision = replace(step.decision, T_world_camera=T_world_camera, index=index, why="chosen by hand")
+        return replace(decision, saliency=saliency, cost=cost, score=score)
 
     def go(self) -> None:
         """Send the robot to the next view.

@@ -280,9 +280,8 @@ class SessionPool:
     def _check_room(self) -> None:
         free, least = shutil.disk_usage(self.folder).free, self.config.session.min_free
         if free < least:
-            raise FullError(
-                f"the disk has {free / 1e9:.1f} GB left; session.min_free is {least / 1e9:.1f} GB"
-            )
+            reason = f"the disk has {free / 1e9:.1f} GB left"
+            raise FullError(f"{reason}; session.min_free is {least / 1e9:.1f} GB")
 
     def _opened(self, name: str, session: Session) -> Session:
         """Keep a session open as the most recently used one."""

@@ -134,9 +134,7 @@ def find_scenes(sources: Iterable[str]) -> list[str]:
             raise InputError(source, "is neither a built-in scene nor a folder", remedy)
         scenes = sorted(file.parent for file in (*folder.glob(SCENE_FILE), *folder.glob(f"*/{SCENE_FILE}")))
         if not scenes:
-            raise InputError(
-                source, f"has no {SCENE_FILE}", "give a scene folder, or a folder of scene folders"
-            )
+            raise InputError(source, f"has no {SCENE_FILE}", "give a scene folder, or a folder of them")
         if missing := [scene for scene in scenes if not (scene / TRUTH_FILE).is_file()]:
             raise InputError(missing[0], f"has no {TRUTH_FILE}", "write the ground truth")
         found += map(str, scenes)

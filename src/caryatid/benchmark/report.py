@@ -175,21 +175,12 @@ def summarise_store(store: ResultStore, reference: str | None = None) -> list[Su
         failures = []
         for row in table[table["error"].notna()].itertuples():
             scene = Path(row.scene).name
-            failures.append(
-                [row.method, row.condition, scene, str(row.seed), row.error.replace(row.scene, scene)]
-            )
-        results.append(
-            SuiteResult(
-                name,
-                chosen,
-                planned=len(store.suites[name]),
-                episodes=len(table[["method", "condition", "scene", "seed"]].drop_duplicates()),
-                scenes=table["scene"].nunique(),
-                seeds=table["seed"].nunique(),
-                failures=failures,
-                summary=summarise(table, reference=chosen, gap=known.gap if known else None),
-            )
-        )
+            error = row.error.replace(row.scene, scene)
+            failures.append([row.method, row.condition, scene, str(row.seed), error])
+        planned, scenes, seeds = len(store.suites[name]), table["scene"].nunique(), table["seed"].nunique()
+        episodes = len(table[["method", "condition", "scene", "seed"]].drop_duplicates())
+        summary = summarise(table, reference=chosen, gap=known.gap if known else None)
+        results.append(SuiteResult(name, chosen, planned, episodes, scenes, seeds, failures, summary))
     return results
 
 

@@ -113,11 +113,9 @@ def connect(address: str, patience: float = 10.0) -> Client:
             thread.submit(asyncio.run, greet()).result()
         return Client(address, timeout=patience, set_as_default=False)
     except (OSError, ImportError, ValueError, TypeError, RuntimeError, MemoryError) as error:
-        raise InputError(
-            f"--scheduler {address}",
-            f"no scheduler answers ({' '.join(str(error).split()) or 'it is silent'})",
-            "start one with `dask scheduler` and give its address, such as tcp://10.0.0.5:8786",
-        ) from None
+        reason = f"no scheduler answers ({' '.join(str(error).split()) or 'it is silent'})"
+        remedy = "start one with `dask scheduler` and give its address, such as tcp://10.0.0.5:8786"
+        raise InputError(f"--scheduler {address}", reason, remedy) from None
 
 
 def run_on_worker(episode: Episode, code: str) -> Outcome:

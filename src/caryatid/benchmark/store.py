@@ -40,13 +40,6 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class _First:
-    """The first line."""
-
-    about: dict[str, str]
-
-
-@dataclass(frozen=True, slots=True)
 class _Plan:
     """A line with the members of a suite."""
 
@@ -174,7 +167,7 @@ class ResultStore:
         whole = content[: content.rfind(b"\n") + 1]
         try:
             about, *lines = [json.loads(line) for line in whole.splitlines()] or [{"about": {}}]
-            self.about = parse_json(_First, about, self.path).about
+            self.about = parse_json(dict[str, dict[str, str]], about, self.path)["about"]
             for line in lines:
                 if "suite" in line:
                     plan = parse_json(_Plan, line, self.path)
@@ -184,7 +177,7 @@ class ResultStore:
                     self._keep(done.key, Outcome(done.rows, done.error))
             if not whole and (self._file is None or not b'{"about"'.startswith(content[:8])):
                 raise ValueError
-        except (ValueError, TypeError, RecursionError, InputError):
+        except (ValueError, TypeError, LookupError, RecursionError, InputError):
             raise InputError(self.path, "is not a result file", "choose another folder") from None
         if self._file is not None and len(whole) < len(content):
             self._file.truncate(len(whole))

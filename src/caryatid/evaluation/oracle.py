@@ -117,11 +117,9 @@ class OraclePlanner:
         self.camera.taken.clear()
         same_views = self._scene.views == len(state.visited)
         if not same_views or graph_text(self._scene.graph) != graph_text(state.graph):
-            raise InputError(
-                f"planner {ORACLE}",
-                "its views and settings are not those of this exploration",
-                "pass its camera to explore(), with the same configuration, segmentation and seed",
-            )
+            reason = "its views and settings are not those of this exploration"
+            remedy = "pass its camera to explore(), with the same configuration, segmentation and seed"
+            raise InputError(f"planner {ORACLE}", reason, remedy)
 
     def _f1_after(self, T_world_camera: Array) -> float:
         """F1 of the fused graph after a view from there, or -1 if that view cannot be used."""

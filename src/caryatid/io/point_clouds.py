@@ -74,14 +74,9 @@ class StoredCloud:
         normals = None if self.normals is None else transforms.unit(self.normals[kept])
         if normals is None or not (np.isfinite(normals).all() and (normals != 0.0).any(axis=1).all()):
             normals = estimate_normals(points, self.viewpoint, config.neighbours)
-        return Cloud(
-            points,
-            normals,
-            None if self.labels is None else self.labels[kept],
-            None if self.rgb is None else self.rgb[kept],
-            self.viewpoint,
-            self.name,
-        )
+        labels = None if self.labels is None else self.labels[kept]
+        rgb = None if self.rgb is None else self.rgb[kept]
+        return Cloud(points, normals, labels, rgb, self.viewpoint, self.name)
 
 
 def read_stored_cloud(path: str | Path, label_divisor: int = 1) -> StoredCloud:

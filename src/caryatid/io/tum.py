@@ -84,11 +84,8 @@ def _read_camera(folder: Path, camera_file: Path | None) -> tuple[_CameraFile, t
         if name in folder.resolve().name.lower():
             note = f"camera: as published for {name}, fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g} px"
             return _CameraFile(fx, fy, cx, cy), (640, 480), note
-    raise InputError(
-        folder,
-        f"the camera is unknown: the folder's name contains none of {', '.join(PUBLISHED)}",
-        'give --camera FILE.json with {"fx": …, "fy": …, "cx": …, "cy": …}',
-    )
+    reason = f"the camera is unknown: the folder's name contains none of {', '.join(PUBLISHED)}"
+    raise InputError(folder, reason, 'give --camera FILE.json with {"fx": …, "fy": …, "cx": …, "cy": …}')
 
 
 def _read_poses(path: Path, max_gap: float) -> TransformTree:

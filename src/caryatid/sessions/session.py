@@ -339,9 +339,8 @@ class Session:
         record = capture.record
         if number is not None and number != self.views:
             if number != self.views - 1 or record.digest != self._records[-1].digest:
-                raise SessionConflictError(
-                    record.name, f"was given the number {number}, the next one is {self.views}"
-                )
+                reason = f"was given the number {number}, the next one is {self.views}"
+                raise SessionConflictError(record.name, reason)
             return self._added()
         decoded = self._decode(capture)
         self._check_alike(decoded)

@@ -202,14 +202,10 @@ def render(scene: SimulatedScene, T_world_camera: Array, K: Array, sensor: Senso
     geoms[missed], depth[missed], normals_world[missed] = -1, 0.0, 0.0
     cosine = -np.einsum("ij,ij->i", normals_world, rays_world) / lengths
     normals_world[cosine < 0.0] *= -1.0
-    labels = np.append(scene.geom_labels, np.int32(0))[geoms]
-    return Rendering(
-        depth.reshape(shape),
-        normals_world.reshape(*shape, 3),
-        np.arccos(np.minimum(np.abs(cosine), 1.0)).reshape(shape),
-        labels.reshape(shape),
-        _shade(scene, geoms, normals_world, sensor).reshape(*shape, 3),
-    )
+    incidence = np.arccos(np.minimum(np.abs(cosine), 1.0)).reshape(shape)
+    labels = np.append(scene.geom_labels, np.int32(0))[geoms].reshape(shape)
+    rgb = _shade(scene, geoms, normals_world, sensor).reshape(*shape, 3)
+    return Rendering(depth.reshape(shape), normals_world.reshape(*shape, 3), incidence, labels, rgb)
 
 
 def pixel_rays(K: Array, R_world_camera: Array, width: int, height: int) -> tuple[Array, Array]:
