@@ -27,6 +27,7 @@ from fit_speed import measure_fits
 from measures import gate, print_table, read_baseline, run_main, write_baseline
 from rich.console import Console
 from rows import FULL, NOTHING, QUICK, Effort, Row, machine, measures, table_of_rows
+from viewer import measure_viewer
 
 from caryatid.benchmark.store import collect_provenance, describe_provenance
 from caryatid.errors import InputError
@@ -45,6 +46,7 @@ MEASUREMENTS: dict[str, Callable[[Effort], list[Row]]] = {
     "real": speed.measure_real,
     "start": speed.measure_start,
     **{f"growth.{axis}": partial(speed.measure_growth, axis) for axis in speed.AXES},
+    "viewer": measure_viewer,
 }
 """Name → what is measured; `turn` gives the rows of perceiving and of the stages too."""
 

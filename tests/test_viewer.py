@@ -27,9 +27,10 @@ from caryatid.graph import Support, SupportGraph
 from caryatid.io.graph_json import graph_text
 from caryatid.sources import open_source
 from caryatid.steps import read_run
-from caryatid.viewer.drawing import BY_HAND, LAYERS, SPACING, reduced, visible_points
+from caryatid.viewer.drawing import BY_HAND, EARLIER_POINTS, LAYERS, SPACING, reduced, visible_points
 from caryatid.viewer.loop import LoopPage, candidate_under
 from caryatid.viewer.page import Page, PageProcess, describe_object, describe_view
+from caryatid.viewer.robot import RobotDrawing, stations
 from caryatid.viz.colours import object_colour, rgb
 
 pytest.importorskip("viser")
@@ -112,12 +113,8 @@ def test_what_is_hidden_is_not_sent_until_it_is_asked_for(opening, settings):
     page = LoopPage(opening, settings, segmentation="labels")
     page.turn()
     page.wait()
-    assert [name for name, nodes in page.drawing.nodes.items() if nodes] == [
-        "shapes",
-        "names",
-        "supports",
-        "cameras",
-    ]
+    sent = {name.split("/")[0] for name, nodes in page.drawing.nodes.items() if nodes}
+    assert sent == {"shapes", "names", "supports", "cameras"}
     page.show_layer("cloud", True)
     page.wait()
     assert page.drawing.nodes["cloud"]
@@ -234,13 +231,14 @@ def test_the_loop_gives_the_views_that_explore_gives_and_says_when_it_would_stop
 def test_a_view_chosen_by_hand_is_taken_and_taken_again_with_another_fusion(loop):
     loop.turn()
     step = loop.steps[0]
-    index = len(step.candidates) // 3
+    candidates = loop._explorer.step.candidates
+    index = len(candidates) // 3
     said = loop.choose(index)
     yours, planned = (float(number) for number in re.findall(r"\d\.\d+", said))
     assert yours <= planned == pytest.approx(step.decision.score, abs=0.01)
     loop.turn()
     poses = [step.view.T_world_camera for step in loop.steps]
-    np.testing.assert_array_equal(poses[1], step.candidates.T_world_camera[index])
+    np.testing.assert_array_equal(poses[1], candidates.T_world_camera[index])
     assert "sg" in loop.use_fusion("sg")
     assert [step.decision.why == "chosen by hand" for step in loop.steps] == [True, False]
     np.testing.assert_array_equal([step.view.T_world_camera for step in loop.steps], poses)
@@ -259,6 +257,43 @@ def test_another_planner_chooses_the_next_view_at_once(loop):
     np.testing.assert_array_equal(loop.steps[1].view.T_world_camera, after.decision.T_world_camera)
     with pytest.raises(InputError):
         loop.use_planner("nobody")
+
+
+def test_the_robot_drives_its_way_to_where_it_takes_the_view(loop, monkeypatch):
+    passed, drive = [], RobotDrawing.drive
+    monkeypatch.setattr(RobotDrawing, "drive", lambda robot: (drive(robot), passed.append(robot))[0])
+    loop.show_layer("robot", True)
+    for _ in range(2):
+        loop.turn()
+        loop.wait()
+    way, there = loop.steps[0].decision.waypoints, loop.steps[1].robot.posture
+    places = np.array(stations(way))
+    assert len(passed) >= len(places)
+    np.testing.assert_allclose(places[0][:3], way[0].platform_world)
+    assert np.linalg.norm(np.diff(places[:, :2], axis=0), axis=1).max() < 0.051
+    (body,) = loop.drawing.nodes["robot"]
+    np.testing.assert_allclose(body.position[:2], there.platform_world[:2])
+    loop.go_to(0)
+    loop.wait()
+    (body,) = loop.drawing.nodes["robot"]
+    np.testing.assert_allclose(body.position[:2], way[0].platform_world[:2])
+
+
+def test_earlier_views_keep_few_points_and_their_cameras_are_not_sent_again(step, settings):
+    page = Page("many", settings.support)
+    cloud = step.cloud.select(np.arange(50_000) % len(step.cloud))
+    for k in range(3):
+        page.add(replace(step, index=k, cloud=replace(cloud)))
+        page.wait()
+    (first, *_), (frustum, _) = page.steps, page.drawing.nodes["cameras/1"]
+    assert EARLIER_POINTS / 2 <= len(first.cloud) <= EARLIER_POINTS < len(page.steps[-1].cloud)
+    page.add(replace(step, index=3))
+    page.wait()
+    assert page.drawing.nodes["cameras/1"][0] is frustum
+    page.go_to(0)
+    page.wait()
+    assert "cameras/2" not in page.drawing.nodes
+    page.close()
 
 
 def test_a_recording_ends_with_its_views(recording, settings):
@@ -569,7 +604,7 @@ def test_a_view_is_chosen_by_hand(page, tab):
     tab.wait_until(lambda: np.linalg.norm(client.camera.position - centre) > 2.0 * radius)
     towards_eye = transforms.unit(client.camera.position - step.sphere.centre_world)
     facing = np.argmax(step.candidates.directions @ towards_eye)
-    eye = step.candidates.T_world_camera[facing][:3, 3]
+    eye = step.sphere.centre_world + radius * step.candidates.directions[facing]
     click(page, eye, tab)
     tab.wait_for_text("your view is next")
     tab.press("next view")

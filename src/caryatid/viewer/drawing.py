@@ -16,6 +16,7 @@ from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import Cloud, View
+from caryatid.viewer.robot import RobotDrawing
 from caryatid.viz.colours import SALIENCY_STOPS, Colour, label_colours, object_colour, rgb, scale
 from caryatid.viz.drawings import image_of
 from caryatid.viz.tables import count_of
@@ -28,8 +29,10 @@ LAYERS = {
 """What can be shown and hidden, and whether it shows at first."""
 CERTAIN, UNCERTAIN = (26, 32, 40), (196, 78, 12)
 """Colours of supports; uncertain ones are dashed too."""
-EARLIER, NEXT, BY_HAND, ROBOT = (128, 136, 146), (11, 92, 148), (170, 30, 120), (120, 130, 142)
-"""Colours of earlier views, the planner's choice, one by hand, and the robot."""
+EARLIER, NEXT, BY_HAND = (128, 136, 146), (11, 92, 148), (170, 30, 120)
+"""Colours of earlier views, the planner's choice, and one by hand."""
+EARLIER_POINTS = 10_000
+"""Points that are kept of the cloud after an earlier view, so that 200 views take less than 100 MB [1]."""
 ARROW = {"shaft_radius": 0.0035, "head_radius": 0.0095, "head_length": 0.02}
 """Sizes of an arrow at 1 m from the eye [m]."""
 LETTER = 0.03
@@ -42,14 +45,30 @@ SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
 
 
 def reduced(step: Step) -> Step:
-    """The step with an image no larger than it is drawn, so that the page can keep every one."""
-    view = step.view
-    if view is None:
-        return step
-    k = max(1, view.depth.shape[1] // 240)
-    rgb = None if view.rgb is None else view.rgb[::k, ::k].copy()
-    K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
-    return replace(step, view=View(view.depth[::k, ::k].copy(), K, view.T_world_camera, rgb, name=view.name))
+    """The step with no more than is drawn of it, so that the page can keep every one."""
+    view, cloud, candidates, decision = step.view, step.cloud, step.candidates, step.decision
+    if view is not None:
+        k = max(1, view.depth.shape[1] // 240)
+        rgb = None if view.rgb is None else view.rgb[::k, ::k].copy()
+        K = np.diag([1.0 / k, 1.0 / k, 1.0]) @ view.K
+        view = View(view.depth[::k, ::k].copy(), K, view.T_world_camera, rgb, name=view.name)
+    points: Any = cloud.points_world.astype(np.float32)
+    cloud = replace(cloud, points_world=points, normals_world=np.zeros(points.shape, np.int8))
+    sphere = replace(step.sphere, directions=step.sphere.directions[step.sphere.directions[:, 2] > 0.0])
+    sphere = replace(sphere, directions=sphere.directions[:: max(1, len(sphere.directions) // 900)])
+    if candidates is not None:
+        none = candidates.T_world_camera[:0]
+        candidates = replace(candidates, T_world_camera=none, path_length=none[:, 0, 0], indices=None)
+    if decision is not None:
+        decision = replace(decision, sphere_saliency=None)
+    drawn = replace(step, view=view, labels=step.labels[:0], cloud=cloud)
+    return replace(drawn, sphere=sphere, candidates=candidates, decision=decision)
+
+
+def thinned(step: Step) -> Step:
+    """The step with at most `EARLIER_POINTS` of its cloud."""
+    every = -(-len(step.cloud) // EARLIER_POINTS)
+    return step if every < 2 else replace(step, cloud=step.cloud.select(np.arange(0, len(step.cloud), every)))
 
 
 def step_of_scene(scene: Scene) -> Step:
@@ -71,7 +90,8 @@ class SceneDrawing:
         clicked: Called with the id of an object whose shape is clicked.
 
     Attributes:
-        nodes: What the browser shows, by layer.
+        nodes: What the browser shows, by layer, or layer and camera.
+        robot: The robot, once it is shown.
         anchors: Where each object's name belongs (3,): a point of its surface that can be seen, by id; hidden
             objects have none.
     """
@@ -83,6 +103,8 @@ class SceneDrawing:
             self._frames[name].visible = shown
         self._shown: dict[str, tuple[object, ...]] = {}
         self._graph = SupportGraph()
+        self._shown_robot: RobotPose | None = None
+        self.robot: RobotDrawing | None = None
         self._surface: tuple[SupportGraph, Array, NDArray[np.intp]] | None = None
         self.anchors: dict[str, Array] = {}
         self.nodes: dict[str, list[Any]] = {name: [] for name in LAYERS}
@@ -118,15 +140,25 @@ class SceneDrawing:
             "names": (step.graph,),
             "sphere": (step.sphere, step.candidates, decision),
             "interest": (step.sphere, decision),
-            "cameras": (decision, *steps),
-            "robot": (step.robot,),
+            "robot": (step.robot, steps[-2] if len(steps) > 1 else None),
         }
+        for each in steps:
+            colour = CERTAIN if each is steps[-1] else EARLIER
+            layers[f"cameras/{each.index + 1}"] = f"{each.index + 1}", each.view, None, colour
+        if decision is not None:
+            colour = BY_HAND if decision.why == "chosen by hand" else NEXT
+            layers["cameras/next"] = "next", steps[-1].view, decision.T_world_camera, colour
         with self._server.atomic():
+            for name in self._shown.keys() - layers.keys() - {"supports"}:
+                del self._shown[name]
+                for node in self.nodes.pop(name):
+                    node.remove()
             for name, shown in layers.items():
-                if self._frames[name].visible and self._shown.get(name) != shown:
-                    for node in self.nodes[name]:
+                layer = name.partition("/")[0]
+                if self._frames[layer].visible and self._shown.get(name) != shown:
+                    for node in self.nodes.get(name, ()):
                         node.remove()
-                    self.nodes[name], self._shown[name] = getattr(self, f"_{name}")(*shown), shown
+                    self.nodes[name], self._shown[name] = getattr(self, f"_{layer}")(*shown), shown
             self._graph = step.graph
             self.face(T_world_eye)
 
@@ -254,10 +286,8 @@ class SceneDrawing:
 
     def _sphere(self, sphere: ViewSphere, candidates: Any, decision: Any) -> list[Any]:
         """Where the camera can go, painted with saliency; where it cannot, pale and only above the table."""
-        above = sphere.positions_world[sphere.directions[:, 2] > 0.0]
-        above = above[:: max(1, len(above) // 900)]
-        pale = np.full((len(above), 3), (206, 209, 213), dtype=np.uint8)
-        nodes = [self._points("/sphere/beyond", above, pale, 0.005)]
+        pale = np.full(sphere.directions.shape, (206, 209, 213), dtype=np.uint8)
+        nodes = [self._points("/sphere/beyond", sphere.positions_world, pale, 0.005)]
         if candidates is not None and len(candidates):
             few = candidates.looks(10_000).chosen
             rated = None if decision is None else decision.candidate_saliency
@@ -283,45 +313,28 @@ class SceneDrawing:
         )
         return [self._points("/interest/points", at, colours, 0.02), *rays]
 
-    def _cameras(self, decision: Any, *steps: Step) -> list[Any]:
-        nodes: list[Any] = []
-        views = [(step.index, step.view) for step in steps if step.view is not None]
-        for number, view in views:
-            if view.T_world_camera is not None:
-                newest = number == steps[-1].index
-                look = {"image": image_of(view), "format": "jpeg", "variant": "wireframe"}
-                look |= {"scale": 0.06, "color": CERTAIN} if newest else {"scale": 0.04, "color": EARLIER}
-                nodes += self._camera(str(number + 1), view, view.T_world_camera, **look)
-        if views and decision is not None:
-            colour = BY_HAND if decision.why == "chosen by hand" else NEXT
-            look = {"variant": "filled", "scale": 0.05, "color": colour}
-            nodes += self._camera("next", views[-1][1], decision.T_world_camera, **look)
-        return nodes
-
-    def _camera(self, name: str, lens: View, T_world_camera: Array, **look: Any) -> list[Any]:
-        height, width = lens.depth.shape
+    def _cameras(self, name: str, view: View | None, T_world_next: Array | None, colour: Colour) -> list[Any]:
+        """A view's camera with what it saw, or the camera at the next pose (4, 4)."""
+        T_world_camera = T_world_next
+        look: dict[str, Any] = {"variant": "filled", "scale": 0.05}
+        if view is not None and T_world_next is None:
+            T_world_camera = view.T_world_camera
+            look = {"image": image_of(view), "format": "jpeg", "variant": "wireframe"}
+            look["scale"] = 0.06 if colour == CERTAIN else 0.04
+        if view is None or T_world_camera is None:
+            return []
+        height, width = view.depth.shape
         look |= _pose(T_world_camera) | SCREEN | {"cast_shadow": False, "receive_shadow": False}
-        field_of_view = 2.0 * float(np.arctan2(height / 2.0, lens.K[1, 1]))
-        frustum = self._scene.add_camera_frustum(f"/cameras/{name}", field_of_view, width / height, **look)
+        angle, shape = 2.0 * float(np.arctan2(height / 2.0, view.K[1, 1])), width / height
+        frustum = self._scene.add_camera_frustum(f"/cameras/{name}", angle, shape, color=colour, **look)
         return [frustum, self._label(f"/cameras/name {name}", name, T_world_camera[:3, 3] + [0.0, 0.0, 0.06])]
 
-    def _robot(self, robot: RobotPose | None) -> list[Any]:
-        """A platform, column and neck, or the base of an arm and its links."""
-        if robot is None:
-            return []
-        eye = robot.T_world_camera[:3, 3]
-        x, y, yaw = robot.posture.platform_world
-        height, radius = (0.1, 0.08) if robot.arm else (0.3, robot.footprint)
-        foot = np.array([x, y, max(0.0, eye[2] - robot.posture.camera_height)])
-        top = foot + [0.0, 0.0, height]
-        middle = (top + eye) / 2.0 + [0.0, 0.0, 0.25] if robot.arm else np.array([x, y, eye[2]])
-        nose = top + 0.8 * radius * np.array([np.cos(yaw), np.sin(yaw), 0.0])
-        place: dict[str, Any] = {"position": (foot + top) / 2.0, "color": ROBOT}
-        return [
-            self._scene.add_cylinder("/robot/platform", radius=radius, height=height, **place),
-            *self._lines("/robot/links", np.array([[top, middle], [middle, eye]]), ROBOT, thickness=0.1),
-            self._arrow("/robot/front", top, nose, CERTAIN),
-        ]
+    def _robot(self, robot: RobotPose | None, before: Step | None) -> list[Any]:
+        """The robot; it drives there if it was shown at the view before."""
+        came = before is not None and before.robot is not None and before.robot is self._shown_robot
+        way = before.decision.waypoints if came and before is not None and before.decision else ()
+        self._shown_robot, self.robot = robot, RobotDrawing(self._scene, robot, way)
+        return self.robot.nodes
 
 
 def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Array) -> dict[int, Array]:

@@ -7,6 +7,7 @@ import logging
 import os
 import secrets
 import signal
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from html import escape
@@ -28,7 +29,7 @@ from caryatid.graph import SupportGraph
 from caryatid.scene import Scene
 from caryatid.sensing.view_sphere import direction
 from caryatid.support.relations import predict_removal
-from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene
+from caryatid.viewer.drawing import LAYERS, NEXT, SceneDrawing, reduced, step_of_scene, thinned
 from caryatid.viz.colours import SALIENCY_STOPS, object_colour, scale
 from caryatid.viz.drawings import draw_chart, draw_layers
 from caryatid.viz.graph_drawing import draw_graph
@@ -86,6 +87,7 @@ class Page:
         self._drawer = ThreadPoolExecutor(1, "viewer")
         self._pending: Future[None] | None = None
         self._turning: Future[None] | None = None
+        self._driving: Future[None] | None = None
         self._T_world_eye = transforms.look_at((-1.0, 0.0, 1.0), (0.0, 0.0, 0.0))
         self._build()
         self.server.on_client_connect(self._follow)
@@ -98,6 +100,8 @@ class Page:
     def add(self, step: Step, f1: float | None = None) -> None:
         """Add a step, or replace that of the same view; a page that shows the newest step moves to it."""
         newest = self._shown == len(self.steps) - 1
+        if step.index == len(self.steps) > 0:
+            self.steps[-1] = thinned(self.steps[-1])
         self.steps[step.index : step.index + 1] = [reduced(step)]
         self.scores[step.index : step.index + 1] = [f1]
         if newest:
@@ -153,6 +157,8 @@ class Page:
         self._drawer.submit(lambda: None).result()
         if self._pending is not None:
             self._pending.result()
+        while (driving := self._driving) is not None and not driving.done():
+            self._drawer.submit(lambda: None).result()
 
     def close(self) -> None:
         """Stop serving the page."""
@@ -223,6 +229,12 @@ class Page:
 
         client.camera.on_update(moved)
 
+    def _drive(self) -> None:
+        """Move the robot on along its way, and again soon until it is there."""
+        if self.drawing.robot is not None and self.drawing.robot.drive():
+            time.sleep(0.03)
+            self._driving = self._soon(self._driving, self._drive)
+
     def _draw(self) -> None:
         steps, scores, chosen = self.steps[: self._shown + 1], [*self.scores], self._chosen
         if not steps:
@@ -237,6 +249,7 @@ class Page:
         self._slider.disabled = last == 0
         self._slider.value = self._shown + 1
         self._told.content = describe_view(step, f1, last + 1)
+        self._driving = self._soon(self._driving, self._drive)
         graph = step.graph
         if graph is not self._graph_drawn:
             self._graph_drawn = graph
