@@ -1,4 +1,4 @@
-"""Environments that lack something: the documented exit status, and nothing half-written."""
+"""Signals, damaged kernels, threads, and compilers that outlive nobody."""
 
 from __future__ import annotations
 
@@ -15,50 +15,6 @@ from numba import njit
 from caryatid.runtime import parallel
 
 pytestmark = pytest.mark.slow
-
-
-def run(words, shell="", **environment):
-    """Status, stdout and stderr of a command in a shell that redirects it."""
-    known = {name: value for name, value in os.environ.items() if name not in ("HOME", "TMPDIR")}
-    done = subprocess.run(
-        ["sh", "-c", f'exec "$@" {shell}', "sh", sys.executable, "-m", "caryatid", *map(str, words)],
-        env=known | environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-    assert "Traceback" not in done.stderr
-    assert "a fault in caryatid" not in done.stderr
-    return done.returncode, done.stdout, done.stderr
-
-
-@pytest.fixture
-def commands(tmp_path, kept_run, kept_recording):
-    """Commands that print, that write a file, and that write a folder."""
-    return {
-        "config": ["config"],
-        "export": ["export", kept_run, "--out", tmp_path / "out/scene.xml"],
-        "extract": ["extract", kept_recording, "--out", tmp_path / "out/run"],
-    }
-
-
-@pytest.mark.parametrize("command", ["config", "export", "extract"])
-@pytest.mark.parametrize(
-    ("shell", "environment", "expected"),
-    [
-        ("", {}, 0),
-        ("", {"TMPDIR": "/nowhere", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}, 0),
-        (">&-", {}, 0),
-        ("2>&-", {}, 0),
-        (">/dev/full", {}, None),
-    ],
-    ids=["no HOME", "no TMPDIR, locale C", "closed stdout", "closed stderr", "full stdout"],
-)
-def test_what_lacks(tmp_path, commands, command, shell, environment, expected):
-    (tmp_path / "out").mkdir()
-    status, out, said = run(commands[command], shell, **environment)
-    prints = command == "config"
-    assert status == (int(prints) if expected is None else expected), said
-    assert bool(out) == (prints and ">" not in shell.replace("2>", ""))
-    assert not status or said.count("\n") == 1
-    assert [name for name in os.listdir(tmp_path / "out") if name.startswith(".")] == []
 
 
 def test_sigterm_is_as_an_interrupt(tmp_path, scene_file):

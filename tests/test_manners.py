@@ -5,11 +5,15 @@ from __future__ import annotations
 import inspect
 import io
 import json
+import os
 import pickle
 import re
 import shlex
 import shutil
+import subprocess
 import sys
+import time
+from pathlib import Path
 
 import pytest
 from bag_files import write_tum
@@ -149,8 +153,13 @@ WORKING = {
     "scenes": ("", {"scenes", "samples"}),
     "config": ("", {"fit", "fusion"}),
     "completion": ("bash", {"shell", "script"}),
+    "serve": ("{out} --port 0", set()),
+    "view": ("{run} --no-browser --port 0", set()),
 }
 """Words that make each command work, and keys of its document; `serve` and `view` go on until stopped."""
+PRINTING = "evaluate", "order", "clear", "scenes", "config", "completion", "session next", "session graph"
+"""Those that print a result also with --quiet and without --json."""
+ENDING = [name for name in WORKING if name not in ("serve", "view")]
 
 
 @pytest.fixture
@@ -172,7 +181,7 @@ def words(tmp_path, kept, kept_run, scene_file, recording):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [name for name in COMMANDS if name not in ("serve", "view")])
+@pytest.mark.parametrize("command", ENDING)
 def test_with_json_stdout_is_one_document_and_stderr_is_empty(command, words, capfd):
     capfd.readouterr()
     assert run_command(*words(command), "--json") == 0
@@ -180,6 +189,46 @@ def test_with_json_stdout_is_one_document_and_stderr_is_empty(command, words, ca
     assert said.err == ""
     assert json.loads(said.out).keys() >= WORKING[command][1]
     assert said.out.endswith("\n")
+
+
+# Environments that lack something
+
+
+POOR = {"TMPDIR": "/nowhere", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+
+
+def begun(words, redirected="", folder=None):
+    """A quiet command without HOME, TMPDIR and UTF-8, in a shell that redirects it."""
+    shell = ["sh", "-c", f'exec "$@" {redirected}', "sh", sys.executable, "-m", "caryatid"]
+    known = {name: value for name, value in os.environ.items() if name != "HOME"} | POOR
+    return subprocess.Popen(
+        [*shell, *map(str, words), "--quiet"], cwd=folder, env=known, text=True,
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", ENDING)
+@pytest.mark.parametrize("redirected", ["", ">&- 2>&-", ">/dev/full"])
+def test_a_command_ends_well_or_in_one_line_whatever_is_missing(command, redirected, words):
+    """Also in a folder that nobody, not even root, can write to."""
+    process = begun(words(command), redirected, "/sys")
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == (redirected == ">/dev/full" and command in PRINTING), said
+    assert said.count("\n") == process.returncode
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", WORKING)
+def test_sigterm_ends_a_command_in_one_line(command, words):
+    process = begun(words(command))
+    status = Path(f"/proc/{process.pid}/status")
+    while process.poll() is None and not int(status.read_text().split("SigCgt:")[1].split()[0], 16) >> 14 & 1:
+        time.sleep(0.01)
+    process.terminate()
+    _, said = process.communicate(timeout=120)
+    assert process.returncode in (0, 130), said
+    assert said.count("\n") == (process.returncode == 130)
 
 
 # Colours, and what moves

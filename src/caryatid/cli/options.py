@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -191,7 +192,19 @@ class Command:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LookingCommand(Command):
+class ComputingCommand(Command):
+    """A command that computes."""
+
+    threads: Annotated[OptionalCount, shown(default="CARYATID_THREADS, or all cores")] = None
+    """Number of threads."""
+
+    def __post_init__(self) -> None:
+        if self.threads is not None:
+            os.environ["CARYATID_THREADS"] = str(self.threads)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LookingCommand(ComputingCommand):
     """A command that looks at views."""
 
     settings: Modelling = Modelling()

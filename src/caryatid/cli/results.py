@@ -103,7 +103,7 @@ class Evaluate(options.Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OrderCommand(options.Command):
+class OrderCommand(options.ComputingCommand):
     """Find a safe order in which to remove everything, or to reach one object.
 
     Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others equally

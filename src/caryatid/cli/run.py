@@ -33,7 +33,7 @@ PORT = 8770
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunCommand(options.Command):
+class RunCommand(options.ComputingCommand):
     """A command that writes a run folder."""
 
     source: str

@@ -19,7 +19,7 @@ KEPT = "the session keeps every view and report that is in it"
 
 
 @dataclass(frozen=True, kw_only=True)
-class SessionStep(options.Command):
+class SessionStep(options.ComputingCommand):
     """A command on a session."""
 
     folder: Folder
