@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 
 import mujoco
@@ -15,6 +16,7 @@ import yourdfpy
 from conftest import run_command
 from scipy.spatial.transform import Rotation
 
+from caryatid.config import ExportConfig
 from caryatid.errors import InputError
 from caryatid.exports import export_graph
 from caryatid.geometry import transforms
@@ -204,6 +206,17 @@ def test_a_graph_file_alone_can_be_exported_and_settings_count(tmp_path, graph):
     assert run_command("export", tmp_path / "graph.json", "--out", tmp_path / "s.urdf", *heavy) == 0
     robot = yourdfpy.URDF.load(str(tmp_path / "s.urdf"))
     assert robot.link_map["o3"].inertial.mass == pytest.approx(1200.0 * graph["o3"].shape.volume)
+
+
+def test_too_many_objects_are_refused_before_they_are_read(tmp_path, graph, capsys):
+    with pytest.raises(InputError, match="objects, more than export"):
+        export_graph(graph, tmp_path / "a.dot", ExportConfig(max_objects=1))
+    many = tmp_path / "graph.json"
+    with many.open("w") as file:
+        file.truncate(700_000_000)
+    assert run_command("export", many, "--out", tmp_path / "a.xml") == 1
+    assert "is 700 MB large, more than export.max_objects = 2,000 take" in capsys.readouterr().err
+    assert os.listdir(tmp_path) == ["graph.json"]
 
 
 @pytest.mark.parametrize(

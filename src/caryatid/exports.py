@@ -56,13 +56,16 @@ def export_graph(graph: SupportGraph, path: str | Path, config: ExportConfig | N
         config: Density, friction and how fine meshes are.
 
     Raises:
-        InputError: The suffix is unknown, there is nothing to export, the format rejects the name of an
-            object, or the file cannot be written.
+        InputError: The suffix is unknown, there is nothing to export or too much, the format rejects the
+            name of an object, or the file cannot be written.
     """
     path, config = Path(path), config or ExportConfig()
     chosen = format_of(path)
     if not graph.objects:
         raise InputError("the scene model", "holds no objects", "nothing was written")
+    if len(graph.objects) > config.max_objects:
+        reason = f"has {len(graph.objects):,} objects, more than export.max_objects = {config.max_objects:,}"
+        raise InputError("the scene model", reason, "raise that setting")
     match chosen:
         case "mjcf":
             content = _mjcf(graph, config).encode()

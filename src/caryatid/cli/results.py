@@ -10,7 +10,10 @@ import tyro
 
 from caryatid.cli import options
 from caryatid.config.choices import ExportFormat
+from caryatid.errors import InputError
 
+OBJECT = 20_000
+"""Maximum size of an object with its supports in graph.json [bytes]; a box has 700."""
 Topic = Annotated[str | None, options.shown("TOPIC")]
 
 
@@ -191,7 +194,13 @@ class Export(options.Command):
         from caryatid.viz.tables import census
 
         config, format_ = self.settings.read(), format_of(self.out, self.format)
-        graph = read_graph(self.run) if self.run.suffix == ".json" else read_run(self.run).graph
+        file = self.run if self.run.suffix == ".json" else self.run / "graph.json"
+        size = file.stat().st_size if file.is_file() else 0
+        if size > OBJECT * config.export.max_objects:
+            most = f"export.max_objects = {config.export.max_objects:,}"
+            remedy = "raise that setting; reading takes ten times as much memory"
+            raise InputError(file, f"is {size / 1e6:,.0f} MB large, more than {most} take", remedy)
+        graph = read_graph(file) if file is self.run else read_run(self.run).graph
         export_graph(graph, self.out, config.export)
         self.output.result({"file": str(self.out), "format": format_}, "")
         self.output.say(f"{self.out}: {format_}, {census(graph)}")

@@ -592,6 +592,8 @@ class ExportConfig:
     """Sliding friction of objects [1]; that of the simulated scenes."""
     corners: Annotated[int, Field(ge=8)] = 48
     """Corners of a cylinder's ends in meshes [1]; its radius is then right to 0.2 %."""
+    max_objects: Count = 2000
+    """Maximum number of objects [1]; MuJoCo takes 2 s for so many, and no more than about 4,000."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
