@@ -56,20 +56,20 @@ def test_what_lies_elsewhere_is_a_new_object_with_a_label_never_given():
 
 def test_a_part_of_another_colour_is_a_new_object_though_it_lies_on_a_shape():
     part = seen(CRATE, seed=1)
-    unlike = np.zeros((len(part) + 5, len(KNOWN)), dtype=bool)
-    assert names_of(part, unlike=unlike) == {1: 3}
-    unlike[: 4 * len(part) // 5, 0] = True
-    assert names_of(part, unlike=unlike) == {1: 8}
+    other_colour = np.zeros((len(part) + 5, len(KNOWN)), dtype=bool)
+    assert names_of(part, other_colour=other_colour) == {1: 3}
+    other_colour[: 4 * len(part) // 5, 0] = True
+    assert names_of(part, other_colour=other_colour) == {1: 8}
 
 
 def test_a_few_points_of_another_colour_go_to_the_neighbour_that_has_it():
     crate, few = seen(CRATE, seed=1), seen(BALL, seed=1)[:20]
     part = np.concatenate([crate, few])
-    unlike = np.zeros((len(part) + 5, len(KNOWN)), dtype=bool)
-    assert names_of(part, unlike=unlike) == {1: 3}
-    unlike[len(crate) : len(part), 0] = True
-    unlike[: len(crate), 1] = True
-    assert names_of(part, unlike=unlike) == {1: [3, 7]}
+    other_colour = np.zeros((len(part) + 5, len(KNOWN)), dtype=bool)
+    assert names_of(part, other_colour=other_colour) == {1: 3}
+    other_colour[len(crate) : len(part), 0] = True
+    other_colour[: len(crate), 1] = True
+    assert names_of(part, other_colour=other_colour) == {1: [3, 7]}
 
 
 @pytest.mark.parametrize(("share", "name"), [(0.2, 8), (0.5, 3)])

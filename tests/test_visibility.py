@@ -10,7 +10,7 @@ from raycast import TABLE, from_the_side, table_scene
 from synthetic import box, sphere
 
 from caryatid.geometry import transforms
-from caryatid.objects.changes import ODDS, Sight, likelihood_ratio
+from caryatid.objects.changes import PRIOR_ODDS, Sight, likelihood_ratio
 
 EYE = from_the_side(azimuth=180.0)
 CRATE = box((0.0, 0.0, TABLE + 0.06), (0.1, 0.1, 0.12))
@@ -59,7 +59,7 @@ HALF = np.where(np.arange(640) % 2 == 0, 0.0, EMPTY.depth)
 )
 def test_a_shape_is_gone_where_readings_lie_behind_its_surface(shape, view, expected):
     through, there = Sight(view).cells(*shape.surface(0.01))
-    assert (likelihood_ratio(through, there) > ODDS) == expected
+    assert (likelihood_ratio(through, there) > PRIOR_ODDS) == expected
 
 
 def test_more_that_is_contradicted_and_less_that_is_confirmed_speak_for_a_change():

@@ -335,7 +335,7 @@ class Scene(Pictured):
         observation, moved = self._registered(observation, named)
         watch.lap("register")
         before = self.voxels
-        gone, new = self._noticed(observation, named)
+        missing, new = self._changes_seen(observation, named)
         if self.surface and before and self._registration and observation.view:
             # Where everything it shows would have changed, its pose is wrong rather.
             explained = list(new) if set(observation.shown) - new.keys() - {0, SUPPORT_LABEL} else []
@@ -357,14 +357,14 @@ class Scene(Pictured):
         watch.lap("map")
         observation = self._fitted(observation, shown, voxels, given, named)
         if not named:
-            observation, new = self._recognised(observation, new)
+            observation, new = self._reidentified(observation, new)
         watch.lap("fit")
         newest = self._inferred(surface, voxels)
         watch.lap("infer")
         observation = self._fused(observation, newest, given)
         names = {k: self._ids.get(k, object_id(k)) for k in (*self._models.points.objects, *new)}
         present = {names[k] for k in self._models.points.objects}
-        self._detector.record(self.views, gone, {names[k]: why for k, why in new.items()}, present)
+        self._detector.record(self.views, missing, {names[k]: why for k, why in new.items()}, present)
         self.labels = label_image(observation, source)
         self.T_world_camera = None if observation.view is None else observation.view.T_world_camera
         if self.T_world_camera is not None:
@@ -499,7 +499,7 @@ class Scene(Pictured):
             self._shown = tuple(frozenset(names.get(i, i) for i in ids) for ids in self._shown)
         return observation.relabelled(dict(given_up))
 
-    def _noticed(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
+    def _changes_seen(self, observation: Observation, named: bool) -> tuple[dict[str, str], dict[int, str]]:
         """Find objects that changed, and forget them before anything is added.
 
         Returns:
@@ -509,7 +509,7 @@ class Scene(Pictured):
         view, voxels, registration = observation.view, self.voxels, self._registration
         if view is None or voxels is None or (registration and not registration.aligned):
             return {}, {}
-        gone = self._detector.gone(view, self._surfaces())
+        missing = self._detector.missing(view, self._surfaces())
         new = dict[int, str]()
         if self.config.fusion.method != "sg":
             rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
@@ -517,8 +517,8 @@ class Scene(Pictured):
             new = appeared(view.name, points, observation.labels[rows], voxels.free_around(points))
         if named:
             known = {object_id(k): why for k, why in new.items() if k in self._models.points.objects}
-            gone = known | gone
-        for id_ in gone:
+            missing = known | missing
+        for id_ in missing:
             o = next((o for o in self.graph.objects if o.id == id_), None)
             self._detector.lose(id_, o)
             if o is None:
@@ -531,7 +531,7 @@ class Scene(Pictured):
             assert self.voxels is not None
             which = self.voxels.behind(view, pixels, self.config.fit.max_extent)
             self.voxels = self.voxels.forgotten(which & (self.voxels.hits == 0))
-        return gone, new
+        return missing, new
 
     def _surfaces(self) -> dict[str, tuple[Array, Array]]:
         """Points and normals of the objects by id: as seen, or with `sg` of their shapes."""
@@ -543,10 +543,10 @@ class Scene(Pictured):
             found[self._ids.get(label, object_id(label))] = cloud.points_world, cloud.normals_world
         return found
 
-    def _recognised(
+    def _reidentified(
         self, observation: Observation, new: dict[int, str]
     ) -> tuple[Observation, dict[int, str]]:
-        """Give what is new the labels of the objects that are gone, where the shapes are alike."""
+        """Give what is new the labels of the objects that are missing, where the shapes are alike."""
         new = {k: why for k, why in new.items() if k in self._models.fits}
         found = self._detector.found_again(self._models.fits, new, self._label_of)
         for old, label in found.items():

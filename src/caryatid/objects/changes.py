@@ -1,4 +1,4 @@
-"""Change detection: whether a new view shows the objects where earlier ones showed them."""
+"""Change detection: whether a new view shows objects where earlier views showed them."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from caryatid.geometry.transforms import Array
 from caryatid.graph import Change, ChangeKind, SceneObject
 from caryatid.sensing.views import View
 
-BEYOND = 0.02
+DEPTH_MARGIN = 0.02
 """Distance behind a point at which a reading contradicts it [m], at 1.5 m and growing with z²: 2σ of pose
 and depth.
 """
-ASIDE = 0.01
-"""Distance beside a point within which readings count [m]: 2σ of registration; otherwise views look past
-rims.
+PIXEL_MARGIN = 0.01
+"""Distance beside a point within which readings count [m]: 2σ of registration, so that a view past a rim does
+not contradict it.
 """
 CELL = 0.02
 """Edge of the cells in which points count once [m]: nearer points share their errors."""
-ERRS = 0.2
-"""Share of an object's cells up to which errors contradict them although it stayed in place [1]."""
+ERROR_SHARE = 0.2
+"""Maximum share of cells that errors contradict on an object that has not moved [1]."""
 TINY = 1e-300
 """Minimum probability [1], so that logarithms stay finite."""
-ODDS = 7.0
+PRIOR_ODDS = 7.0
 """Log-odds against a change, before anything is seen: one in a thousand objects changes between two views."""
-ALIKE = 0.2
+SIZE_TOLERANCE = 0.2
 """Share by which sizes of one object may differ [1], beyond what the fits' uncertainty explains."""
 
 
@@ -45,7 +45,7 @@ class ChangeDetector:
         self.history: tuple[Change, ...] = ()
         self._odds: dict[str, float] = {}
         self._lost: dict[str, SceneObject] = {}
-        self._fresh: frozenset[int] = frozenset()
+        self._unmatched: frozenset[int] = frozenset()
 
     def copy(self) -> ChangeDetector:
         """Return an independent copy."""
@@ -53,8 +53,8 @@ class ChangeDetector:
         other._lost = self._lost.copy()
         return other
 
-    def gone(self, view: View, surfaces: Mapping[str, tuple[Array, Array]]) -> dict[str, str]:
-        """Find objects that views look through where they were.
+    def missing(self, view: View, surfaces: Mapping[str, tuple[Array, Array]]) -> dict[str, str]:
+        """Find objects whose last known place views look through.
 
         Args:
             view: The newest view.
@@ -63,18 +63,18 @@ class ChangeDetector:
         Returns:
             Ids of these objects, each with the reason.
         """
-        sight, gone = Sight(view), dict[str, str]()
+        sight, missing = Sight(view), dict[str, str]()
         odds, self._odds = self._odds, {}
         for object_id, (points, normals) in surfaces.items():
             through, confirmed = sight.cells(points, normals)
             self._odds[object_id] = max(odds.get(object_id, 0.0) + likelihood_ratio(through, confirmed), 0.0)
-            if self._odds[object_id] > ODDS:
+            if self._odds[object_id] > PRIOR_ODDS:
                 total = through + confirmed
-                gone[object_id] = f"{view.name} looks through {through} of {total} places of its surface"
-        return gone
+                missing[object_id] = f"{view.name} looks through {through} of {total} places of its surface"
+        return missing
 
     def lose(self, object_id: str, o: SceneObject | None) -> None:
-        """Record an object as gone; its shape helps to find it again."""
+        """Record an object as missing; its shape helps to find it again."""
         self._odds.pop(object_id, None)
         if o is not None:
             self._lost[object_id] = o
@@ -92,33 +92,33 @@ class ChangeDetector:
         Returns:
             Label of the new object → label it had before.
         """
-        self._fresh = (self._fresh | new.keys()) & fits.keys()
+        self._unmatched = (self._unmatched | new.keys()) & fits.keys()
         found: dict[int, int] = {}
         for object_id, o in self._lost.items():
             label = label_of(object_id)
-            among = [k for k in sorted(self._fresh - found.keys()) if alike(fits[k], o)]
+            among = [k for k in sorted(self._unmatched - found.keys()) if alike(fits[k], o)]
             if among and label is not None:
                 found[among[0]] = label
-        self._fresh -= found.keys()
+        self._unmatched -= found.keys()
         return found
 
     def record(
-        self, view: int, gone: Mapping[str, str], appeared: Mapping[str, str], present: set[str]
+        self, view: int, missing: Mapping[str, str], appeared: Mapping[str, str], present: set[str]
     ) -> None:
         """Add the changes before a view to the history.
 
         Args:
             view: Its number.
-            gone: Ids of the objects that are not where they were, each with the reason.
+            missing: Ids of the objects that are not where they were, each with the reason.
             appeared: Ids of the objects that are where space was free, each with the reason.
             present: Ids of all objects; one both lost and present was moved.
         """
         for object_id in sorted(self._lost.keys() | appeared.keys()):
-            why = gone.get(object_id) or appeared.get(object_id, "it is found again")
+            why = missing.get(object_id) or appeared.get(object_id, "it was found again")
             if object_id in present:
                 kind: ChangeKind = "moved" if self._lost.pop(object_id, None) else "added"
                 self.history = (*self.history, Change(kind, object_id, view, why))
-            elif object_id in gone:
+            elif object_id in missing:
                 self.history = (*self.history, Change("removed", object_id, view, why))
 
 
@@ -140,7 +140,7 @@ def appeared(
     for label in np.unique(labels).tolist():
         own = labels == label
         there, other = distinct(points_world[own & free]), distinct(points_world[own & ~free])
-        if likelihood_ratio(there, other) > ODDS:
+        if likelihood_ratio(there, other) > PRIOR_ODDS:
             new[label] = f"{name} shows {there} of {there + other} places of it where space was free"
     return new
 
@@ -156,7 +156,7 @@ class Sight:
         self._view = view
         readings = view.depth[view.depth > 0.0]
         typical = float(np.median(readings)) if len(readings) else 1.0
-        self._reach = max(1, round(ASIDE * float(view.K[0, 0]) / typical))
+        self._reach = max(1, round(PIXEL_MARGIN * float(view.K[0, 0]) / typical))
         assert view.T_world_camera is not None
         self._T_camera_world = transforms.invert(view.T_world_camera)
 
@@ -181,12 +181,12 @@ class Sight:
             facing & (points[:, 2] > 0.1) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
         )
         u, v, z = u[rows], v[rows], z[rows]
-        beyond = BEYOND * np.maximum(1.0, (z / 1.5) ** 2)
+        beyond = DEPTH_MARGIN * np.maximum(1.0, (z / 1.5) ** 2)
         reading = self._view.depth[v, u]
         confirmed = (reading > 0.0) & (np.abs(reading - z) <= beyond)
-        deeper = np.flatnonzero((reading <= 0.0) | (reading > z + beyond))
-        around = self._nearest(u[deeper], v[deeper])
-        through = deeper[np.isfinite(around) & (around > (z + beyond)[deeper])]
+        behind = np.flatnonzero((reading <= 0.0) | (reading > z + beyond))
+        around = self._nearest(u[behind], v[behind])
+        through = behind[np.isfinite(around) & (around > (z + beyond)[behind])]
         return distinct(points_world[rows[through]]), distinct(points_world[rows[confirmed]])
 
     def _nearest(self, u: NDArray[np.intp], v: NDArray[np.intp]) -> Array:
@@ -200,13 +200,14 @@ class Sight:
 
 
 def likelihood_ratio(contradicted: int, confirmed: int) -> float:
-    """Log-likelihood ratio of so many contradicted cells, after a change over without one.
+    """Log-likelihood ratio of a change, given the number of contradicted and confirmed cells.
 
-    Without one a share of up to `ERRS` of them is, after one a larger share; any such share is as likely.
+    Without a change, errors contradict a share of up to `ERROR_SHARE`; after one the share is larger. Within
+    its range, every share is equally likely.
     """
-    few = betainc(contradicted + 1, confirmed + 1, ERRS)
-    many = betainc(confirmed + 1, contradicted + 1, 1.0 - ERRS)
-    return float(np.log(max(many, TINY) / (1.0 - ERRS)) - np.log(max(few, TINY) / ERRS))
+    few = betainc(contradicted + 1, confirmed + 1, ERROR_SHARE)
+    many = betainc(confirmed + 1, contradicted + 1, 1.0 - ERROR_SHARE)
+    return float(np.log(max(many, TINY) / (1.0 - ERROR_SHARE)) - np.log(max(few, TINY) / ERROR_SHARE))
 
 
 def distinct(points_world: Array) -> int:
@@ -223,4 +224,4 @@ def alike(a: SceneObject, b: SceneObject) -> bool:
     unsure = [np.zeros(3) if o.uncertainty is None else 2.0 * o.uncertainty.sizes for o in (a, b)]
     first, second = (o.shape.extents[rows] for o, rows in zip((a, b), order, strict=True))
     excess = np.abs(first - second) - np.hypot(*(u[rows] for u, rows in zip(unsure, order, strict=True)))
-    return bool((excess <= ALIKE * np.minimum(first, second)).all())
+    return bool((excess <= SIZE_TOLERANCE * np.minimum(first, second)).all())

@@ -1,4 +1,4 @@
-"""One object or two: model split and model merge compare the description lengths of the same two readings."""
+"""One object or two: splitting and merging compare the description lengths of both explanations."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Hints = Callable[[], Sequence[Mask]]
 Pair = tuple[int, int]
 
 GROWTH = 1.3
-"""What was found to be one object, or two, is looked at again when its points have grown by this [1]."""
+"""A decision for one object or two is revised once the number of points has grown by this factor [1]."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -49,7 +49,7 @@ class TwoObjects:
     Attributes:
         second: Which points (N,) are the second's.
         explanations: Of both.
-        cost: Of both and of the border between them, less what their colours speak for two [nats].
+        cost: Cost of both and of the border between them, less the evidence of their colours for two [nats].
         by_colour: Whether their colours alone pay for another object.
     """
 
@@ -70,16 +70,16 @@ def split(
 ) -> Groups | None:
     """Split points that several shapes explain at a lower cost than one.
 
-    Where one shape does not explain all, pieces with free space between them are two. Otherwise tried are
-    hints, the patches that the single shape does not explain, and cuts across the vertical, where one object
-    lies on another, and across the two horizontal directions of the points' faces, where they stand side by
-    side. From each such hypothesis the points go to the shape that explains them better, and the shapes are
-    fitted again.
+    Where one shape does not explain all points, pieces with free space between them are two objects.
+    Otherwise the hypotheses are: hints; the patches that the single shape does not explain; cuts across the
+    vertical, where one object lies on another; and cuts across the two main horizontal directions of the
+    faces, where objects stand side by side. From each hypothesis, points go to the shape that explains them
+    better and both shapes are fitted again, in turn.
 
     Args:
         evidence: The points of what is taken for one object.
         whole: Its best single explanation.
-        hints: Gives points (N,) that may be an object of their own; asked only where something is tried.
+        hints: Returns masks (N,) of points that may be an object of their own; called only if needed.
         up: Unit vector (3,) upwards.
         config: What is tried, what it costs, and how shapes are fitted.
         rng: Source of the samples.
@@ -88,7 +88,7 @@ def split(
         Group of each point (N,), from 0, or None where one object is the better explanation.
     """
     if not explained(whole, evidence, config.explanation):
-        pieces = _far_apart(evidence, config)
+        pieces = _separated_pieces(evidence, config)
         if pieces is not None:
             return pieces
     parts = _parts(evidence, whole, np.arange(len(evidence)), cache(hints), up, config, rng)
@@ -109,10 +109,10 @@ def _parts(
     config: Config,
     rng: np.random.Generator,
 ) -> list[tuple[Groups, float]] | None:
-    """Points of each object among those with this index, and its cost [nats]; None where they are one.
+    """Points of each object among those with this index, and its cost [nats]; None if they are one object.
 
-    A shape must explain each, or their colours pay for another object: pieces of a thing that has no shape
-    are not objects.
+    A shape must explain each part, or the colours must pay for another object: pieces of an object that has
+    no shape are not objects.
     """
     own = evidence.select(index)
     found = _best_two(own, whole, index, hints, up, config, rng)
@@ -138,14 +138,14 @@ def _best_two(
     config: Config,
     rng: np.random.Generator,
 ) -> TwoObjects | None:
-    """How points (those with this index among all) are best taken for two objects; None if one is better."""
+    """Best division of points (those with this index among all) into two objects; None if one is better."""
     costs = config.explanation
     if len(evidence) < 2 * config.split.min_points:
         return None
-    near = _around(evidence.points)
+    near = _neighbours(evidence.points)
     own = point_costs(whole.shape, evidence, costs)
-    bad = own[near].mean(axis=1)
-    excess = float(np.maximum(bad - costs.usual, 0.0).sum()) * evidence.weight
+    misfit = own[near].mean(axis=1)
+    excess = float(np.maximum(misfit - costs.usual, 0.0).sum()) * evidence.weight
     free = whole.cost - price(whole.shape, costs) - float(own.sum()) * evidence.weight
     starts = [h[index] for h in hints()]
     starts = [h for h in starts if h.any() and not h.all()]
@@ -153,7 +153,7 @@ def _best_two(
     colours = max((_colours(evidence, start, costs) for start in starts), default=0.0)
     if excess + free + colours < costs.parameter_cost * min(kind.parameters for kind in KINDS.values()):
         return None
-    starts += _hypotheses(evidence, bad, up, config)
+    starts += _hypotheses(evidence, misfit, up, config)
     looks = _settled(evidence, starts, hinted, near, 0, config, rng, first_look=True)
     # The best two of those with a shape for one side at least are settled with full fits.
     shaped = [k for k, look in enumerate(looks) if look and any(e.shape for e in look.explanations)]
@@ -174,7 +174,7 @@ def _colours(evidence: Evidence, second: Mask, costs: ExplanationConfig) -> floa
 
 
 def _is_layer(evidence: Evidence, two: TwoObjects) -> bool:
-    """Whether one side is only a layer of points on the other's surface, left by a view that is off."""
+    """Whether one side is only a layer of points on the other's surface, left by a misaligned view."""
     sides = evidence.points[two.second], evidence.points[~two.second]
     # 9 mm: a view that is off by 3σ leaves points that far from a surface.
     return any(
@@ -194,13 +194,13 @@ def _settled(
     *,
     first_look: bool = False,
 ) -> list[TwoObjects | None]:
-    """Fit both sides of each start, give each point to the side that explains it better, and so on.
+    """Fit both sides of each start, assign each point to the side that explains it better, and iterate.
 
-    Colours count for the first starts, the `hinted` ones: a view showed a border between their sides, and
-    elsewhere a border of colours may be one of a print.
+    Colours count only for the first, `hinted` starts, where a view showed a border between the sides:
+    elsewhere a border of colours may be part of a print.
 
     Returns:
-        What each start settles at; None where one side is left with too few points.
+        The division each start converges to; None if one side is left with too few points.
     """
 
     def side_explained(sides: list[Mask], rngs: list[np.random.Generator], number: int) -> Explanation:
@@ -236,13 +236,13 @@ def _settled(
     return settled
 
 
-def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> Iterator[Mask]:
-    """Points (N,) that may be an object of their own: badly explained patches, and what lies beyond cuts."""
-    poor = bad > config.explanation.irregular
+def _hypotheses(evidence: Evidence, misfit: Array, up: Array, config: Config) -> Iterator[Mask]:
+    """Masks (N,) of points that may be one object: poorly explained patches, and sides of cuts."""
+    poor = misfit > config.explanation.irregular
     if poor.any():
         part = _components(evidence.points[poor])
         for number in np.argsort(-np.bincount(part))[:3]:
-            start = np.zeros(len(bad), dtype=bool)
+            start = np.zeros(len(misfit), dtype=bool)
             start[np.flatnonzero(poor)[part == number]] = True
             yield start
     shares = np.linspace(0.0, 1.0, config.split.cuts + 2)[1:-1]
@@ -252,7 +252,7 @@ def _hypotheses(evidence: Evidence, bad: Array, up: Array, config: Config) -> It
             yield height > level
 
 
-def _far_apart(evidence: Evidence, config: Config) -> Groups | None:
+def _separated_pieces(evidence: Evidence, config: Config) -> Groups | None:
     """Piece (N,) of each point where free space parts the largest from others, or None where none is."""
     points, voxels = evidence.points, evidence.voxels
     piece = _components(points, config.explanation.reach)
@@ -305,26 +305,26 @@ def best_merge(
     config: Config,
     seed: int,
 ) -> Pair | None:
-    """Find the pair that it is best to take for one: neighbours, or sides of one colour.
+    """Find the pair of objects that it pays most to merge: neighbours, or sides of one colour.
 
     Args:
         known: Points of each object, by label, and their explanation as an object of its own.
-        changed: Only pairs with one of these are looked at.
-        apart: Pairs found to be two, with the number of points they had then; they are looked at again when
-            they have grown. Added to.
-        distinct: Pairs known to be two whatever their points say.
+        changed: Only pairs with one of these labels are considered.
+        apart: Pairs found to be two objects, with the number of points they had then; they are considered
+            again when they have grown. Updated in place.
+        distinct: Pairs known to be two objects, whatever their points suggest.
         config: What explanations cost, and how shapes are fitted.
         seed: Seed of the fits.
 
     Returns:
-        The larger object and the one it takes in, or None where all are better apart.
+        The larger object and the one merged into it, or None if no merge pays.
     """
     trees = {k: cKDTree(evidence.points) for k, (evidence, _) in known.items()}
     sizes = {k: len(evidence) for k, (evidence, _) in known.items()}
-    sides = {k: _sides(evidence, config.explanation) for k, (evidence, _) in known.items()}
+    sides = {k: _length_and_colour(evidence, config.explanation) for k, (evidence, _) in known.items()}
 
     def gap(a: int, b: int) -> float:
-        """Gap up to which two may be one [m]: as long as the longer one where they have the same colour."""
+        """Maximum gap between parts of one object [m]: the longer one's length if they share a colour."""
         (length, colour), (other_length, other) = sides[a], sides[b]
         alike = colour is not None and other is not None and np.linalg.norm(colour - other) <= PLAIN
         return max(config.explanation.reach, length, other_length) if alike else config.explanation.reach
@@ -347,7 +347,7 @@ def best_merge(
     return best
 
 
-def _sides(evidence: Evidence, costs: ExplanationConfig) -> tuple[float, Array | None]:
+def _length_and_colour(evidence: Evidence, costs: ExplanationConfig) -> tuple[float, Array | None]:
     """Length of an object [m], and its plain colour (3,): sides of that colour so far off may be its own."""
     colour = None if evidence.rgb is None else plain_colour(evidence.rgb, costs)[1]
     return float(np.linalg.norm(np.ptp(evidence.points, axis=0))), colour
@@ -356,16 +356,16 @@ def _sides(evidence: Evidence, costs: ExplanationConfig) -> tuple[float, Array |
 def _gain(
     known: Mapping[int, tuple[Evidence, Explanation]], labels: Pair, config: Config, seed: int
 ) -> float:
-    """How much less [nats] one object costs than two, by their shapes, fits to all the points, and colours.
+    """How much less [nats] one object costs than two, by their shapes, a joint fit, and colours.
 
-    Nothing where one shape leaves one of the two unexplained, or none explains both: later views may undo
-    what is two, but not what is one.
+    Zero if the joint shape leaves one of the two unexplained, or if there is none: prefer two objects until
+    the evidence for one is clear.
     """
     costs, rng = config.explanation, np.random.default_rng([seed, *labels])
     pair = [known[label] for label in labels]
     (first, alone), (second, other) = pair
     both = first.joined(second)
-    two = _two(both, np.arange(len(both)) >= len(first), (alone, other), _around(both.points), config)
+    two = _two(both, np.arange(len(both)) >= len(first), (alone, other), _neighbours(both.points), config)
     one = best_explanation([e.shape for e in (alone, other) if e.shape is not None], both, costs)
     for first_look in (True, False):
         one = min(one, explain(both, costs, config.fit, rng, first_look=first_look), key=lambda e: e.cost)
@@ -387,7 +387,7 @@ def _gain(
     return gain if is_one else 0.0
 
 
-def _around(points: Array) -> Groups:
+def _neighbours(points: Array) -> Groups:
     """Indices (N, 8) of the points (N, 3) nearest to each, itself among them: 2 cm square of them."""
     count = min(8, len(points))
     return np.asarray(cKDTree(points).query(points, k=count)[1]).reshape(len(points), count)
@@ -396,7 +396,7 @@ def _around(points: Array) -> Groups:
 def _two(
     evidence: Evidence, second: Mask, pair: tuple[Explanation, Explanation], near: Groups, config: Config
 ) -> TwoObjects:
-    """Points taken for two objects; a border costs where the surface goes on without a concave crease."""
+    """Two objects with these points; a border costs where the surface continues without a concave crease."""
     row, col = np.repeat(np.arange(len(second)), near.shape[1]), near.ravel()
     across = second[row] != second[col]
     row, col = row[across], col[across]

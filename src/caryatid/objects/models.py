@@ -1,4 +1,4 @@
-"""Every object's points and the shape fitted to them, kept up to date view by view."""
+"""The points of every object and the shape fitted to them, updated view by view."""
 
 from __future__ import annotations
 
@@ -200,7 +200,7 @@ class ObjectModels:
         self._distinct: set[frozenset[int]] = set()
 
     def copy(self) -> ObjectModels:
-        """Return models that know the same and go on by themselves; clouds, trees and shapes are shared."""
+        """Return an independent copy; clouds, trees and shapes are shared."""
         other = copy.copy(self)
         other.points = self.points.copy()
         other.fits = self.fits.copy()
@@ -213,7 +213,7 @@ class ObjectModels:
         return other
 
     def forget(self, labels: set[int]) -> None:
-        """Drop what is known of some objects: points and shapes."""
+        """Drop the points and shapes of some objects."""
         self.points.forget(labels)
         for label in labels:
             for known in (self.fits, self._solids, self._compounds):
@@ -230,7 +230,7 @@ class ObjectModels:
         self._forget({label})
 
     def rename(self, old: int, new: int) -> None:
-        """Let an object have another label, which no object has."""
+        """Give an object a label that no object has."""
         self.points.merge(old, new)
         for known in (self.fits, self._solids):
             if old in known:
@@ -259,8 +259,8 @@ class ObjectModels:
         Args:
             observation: The view.
             known: The objects so far.
-            masks: Its segments are given; two of one view are two objects for good.
-            new: Labels of segments that are not known object's.
+            masks: Whether its segments are given; two segments of one view are never merged.
+            new: Labels of segments that belong to no known object.
         """
         points, labels = observation.cloud.points_world, observation.labels
         segments = np.where(labels == SUPPORT_LABEL, 0, labels)
@@ -276,29 +276,30 @@ class ObjectModels:
             self._config.segmentation,
             self.points.labels_used,
             masks=masks,
-            unlike=None if masks else self._unlike(observation),
+            other_colour=None if masks else self._other_colour(observation),
             new=new,
         )
         if masks:
             self._distinct |= set(map(frozenset, combinations(np.unique(named[named > 0]).tolist(), 2)))
         return observation.with_labels(np.where(labels == SUPPORT_LABEL, labels, named))
 
-    def _unlike(self, observation: Observation) -> NDArray[np.bool_] | None:
+    def _other_colour(self, observation: Observation) -> NDArray[np.bool_] | None:
         """Which points (N,) of a view have another colour than plain objects (K,), ascending: (N, K)."""
         config, rgb, names = self._config.explanation, observation.cloud.rgb, self.points.objects
         if rgb is None:
             return None
-        unlike = np.zeros((len(rgb), len(names)), dtype=bool)
+        other_colour = np.zeros((len(rgb), len(names)), dtype=bool)
         rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
         for column, name in enumerate(names):
             colours = self.points.of(name, config.spacing).rgb
             plain = None if colours is None else plain_colour(colours, config)[1]
             if plain is not None:
-                unlike[rows, column] = colour_costs(rgb[rows], plain[None], config)[:, 0] >= config.outlier
-        return unlike
+                costs = colour_costs(rgb[rows], plain[None], config)[:, 0]
+                other_colour[rows, column] = costs >= config.outlier
+        return other_colour
 
     def mislabelled(self, observation: Observation) -> tuple[int, int]:
-        """How many labels of a view lie on objects that had other labels before, and how many there are."""
+        """Number of labels of a view that lie on objects with other labels, and number of its labels."""
         config = self._config.segmentation
         rows = np.flatnonzero((observation.labels > 0) & (observation.labels != SUPPORT_LABEL))
         rows = rows[:: len(rows) // 1000 + 1]  # some are enough to tell where a mask lies
@@ -402,7 +403,7 @@ class ObjectModels:
         return given_up
 
     def nearest(self, observation: Observation, labels: set[int]) -> Observation:
-        """Give the points of a view that carry one of these labels the label of the nearest point of any."""
+        """Relabel the points of a view with one of these labels by the nearest known point of any."""
         among = np.flatnonzero(np.isin(observation.labels, sorted(labels)))
         known = [self.points.of(k) for k in sorted(labels)]
         owners = np.repeat(sorted(labels), [len(c) for c in known])
@@ -412,9 +413,9 @@ class ObjectModels:
         return observation.with_labels(changed)
 
     def form(self, labels: set[int], voxels: VoxelMap | None) -> None:
-        """Take solids for objects whose points cost less without any primitive.
+        """Replace primitives by solids where the points cost less without any primitive.
 
-        Points of other objects inside a primitive count as ones it does not explain: they were seen there.
+        A primitive does not explain points of other objects that were seen inside it.
 
         Args:
             labels: Objects whose points have changed.
@@ -449,7 +450,7 @@ class ObjectModels:
     def _explained(
         self, label: int, noise: float, voxels: VoxelMap | None, *, compound: bool = False
     ) -> tuple[Evidence, Explanation]:
-        """What explanations of an object go by, and its explanation by its shape, or by a compound too."""
+        """Evidence of an object, and its best explanation: its fitted shape or, if asked, a compound."""
         config = self._config.explanation
         cloud = self.points.of(label, config.spacing)
         weight = config.spacing**2 / config.reading
@@ -477,7 +478,7 @@ class ObjectModels:
         return hints
 
     def _forget(self, labels: set[int]) -> None:
-        """Drop what was found of objects that have changed: which are one, and which pairs are two."""
+        """Drop the results of earlier splits and merges for objects that have changed."""
         self._undivided = {k: n for k, n in self._undivided.items() if k not in labels}
         self._apart = {pair: n for pair, n in self._apart.items() if not labels & set(pair)}
 
@@ -491,7 +492,7 @@ class ObjectModels:
     def _fit(
         self, labels: set[int], points_of: Callable[[int], Cloud], voxels: VoxelMap | None = None
     ) -> None:
-        """Fit objects to their points, on all cores; each is fitted as it would be alone."""
+        """Fit objects to their points on all cores; the result for each does not depend on the others."""
         names = sorted(labels)
 
         def fitted(number: int) -> Fit | FitFailure:
@@ -524,15 +525,15 @@ def associate(
     labels_used: int = 0,
     *,
     masks: bool = False,
-    unlike: NDArray[np.bool_] | None = None,
+    other_colour: NDArray[np.bool_] | None = None,
     new: Set[int] = frozenset(),
 ) -> NDArray[np.int32]:
     """Give the points of each new segment the label of the object they belong to, or one never used before.
 
-    An automatic segment that lies at several known objects, with a tenth of its points or more, is divided
-    among them: each point goes to the nearest. A point of another colour than these goes to the object that
-    is nearest of all with its colour, if one is near.
-    A mask is all that a view shows of one object: masks and objects are matched one to one, so that they
+    An automatic segment with a tenth of its points or more on each of several known objects is divided among
+    them: each point goes to the nearest. A point whose colour differs from all of these goes to the nearest
+    object of its own colour, if there is one within reach.
+    A mask is all that a view shows of one object. Masks and objects are matched one to one, so that they
     share as many points as possible.
 
     Args:
@@ -543,7 +544,7 @@ def associate(
         config: Share that must overlap, and the distance that counts as overlap.
         labels_used: Highest label ever given; new objects are numbered from the next one.
         masks: Whether the segments are masks.
-        unlike: Which points have another colour than which known object (N, K); None where none has.
+        other_colour: Which points differ in colour from which known object (N, K); None if none does.
         new: Segments that belong to no known object.
 
     Returns:
@@ -559,9 +560,9 @@ def associate(
     shapes = [known_shapes.get(k) for k in names.tolist()]
     counts = np.bincount(labels, minlength=1)
     kept = most_central(points_world, labels, np.where(np.arange(len(counts)) > 0, spacing, 0.0))
-    if unlike is None:
-        unlike = np.zeros((len(labels), len(names)), dtype=bool)
-    owner = _nearest_objects(points_world[kept], points, owners, shapes, unlike[kept], reach)
+    if other_colour is None:
+        other_colour = np.zeros((len(labels), len(names)), dtype=bool)
+    owner = _nearest_objects(points_world[kept], points, owners, shapes, other_colour[kept], reach)
     segments = np.flatnonzero(counts[1:]) + 1
     shared = np.zeros((len(segments), len(names)), dtype=np.intp)
     near = owner >= 0
@@ -569,23 +570,23 @@ def associate(
     shared[np.isin(segments, sorted(new))] = 0
     shares = shared / np.bincount(labels[kept], minlength=len(counts))[segments, None]
     chosen = _one_to_one(shared, shares, config.overlap) if masks else _all_near(shares, config.overlap)
-    fresh = max(labels_used, int(names.max(initial=0)))
+    highest = max(labels_used, int(names.max(initial=0)))
     result = np.zeros(len(labels), dtype=np.int32)
     for segment, among in zip(segments, chosen, strict=True):
         index = np.flatnonzero(labels == segment)
         if not len(among):
-            fresh += 1
-            result[index] = fresh
+            highest += 1
+            result[index] = highest
         else:
-            own, other = points_world[index], unlike[index]
+            own, other = points_world[index], other_colour[index]
             theirs = np.isin(owners, among)
             nearest = np.full(len(index), among[0], dtype=np.int32)
             if len(among) > 1:
                 some = [shape if k in among else None for k, shape in enumerate(shapes)]
                 nearest = _nearest_objects(own, points[theirs], owners[theirs], some, other, reach)
-            stray = other[:, among].all(axis=1)
-            if stray.any():
-                nearest[stray] = _nearest_objects(own[stray], points, owners, shapes, other[stray], reach)
+            none = other[:, among].all(axis=1)
+            if none.any():
+                nearest[none] = _nearest_objects(own[none], points, owners, shapes, other[none], reach)
             far = nearest < 0
             if far.any():
                 nearest[far] = owners[theirs][cKDTree(points[theirs]).query(own[far])[1]]
@@ -614,7 +615,7 @@ def _nearest_objects(
     known: Array,
     owners: NDArray[np.int32],
     shapes: list[Shape | None],
-    unlike: NDArray[np.bool_],
+    other_colour: NDArray[np.bool_],
     reach: float,
 ) -> NDArray[np.int32]:
     """Which object (N,) is nearest to each point (N, 3), by its points or its shape's surface; −1 = none.
@@ -624,7 +625,7 @@ def _nearest_objects(
         known: Points (M, 3) [m] of all objects.
         owners: Object (M,) of each: 0 … K−1.
         shapes: Shape of each object, or None.
-        unlike: Points that have another colour than the object (N, K).
+        other_colour: Points that have another colour than the object (N, K).
         reach: Objects from here on count as none [m].
     """
     nearest, gap = np.full(len(points), -1, dtype=np.int32), np.full(len(points), reach)
@@ -635,7 +636,7 @@ def _nearest_objects(
 
     for number, shape in enumerate(shapes):
         own = known[owners == number]
-        rows = np.flatnonzero(~unlike[:, number])
+        rows = np.flatnonzero(~other_colour[:, number])
         if len(own) and len(rows):
             among = (points[rows] > own.min(axis=0) - reach) & (points[rows] < own.max(axis=0) + reach)
             close = rows[among.all(axis=1)]
