@@ -293,10 +293,9 @@ def free_in_slab(slab: Box, voxels: VoxelMap) -> int:
     local = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3) * slab.extents
     # The seen part of a surface may lie in the voxel beside it.
     beside = 0.5 * voxels.config.size * np.eye(3)[slab.extents.argmin()]
-    free = np.ones(len(local), dtype=np.bool_)
-    for off in (-beside, 0.0, beside):
-        free &= voxels.empty_at(transforms.transform(slab.T_world_object, local + off))
-    return int(np.count_nonzero(free))
+    around = np.concatenate([local - beside, local, local + beside])
+    free = voxels.empty_at(transforms.transform(slab.T_world_object, around))
+    return int(np.count_nonzero(free.reshape(3, -1).all(axis=0)))
 
 
 def _open_boxes(points: Array, normals: Array, thickness: float) -> Iterator[OpenBox]:

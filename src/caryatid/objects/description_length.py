@@ -131,8 +131,12 @@ def best_explanation(
     shapes: Sequence[Shape | Compound], evidence: Evidence, config: ExplanationConfig
 ) -> Explanation:
     """Explain points by one of some shapes, or as an irregular object, whichever costs least."""
-    found = [Explanation(shape, _cost(shape, evidence, config)) for shape in (None, *shapes)]
-    return min(found, key=lambda e: e.cost)
+    best = Explanation(None, _cost(None, evidence, config))
+    for shape in shapes:
+        cost = _cost(shape, evidence, config, best.cost)
+        if cost < best.cost:
+            best = Explanation(shape, cost)
+    return best
 
 
 def best_compound(evidence: Evidence, config: Config, below: float) -> Explanation:
