@@ -98,9 +98,7 @@ def plan_order(
     found: list[TakeStep] = []
     refusal = ""
     while len(found) != steps and (left := rehearsal.left()) and (goal is None or goal in left):
-        wanted = (
-            _in_turn(graph, left, rehearsal) if goal is None else _on_the_way(graph, goal, left, rehearsal)
-        )
+        wanted = _in_turn(rehearsal) if goal is None else _on_the_way(goal, rehearsal)
         trial, tried = _safest(rehearsal, wanted, hands)
         if trial.risk > rehearsal.accepted and not refusal:
             refusal = _refusal(trial, tried)
@@ -109,26 +107,26 @@ def plan_order(
     return Order(tuple(found), refusal)
 
 
-def _in_turn(graph: SupportGraph, left: Sequence[str], rehearsal: _Rehearsal) -> list[str]:
-    """The remaining objects; those that support nothing come first.
+def _in_turn(rehearsal: _Rehearsal) -> list[str]:
+    """The remaining objects: those that support nothing come first.
 
-    Among these come first the ones that do not stand in rehearsals, which any touch may topple, and then the
-    highest.
+    Among these, the ones that do not stand in rehearsals come first, because any touch may topple them, and
+    then the highest.
     """
+    left, graph, restless = rehearsal.left(), rehearsal.graph, rehearsal.restless()
     carrying = {s.supporter for s in graph.supports if s.supported in left}
     height = {o.id: float(o.centre_world[2]) for o in graph.objects}
-    restless = rehearsal.restless()
     return sorted(left, key=lambda i: (i in carrying, -restless[i], -height[i], i))
 
 
-def _on_the_way(graph: SupportGraph, goal: str, left: Sequence[str], rehearsal: _Rehearsal) -> list[str]:
+def _on_the_way(goal: str, rehearsal: _Rehearsal) -> list[str]:
     """The goal if it can be lifted; otherwise the objects its lift disturbs, and so on, the nearest first."""
     found = [goal]
     for object_id in found:
         trial = rehearsal.try_lift(object_id)
         if trial.risk <= rehearsal.accepted:
             return [object_id]
-        found += [i for i in _in_turn(graph, left, rehearsal) if i in trial.harmed and i not in found]
+        found += [i for i in _in_turn(rehearsal) if i in trial.harmed and i not in found]
     return found
 
 
@@ -168,7 +166,8 @@ def _refusal(trial: _Trial, tried: Sequence[_Trial]) -> str:
     try:
         edges = nx.find_cycle(blocked, trial.object_id)
     except nx.NetworkXNoCycle:
-        return f"no safe order: lifting {trial.object_id} disturbs {', '.join(trial.harmed)}"
+        harm = ", ".join(trial.harmed) or "nothing, but rehearsal.draws are too few for the risk"
+        return f"no safe order: lifting {trial.object_id} disturbs {harm}"
     cycle = ", ".join(f"lifting {a} disturbs {b}" for a, b in edges)
     return f"no safe order: {cycle}; whichever goes first"
 
@@ -199,7 +198,7 @@ class _Rehearsal:
                 f"has {len(self.ids)} objects, for which MuJoCo reserves about {reserved:.1f} GB a thread"
             )
             raise InputError("graph", reason, "raise rehearsal.max_objects, or give a part of the scene")
-        self._graph, self._config, self._seed, self._threads = graph, config, seed, threads
+        self.graph, self._config, self._seed, self._threads = graph, config, seed, threads
         self.accepted = config.rehearsal.risk
         self._scenes: list[_DrawnScene] = []
         self._trials: dict[tuple[str, ...], _Trial] = {}
@@ -212,7 +211,7 @@ class _Rehearsal:
 
     def restless(self) -> dict[str, float]:
         """Shares of the first scenes in which each object does not stay in place, by id."""
-        found = self._each(slice(BATCH), lambda scene: scene.restless)
+        found = self._each(lambda scene: scene.restless, slice(0, BATCH))
         return dict(zip(self.ids, np.mean(found, axis=0).tolist(), strict=True))
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> _Trial:
@@ -225,43 +224,39 @@ class _Rehearsal:
     def _tried(self, object_id: str, hold: tuple[str, ...]) -> _Trial:
         # An object held in a scene because it does not stay there moves if it loses a support.
         free = set(self.left()) - set(hold)
-        supports = [self._graph.support(object_id, i) if i in free else None for i in self.ids]
+        supports = [self.graph.support(object_id, i) if i in free else None for i in self.ids]
         loses = np.array([0.0 if s is None else s.belief for s in supports])
-        index, held = self._indices(object_id, hold)
-        most, harm = self._config.rehearsal.draws, np.zeros((0, len(self.ids)))
-        while True:
-            found = self._each(slice(len(harm), len(harm) + BATCH), lambda s: s.lift(index, held))
-            harm = np.concatenate([harm, np.stack([np.maximum(d, r * loses) for d, r in found])])
+        accepted, most = self.accepted, self._config.rehearsal.draws
+        harm, harms, risk = np.zeros((0, len(self.ids))), 0.5, 1.0
+        while not len(harm) or (len(harm) < most and risk > accepted >= harms / (most + 1.0)):
+            scenes = slice(len(harm), len(harm) + BATCH)
+            found = self._each(
+                lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.restless * loses), scenes
+            )
+            harm = np.concatenate([harm, found])
             harms = float((1.0 - np.prod(1.0 - harm, axis=1)).sum()) + 0.5
             risk = harms / (len(harm) + 1.0)
-            if risk <= self.accepted or harms / (most + 1.0) > self.accepted or len(harm) == most:
-                break
         shares = zip(self.ids, harm.mean(axis=0).tolist(), strict=True)
         harmed = {i: share for i, share in shares if share > 0.0}
         return _Trial(object_id, hold, len(harm), risk, harmed)
 
     def take(self, trial: _Trial) -> None:
         """Continue without an object whose lift was tried; others that moved are put back."""
-        taken = self._indices(trial.object_id, trial.hold)
-        self._each(slice(None), lambda scene: scene.take(*taken))
+        self._each(lambda scene: scene.take(trial.object_id, trial.hold), slice(0, len(self._scenes)))
         self._taken.append(trial)
         self._trials.clear()
 
-    def _indices(self, object_id: str, hold: Collection[str]) -> tuple[int, frozenset[int]]:
-        return self.ids.index(object_id), frozenset(self.ids.index(i) for i in hold)
-
     def _draw(self, number: int) -> _DrawnScene:
-        scene = _DrawnScene(self._graph, self.ids, number, self._config, self._seed)
+        scene = _DrawnScene(self.graph, self.ids, number, self._config, self._seed)
         for trial in self._taken:
-            scene.take(*self._indices(trial.object_id, trial.hold))
+            scene.take(trial.object_id, trial.hold)
         return scene
 
-    def _each(self, numbers: slice, do: Callable[[_DrawnScene], Any]) -> list[Any]:
+    def _each(self, do: Callable[[_DrawnScene], Any], numbers: slice) -> list[Any]:
         """Do something in these scenes, in order; those that are missing are drawn."""
+        missing = range(len(self._scenes), min(numbers.stop, self._config.rehearsal.draws))
         with ThreadPoolExecutor(self._threads) as pool:
-            self._scenes += pool.map(
-                self._draw, range(len(self._scenes), min(numbers.stop or 0, self._config.rehearsal.draws))
-            )
+            self._scenes += pool.map(self._draw, missing)
             return list(pool.map(do, self._scenes[numbers]))
 
 
@@ -271,27 +266,22 @@ class _DrawnScene:
     def __init__(
         self, graph: SupportGraph, ids: Sequence[str], number: int, config: Config, seed: int
     ) -> None:
-        self._config = config.lift
+        self._ids, self._config = ids, config.lift
         spec = _drawn_spec(graph, number, config, np.random.default_rng([seed, number]))
         self._lifting, self.restless, self._state = _settled(spec, ids, config.lift)
-        self._lifts: dict[tuple[int, frozenset[int]], Lift] = {}
 
-    def lift(self, index: int, held: frozenset[int]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Lift an object while others are held: which (N,) are disturbed, and which do not stay in place."""
-        if (index, held) not in self._lifts:
-            also = held | (set(np.flatnonzero(self.restless).tolist()) - {index})
-            self._lifts[index, held] = self._lifting.lift(
-                self._state, index, self._config, held=also, to_the_end=False
-            )
-        return self._lifts[index, held].disturbed, self.restless
+    def lift(self, object_id: str, hold: Collection[str]) -> Lift:
+        """Lift an object while others are held, and those that do not stay in place."""
+        index = self._ids.index(object_id)
+        held = {self._ids.index(i) for i in hold} | ({*np.flatnonzero(self.restless).tolist()} - {index})
+        return self._lifting.lift(self._state, index, self._config, held=held, to_the_end=False)
 
-    def take(self, index: int, held: frozenset[int]) -> None:
+    def take(self, object_id: str, hold: Collection[str]) -> None:
         """Continue without an object; others that moved are put back."""
-        disturbed, _ = self.lift(index, held)
-        stays = self.restless | disturbed.any()
-        self._state = np.where(stays[:, None], self._state, self._lifts[index, held].film[-1])
+        lift, index = self.lift(object_id, hold), self._ids.index(object_id)
+        stays = self.restless | lift.disturbed.any()
+        self._state = np.where(stays[:, None], self._state, lift.film[-1])
         self._state[index, :3] = 0.0, 0.0, ASIDE + index
-        self._lifts.clear()
 
 
 def _drawn_spec(graph: SupportGraph, number: int, config: Config, rng: np.random.Generator) -> Any:
