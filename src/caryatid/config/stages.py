@@ -59,7 +59,7 @@ class CloudConfig:
     min_depth: NotNegative = 0.1
     """Nearer readings are the robot's own hand [m]; below any sensor's range."""
     normal_window: Count = 7
-    """Largest side of the square window of the local planes [px]; 7 × 7 reduce the noise to a quarter."""
+    """Largest side of the square window of the local planes [px]; 7 × 7 reduces the noise to a quarter."""
     normal_size: Positive = 0.02
     """The same on the surface at the median distance [m]: 7 px at 1.5 m with f = 525 px; fewer in coarse
     images, where 7 px would span an object."""
@@ -83,21 +83,21 @@ class SurfaceConfig:
     tolerance: Positive = 0.01
     """Distance within which a point belongs to the plane [m]; 3σ of the sensor at 1.8 m."""
     max_tilt: Angle = 10.0
-    """How far the normal may lean from the vertical where the view has a pose [deg]."""
+    """Maximum angle between its normal and the vertical, if the view has a pose [deg]."""
     max_deviation: Angle = 25.0
-    """How far a point's normal may lean from its plane's [deg]; 3σ of normals from depth."""
+    """Maximum angle between the normals of a point and its plane [deg]; 3σ of normals from depth."""
     gap: Positive = 0.3
     """Parts of one plane farther apart than this are two surfaces [m]; shadows of objects are narrower."""
     min_area: NotNegative = 0.05
     """Minimum visible area of a table [m²]; larger than the top of most objects."""
     storey: NotNegative = 0.6
-    """A plane that has a table this far above it is the floor [m]; lower ones are tops of objects."""
+    """A plane this far below a table is the floor [m]; a smaller step is the top of an object."""
     min_points: Count = 200
     """Minimum number of inliers of a table [points]; a tenth of `min_area` at 5 mm."""
     search: Positive = 0.05
-    """A known table is searched for within this height of where it was [m]; 5σ of registration and tilt."""
+    """A known table is searched for within this height of its last place [m]; 5σ of registration and tilt."""
     spacing: Positive = 0.02
-    """Spacing of its points that are kept for later views [m]; its outline needs no finer."""
+    """Spacing of its points kept for later views [m]; fine enough for its outline."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -123,7 +123,7 @@ class RegistrationConfig:
     min_points: Count = 100
     """Minimum number of matches that determine a pose [1]."""
     kept: Count = 12
-    """Views to which later ones are registered, and which move with them [1]; 30° apart on a full turn."""
+    """Number of views that later ones are registered to, and that move too [1]; 30° apart on a circle."""
     max_translation: NotNegative = 0.1
     """A longer move is refused [m]."""
     max_rotation: Angle = 5.0
@@ -160,7 +160,7 @@ class SegmentationConfig:
     min_width: NotNegative = 0.02
     """A segment narrower than this beside a larger one belongs to it [m]; creases are rounded by as much."""
     merge_gap: NotNegative = 0.25
-    """Segments are merged across a nearer object that hides up to this much between them [m]."""
+    """Segments are merged across a nearer object that hides at most this length between them [m]."""
     clearance: NotNegative = 0.008
     """Points nearer to the support surface than this belong to it [m]; 2σ of the sensor at 1.5 m."""
     max_height: Positive = 0.6
@@ -176,9 +176,9 @@ class MaskConfig:
     """Masks of a learned segmenter."""
 
     min_pixels: WholeNumber = 200
-    """Masks with fewer pixels, before or after smaller ones are laid over them, are left out [px]."""
+    """Minimum number of pixels of a mask [px], also after smaller masks are laid over it."""
     max_share: Share = 0.4
-    """A mask of more than this share of the image is the table or what is behind it [1]."""
+    """A mask that covers a larger share of the image is the table or the background [1]."""
     min_score: float = 0.0
     """Masks with a lower score are left out [the segmenter's unit]."""
 
@@ -194,7 +194,7 @@ class FitConfig:
     max_points: Count = 800
     """Points by which a shape is scored [1]; 1.5 cm apart on the largest objects."""
     search_points: Count = 250
-    """Points that the search uses, or nearly twice as many [1]; the best hypotheses are refined on all."""
+    """Points used by the search, or up to twice as many [1]; the best hypotheses are refined on all."""
     min_points: Count = 12
     """Minimum number of points of an object [1]; a box has nine parameters."""
     threshold: Positive = 0.01
@@ -218,7 +218,7 @@ class FitConfig:
     rim: NotNegative = 0.003
     """Standard deviation of the points' border beside a depth edge [m]: one pixel at 1.5 m."""
     max_residual: Positive = 0.008
-    """Mean distance beyond which none of the shapes explains the object [m]: `poor_fit`."""
+    """Mean distance beyond which no shape explains the object [m]: `poor_fit`."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -235,20 +235,20 @@ class SplitConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class ExplanationConfig:
-    """Description length of points explained by shapes: the least decides between one object and two."""
+    """Description length of points explained by shapes, which decides between one object and two."""
 
     parameter_cost: NotNegative = 4.5
     """Cost of each parameter of a shape [nats]; each is known to a ninetieth of its range."""
     outlier: NotNegative = 4.0
     """Cost of a point that no shape explains [nats]; as likely as one 2.8σ off."""
     irregular: NotNegative = 1.4
-    """Cost of a point on an object that is none of the shapes [nats]."""
+    """Cost of a point on an object that no shape fits [nats]."""
     normal_weight: NotNegative = 4.0
     """Cost of a normal turned by 90° [nats]; normals, blurred over edges, are good to 30°."""
     reading: Positive = 0.0002
     """Area whose points share one error [m²]; half of the 2 cm square a registration error shows in."""
     border: NotNegative = 4.0
-    """Cost of a point with only the other object around it, on a surface without crease [nats]."""
+    """Cost of a point surrounded by the other object's, on a surface without a crease [nats]."""
     free_cost: NotNegative = 0.5
     """Cost of a voxel inside a shape that was seen free [nats]; four points off at 5 mm spacing."""
     usual: NotNegative = 0.9
@@ -261,7 +261,7 @@ class ExplanationConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class CompletionConfig:
-    """How far shapes reach into unseen space below them."""
+    """Extension of shapes into the unseen space below them."""
 
     enabled: bool = True
     """Whether unseen sides are extended."""
@@ -277,7 +277,7 @@ class CompletionConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class PlausibilityConfig:
-    """Shapes that neither overlap nor float."""
+    """Correction of shapes that overlap or float."""
 
     rounds: WholeNumber = 3
     """Maximum number of corrections [1]; 0 leaves shapes as they were fitted."""
@@ -292,23 +292,23 @@ class SupportConfig:
     """Support relations, section III-A."""
 
     contact_margin: NotNegative = 0.005
-    """Gap up to which two shapes are in contact, however certain both are [m]."""
+    """Gap up to which two shapes are in contact, even if both are certain [m]."""
     margin_sigma: NotNegative = 2.0
-    """The same in standard deviations of the gap, if larger [1]; misses one contact in forty."""
+    """The same in standard deviations of the gap, if larger [1]; it misses one contact in forty."""
     max_margin: NotNegative = 0.01
-    """Shapes farther apart are not in contact, however uncertain they are [m]."""
+    """Shapes farther apart are not in contact, even if they are uncertain [m]."""
     reach: NotNegative = 0.012
     """Gap up to which a contact is assumed where an object would tip without it [m]; 2.5σ of the gap."""
     gentle_tilt: Angle = 25.0
-    """Planes steeper than this, where nothing overlaps, carry only what would tip without them [deg]."""
+    """Steeper planes, where nothing overlaps, carry only what would tip without them [deg]."""
     max_tilt: Angle = 75.0
-    """Separating planes steeper than this carry nothing [deg]: the normal is too near the horizontal."""
+    """Steeper separating planes carry nothing [deg]: their normal is too close to the horizontal."""
     patch_depth: NotNegative = 0.003
-    """Surface this near to the first contact counts as touching [m]; the noise of one reading at 1.5 m."""
+    """Surfaces this close to the first contact also touch [m]; the noise of one reading at 1.5 m."""
     min_area_ratio: Share = 0.1
     """r_s,min of eq. 1 [1]."""
     overhang: NotNegative = 0.003
-    """A centre of mass this far outside the support polygon tips [m]; 1σ of a fit's position."""
+    """An object tips if its centre of mass is this far outside the support polygon [m]; 1σ of a fit."""
     stability: Literal["area", "balance"] = "balance"
     """When an object is unstable: by r_s of eq. 1 over its contact points (`area`, the paper's; all that is
     on it may hold it), or also by its centre of mass (`balance`; only what counters its tipping holds it)."""
@@ -317,7 +317,7 @@ class SupportConfig:
     force_share: Share = 0.03
     """Minimum share of an object's weight [1] that a supporter carries in a draw, as in the ground truth."""
     at_rest: Share = 0.05
-    """Acceleration below which an object is at rest in a draw [g]: it closes a gap of 2 mm at most."""
+    """Acceleration below which an object is at rest in a draw [g]: it closes a gap of at most 2 mm."""
     unexplained: Share = 0.1
     """Weight of a draw for an object that does not rest in it [1]: how often something unseen holds one."""
     friction: Lengths = (0.4, 1.0)
@@ -369,7 +369,7 @@ class VoxelConfig:
     stride: Count = 2
     """Pixels between the rays that are followed; 2 is 6 mm at 1.5 m, below the voxel's size."""
     margin: NotNegative = 0.01
-    """Length before a reading that a ray does not clear [m]; depth noise within it carves no surface."""
+    """Distance before a reading that a ray leaves uncleared [m], so that depth noise carves no surface."""
     hit: Likelihood = 0.7
     """Occupancy that one view with a reading in a voxel implies [1]; the usual sensor model."""
     miss: Likelihood = 0.4
@@ -381,19 +381,19 @@ class ActiveVisionConfig:
     """Points of interest, view sphere and the choice of the next view, section IV."""
 
     sphere_points: Count = 40_000
-    """Points the view sphere is discretised to; the paper's."""
+    """Number of points of the view sphere [1]; the paper's."""
     sphere_radius: Positive = 1.5
     """Radius of the view sphere [m]; the paper's."""
     saliency_weight: Share = 0.75
     """λ_s of eq. 2 [1]; the paper's."""
     saliency: Literal["paper", "decreasing"] = "decreasing"
-    """Eq. 2 with 2π as printed, or with π so that relations seen often matter less."""
+    """Eq. 2 with 2π as printed, or with π so that relations seen often count less."""
     edge_point: Literal["midpoint", "contact"] = "contact"
     """Where a relation's point of interest lies: the middle of the centres, or the contact patch."""
     occlusion: Literal["invert", "ignore"] = "invert"
-    """Saliency of a point is negated where it is hidden, as in the paper; or hidden points count as seen."""
+    """Saliency of a hidden point: negated, as in the paper, or as if the point were visible."""
     propagation: bool = True
-    """Saliency spreads to neighbouring views, as in the paper; or a point's nearest view alone gets it."""
+    """Whether saliency spreads to neighbouring views, as in the paper, or only the nearest view gets it."""
     spread: Positive = 20.0
     """Angle on the sphere at which saliency has fallen to exp(−½) [deg]."""
     inhibition: NotNegative = 1.0
@@ -408,7 +408,7 @@ class ActiveVisionConfig:
     look_directions: Count = 1200
     """Maximum number of directions on the whole sphere that planners try [1]; about 6° apart."""
     effort: NotNegative = 0.05
-    """Share of all unseen surface worth a path of one sphere diameter to planner `support` [1]."""
+    """Share of all unseen surface that is worth a path of one sphere diameter, for planner `support` [1]."""
     view_cone: Acute = 30.0
     """Angle from the optical axis within which a point is in the image [deg]; 57° × 43° sensor."""
 
@@ -432,7 +432,7 @@ class RobotConfig:
     floor: Positive = 3.0
     """Half the side of the square of floor the robot may use, around the table [m]."""
     head_yaws: Count = 9
-    """Head yaws tried within the limits, straight ahead first, to stand clear of an obstacle."""
+    """Number of head yaws tried to stand clear of an obstacle, straight ahead first [1]."""
     home: tuple[Azimuth, Elevation] = (180.0, 35.0)
     """Azimuth and elevation on the view sphere of the first view [deg]."""
 
@@ -444,12 +444,12 @@ class ArmConfig:
     base: tuple[float, float, float] = (-0.5, 0.0, 0.0)
     """Position of a simulated arm from the middle of the table top [m]; 0.2 m beside a built-in table."""
     base_yaw: Azimuth = 0.0
-    """Where the x axis of its base points, from the world's x towards y [deg]; 0 is over the table."""
+    """Direction of its base's x axis, from the world's x towards y [deg]; 0 points to the table."""
     radius: Lengths = (0.4, 1.0)
     """Smallest and largest view sphere tried [m]; nearer, the camera meets objects on the table; farther, a
     common arm does not reach. Equal values fix the radius."""
     radius_views: Count = 400
-    """Views tried on each sphere to choose among the spheres [1]; about 10° apart."""
+    """Views tried on each sphere to choose a radius [1]; about 10° apart."""
     sphere_points: Count = 4000
     """Points of the view sphere [1]; about 3° apart, a tenth of the humanoid's since reachability is slow."""
     rolls: Count = 8
@@ -459,7 +459,7 @@ class ArmConfig:
     cell: Positive = 0.08
     """Edge of a cell of a sampled map [m]; finer ones need more samples, by the third power."""
     view_directions: Count = 150
-    """Viewing directions that a sampled map distinguishes [1]; about 16° apart."""
+    """Number of viewing directions in a sampled map [1]; about 16° apart."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -473,7 +473,7 @@ class SensorConfig:
     focal: Positive = 525.0
     """Focal length [px]; the driver's nominal value."""
     far: Positive = 10.0
-    """Surfaces deeper than this are not seen at all [m]; noise cuts readings to the sensor's own range."""
+    """Surfaces deeper than this are invisible [m]; noise limits readings to the sensor's own range."""
     light: tuple[float, float, float] = (-0.4, 0.3, 0.87)
     """Direction towards the lamp in the world; off the vertical, so that faces of a box differ."""
     ambient: Share = 0.45
@@ -489,11 +489,11 @@ class NoiseConfig:
     disparity_step: Positive = 0.00285
     """Depth is quantised in equal steps of 1/z [1/m]: 1/8 px of disparity, f = 580 px, baseline 75 mm."""
     grazing: Angle = 80.0
-    """No return if the surface is turned away by more than this [deg]."""
+    """Surfaces turned away by more than this give no return [deg]."""
     range: Lengths = (0.35, 3.0)
     """Nearest and farthest reading [m]."""
     edge_jump: NotNegative = 0.03
-    """No return at pixels beside a depth step larger than this [m]."""
+    """Pixels beside a larger depth step give no return [m]."""
     translation: NotNegative = 0.005
     """σ of the registration error's translation, each view [m]."""
     rotation: Angle = 0.3
@@ -531,9 +531,9 @@ class EvaluationConfig:
     """Scores against a ground truth, method notes section 5."""
 
     min_iou: Share = 0.5
-    """Volumes or masks that overlap by at least this are the same object [1]."""
+    """Minimum IoU of volumes or masks of the same object [1]."""
     table_tolerance: NotNegative = 0.02
-    """The table is found when its top is within this of the true height [m]."""
+    """Maximum error of the height of the table's top for the table to be found [m]."""
     samples: Count = 10_000
     """Points that measure the overlap of two volumes [1]; σ is at most 0.01, 0.005 for most pairs."""
 
@@ -543,7 +543,7 @@ class OracleConfig:
     """The planner that knows the ground truth, method notes section 6."""
 
     candidates: Count = 32
-    """Maximum number of views tried beside the default planner's [1]; about 20° apart, 0.7 s each."""
+    """Maximum number of views tried besides the default planner's [1]; about 20° apart, 0.7 s each."""
     stride: Count = 2
     """Pixels between the rays that look for true surface [1]; 6 mm at 1.5 m, below the cell's size."""
 
@@ -558,28 +558,28 @@ class ReportConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class RecordingConfig:
-    """Which images and frames become views."""
+    """Choice of the images and frames that become views."""
 
     max_pixels: Count = 16_000_000
     """Maximum number of pixels of any image [1]; bounds memory, at several times a depth camera's."""
     max_views: Count = 30
-    """Maximum number of views [1]; those farthest apart are kept. A table is known after 5 to 10."""
+    """Maximum number of views [1]; those farthest apart are kept. A table needs 5 to 10."""
     min_distance: Positive = 0.10
-    """A view is new if its camera has moved by this from all others [m] …"""
+    """Distance from which on a view is new, whatever its direction [m]; objects then show other sides."""
     min_angle: Annotated[float, Field(gt=0, le=180)] = 10.0
-    """… or has turned by this [deg]; from 10 cm or 10° on, sides of objects come into sight."""
+    """Turn from which on a view is new, wherever its camera is [deg]; objects then show other sides."""
     sharp_window: NotNegative = 0.5
-    """A frame's sharpness is compared with that of frames within this [s]; they show nearly the same."""
+    """Time within which frames are compared by sharpness [s]; they show nearly the same."""
     sharp_share: Share = 0.7
     """Minimum sharpness, as a share of the sharpest within the window [1]; it varies by 10 % at rest."""
     colour_gap: NotNegative = 0.02
-    """Colour belongs to a depth image when it was taken within this [s]; just over half of 1/30 s."""
+    """Maximum time between a depth image and its colour [s]; just over half of 1/30 s."""
     pose_gap: Positive = 0.2
     """Maximum time between two poses that are interpolated [s]; robots send 10 a second."""
     min_readings: Likelihood = 0.1
     """Minimum share of pixels with a depth reading [1]; a camera too close to a surface has fewer."""
     far: Annotated[float, Field(gt=0, le=65)] = 10.0
-    """Readings farther away than this are left out [m]; beyond what RGB-D cameras measure."""
+    """Farther readings are left out [m]; beyond the range of RGB-D cameras."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
@@ -610,21 +610,21 @@ class SessionConfig:
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class LiftConfig:
-    """One object lifted straight up, and what counts as harm to the others."""
+    """A lift straight up, and what counts as a disturbance of the other objects."""
 
     speed: Positive = 0.1
     """Speed of the lift [m/s]; a careful arm's."""
     watch: NotNegative = 2.0
     """How long the others are observed after the lift [s]; long enough for slow tipping."""
     moved: NotNegative = 0.02
-    """An object displaced by more than this has been disturbed [m]: it slid or fell, and did not settle."""
+    """An object displaced by more than this was disturbed [m]: it slid or fell, rather than settled."""
     turned: Angle = 15.0
-    """An object turned by more than this has been disturbed [deg]."""
+    """An object turned by more than this was disturbed [deg]."""
 
 
 @dataclass(frozen=True, slots=True, config=CHECKED)
 class RehearsalConfig:
-    """Lifts simulated on the extracted shapes before they are done."""
+    """Lifts simulated with the extracted shapes before they are carried out."""
 
     draws: Count = 32
     """Maximum number of scenes in which a lift is rehearsed [1]: the extracted shapes, and draws from their
