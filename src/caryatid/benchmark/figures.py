@@ -59,7 +59,7 @@ def draw_group(group: pd.DataFrame, measure: str, heading: str, reference: str) 
         reference: Reference method of the differences.
     """
     family = group["family"].iloc[0]
-    scenes = f"{family} scenes".strip()
+    scenes = f"{family or 'all'} scenes"
     curves, path = curves_of(group, measure), curves_of(group, "path")
     if curves:
         caption = f"{heading} after each view: mean over {scenes}, with intervals."

@@ -45,7 +45,7 @@ TO_THRESHOLD = {
     "median views": "median views",
     "median path": "median path [m]",
     "mean path": "path, mean curve [m]",
-    "path ratio": "… by that of the reference",
+    "path ratio": "… relative to the reference",
 }
 """Quantities of a threshold of F1, and their headings."""
 TIMES = {
@@ -333,7 +333,7 @@ def _tables(group: pd.DataFrame, measures: Mapping[str, str], reference: str) ->
         for at in sorted(group["at"][group["quantity"] == "share"].unique(), reverse=True):
             tables[f"Until F1 reaches {at:.2f}"] = {(name, at): text for name, text in TO_THRESHOLD.items()}
         budget = max(group["value"][group["quantity"] == "budget"], default=0.0)
-        title = f"F1 along the path, over {budget:.2f} m; quantiles of the times to choose and to see a view"
+        title = f"F1 along the path, over {budget:.2f} m; quantiles of planning and perception times"
         tables[title] = {("area", 0.0): "F1 along the path"} | TIMES
     for title, columns in tables.items():
         used = [column for column in columns if column in cells]
