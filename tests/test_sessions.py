@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -297,10 +298,12 @@ def test_a_view_that_cannot_be_written_changes_nothing(begun, views, monkeypatch
 
 
 def test_what_a_death_left_is_cleared(begun):
-    left = begun / "views/.partial-000002-abc"
+    dead = subprocess.Popen(["true"])
+    dead.wait()
+    left = begun / f"views/.partial-000002-{dead.pid}-0123abcd"
     left.mkdir()
     (left / "depth.npy").write_bytes(b"half")
-    (begun / "state/.partial-abc.pickle").write_bytes(b"half")
+    (begun / f"state/.partial-000002.pickle-{dead.pid}-0123abcd").write_bytes(b"half")
     with Session.open(begun, read_only=True) as session:
         assert session.views == 2
         assert left.exists()

@@ -56,7 +56,7 @@ class StagedFolder:
         self._partial = _partial(self._place)
         self._old = self._partial.with_name(f"{self._partial.name}{REPLACED}")
         self.written: set[str] = set()
-        _recover(self._place)
+        recover(self._place)
         self._made = [parent for parent in self._place.parents if not parent.exists()]
         if goes_on:
             return
@@ -188,11 +188,22 @@ def remove_file(path: Path) -> None:
         sync(path.parent)
 
 
-def clear_partials(folder: Path) -> None:
-    """Remove the staged files of killed processes; for the only writer of the folder."""
-    for path in folder.glob(f"{PARTIAL}*"):
-        with suppress(OSError):
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+def recover(place: Path) -> None:
+    """Remove staged files of killed processes in and beside a folder; restore it if it was being replaced."""
+    staged = re.compile(rf"{re.escape(PARTIAL)}(.+)-(\d+)-[0-9a-f]{{8}}({REPLACED})?")
+    with suppress(OSError):
+        for path in (*place.parent.glob(f"{PARTIAL}*"), *place.rglob(f"{PARTIAL}*")):
+            found = staged.fullmatch(path.name)
+            if found is None or _runs(int(found[2])):
+                continue
+            if path.parent == place.parent and found[1] != place.name:
+                continue
+            if found[3] and not place.exists():
+                path.rename(place)
+            elif path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
 
 
 @contextmanager
@@ -243,22 +254,6 @@ def sync(path: Path) -> None:
 
 def _partial(path: Path) -> Path:
     return path.with_name(f"{PARTIAL}{path.name}-{os.getpid()}-{secrets.token_hex(4)}")
-
-
-def _recover(place: Path) -> None:
-    """Remove staged files of killed processes; restore a folder that was being replaced."""
-    name = re.compile(rf"{re.escape(PARTIAL + place.name)}-(\d+)-[0-9a-f]{{8}}({REPLACED})?")
-    inside = re.compile(rf"{re.escape(PARTIAL)}.+-(\d+)-[0-9a-f]{{8}}")
-    with suppress(OSError):
-        for path in place.parent.iterdir():
-            if (found := name.fullmatch(path.name)) and not _runs(int(found[1])):
-                if found[2] and not place.exists():
-                    path.rename(place)
-                else:
-                    shutil.rmtree(path, ignore_errors=True)
-        for path in place.rglob(f"{PARTIAL}*"):
-            if (found := inside.fullmatch(path.name)) and not _runs(int(found[1])):
-                path.unlink()
 
 
 def _runs(process: int) -> bool:

@@ -40,8 +40,8 @@ from caryatid.io.images import png, read_mask
 from caryatid.io.json_files import Numbers, parse_json, read_json
 from caryatid.io.staging import (
     StagedFolder,
-    clear_partials,
     read_errors,
+    recover,
     remove_file,
     remove_folder,
     sync,
@@ -216,8 +216,7 @@ class Session:
         most, name = beginning.settings.recording.max_pixels, f"{path / 'session.json'}: ignore"
         self._ignored = None if mask is None else read_mask(mask, name, most)
         if lock is not None:
-            for folder in (path, path / "views", path / "reports", path / "state"):
-                clear_partials(folder)
+            recover(path)
         self._events = self._kept()
         self._first = self._decoded(0) if self._records else None
         self.scene = self._after(self._events)
