@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -19,20 +20,21 @@ from robot_client import RobotClient, png16
 
 
 def image(values: NDArray[Any]) -> bytes:
-    """What the client sends of an image: a 16-bit PNG."""
+    """Encode an image as a 16-bit PNG."""
     return png16(values.shape[1], values.shape[0], values.astype(">u2").tobytes())
 
 
 def main() -> None:
-    """Start a service, and drive the robot where it says."""
+    """Start a service, and drive the robot to the views it asks for."""
     stage = make_simulation(load_scene("tower"), ct.Config(), noise="carmine", seed=0)
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "caryatid", "serve", folder, "--port", "0", "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
             try:
-                told = "".join(iter(lambda: service.stdout.readline() or "}\n", "}\n")) + "}"  # type: ignore[union-attr]
-                assert len(told) > 1, "the service ended; see its error above"
-                graph = drive(RobotClient(json.loads(told)["address"]), stage)
+                assert service.stdout is not None
+                lines = [*takewhile(lambda line: line != "}\n", service.stdout), "}"]
+                assert len(lines) > 1, "the service ended; see its error above"
+                graph = drive(RobotClient(json.loads("".join(lines))["address"]), stage)
             finally:
                 service.terminate()
     print(*(f"{s['supporter']} holds {s['supported']} ({s['kind']})" for s in graph["supports"]), sep="\n")
@@ -41,17 +43,17 @@ def main() -> None:
 
 
 def drive(robot: RobotClient, stage: Simulation) -> dict[str, Any]:
-    """Look, say what was seen, ask, go there."""
+    """Look, send the view, ask for the next one, and go there."""
     robot.begin("table", segmentation="labels")
     while True:
         view = stage.camera.capture(stage.robot.T_world_camera)
         depth, labels = image(1e3 * view.depth), image(np.asarray(view.labels))
         added = robot.add("table", depth, view.K.tolist(), view.pose.tolist(), labels=labels)
-        told = robot.next("table")
-        print(f"{len(added['graph']['objects']) - 1} objects; {told['stop'] or told['why']}")
-        if told["stop"]:
+        following = robot.next("table")
+        print(f"{len(added['graph']['objects']) - 1} objects; {following['stop'] or following['why']}")
+        if following["stop"]:
             return dict(added["graph"])
-        stage.robot.move_to(np.array(told["T_world_camera"]))
+        stage.robot.move_to(np.array(following["T_world_camera"]))
 
 
 if __name__ == "__main__":

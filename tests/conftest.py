@@ -1,4 +1,4 @@
-"""Small scenes and recordings, made anew for every test that changes them."""
+"""Small scenes and recordings, made for every test that changes them."""
 
 from __future__ import annotations
 

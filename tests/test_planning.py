@@ -472,7 +472,7 @@ def beside_screen(**settings):
 
 @pytest.fixture(scope="module")
 def worked_out():
-    """A decision, and what each look shows anew (K, C) of surfaces, relations and space, by the samples."""
+    """A decision, and what each look newly shows (K, C) of surfaces, relations and space, by the samples."""
     objects = (
         CUBE,
         box(2, (0.2, 0.3, 0.83), (0.1, 0.2, 0.16)),

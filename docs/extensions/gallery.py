@@ -17,7 +17,7 @@ RUN = re.compile(r"/\d\d_")
 
 
 def copy_examples(examples: Path, destination: Path) -> None:
-    """Copy the programs, titled by their names; what has not changed is not written anew.
+    """Copy the programs, titled by their names; what has not changed is not written again.
 
     Args:
         examples: Where they are.

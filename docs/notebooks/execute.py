@@ -28,7 +28,7 @@ def notebooks() -> list[Path]:
 
 
 def execute(path: Path, parameters: Mapping[str, object] | None = None) -> NotebookNode:
-    """Run a notebook anew and return it with its outputs.
+    """Run a notebook and return it with its outputs.
 
     Args:
         path: The notebook; it is not changed.

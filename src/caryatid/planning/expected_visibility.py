@@ -144,10 +144,10 @@ def visibility(
 ) -> Array:
     """How well each camera (T, 4, 4) sees each sample: (K, T) from 0 hidden to 1."""
     alike = replace(samples, weights=np.ones_like(samples.weights))
-    return shown_anew(alike, np.zeros_like(samples.weights), T_world_camera, occluders, config)
+    return newly_visible(alike, np.zeros_like(samples.weights), T_world_camera, occluders, config)
 
 
-def shown_anew(
+def newly_visible(
     samples: Samples, before: Array, T_world_camera: Array, occluders: Occluders, config: ActiveVisionConfig
 ) -> Array:
     """Value (K, T) of what cameras (T, 4, 4) show of samples beyond how well those were seen before (K,).

@@ -19,8 +19,8 @@ from caryatid.sensing.views import Cloud, View
 from caryatid.viewer.robot import RobotDrawing
 from caryatid.viz.colours import SALIENCY_STOPS, Colour, label_colours, object_colour, rgb, scale
 from caryatid.viz.drawings import image_of
+from caryatid.viz.scene_3d import name_plate, support_ends
 from caryatid.viz.tables import count_of
-from caryatid.viz.turntable import name_plate, support_ends
 
 LAYERS = {
     "shapes": True, "names": True, "supports": True, "cameras": True,
@@ -45,7 +45,7 @@ SCREEN: dict[str, Any] = {"thickness": 1.6, "thickness_units": "screen"}
 
 
 def reduced(step: Step) -> Step:
-    """The step with no more than is drawn of it, so that the page can keep every one."""
+    """The step reduced to what is drawn of it, so that the page can keep every step."""
     view, cloud, candidates, decision = step.view, step.cloud, step.candidates, step.decision
     if view is not None:
         k = max(1, view.depth.shape[1] // 240)
@@ -338,7 +338,7 @@ class SceneDrawing:
 
 
 def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Array) -> dict[int, Array]:
-    """Find for each object the point of its surface that is amid what can be seen of it.
+    """Find for each object a visible point of its surface, in the middle of what can be seen of it.
 
     Points are put into a coarse image with the least depth in each pixel; a point is seen where none is more
     than a centimetre nearer in its pixel and those around.
@@ -346,10 +346,10 @@ def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Arra
     Args:
         points_world: Points (N, 3) of all surfaces, `SPACING` apart.
         owner: Number (N,) of the object of each.
-        eye_world: Where it is looked from (3,) [m].
+        eye_world: Position of the eye (3,) [m].
 
     Returns:
-        A point (3,) by the object's number; objects of which nothing is seen have none.
+        A point (3,) by the object's number; objects that cannot be seen have none.
     """
     from scipy.ndimage import minimum_filter
 
@@ -368,8 +368,8 @@ def visible_points(points_world: Array, owner: NDArray[np.intp], eye_world: Arra
     found = {}
     for number in np.unique(owner[before[seen]]):
         own = seen & (owner[before] == number)
-        amid = np.argmin(np.linalg.norm(at[own] - np.median(at[own], axis=0), axis=1))
-        found[int(number)] = points_world[before[own][amid]]
+        middle = np.argmin(np.linalg.norm(at[own] - np.median(at[own], axis=0), axis=1))
+        found[int(number)] = points_world[before[own][middle]]
     return found
 
 

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 class LoopPage(Page):
     """A page with an exploration whose turns a person asks for, and the one thread that takes them.
 
-    The exploration does not end by itself as `explore` does, but the page says when that would have.
+    The exploration continues until the user stops; the page says when `explore` would have ended.
 
     Args:
         open_source: Opens what is explored, again each time, for some settings.

@@ -41,26 +41,26 @@ from caryatid.viz.tables import census, object_table, support_table
 class Page:
     """A viewer in the browser, served by this process.
 
-    Steps are added as they come, from any thread; they are drawn in a thread of the page's own, and where
-    they come faster than they are drawn the newest is.
+    Steps are added from any thread and drawn in the page's own thread; if they arrive faster than they can be
+    drawn, only the newest is.
 
     Args:
         title: What the page is of.
-        support: The numbers the graphs were inferred with: they say what would fall.
-        host: Address to listen at; at 127.0.0.1 only this machine's own programs come.
+        support: Settings that the graphs were inferred with, to predict what falls.
+        host: Address to listen at; at 127.0.0.1 only programs on this machine can connect.
         port: Port to listen at, or the next free one; 0 = any that is free.
-        small: It has little room, as within a notebook: panels begin folded up.
+        small: The page has little room, as in a notebook: panels are folded at first.
 
     Attributes:
-        url: Where the page is; it holds a token, without which nothing is shown.
-        server: The `viser.ViserServer`, for controls of one's own.
+        url: Address of the page, with the token that it requires.
+        server: The `viser.ViserServer`, to add controls to.
         drawing: The scene in the page.
-        steps: What has been added so far.
-        scores: F1 after each, of vertices and edges together, or None where the ground truth is not known.
-        working: Held by whoever runs compiled kernels, which not every threading layer lets two threads do.
+        steps: The steps added so far.
+        scores: F1 after each step, or None where the ground truth is not known.
+        working: Lock for compiled kernels: not every threading layer lets two threads run them.
 
     Raises:
-        InputError: viser is not installed, or nothing can be listened at.
+        InputError: viser is not installed, or the page cannot be served.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class Page:
         self.server.on_client_connect(self._follow)
 
     def say(self, text: str) -> None:
-        """Say something at the top of the page, in place of what was said before."""
+        """Show a message at the top of the page, in place of the one before."""
         self._notice.content = cell_html(Section("", text))
         self._notice.visible = bool(text)
 
@@ -111,7 +111,7 @@ class Page:
         self.redraw()
 
     def update(self, scene: Scene) -> None:
-        """Add what a scene knows by now; the slider goes back to what it knew before."""
+        """Add what a scene knows now; the slider goes back to earlier states."""
         if scene.views:
             self.add(step_of_scene(scene))
 
@@ -135,17 +135,17 @@ class Page:
         self.redraw()
 
     def stage(self, step: Step | None) -> None:
-        """Show a step that is none of those added; None goes back to those."""
+        """Show a step without adding it; None shows the added ones again."""
         if step is not self._staged:
             self._staged = step
             self.redraw()
 
     def redraw(self) -> None:
-        """Draw what is to be shown, soon; where that is already about to be done, once."""
+        """Schedule drawing, unless it is already scheduled."""
         self._pending = self._soon(self._pending, self._draw)
 
     def _soon(self, pending: Future[None] | None, work: Callable[[], None]) -> Future[None] | None:
-        """Have work done by the thread that draws, unless it is about to be."""
+        """Schedule work on the drawing thread, unless it is already scheduled."""
         if pending is None or pending.running() or pending.done():
             with contextlib.suppress(RuntimeError):  # The page is being closed.
                 pending = self._drawer.submit(work)
@@ -153,7 +153,7 @@ class Page:
         return pending
 
     def wait(self) -> None:
-        """Wait until all that has been asked for is drawn; what went wrong meanwhile is raised."""
+        """Wait until everything is drawn; errors of drawing are raised."""
         self._drawer.submit(lambda: None).result()
         if self._pending is not None:
             self._pending.result()
@@ -177,7 +177,7 @@ class Page:
         self._notice = gui.add_html("", order=-20, visible=False)
         self._slider = gui.add_slider("view", 1, 2, 1, 1, disabled=True, hint="Go back to an earlier view")
         self._slider.on_update(lambda _: self.go_to(int(self._slider.value) - 1))
-        self._told = gui.add_html("")
+        self._summary = gui.add_html("")
         self._boxes: dict[str, Any] = {}
         with gui.add_folder("show", order=90):
             for name, shown in LAYERS.items():
@@ -195,8 +195,8 @@ class Page:
         with panel.add_tab("key"):
             gui.add_html(_describe_signs())
         with about.add_tab("object"):
-            told = "Click an object in the scene to see what is known of it."
-            self._about = gui.add_html(cell_html(Section("", told)))
+            hint = "Click an object in the scene to see what is known of it."
+            self._about = gui.add_html(cell_html(Section("", hint)))
         panel.dock_left()
         panel.set_width(380)
         about.dock_below(panel)
@@ -220,7 +220,7 @@ class Page:
         self._T_world_eye = transforms.look_at(camera.position, centre)
 
     def _follow(self, client: Any) -> None:
-        """Turn names and arrows to a client's eye, wherever it goes."""
+        """Keep names and arrows turned to a client's eye."""
 
         def moved(camera: Any) -> None:
             rotation = Rotation.from_quat(camera.wxyz, scalar_first=True).as_matrix()
@@ -248,7 +248,7 @@ class Page:
         self._slider.max = max(last + 1, 2)
         self._slider.disabled = last == 0
         self._slider.value = self._shown + 1
-        self._told.content = describe_view(step, f1, last + 1)
+        self._summary.content = describe_view(step, f1, last + 1)
         self._driving = self._soon(self._driving, self._drive)
         graph = step.graph
         if graph is not self._graph_drawn:
@@ -285,11 +285,11 @@ def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
     return page
 
 
-# What is said beside the scene
+# Texts beside the scene
 
 
 def describe_view(step: Step, f1: float | None, count: int) -> str:
-    """Say what is known after a view, of so many, and where to look next."""
+    """Describe what is known after a view, and where to look next."""
     facts = [] if f1 is None else [("F1", f"{f1:.3f}")]
     if step.decision is not None:
         facts.append(("next", step.decision.why))
@@ -300,7 +300,7 @@ def describe_view(step: Step, f1: float | None, count: int) -> str:
 
 
 def _describe_signs() -> str:
-    """Say what the signs in the scene mean."""
+    """Explain the signs in the scene."""
     signs = {
         "Arrow": "supporter → supported, thicker where more probable; dashed where uncertain. "
         "From the table only where uncertain",
@@ -319,7 +319,7 @@ def _describe_signs() -> str:
 def describe_object(
     graph: SupportGraph, object_id: str, config: SupportConfig, *, taken: bool = False
 ) -> str:
-    """Say what an object is, how it is known, its edges, and what falls without it; or that it is taken."""
+    """Describe an object: its edges, what falls without it, size and fit; or that it has been taken away."""
     item = next((o for o in graph.objects if o.id == object_id), None)
     if item is None:
         return cell_html(
@@ -340,15 +340,15 @@ def describe_object(
     return cell_html(Section(item.id, item.shape.kind, facts=facts, colour=object_colour(item.label)))
 
 
-# A page in a process of its own
+# A page in another process
 
 
 class PageProcess:
-    """A page like `Page`, to which steps can be added and no more.
+    """A page in another process; it only takes steps.
 
     Args:
         title: What the page is of.
-        support: The numbers the graphs were inferred with.
+        support: Settings that the graphs were inferred with.
         port: Port to listen at, or the next free one; 0 = any that is free.
 
     Attributes:
@@ -384,7 +384,7 @@ class PageProcess:
 
 
 def _show_sent(connection: Connection, title: str, support: SupportConfig, port: int) -> None:
-    """Serve a page and show the steps that come, until there are no more."""
+    """Serve a page and show the steps that arrive, until the connection closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(os, "nice"):
         os.nice(10)  # Where cores are scarce, the loop goes first.
@@ -398,7 +398,7 @@ def _show_sent(connection: Connection, title: str, support: SupportConfig, port:
 
 
 def _log_failure(drawn: Future[None]) -> None:
-    """Log what went wrong in the thread that draws; the page then shows what it showed before."""
+    """Log an error of the drawing thread; the page keeps showing the step before."""
     error = None if drawn.cancelled() else drawn.exception()
     if error is not None:
         logging.getLogger(__name__).error("a view could not be drawn", exc_info=error)
@@ -436,7 +436,7 @@ def _serve(title: str, host: str, port: int, token: str) -> Any:
 
 
 def _may_come(request: Any, host: str, token: str) -> bool:
-    """Whether a request bears the token, names this machine, and comes from no page but the viewer's own."""
+    """Whether a request has the token, names this machine, and comes from the viewer's own page."""
     named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     try:
         name = urlsplit(f"//{named[0]}").hostname if len(named) == 1 else None

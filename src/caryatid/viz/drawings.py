@@ -56,9 +56,9 @@ class Projection:
         return points_camera[:, :2] / divisor @ self.K[:2, :2].T + self.K[:2, 2], z
 
     def hidden(self, pixels: Array, z: Array) -> NDArray[np.bool_]:
-        """Say of pixels (N, 2) at distances z (N,) [m] whether the picture shows something nearer.
+        """Which pixels (N, 2) at distances z (N,) [m] are hidden: the picture shows something nearer by 2 cm.
 
-        Nearer means by 2 cm: that much is due to noise and registration.
+        Less may be due to noise and registration.
         """
         height, width = self.depth.shape
         u, v = np.rint(np.nan_to_num(np.clip(pixels, -1.0, (width, height)), nan=-1.0)).astype(int).T

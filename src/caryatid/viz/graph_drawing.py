@@ -1,6 +1,6 @@
 """The support graph drawn: layers in the order of support, few crossings, even spacing.
 
-networkx' `multipartite_layout` takes no heed of edges: on the shared scenes it draws some forty crossings and
+networkx' `multipartite_layout` ignores edges: on the shared scenes it draws some forty crossings and
 ten edges through vertices, where this draws none.
 """
 

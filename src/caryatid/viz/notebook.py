@@ -1,7 +1,7 @@
-"""How scenes, steps, graphs and shapes show themselves in a notebook.
+"""Scenes, steps, graphs and shapes in a notebook.
 
-Jupyter asks the value at the end of a cell for its `_repr_html_`; the classes answer with `draw_cell`. A cell
-is small, loads nothing, runs no script, and takes its colours from the page around it, light or dark.
+Jupyter calls `_repr_html_` of the value at the end of a cell; the classes return `draw_cell`. The HTML is
+small, loads nothing, runs no script, and takes its colours from the page around it, light or dark.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def _cell_of(shown: object) -> Section:
             lead = f"{count_of(len(shown.steps), 'object')} to take, {'safe' if shown.safe else 'not safe'}"
             facts = [("refused", shown.refusal)] * bool(shown.refusal)
             return Section("Order", lead, facts=facts, tables=[order_table(shown)])
-    raise TypeError(f"a {type(shown).__name__} has no cell of its own")
+    raise TypeError(f"a {type(shown).__name__} cannot be shown in a notebook")
 
 
 def _graph_cell(title: str, lead: str, graph: SupportGraph, *others: Figure) -> Section:
@@ -137,7 +137,7 @@ def _image(view: View, labels: NDArray[np.int32], graph: SupportGraph, caption: 
 
 
 def _pose(T_world_camera: Array | None) -> str:
-    """Say where a camera is and how far it looks down from its pose (4, 4), or that this is not known."""
+    """Where a camera is and how far it looks down, from its pose (4, 4), in words."""
     if T_world_camera is None:
         return "pose not known"
     x, y, z = T_world_camera[:3, 3]

@@ -33,7 +33,7 @@ def render_pdf(report: Report) -> bytes:
 
 
 class _Sheets:
-    """Pages that are filled from top to bottom."""
+    """Pages, filled from top to bottom."""
 
     def __init__(self, pdf: Any, title: str) -> None:
         self._pdf, self._title, self._number = pdf, title, 0
@@ -49,7 +49,7 @@ class _Sheets:
         self._write(str(self._number), WIDTH - MARGIN, 7.0, MARGIN / 2.0, color=SOFT, ha="right")
 
     def _room(self, height: float) -> None:
-        """Turn the page where less than so much of it is left [in]."""
+        """Begin a new page if less than this height is left [in]."""
         if self._top - height < MARGIN:
             self._pdf.savefig(self._sheet)
             self._begin()
@@ -60,7 +60,7 @@ class _Sheets:
         self._sheet.text(left / WIDTH, at / HEIGHT, text, fontsize=size, va="top", linespacing=1.3, **look)
 
     def section(self, section: Section) -> None:
-        """Write a section, where there is room for its heading and its first pictures."""
+        """Write a section; its heading stays with its first pictures."""
         self._room(0.5 + (7.2 / section.figures[0].share if section.figures else 0.6))
         self._chapters.append((section.title, self._number - 1))
         self.text(section.title, 13.0, bold=True)
@@ -124,7 +124,7 @@ class _Sheets:
         self._top -= 0.1
 
     def finish(self) -> None:
-        """Put the last page down, and write the bookmarks, for which `PdfPages` has no way of its own."""
+        """Write the last page, and the bookmarks, which `PdfPages` does not support."""
         from matplotlib.backends.backend_pdf import Name
 
         self._pdf.savefig(self._sheet)

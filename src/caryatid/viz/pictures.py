@@ -1,4 +1,4 @@
-"""Pictures drawn with matplotlib, whoever shows them: the report, its PDF, notebook cells, the docs.
+"""Pictures drawn with matplotlib for the report, its PDF, notebook cells and the docs.
 
 No display is needed, the user's own matplotlib settings have no effect, and the same picture gives the same
 bytes.

@@ -1,4 +1,4 @@
-"""The report of a run: what it says, section by section, written to one HTML file that opens anywhere."""
+"""The report of a run, section by section, as one HTML file that opens anywhere."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from caryatid.simulation.world import SimulatedScene, posed
 from caryatid.viz.drawings import draw_chart, draw_cloud, draw_image, draw_layers, draw_sphere, draw_stands
 from caryatid.viz.graph_drawing import draw_graph
 from caryatid.viz.pictures import Picture, picture_png, picture_svg
+from caryatid.viz.scene_3d import scene_3d_html
 from caryatid.viz.tables import (
     Table,
     census,
@@ -35,7 +36,6 @@ from caryatid.viz.tables import (
     support_table,
     uncertain_supports,
 )
-from caryatid.viz.turntable import turntable_html
 
 if TYPE_CHECKING:
     import jinja2
@@ -83,7 +83,7 @@ class Section:
         title: Its heading.
         text: What stands below or beside it.
         figures: Pictures, as many side by side as there is room for.
-        facts: Names and what is said under them.
+        facts: Names and texts.
         tables: Tables, one below the other.
         colour: Colour of the chip before the title, `#rrggbb`, or empty.
         folded: On the page, only the title shows until it is clicked.
@@ -105,7 +105,7 @@ class Section:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Report:
-    """All a report says.
+    """The contents of a report.
 
     Attributes:
         title: Its heading.
@@ -146,20 +146,21 @@ def make_report(
     width = (config or ReportConfig()).image_width
     seen: list[Step] = []
     views: list[Section] = []
-    contacts, shown, last = [], None, None
+    contacts, shown, last, most = [], None, None, 0
     for number, step in enumerate(steps):
         f1 = f"F1 {scores[number]['f1']:.3f}" if number < len(scores) else ""
         before = seen[-1] if seen else None
-        views.append(_view(step, before, f1, width))
+        news = "" if before is None else "; ".join(changes(before.graph, step.graph)) or "nothing new"
+        views.append(_view(step, news, f1, width))
         if step.view is not None:
             picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
             why = "the first view" if before is None or before.decision is None else before.decision.why
-            news = "; ".join(changes(before.graph, step.graph)) or "nothing new" if before else ""
             caption = textwrap.shorten(f"{sentence(why)} {sentence(news)}", 220, placeholder=" …")
             heading = " · ".join(filter(None, (views[-1].title, f1)))
             contacts.append(Figure(heading, picture, caption, 4, views[-1].anchor))
-        if shown is None or step.changes or _number_seen(step) >= _number_seen(shown):
-            shown = step
+        count = len(np.unique(step.labels))
+        if shown is None or step.changes or count >= most:
+            shown, most = step, count
         last = step
         nothing = step.cloud.select(np.zeros(0, dtype=np.intp))
         seen.append(replace(step, view=None, labels=step.labels[:0], cloud=nothing, candidates=None))
@@ -168,7 +169,7 @@ def make_report(
     if scores and len(scores) != len(seen):
         raise ValueError(f"{len(scores)} scores for {len(seen)} views")
     sections = [*_answer(last, shown, len(seen), scores[-1] if scores else None, width)]
-    facts = [(f"Before view {step.index + 1}", _told(change)) for step in seen for change in step.changes]
+    facts = [(f"Before view {step.index + 1}", _in_words(change)) for step in seen for change in step.changes]
     facts += [("Finished", sentence(last.stop))] if last.stop else []
     pictures = [*contacts * (len(contacts) > 1), *_charts(seen, scores)]
     if pictures or facts:
@@ -184,11 +185,7 @@ def make_report(
     return Report(title, about, sections)
 
 
-def _number_seen(step: Step) -> int:
-    return len(np.unique(step.labels))
-
-
-def _told(change: Change) -> str:
+def _in_words(change: Change) -> str:
     return f"{change.object_id} was {change.kind}: {change.why}"
 
 
@@ -231,13 +228,15 @@ def _answer(
     figures = [supports, seen] if wide else [seen, supports]
     if graph.objects:
         caption = "Drag to turn, scroll to zoom. Arrows show through the objects; orange: uncertain."
-        page = turntable_html(graph, azimuth)
+        page = scene_3d_html(graph, azimuth)
         figures.append(Figure("In 3D" if wide else "", solid, caption, share=2 if wide else 1, page=page))
     yield Section("Answer", text, figures if wide else figures[:2], facts)
-    told = doubts(graph)
-    text = "" if told else "Nothing: every support has a probability of 0.95 or more, and every shape fits."
-    more = [("And", f"{len(told) - MOST} more; see the tables.")] if len(told) > MOST else []
-    yield Section("What is uncertain", text, facts=told[:MOST] + more)
+    doubtful = doubts(graph)
+    text = (
+        "" if doubtful else "Nothing: every support has a probability of 0.95 or more, and every shape fits."
+    )
+    more = [("And", f"{len(doubtful) - MOST} more; see the tables.")] if len(doubtful) > MOST else []
+    yield Section("What is uncertain", text, facts=doubtful[:MOST] + more)
     if figures[2:] and not wide:
         yield Section("In 3D", figures=figures[2:])
 
@@ -266,19 +265,17 @@ def _charts(steps: Sequence[Step], scores: Sequence[Mapping[str, float]]) -> lis
     return figures
 
 
-def _view(step: Step, before: Step | None, f1: str, width: int) -> Section:
+def _view(step: Step, news: str, f1: str, width: int) -> Section:
     """A view: its counts, its score and what it changed, pictures, what comes next, tables."""
-    graph, decision = step.graph, step.decision
-    news = "" if before is None else "; ".join(changes(before.graph, graph)) or "nothing new"
-    parts = [step.name, census(graph), f1, news]
-    facts, tables = [("Before this view", _told(change)) for change in step.changes], []
+    decision = step.decision
+    facts, tables = [("Before this view", _in_words(change)) for change in step.changes], []
     if decision is not None:
         scores = (
             f"saliency {decision.saliency:.2f}, path cost {decision.cost:.2f}, score {decision.score:.2f}"
         )
         facts.append(("Next view", f"{decision.why.rstrip('.')} ({scores})."))
         tables += [point_table(decision)] * bool(decision.points_of_interest)
-    text = " · ".join(filter(None, parts))
+    text = " · ".join(filter(None, (step.name, census(step.graph), f1, news)))
     return Section(f"View {step.index + 1}", text, _figures(step, width), facts, tables, folded=True)
 
 

@@ -1,4 +1,4 @@
-"""What tables say in words: objects, supports, points of interest, orders; and what a view changed."""
+"""Tables of objects, supports, points of interest and orders; and in words, what a view changed."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Table(NamedTuple):
 
 
 def object_table(graph: SupportGraph) -> Table:
-    """Say of each object what it is, how well it is known and whether it stands."""
+    """Make the table of objects: shape, evidence and stability."""
     rows = [_object_row(item, graph) for item in graph.objects]
     return Table.of("Objects", rows[0] if rows else (), (row.values() for row in rows))
 
@@ -74,7 +74,7 @@ def _object_row(item: SceneObject, graph: SupportGraph) -> dict[str, str | Entry
 
 
 def support_table(graph: SupportGraph) -> Table:
-    """Say of each support what it is, how likely it is, how often it was found and why."""
+    """Make the table of supports: kind, probability and evidence."""
     colour = {o.id: object_colour(o.label) for o in graph.objects}
     rows = (
         (
@@ -92,7 +92,7 @@ def support_table(graph: SupportGraph) -> Table:
 
 
 def point_table(decision: Decision | None) -> Table:
-    """Say of each point of interest what it is about, the most salient first."""
+    """Make the table of points of interest, the most salient first."""
     points = () if decision is None else sorted(decision.points_of_interest, key=lambda p: -p.saliency)
     rows = (
         (" – ".join(p.subject) or "–", Entry(f"{p.saliency:.2f}", saliency_colour(p.saliency)), p.why)
@@ -102,7 +102,7 @@ def point_table(decision: Decision | None) -> Table:
 
 
 def order_table(order: Order) -> Table:
-    """Say what to take away, one after the other."""
+    """Make the table of the steps of an order."""
     rows = (
         (
             str(number),
@@ -117,7 +117,7 @@ def order_table(order: Order) -> Table:
 
 
 def size_of(shape: Shape) -> str:
-    """Say the sizes of a shape in millimetres."""
+    """Return the size of a shape in words [mm]."""
     match shape:
         case Cylinder():
             return f"⌀ {2e3 * shape.radius:.0f} × {1e3 * shape.height:.0f}"
@@ -127,7 +127,7 @@ def size_of(shape: Shape) -> str:
 
 
 def count_of(number: int, name: str) -> str:
-    """Say how many there are of something, in the singular or plural."""
+    """Return a number and a noun in the singular or plural."""
     ending = "" if number == 1 else "es" if name.endswith("x") else "s"
     return f"{number:,} {name}{ending}"
 
@@ -145,28 +145,28 @@ def uncertain_supports(graph: SupportGraph) -> int:
 
 
 def doubts(graph: SupportGraph) -> list[tuple[str, str]]:
-    """Say of each support and object in doubt why, and what would settle it; the least known supports first.
+    """List doubtful supports and objects with the reason and what would settle it, the least known first.
 
-    In doubt is a support whose probability is below 0.95, and an object that nothing is known to support,
-    whose shape fits poorly or is implausible.
+    A support is doubtful if its probability is below 0.95; an object if it has no known supporter, or its
+    shape fits poorly or is implausible.
     """
-    said = []
+    found = []
     for s in sorted(graph.supports, key=lambda s: abs(s.belief - 0.5)):
         if not s.certain or s.belief < 0.95:
             lead = f"{s.supporter} → {s.supported}, probability {s.belief:.2f}"
-            said.append((lead, f"{s.why}. {_settled_by(graph, s.supporter, s.supported)}"))
+            found.append((lead, f"{s.why}. {_settled_by(graph, s.supporter, s.supported)}"))
     for item in graph.objects:
         poor = f"the shape is {1e3 * item.residual:.1f} mm off its points on average"
         known = item.role == "support_surface" or graph.supporters(item.id)
         reasons = [poor] * item.poor_fit + [item.doubt] * bool(item.doubt)
         reasons += ["nothing is known to support it"] * (not known)
         if reasons:
-            said.append((item.id, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
-    return said
+            found.append((item.id, f"{'; '.join(reasons)}. {_settled_by(graph, item.id)}"))
+    return found
 
 
 def _settled_by(graph: SupportGraph, *ids: str) -> str:
-    """Say from where sides of objects are seen that no view has seen yet."""
+    """From where to see the sides of objects that no view has seen."""
     views = []
     for item in (graph[name] for name in ids):
         if item.role == "support_surface" or not any(item.seen):
@@ -191,19 +191,19 @@ def sentence(text: str) -> str:
 
 
 def changes(before: SupportGraph | None, after: SupportGraph) -> list[str]:
-    """Say what a view changed: a line each for objects found, shaped or supported differently, and gone."""
-    known, now = {} if before is None else _held(before), _held(after)
+    """List what a view changed: a line each for objects found, shaped or supported differently, and gone."""
+    known, now = {} if before is None else _supported(before), _supported(after)
     lines = {
-        "found": [f"{name} {said}" for name, said in now.items() if name not in known],
-        "now": [f"{name} {said}" for name, said in now.items() if known.get(name, said) != said],
+        "found": [f"{name} {text}" for name, text in now.items() if name not in known],
+        "now": [f"{name} {text}" for name, text in now.items() if known.get(name, text) != text],
         "gone": [name for name in known if name not in now],
     }
     return [f"{kind}: {', '.join(items)}" for kind, items in lines.items() if items]
 
 
-def _held(graph: SupportGraph) -> dict[str, str]:
+def _supported(graph: SupportGraph) -> dict[str, str]:
     """Shape and supporters of each object by id; uncertain supporters with a question mark."""
-    said = {}
+    texts = {}
     for item in graph.objects:
         supporters = sorted(graph.supporters(item.id), key=lambda s: s.supporter)
         names = [
@@ -212,5 +212,5 @@ def _held(graph: SupportGraph) -> dict[str, str]:
             for s in supporters
         ]
         if item.role == "object":
-            said[item.id] = f"({item.shape.kind}) held by {' and '.join(names) or 'nothing seen yet'}"
-    return said
+            texts[item.id] = f"({item.shape.kind}) held by {' and '.join(names) or 'nothing seen yet'}"
+    return texts

@@ -23,8 +23,8 @@ from caryatid.planning.expected_visibility import (
     SPACE,
     Samples,
     join,
+    newly_visible,
     relation_samples,
-    shown_anew,
     space_samples,
     surface_samples,
     unseen_shares,
@@ -89,7 +89,7 @@ def _expected_gain(
     samples = join([surfaces, points, space])
     samples = replace(samples, weights=samples.weights * matter(samples, state.graph, state.goal))
     before = np.concatenate([seen, np.zeros(len(space.weights))])
-    return samples, shown_anew(samples, before, T_world_camera, occluders, config)
+    return samples, newly_visible(samples, before, T_world_camera, occluders, config)
 
 
 def _on_sphere(

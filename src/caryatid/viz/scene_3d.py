@@ -18,7 +18,7 @@ LETTER = 0.024
 """Height of a name plate [m]."""
 
 
-def turntable_html(graph: SupportGraph, azimuth: float) -> str:
+def scene_3d_html(graph: SupportGraph, azimuth: float) -> str:
     """Write a page on which the mouse turns the shapes, with arrows from supporter to supported.
 
     Objects are translucent, so that arrows show through them. Arrows are the thicker the more probable their
