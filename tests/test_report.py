@@ -30,10 +30,17 @@ from caryatid.planning.posture import Posture
 from caryatid.sensing.view_sphere import ViewSphere
 from caryatid.sensing.views import SUPPORT_LABEL, Cloud, View
 from caryatid.viz.colours import object_colour, rgb
-from caryatid.viz.drawings import Projection, draw_chart, draw_cloud, draw_image, draw_sphere
+from caryatid.viz.drawings import (
+    Projection,
+    draw_chart,
+    draw_cloud,
+    draw_image,
+    draw_layers,
+    draw_sphere,
+)
 from caryatid.viz.graph_drawing import arrange, draw_graph, layers
 from caryatid.viz.pdf import render_pdf
-from caryatid.viz.pictures import keep_apart, picture_svg
+from caryatid.viz.pictures import Tag, keep_apart, picture_svg
 from caryatid.viz.report import Figure, Report, make_report, render_html
 from caryatid.viz.tables import object_table
 
@@ -411,6 +418,18 @@ def test_tags_end_up_apart_and_inside():
     gaps = np.abs(centres[:, None] - centres[None, :]) - sizes
     assert not ((gaps < -0.5).all(axis=-1) & ~np.eye(14, dtype=bool)).any()
     assert ((centres >= sizes / 2 - 1e-9) & (centres <= room - sizes / 2 + 1e-9)).all()
+
+
+def test_names_shrink_in_a_crowd_and_are_left_out_where_they_could_not_be_read():
+    sizes = []
+    for count in (5, 60, 400):
+        places = np.random.default_rng(0).uniform(0.0, (400.0, 300.0), (count, 2))
+        tags = [Tag(x, y, f"o{k}", "#0072b2") for k, (x, y) in enumerate(places.tolist())]
+        svg = picture_svg(draw_layers("tags", [np.zeros((300, 400, 3), np.uint8)], tags=tags))
+        found = re.findall(r"font-size: ([\d.]+)px", svg)
+        assert len(found) in (0, count)
+        sizes += [float(found[0]) if found else 0.0]
+    assert sizes[0] == 15.0 > sizes[1] >= 6.0 > sizes[2] == 0.0
 
 
 def test_the_same_step_is_drawn_in_the_same_bytes(make_step):
