@@ -75,30 +75,7 @@ class RunCommand(options.ComputingCommand):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Exploring(options.ExploringCommand):
-    """A command that explores a source and keeps the steps."""
-
-    source: str
-    no_early_stop: options.Flag = False
-    """Continue to the maximum number of views; otherwise stop when no view is worth its path."""
-
-    def explore(self, config: Config, **options: Any) -> tuple[Source, Iterator[Step]]:
-        """Open the source; returns it and the steps of `explore` with these options."""
-        from caryatid.evaluation.oracle import planner_for
-        from caryatid.exploration import explore
-
-        known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
-        with self.output.working("opening"):
-            masks = self.mask_source(config)
-            source = _opening(self, masks)(config)
-        planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
-        known |= {"planner": planner, "config": config, "masks": masks}
-        known |= options | {"early_stop": not self.no_early_stop}
-        return source, explore(camera, source.robot, **known)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Explore(RunCommand, Exploring):
+class Explore(RunCommand, options.ExploringCommand):
     """Explore a scene until it is known which object supports which.
 
     SOURCE is one of
@@ -116,6 +93,8 @@ class Explore(RunCommand, Exploring):
 
     source: options.SourceName
     """Scene or recording."""
+    no_early_stop: options.Flag = False
+    """Continue to the maximum number of views; otherwise stop when no view is worth its path."""
     goal: Annotated[str | None, options.shown("ID")] = None
     """Look only at what matters for removing this object, and stop when it is known what its removal
     moves.
@@ -126,8 +105,17 @@ class Explore(RunCommand, Exploring):
     """Show every view in the browser; the page then stays until Ctrl-C."""
 
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
-        source, steps = self.explore(config, goal=self.goal, until=self.until)
-        return source.name, source.truth, steps
+        from caryatid.evaluation.oracle import planner_for
+        from caryatid.exploration import explore
+
+        known: dict[str, Any] = {"segmentation": self.segmentation, "seed": self.settings.seed}
+        with self.output.working("opening"):
+            masks = self.mask_source(config)
+            source = _opening(self, masks)(config)
+        planner, camera = planner_for(self.chosen_planner, source.camera, source.truth, config, **known)
+        known |= {"planner": planner, "config": config, "masks": masks}
+        known |= {"goal": self.goal, "until": self.until, "early_stop": not self.no_early_stop}
+        return source.name, source.truth, explore(camera, source.robot, **known)
 
     def __call__(self) -> None:
         config = self.config()
@@ -364,7 +352,7 @@ class Clear(options.ExploringCommand):
         output.result(document, shown)
 
 
-def _opening(command: Exploring | View | Clear, masks: MaskSource | None) -> Callable[[Config], Source]:
+def _opening(command: Explore | View | Clear, masks: MaskSource | None) -> Callable[[Config], Source]:
     """A function that opens the source of a command."""
     from caryatid.sources import open_source
 
@@ -413,9 +401,9 @@ def _about(command: RunCommand | Clear) -> dict[str, Any]:
     names = ("robot", "segmentation", "noise", "label_divisor", "level", "goal", "until", "hands")
     options = {name: getattr(command, name) for name in names if hasattr(command, name)}
     options["preset"] = command.settings.preset
-    if isinstance(command, Exploring | Clear):
+    if isinstance(command, Explore | Clear):
         options["planner"] = command.chosen_planner
-    if isinstance(command, Exploring):
+    if isinstance(command, Explore):
         options["early_stop"] = not command.no_early_stop
     name, seed = type(command).__name__.lower(), command.settings.seed
     return {"command": name, "source": command.source, "seed": seed, "options": options}

@@ -6,12 +6,15 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
 from caryatid.cli import options
 from caryatid.errors import needs_extra
+
+if TYPE_CHECKING:
+    from caryatid.sessions import Session
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[Path | None, options.shown("FILE")]
@@ -24,6 +27,14 @@ class SessionStep(options.ComputingCommand):
 
     folder: Folder
     """Folder of the session."""
+
+    def show_changed(self, session: Session, lead: str) -> None:
+        """Print number of views and graph after a change."""
+        from caryatid.io.graph_json import graph_to_json
+        from caryatid.viz.tables import census
+
+        document = {"views": session.views, "graph": graph_to_json(session.graph)}
+        self.show(document, f"{lead}: {census(session.graph)}")
 
     def show(self, document: Mapping[str, Any], line: str) -> None:
         """Print one JSON document, or a line unless --quiet."""
@@ -163,17 +174,14 @@ class Take(SessionStep):
 
     def __call__(self) -> None:
         from caryatid.cli.output import kept
-        from caryatid.io.graph_json import graph_to_json
         from caryatid.io.json_files import parse_json, read_json
         from caryatid.sessions import Session
         from caryatid.sessions.session import Moved
-        from caryatid.viz.tables import census
 
         T = None if self.moved is None else parse_json(Moved, read_json(self.moved), self.moved).T
         with kept(KEPT), Session.open(self.folder) as session:
-            graph = session.take(self.object, T)
-            document = {"views": session.views, "graph": graph_to_json(graph)}
-            self.show(document, f"{self.object} {'taken' if T is None else 'moved'}: {census(graph)}")
+            session.take(self.object, T)
+            self.show_changed(session, f"{self.object} {'taken' if T is None else 'moved'}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,14 +194,11 @@ class Undo(SessionStep):
 
     def __call__(self) -> None:
         from caryatid.cli.output import kept
-        from caryatid.io.graph_json import graph_to_json
         from caryatid.sessions import Session
-        from caryatid.viz.tables import census, count_of
+        from caryatid.viz.tables import count_of
 
         with kept(KEPT), Session.open(self.folder) as session:
-            left = session.undo()
-            document = {"views": left, "graph": graph_to_json(session.graph)}
-            self.show(document, f"{count_of(left, 'view')} left: {census(session.graph)}")
+            self.show_changed(session, f"{count_of(session.undo(), 'view')} left")
 
 
 @dataclass(frozen=True)

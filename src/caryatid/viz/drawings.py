@@ -321,10 +321,7 @@ def draw_stands(steps: Sequence[Step]) -> Picture:
             forward = robot.T_world_camera[:2, 2]
             gaze = float(np.rad2deg(np.arctan2(-forward[1], forward[0])))
             radius = scale * (0.08 if robot.arm else robot.footprint)
-            axes.add_patch(
-                Circle(platform, radius, facecolor=VISITED, edgecolor="none", alpha=0.1, zorder=5.8)
-            )
-            axes.add_patch(Circle(platform, radius, fill=False, color=VISITED, linewidth=1.0, zorder=5.9))
+            axes.add_patch(Circle(platform, radius, facecolor=VISITED + "1a", edgecolor=VISITED, zorder=5.9))
             cone = Wedge(eye, 0.3 * scale, gaze - 30.0, gaze + 30.0, color=VISITED, alpha=0.35, zorder=6.0)
             axes.add_patch(cone)
             axes.plot(*platform, "o", markersize=6.0, color=VISITED, zorder=6.5)
