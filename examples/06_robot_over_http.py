@@ -31,10 +31,9 @@ def main() -> None:
         command = [sys.executable, "-m", "caryatid", "serve", folder, "--port", "0", "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as service:
             try:
-                assert service.stdout is not None
-                lines = [*takewhile(lambda line: line != "}\n", service.stdout), "}"]
-                assert len(lines) > 1, "the service ended; see its error above"
-                graph = drive(RobotClient(json.loads("".join(lines))["address"]), stage)
+                printed = "".join(takewhile(lambda line: line != "}\n", service.stdout or ()))
+                assert printed, "the service ended; see its error above"
+                graph = drive(RobotClient(json.loads(printed + "}")["address"]), stage)
             finally:
                 service.terminate()
     print(*(f"{s['supporter']} holds {s['supported']} ({s['kind']})" for s in graph["supports"]), sep="\n")
