@@ -262,8 +262,9 @@ class Page:
             self._chart.content = cell_html(Section("", figures=[Figure("", chart)]))
         if chosen:
             with self.working:
-                known = any(o.id == chosen for o in steps[-1].graph.objects)
-                self._about.content = describe_object(graph, chosen, self._support, taken=known)
+                gone = {each.lift.object_id for each in steps if each.lift is not None}
+                taken = chosen in gone | {o.id for o in steps[-1].graph.objects}
+                self._about.content = describe_object(graph, chosen, self._support, taken=taken)
 
 
 def show(scene: Scene, *, host: str = "127.0.0.1", port: int = 0) -> Page:
