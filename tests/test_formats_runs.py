@@ -217,7 +217,8 @@ def test_a_disk_that_refuses_is_said_clearly_and_nothing_is_left(tmp_path, monke
     ("name", "content", "said"),
     [
         ("run.json", b'{"format": "other"}', "'format' is \"other\": must be 'caryatid/run'"),
-        ("run.json", b'{"format": "caryatid/run", "version": 3, "views": 0}', "must be 1 or 2"),
+        ("run.json", b'{"format": "caryatid/run", "version": 3, "views": 1}', "must be 1 or 2"),
+        ("run.json", b'{"format": "caryatid/run", "version": 2, "views": 0}', "'views' is 0"),
         ("graph.json", b"{}", "'format' is missing"),
         ("views/01/graph.json", None, "missing"),
         ("views/01/view.json", b"{}", "'name' is missing"),

@@ -15,6 +15,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import PositiveInt
 
 from caryatid.config import Config
 from caryatid.config.settings import changed_settings
@@ -207,7 +208,7 @@ class _RunFile:
 
     format: Literal["caryatid/run"]
     version: Literal[1, 2]
-    views: int
+    views: PositiveInt
     settings: dict[str, Any] = field(default_factory=dict)
 
 
