@@ -113,10 +113,10 @@ def _in_turn(rehearsal: _Rehearsal) -> list[str]:
     Among these, the ones that do not stand in rehearsals come first, because any touch may topple them, and
     then the highest.
     """
-    left, graph, restless = rehearsal.left(), rehearsal.graph, rehearsal.restless()
+    left, graph, unstable = rehearsal.left(), rehearsal.graph, rehearsal.unstable()
     carrying = {s.supporter for s in graph.supports if s.supported in left}
     height = {o.id: float(o.centre_world[2]) for o in graph.objects}
-    return sorted(left, key=lambda i: (i in carrying, -restless[i], -height[i], i))
+    return sorted(left, key=lambda i: (i in carrying, -unstable[i], -height[i], i))
 
 
 def _on_the_way(goal: str, rehearsal: _Rehearsal) -> list[str]:
@@ -209,9 +209,9 @@ class _Rehearsal:
         taken = {trial.object_id for trial in self._taken}
         return [i for i in self.ids if i not in taken]
 
-    def restless(self) -> dict[str, float]:
+    def unstable(self) -> dict[str, float]:
         """Shares of the first scenes in which each object does not stay in place, by id."""
-        found = self._each(lambda scene: scene.restless, slice(0, BATCH))
+        found = self._each(lambda scene: scene.unstable, slice(0, BATCH))
         return dict(zip(self.ids, np.mean(found, axis=0).tolist(), strict=True))
 
     def try_lift(self, object_id: str, hold: Collection[str] = ()) -> _Trial:
@@ -231,7 +231,7 @@ class _Rehearsal:
         while not len(harm) or (len(harm) < most and risk > accepted >= harms / (most + 1.0)):
             scenes = slice(len(harm), len(harm) + BATCH)
             found = self._each(
-                lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.restless * loses), scenes
+                lambda s: np.maximum(s.lift(object_id, hold).disturbed, s.unstable * loses), scenes
             )
             harm = np.concatenate([harm, found])
             harms = float((1.0 - np.prod(1.0 - harm, axis=1)).sum()) + 0.5
@@ -268,18 +268,18 @@ class _DrawnScene:
     ) -> None:
         self._ids, self._config = ids, config.lift
         spec = _drawn_spec(graph, number, config, np.random.default_rng([seed, number]))
-        self._lifting, self.restless, self._state = _settled(spec, ids, config.lift)
+        self._lifting, self.unstable, self._state = _settled(spec, ids, config.lift)
 
     def lift(self, object_id: str, hold: Collection[str]) -> Lift:
         """Lift an object while others are held, and those that do not stay in place."""
         index = self._ids.index(object_id)
-        held = {self._ids.index(i) for i in hold} | ({*np.flatnonzero(self.restless).tolist()} - {index})
+        held = {self._ids.index(i) for i in hold} | ({*np.flatnonzero(self.unstable).tolist()} - {index})
         return self._lifting.lift(self._state, index, self._config, held=held, to_the_end=False)
 
     def take(self, object_id: str, hold: Collection[str]) -> None:
         """Continue without an object; others that moved are put back."""
         lift, index = self.lift(object_id, hold), self._ids.index(object_id)
-        stays = self.restless | lift.disturbed.any()
+        stays = self.unstable | lift.disturbed.any()
         self._state = np.where(stays[:, None], self._state, lift.film[-1])
         self._state[index, :3] = 0.0, 0.0, ASIDE + index
 
@@ -329,11 +329,11 @@ def _settled(spec: Any, ids: Sequence[str], config: LiftConfig) -> tuple[Lifting
         The scene, which objects (N,) had to be held, and the state (N, 7) of all.
     """
     lifting = Lifting(spec, ids)
-    seen, restless = lifting.start, np.zeros(len(ids), dtype=np.bool_)
+    seen, unstable = lifting.start, np.zeros(len(ids), dtype=np.bool_)
     seconds = lifting.longest(seen, config)
     while True:
-        state = lifting.rest(seen, np.flatnonzero(restless).tolist(), seconds, config)
-        moved = strayed(seen, state, config.moved, config.turned) & ~restless
+        state = lifting.rest(seen, np.flatnonzero(unstable).tolist(), seconds, config)
+        moved = strayed(seen, state, config.moved, config.turned) & ~unstable
         if not moved.any():
-            return lifting, restless, np.where(restless[:, None], seen, state)
-        restless |= moved
+            return lifting, unstable, np.where(unstable[:, None], seen, state)
+        unstable |= moved

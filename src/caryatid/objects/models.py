@@ -584,9 +584,11 @@ def associate(
             if len(among) > 1:
                 some = [shape if k in among else None for k, shape in enumerate(shapes)]
                 nearest = _nearest_objects(own, points[theirs], owners[theirs], some, other, reach)
-            none = other[:, among].all(axis=1)
-            if none.any():
-                nearest[none] = _nearest_objects(own[none], points, owners, shapes, other[none], reach)
+            unmatched = other[:, among].all(axis=1)
+            if unmatched.any():
+                nearest[unmatched] = _nearest_objects(
+                    own[unmatched], points, owners, shapes, other[unmatched], reach
+                )
             far = nearest < 0
             if far.any():
                 nearest[far] = owners[theirs][cKDTree(points[theirs]).query(own[far])[1]]

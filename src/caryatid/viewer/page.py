@@ -420,7 +420,7 @@ def _serve(title: str, host: str, port: int, token: str) -> Any:
 
     def guarded(*given: Any, process_request: Any, **options: Any) -> Any:
         def answer(connection: Any, request: Any) -> Any:
-            if not _may_come(request, host, token):
+            if not _is_allowed(request, host, token):
                 return connection.respond(403, "open the whole address that caryatid printed\n")
             request.path = request.path.removeprefix(f"/{token}")
             return process_request(connection, request)
@@ -436,7 +436,7 @@ def _serve(title: str, host: str, port: int, token: str) -> Any:
         setattr(sockets, "serve", whole)  # noqa: B010
 
 
-def _may_come(request: Any, host: str, token: str) -> bool:
+def _is_allowed(request: Any, host: str, token: str) -> bool:
     """Whether a request has the token, names this machine, and comes from the viewer's own page."""
     named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
     try:

@@ -1,4 +1,4 @@
-"""The robot in the page's scene: where it stands, and how it comes there along its waypoints."""
+"""The robot in the viewer: where it stands, and how it drives there along its waypoints."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class RobotDrawing:
 
     Args:
         scene: A `viser.SceneApi`.
-        robot: Where it is.
-        waypoints: The way it came, which it still has to drive; empty if that is not known.
+        robot: Its pose.
+        waypoints: Way to its pose, which it drives in the viewer; empty if unknown.
     """
 
     def __init__(self, scene: Any, robot: RobotPose | None, waypoints: Sequence[Posture]) -> None:
