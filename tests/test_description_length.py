@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from itertools import product
 
 import numpy as np
@@ -46,7 +45,7 @@ def alone_in(evidence):
 def divided(points, normals):
     """Group of each point, or None where they are one object."""
     evidence = gather(Cloud(points, normals))
-    groups = split(evidence, alone_in(evidence), list, up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    groups = split(evidence, alone_in(evidence), up=UP, config=CONFIG, rng=np.random.default_rng(0))
     return None if groups is None else groups[cKDTree(evidence.points).query(points)[1]]
 
 
@@ -89,7 +88,7 @@ def test_points_that_determine_nothing_have_a_finite_cost(spread, count):
     part = Evidence(points, np.tile(UP, (count, 1)), 1.0, 0.003, None)
     assert np.isfinite(alone_in(part).cost)
     whole = best_explanation([STACKED[0]], part, COSTS)
-    groups = split(part, whole, list, up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    groups = split(part, whole, up=UP, config=CONFIG, rng=np.random.default_rng(0))
     assert groups is None or len(groups) == count
 
 
@@ -230,23 +229,41 @@ def test_flush_boxes_are_two_where_a_view_showed_each_in_a_colour_of_its_own(lef
     clouds = {k: Cloud(points[own], normals[own], rgb=rgb[own]) for k, own in ((1, on_left), (2, ~on_left))}
     assert (pair_of(clouds) is not None) == merged
     whole = gather(Cloud(points, normals, rgb=rgb))
-    for hints, divided in (([whole.points[:, 1] < 0.0], not merged), ([], False)):
-        groups = split(whole, alone_in(whole), partial(list, hints), up=UP, config=CONFIG, rng=rng)
+    shown = 1 + (whole.points[None, :, 1] < 0.0).astype(np.int32)
+    for segments, divided in ((shown, not merged), (None, False)):
+        whole = replace(whole, segments=segments)
+        groups = split(whole, alone_in(whole), up=UP, config=CONFIG, rng=rng)
         assert (groups is not None) == divided
 
 
 def test_a_row_of_flush_boxes_is_divided_where_a_view_showed_each_in_a_colour_of_its_own():
     points, normals, _ = points_of([box((0.0, 0.0, 0.03), (0.06, 0.24, 0.06))])
-    rng, place = np.random.default_rng(2), np.floor(points[:, 1] / 0.06).astype(int) + 2
+    rng, place = np.random.default_rng(2), np.clip(np.floor(points[:, 1] / 0.06).astype(int) + 2, 0, 3)
     colours = np.array([(200, 30, 30), (30, 60, 190), (30, 160, 40), (200, 180, 30)])
     rgb = np.clip(colours[place] + rng.normal(0.0, 3.0, (len(points), 3)), 0, 255).astype(np.uint8)
     whole = gather(Cloud(points, normals, rgb=rgb))
-    place = np.floor(whole.points[:, 1] / 0.06).astype(int) + 2
-    hints = [place == k for k in range(4)]
-    groups = split(whole, alone_in(whole), partial(list, hints), up=UP, config=CONFIG, rng=rng)
-    assert [np.mean(groups == np.bincount(groups[own]).argmax()) for own in hints] == pytest.approx(
-        [own.mean() for own in hints], abs=0.02
+    place = np.clip(np.floor(whole.points[:, 1] / 0.06).astype(int) + 2, 0, 3)
+    whole = replace(whole, segments=(place[None] + 1).astype(np.int32))
+    groups = split(whole, alone_in(whole), up=UP, config=CONFIG, rng=rng)
+    sides = [place == k for k in range(4)]
+    assert [np.mean(groups == np.bincount(groups[own]).argmax()) for own in sides] == pytest.approx(
+        [own.mean() for own in sides], abs=0.02
     )
+
+
+@pytest.mark.parametrize(
+    ("views", "parts"), [([], 2), ([(1, 1)], 1), ([(1, 2)], 2), ([(1, 1), (2, 3), (4, 5)], 2)]
+)
+def test_boxes_side_by_side_are_one_object_where_most_views_show_one(views, parts):
+    """A low box beside a high one, such as the body and the handle of a tool."""
+    low, high = box((0.0, 0.0, 0.03), (0.06, 0.1, 0.06)), box((0.06, 0.0, 0.06), (0.06, 0.1, 0.12))
+    points, normals, _ = points_of([low, high])
+    evidence = gather(Cloud(points, normals))
+    left, count = evidence.points[:, 0] < 0.03, len(evidence)
+    segments = np.array([np.where(left, *labels) for labels in views], dtype=np.int32).reshape(-1, count)
+    evidence = replace(evidence, segments=segments)
+    groups = split(evidence, alone_in(evidence), up=UP, config=CONFIG, rng=np.random.default_rng(0))
+    assert (1 if groups is None else len(np.unique(groups))) == parts
 
 
 @pytest.mark.parametrize(("back", "merged"), [((200, 30, 30), True), ((30, 60, 190), False)])

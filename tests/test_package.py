@@ -77,7 +77,7 @@ def test_what_an_index_is_told(built):
     assert told["License-Expression"] == "BSD-3-Clause"
     assert told["Description-Content-Type"] == "text/markdown"
     assert told.get_payload() == (ROOT / "README.md").read_text()
-    extras = {"view", "serve", "onnx", "ros", "benchmark", "cluster", "bench", "docs", "dev", "all"}
+    extras = {"view", "serve", "ros", "benchmark", "cluster", "bench", "docs", "dev", "all"}
     assert set(told.get_all("Provides-Extra")) == extras
     (scripts,) = (name for name in built[0].namelist() if name.endswith("entry_points.txt"))
     assert "caryatid = caryatid.cli:run_from_shell" in built[0].read(scripts).decode()
@@ -107,7 +107,6 @@ def test_all_that_is_needed_is_pinned():
 MODULES = {
     "view": ["viser"],
     "serve": ["fastapi", "starlette", "uvicorn"],
-    "onnx": ["onnxruntime"],
     "ros": ["rosbags"],
     "benchmark": ["pandas", "pyarrow"],
     "cluster": ["distributed", "dask"],
@@ -153,7 +152,6 @@ def test_the_core_needs_no_extra(tmp_path, scene_file):
 WORDS = {
     "view": "view {run}",
     "serve": "serve {folder}/sessions",
-    "onnx": "explore tower --masks onnx:{folder}/model.onnx --out {folder}/out",
     "ros": "import {folder}/pour.bag --depth /d --info /i --out {folder}/pour",
     "benchmark": "benchmark --out {folder}/bench",
     "cluster": "benchmark --suite smoke --scheduler tcp://127.0.0.1:1 --out {folder}/bench",

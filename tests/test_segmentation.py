@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from caryatid.config import CloudConfig, Config, FitConfig, SegmentationConfig, SurfaceConfig
 from caryatid.errors import PerceptionError
 from caryatid.geometry import transforms
+from caryatid.segmentation.affinities import OFFSETS, affinities
 from caryatid.segmentation.lccp import convex_parts
 from caryatid.segmentation.observation import observe
 from caryatid.segmentation.segments import cut_by_colour, segment, segment_cloud
@@ -219,6 +220,24 @@ SCENES = {
     "boxes of other heights behind a post": (FRONT, [POST, HALF, solid(0.1, 0.08, 0.06, 0.13, 0.16)]),
     "boxes of other depths behind a post": (FRONT, [POST, HALF, solid(0.1, 0.05, 0.16, 0.13, 0.1, x=0.05)]),
 }
+
+
+def test_the_network_tells_two_boxes_apart_and_each_from_the_table():
+    view = table_scene(FRONT, [HALF, solid(0.1, 0.05, 0.06, 0.13, 0.1)], sigma=0.001)
+    grid, K_grid = np.s_[::2, ::2], K / np.array([[2.0], [2.0], [1.0]])
+    odds = affinities(view.depth[grid], K_grid, UP @ FRONT[:3, :3], FRONT[2, 3] - TABLE)
+    labels = view.labels[grid]
+    for right, expected in ((12, True), (32, False)):  # within a box, and across the 7 cm between them
+        first, other, same = (
+            labels[:, :-right],
+            labels[:, right:],
+            odds[OFFSETS.index((0, right))][:, :-right],
+        )
+        both = (first > 0) & (other > 0) & ((first == other) == expected)
+        assert both.sum() > 100
+        assert ((same[both] > 0.0) == expected).mean() > 0.9
+    assert (odds[-1] > 0.0)[labels > 0].mean() > 0.95
+    assert (odds[-1] > 0.0)[labels == 0].mean() < 0.02
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.0015])

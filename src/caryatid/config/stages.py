@@ -159,6 +159,8 @@ class SegmentationConfig:
     """Minimum number of samples of a segment [points]."""
     min_width: NotNegative = 0.02
     """A segment narrower than this beside a larger one belongs to it [m]; creases are rounded by as much."""
+    alike: Share = 0.4
+    """Mean affinity from which parts are merged [1]: 0 a toss-up, 1 certain; 0.4 is a probability of 0.7."""
     merge_gap: NotNegative = 0.25
     """Segments are merged across a nearer object that hides at most this length between them [m]."""
     clearance: NotNegative = 0.008
@@ -247,6 +249,8 @@ class ExplanationConfig:
     """Cost of a normal turned by 90° [nats]; normals, blurred over edges, are good to 30°."""
     reading: Positive = 0.0002
     """Area whose points share one error [m²]; half of the 2 cm square a registration error shows in."""
+    sighted: NotNegative = 2.0
+    """Cost of a point parted from others of its segment in a view [nats]; one in eight is not theirs."""
     border: NotNegative = 4.0
     """Cost of a point surrounded by the other object's, on a surface without a crease [nats]."""
     free_cost: NotNegative = 0.5

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from caryatid.config import Config
-from caryatid.errors import InputError, needs_extra
+from caryatid.errors import InputError
 from caryatid.geometry.transforms import Array
 from caryatid.io.images import MASK_MODES, decode_image, read_mask, read_npy
 from caryatid.segmentation.observation import label_image, observe
@@ -36,8 +36,7 @@ def mask_source(name: str, config: Config, seed: int = 0) -> MaskSource:
         seed: Seed of the segments that a model may use as prompts.
 
     Raises:
-        InputError: There is no such file or folder, the model does not return instance masks, or onnxruntime
-            is not installed.
+        InputError: There is no such file or folder, or the model does not return instance masks.
     """
     if name.startswith(ONNX):
         return OnnxMasks(Path(name.removeprefix(ONNX)), config, seed)
@@ -103,12 +102,12 @@ class OnnxMasks:
         seed: Their seed.
 
     Raises:
-        InputError: There is no such file, it has other inputs or outputs, or onnxruntime is not installed.
+        InputError: There is no such file, or it has other inputs or outputs.
     """
 
     def __init__(self, path: Path, config: Config, seed: int = 0) -> None:
-        with needs_extra("onnx", path):
-            import onnxruntime
+        import onnxruntime
+
         if not path.is_file():
             raise InputError(path, "the file is missing", "give an ONNX model")
         try:

@@ -29,6 +29,7 @@ class Evidence:
         noise: Standard deviation of the points from their surfaces [m].
         voxels: Space seen free, or None if unknown.
         rgb: Colours (N, 3), or None.
+        segments: Segment (V, N) on which each of V views shows them, 0 = none; or None.
     """
 
     points: Array
@@ -37,6 +38,7 @@ class Evidence:
     noise: float
     voxels: VoxelMap | None
     rgb: NDArray[np.uint8] | None = None
+    segments: NDArray[np.int32] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -44,7 +46,8 @@ class Evidence:
     def select(self, kept: NDArray[np.bool_] | NDArray[np.intp]) -> Evidence:
         """Return the evidence of some of the points, by a mask (N,) or indices (M,)."""
         rgb = None if self.rgb is None else self.rgb[kept]
-        return replace(self, points=self.points[kept], normals=self.normals[kept], rgb=rgb)
+        segments = None if self.segments is None else self.segments[:, kept]
+        return replace(self, points=self.points[kept], normals=self.normals[kept], rgb=rgb, segments=segments)
 
     def joined(self, other: Evidence) -> Evidence:
         """Return the evidence of two objects together; noise and space are the same for both."""
@@ -52,7 +55,18 @@ class Evidence:
         normals = np.concatenate([self.normals, other.normals])
         known = self.rgb is not None and other.rgb is not None
         rgb = np.concatenate([self.rgb, other.rgb]) if known else None
-        return replace(self, points=points, normals=normals, rgb=rgb)
+        seen = self.segments is not None and other.segments is not None
+        segments = np.concatenate([self.segments, other.segments], axis=1) if seen else None
+        return replace(self, points=points, normals=normals, rgb=rgb, segments=segments)
+
+    def shown(self, least: int) -> list[NDArray[np.bool_]]:
+        """Points (N,) that a view shows as a segment of its own, beside others."""
+        return [
+            own == label
+            for own in (() if self.segments is None else self.segments)
+            for label in np.unique(own[own > 0])
+            if least <= np.count_nonzero(own == label) < 0.9 * np.count_nonzero(own)
+        ]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -94,6 +108,21 @@ def colour_evidence(first: Evidence, second: Evidence, config: ExplanationConfig
     sides = first.rgb, second.rgb, np.concatenate([first.rgb, second.rgb])
     alone, other, both = (plain_colour(rgb, config)[0] for rgb in sides)
     return both - alone - other
+
+
+def unity(evidence: Evidence, second: NDArray[np.bool_], config: ExplanationConfig) -> float:
+    """Evidence [nats] of views that points, and a second side (N,) of them, are one object; 0 if not.
+
+    Each point of the side with fewer in a view speaks, by the share of the other side's on its segment.
+    """
+    points = 0.0
+    for own in () if evidence.segments is None else evidence.segments:
+        one, other = own[second & (own > 0)], own[~second & (own > 0)]
+        if len(one) and len(other):
+            counts = [np.bincount(side, minlength=int(own.max()) + 1) for side in (one, other)]
+            same = float(counts[0] @ counts[1]) / (len(one) * len(other))
+            points += (2.0 * same - 1.0) * min(len(one), len(other))
+    return config.sighted * evidence.weight * max(points, 0.0)
 
 
 def plain_colour(rgb: NDArray[np.uint8], config: ExplanationConfig) -> tuple[float, Array | None]:

@@ -29,6 +29,7 @@ from caryatid.objects.description_length import (
     point_costs,
     price,
     side_colours,
+    unity,
 )
 from caryatid.runtime.parallel import on_threads
 from caryatid.segmentation.segments import PLAIN
@@ -49,7 +50,7 @@ class TwoObjects:
     Attributes:
         second: Which points (N,) are the second's.
         explanations: Of both.
-        cost: Cost of both and of the border between them, less the evidence of their colours for two [nats].
+        cost: Cost of both and of the border between them, with the evidence of colours and views [nats].
         by_colour: Whether their colours alone pay for another object.
     """
 
@@ -62,7 +63,6 @@ class TwoObjects:
 def split(
     evidence: Evidence,
     whole: Explanation,
-    hints: Hints,
     *,
     up: Array,
     config: Config,
@@ -71,15 +71,14 @@ def split(
     """Split points that several shapes explain at a lower cost than one.
 
     Where one shape does not explain all points, pieces with free space between them are two objects.
-    Otherwise the hypotheses are: hints; the patches that the single shape does not explain; cuts across the
-    vertical, where one object lies on another; and cuts across the two main horizontal directions of the
-    faces, where objects stand side by side. From each hypothesis, points go to the shape that explains them
-    better and both shapes are fitted again, in turn.
+    Otherwise the hypotheses are: segments of views, as hints; the patches that the single shape does not
+    explain; cuts across the vertical, where one object lies on another; and cuts across the two main
+    horizontal directions of the faces, where objects stand side by side. From each hypothesis, points go to
+    the shape that explains them better and both shapes are fitted again, in turn.
 
     Args:
         evidence: The points of what is taken for one object.
         whole: Its best single explanation.
-        hints: Returns masks (N,) of points that may be an object of their own; called only if needed.
         up: Unit vector (3,) upwards.
         config: What is tried, what it costs, and how shapes are fitted.
         rng: Source of the samples.
@@ -91,7 +90,8 @@ def split(
         pieces = _separated_pieces(evidence, config)
         if pieces is not None:
             return pieces
-    parts = _parts(evidence, whole, np.arange(len(evidence)), cache(hints), up, config, rng)
+    hints = cache(partial(evidence.shown, config.split.min_points))
+    parts = _parts(evidence, whole, np.arange(len(evidence)), hints, up, config, rng)
     if parts is None:
         return None
     groups = np.zeros(len(evidence), dtype=np.intp)
@@ -229,7 +229,8 @@ def _settled(
                 two = _two(evidence, second, pair, near, config)
                 gain = _colours(evidence, second, config.explanation) if k < hinted else 0.0
                 by_colour = gain > price(None, config.explanation)
-                settled[k] = replace(two, cost=two.cost - gain, by_colour=by_colour)
+                cost_of_parting = unity(evidence, second, config.explanation) - gain
+                settled[k] = replace(two, cost=two.cost + cost_of_parting, by_colour=by_colour)
                 del moving[k]
             else:
                 moving[k] = second

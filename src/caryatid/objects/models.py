@@ -196,6 +196,7 @@ class ObjectModels:
         self._compounds: dict[int, Shape | Compound | None] = {}
         self._undivided: dict[int, int] = {}
         self._segments: list[tuple[cKDTree, NDArray[np.int32]]] = []
+        self._owners: dict[int, tuple[Cloud, NDArray[np.int32]]] = {}
         self._apart: dict[tuple[int, int], int] = {}
         self._distinct: set[frozenset[int]] = set()
 
@@ -208,6 +209,7 @@ class ObjectModels:
         other._compounds = self._compounds.copy()
         other._undivided = self._undivided.copy()
         other._segments = self._segments.copy()
+        other._owners = self._owners.copy()
         other._apart = self._apart.copy()
         other._distinct = self._distinct.copy()
         return other
@@ -264,7 +266,7 @@ class ObjectModels:
         """
         points, labels = observation.cloud.points_world, observation.labels
         segments = np.where(labels == SUPPORT_LABEL, 0, labels)
-        if not masks:
+        if observation.view is not None and not masks:
             kept = np.flatnonzero(segments)
             kept = kept[thin(points[kept], self._config.explanation.spacing)]
             self._segments.append((cKDTree(points[kept]), labels[kept]))
@@ -361,7 +363,6 @@ class ObjectModels:
             groups = split(
                 evidence,
                 whole,
-                partial(self._hints, evidence.points),
                 up=UP,
                 config=self._config,
                 rng=np.random.default_rng([self._seed, label]),
@@ -454,7 +455,8 @@ class ObjectModels:
         config = self._config.explanation
         cloud = self.points.of(label, config.spacing)
         weight = config.spacing**2 / config.reading
-        evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels, cloud.rgb)
+        shown = self._shown(label, cloud)
+        evidence = Evidence(cloud.points_world, cloud.normals_world, weight, noise, voxels, cloud.rgb, shown)
         shape = self.fits[label].shape
         explanation = best_explanation([shape], evidence, config)
         if not compound or explained(explanation, evidence, config):
@@ -464,18 +466,17 @@ class ObjectModels:
         known = self._compounds[label]
         return evidence, explanation if known is None else best_explanation([shape, known], evidence, config)
 
-    def _hints(self, points: Array) -> Sequence[NDArray[np.bool_]]:
-        """Points (N,) that segmentation took for a segment of its own in one of the views."""
-        hints = []
-        for tree, labels in self._segments:
+    def _shown(self, label: int, cloud: Cloud) -> NDArray[np.int32]:
+        """Segment (V, N) on which each view shows the points of an object, 0 = none."""
+        of, known = self._owners.get(label, (cloud, np.zeros((0, len(cloud)), dtype=np.int32)))
+        known = known if of is cloud else np.zeros((0, len(cloud)), dtype=np.int32)
+        rows = [known]
+        for tree, labels in self._segments[len(known) :]:
             # 2 cm: 2σ of the registration error of both views.
-            gap, index = tree.query(points, distance_upper_bound=0.02)
-            owner = np.where(np.isfinite(gap), np.append(labels, 0)[index], 0)
-            for number in np.unique(owner[owner > 0]):
-                own = owner == number
-                if self._config.split.min_points <= own.sum() < 0.9 * (owner > 0).sum():
-                    hints.append(own)
-        return hints
+            gap, index = tree.query(cloud.points_world, distance_upper_bound=0.02)
+            rows.append(np.where(np.isfinite(gap), np.append(labels, 0)[index], 0)[None].astype(np.int32))
+        self._owners[label] = cloud, np.concatenate(rows)
+        return self._owners[label][1]
 
     def _forget(self, labels: set[int]) -> None:
         """Drop the results of earlier splits and merges for objects that have changed."""

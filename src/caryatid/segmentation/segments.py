@@ -1,4 +1,4 @@
-"""Automatic segmentation: convex parts of one colour on the support surface, some merged."""
+"""Automatic segmentation: convex parts on the support surface, merged where a network takes them for one."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from caryatid.fitting.primitives import Fit, candidates
 from caryatid.geometry.shapes import Primitives, Shape
 from caryatid.geometry.transforms import Array
 from caryatid.runtime.parallel import kernel, on_threads
+from caryatid.segmentation.affinities import OFFSETS, Odds, affinities
 from caryatid.segmentation.insides import MEETING, merge_insides
 from caryatid.segmentation.lccp import convex_parts, grid_edges, number_by_appearance, wide_parts
 from caryatid.segmentation.samples import Samples, take_samples
@@ -25,6 +26,8 @@ from caryatid.sensing.views import Cloud, View, depth_behind
 Labels = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
+SMALLEST = 160
+"""Minimum number of samples across an image for the network [1]: it was trained on crops of 192."""
 PLAIN = 0.02
 """How much the shares of red, green and blue differ on an object of one colour [1]."""
 
@@ -63,9 +66,15 @@ def segment(
     # Something beside the surface, at its edge or in the room behind, is not an object on it.
     over = surface.pixels_over(view, 0.0, np.inf, 0.0)[samples.grid][samples.places]
     part = number_by_appearance(_with_share(np.where(wide[part], part, 0), over, 0.5) - 1)
+    part, enclosed = merge_insides(samples, part)
+    if view.depth.shape[1] >= SMALLEST * config.stride:
+        T = np.eye(4) if view.T_world_camera is None else view.T_world_camera
+        eye_height = float(surface.height(T[None, :3, 3])[0])
+        odds = affinities(samples.depth, samples.K, surface.normal_world @ T[:3, :3], eye_height)
+        part = merge_alike(samples, part, odds, config.alike)
+        part = number_by_appearance(_with_share(part, odds[-1][samples.places] > 0.0, 0.5) - 1)
     if samples.rgb is not None:
         part = cut_by_colour(samples.image(part), samples.rgb, config.min_size)[samples.places]
-    part, enclosed = merge_insides(samples, part)
     part = merge_occluded(samples, part, config, fit_config, rng)
     # Readings of the surface with a common error exceed the clearance, but not by twice as much.
     part = number_by_appearance(_with_share(part, samples.height > 2.0 * config.clearance, 0.05) - 1)
@@ -207,6 +216,39 @@ def _borders_are_clean(piece_of: NDArray[np.intp], colours: dict[int, Array]) ->
         if alike or bend > 1.0 + length / 4.0:  # Round bodies bend their borders more.
             return False
     return True
+
+
+def merge_alike(samples: Samples, part: Labels, odds: Odds, alike: float) -> Labels:
+    """Merge parts (N,) of samples that the network takes for one object.
+
+    The affinity of two parts is the mean over all pairs of samples, one on each, that the network compares.
+    The two with the highest are merged, and so on while it is at least `alike`.
+    """
+    image, count = samples.image(part), int(part.max(initial=0)) + 1
+    height, width = image.shape
+    total, number = np.zeros((count, count)), np.zeros((count, count))
+    for (down, right), same in zip(OFFSETS, odds, strict=False):
+        if down >= height or abs(right) >= width:
+            continue
+        here = np.s_[: height - down, max(0, -right) : width - max(0, right)]
+        there = np.s_[down:, max(0, right) : width + min(0, right)]
+        a, b = image[here], image[there]
+        across = (a != b) & (a > 0) & (b > 0)
+        pairs = a[across] * count + b[across]
+        affinity = np.tanh(same[here][across] / 2.0)
+        total += np.bincount(pairs, affinity, count**2).reshape(count, count)
+        number += np.bincount(pairs, minlength=count**2).reshape(count, count)
+    total, number, merged = total + total.T, number + number.T, part.copy()
+    while True:
+        mean = np.where(number >= MEETING, total / np.maximum(number, 1.0), -1.0)
+        first, second = divmod(int(mean.argmax()), count)
+        if mean[first, second] < alike:
+            return merged
+        merged[merged == second] = first
+        for table in (total, number):
+            table[first] += table[second]
+            table[:, first] += table[:, second]
+            table[second], table[:, second], table[first, first] = 0.0, 0.0, 0.0
 
 
 def merge_occluded(
