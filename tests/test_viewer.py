@@ -605,8 +605,13 @@ def test_a_view_is_chosen_by_hand(page, tab):
     towards_eye = transforms.unit(client.camera.position - step.sphere.centre_world)
     facing = np.argmax(step.candidates.directions @ towards_eye)
     eye = step.sphere.centre_world + radius * step.candidates.directions[facing]
-    click(page, eye, tab)
-    tab.wait_for_text("your view is next")
+
+    def taken_next():
+        click(page, eye, tab)
+        tab.page.wait_for_timeout(500)
+        return tab.page.get_by_text("your view is next").first.is_visible()
+
+    tab.wait_until(taken_next)  # A click before the page listens is lost.
     tab.press("next view")
     tab.wait_for_node(f"/cameras/{number + 1}")
     taken = page.steps[number].view.T_world_camera
