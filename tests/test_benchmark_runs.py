@@ -101,7 +101,7 @@ def interrupt(run, processes):
     os.killpg(run.pid, signal.SIGINT)
     status, said = end(run, processes)
     assert status == 130
-    assert said.endswith("interrupted: what is done is kept, start again to continue\n")
+    assert said.endswith("interrupted: finished episodes are kept; run the same command to continue\n")
 
 
 def kill_worker(run, processes):
@@ -286,7 +286,7 @@ def test_an_address_where_nobody_answers_says_what_to_do():
 def test_a_cluster_takes_no_number_of_jobs(tmp_path, capsys):
     command = ["benchmark", "--suite", "smoke", "--scheduler", "tcp://127.0.0.1:1", "--jobs", "2"]
     assert run_command(*command, "--out", tmp_path / "out") == 1
-    assert "--jobs: a cluster has its own workers; leave --jobs or" in capsys.readouterr().err
+    assert "--jobs: cannot be combined with --scheduler" in capsys.readouterr().err
 
 
 def test_a_scene_folder_must_be_the_same_on_the_worker(scene_file, tmp_path):

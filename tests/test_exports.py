@@ -215,7 +215,7 @@ def test_too_many_objects_are_refused_before_they_are_read(tmp_path, graph, caps
     with many.open("w") as file:
         file.truncate(700_000_000)
     assert run_command("export", many, "--out", tmp_path / "a.xml") == 1
-    assert "is 700 MB large, more than export.max_objects = 2,000 take" in capsys.readouterr().err
+    assert "700 MB is too large for export.max_objects = 2,000" in capsys.readouterr().err
     assert os.listdir(tmp_path) == ["graph.json"]
 
 

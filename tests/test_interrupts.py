@@ -71,7 +71,7 @@ def test_an_exploration_keeps_its_views(tmp_path, scene_file, moment):
     assert (status, out) == (130, "")
     run = whole(folder, 3 if moment == "view 3:" else 1)
     count = "1 view is" if len(run.views) == 1 else f"{len(run.views)} views are"
-    assert told == f"interrupted: {count} kept in {folder}; `caryatid report {folder}` makes the report"
+    assert told == f"interrupted: {count} kept in {folder}; `caryatid report {folder}` writes the report"
     assert len(run.record["scores"]) == len(run.views)
 
 

@@ -42,7 +42,7 @@ def documented(command):
 
 def examples(command):
     """What the help says one may try, without what the shell does with the result."""
-    _, _, block = documented(command).partition("To try:\n")
+    _, _, block = documented(command).partition("Usage examples:\n")
     return [line.strip() for line in block.splitlines() if line.strip()]
 
 
@@ -72,12 +72,12 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
     monkeypatch.setenv("COLUMNS", "160")
     assert run_command("--help") == 0
     lines = capsys.readouterr().out.splitlines()
-    begin = lines.index("To begin:")
+    begin = lines.index("Get started:")
     assert lines[begin + 1].split()[:2] == ["caryatid", "demo"]
     for name in TOP:
         (line,) = (line for line in lines if f"• {name} " in line)
         assert inspect.getdoc(find_command(name)).splitlines()[0][:60] in line
-    assert "To try:" not in lines
+    assert "Usage examples:" not in lines
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_the_help_of_all_says_where_to_begin_and_each_command_in_a_line(capsys, 
         ("explore tower --out x --planner k", "Expected one of ('support', 'attention', 'paper', 'random'"),
         ("export x --out x --format k", "Expected one of ('mjcf', 'urdf', 'gltf', 'graphml', 'dot')"),
         ("explore tower --out x --noise k", "none"),
-        ("explore tower --out x --views 0", "0 is not a whole number of at least 1"),
-        ("explore tower --out x --seed -1", "-1 is not a whole number of at least 0"),
+        ("explore tower --out x --views 0", "0 is not an integer of at least 1"),
+        ("explore tower --out x --seed -1", "-1 is not an integer of at least 0"),
         ("explore tower --out x --colour", "--colour"),
         ("juggle", "juggle"),
         ("expore tower", "Did you mean explore?"),

@@ -179,7 +179,7 @@ def test_it_names_each_object_edge_figure_and_setting(report, html):
         assert figure.heading in page.text
         assert figure.caption in page.text
     for said in (
-        "View 1", "View 2", "0.900", "F1 over views", "Found so far", "How it went", "nothing new",
+        "View 1", "View 2", "0.900", "F1 over views", "Found so far", "How it went", "no change",
         "Sees o2 & o7 best", "The graph did not change", "12 too low", "Taken apart", "image_width=160",
         "masks: simulator · caryatid <1>", "3 objects, 4 supports, 2 of them uncertain after 2 views",
         "Wrong supports: o0 → o2; missing supports: o1 → o7, o0 → lid; objects that are not there: o7; "

@@ -63,7 +63,7 @@ def test_a_session_from_the_first_view_to_the_last(folder, files, capsys, views)
     assert run_command("session", "take", folder, "o1", "--moved", folder.parent / "moved.json") == 0
     assert capsys.readouterr().out.startswith("o1 moved: 2 objects")
     assert run_command("session", "take", folder, "o2") == 0
-    assert capsys.readouterr().out == "o2 taken: 1 object, 1 support\n"
+    assert capsys.readouterr().out == "o2 removed: 1 object, 1 support\n"
     assert run_command("session", "take", folder, "o2") == 1
     assert "not an object of the graph; there are o1" in capsys.readouterr().err
 

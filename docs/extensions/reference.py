@@ -119,7 +119,7 @@ def _allowed(kind: Any) -> str:
             for name, sign in SIGNS.items()
             if hasattr(limit, name)
         ]
-        rising = ["in rising order"] if any(isinstance(rule, AfterValidator) for rule in rules) else []
+        rising = ["in ascending order"] if any(isinstance(rule, AfterValidator) for rule in rules) else []
         return "; ".join(filter(None, [_allowed(plain), ", ".join(limits), *rising]))
     if get_origin(kind) is Literal:
         return ", ".join(f"`{name}`" for name in get_args(kind))

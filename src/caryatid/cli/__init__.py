@@ -1,7 +1,7 @@
 """The command line: `caryatid COMMAND …`.
 
-Each command is a dataclass of its options; calling it runs it. Modules that take long to import are imported
-there. Errors end in `main`, in one line.
+Each command is a dataclass of its options; calling it runs it. Slow imports happen there.
+`main` prints errors in one line.
 """
 
 from __future__ import annotations
@@ -62,16 +62,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _interrupted(error: BaseException | None) -> bool:
-    """Whether Ctrl-C is behind an error: a library that is being imported may turn it into its own."""
+    """Whether Ctrl-C caused an error: a library may turn it into its own error during import."""
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def run_from_shell() -> NoReturn:
-    """Run the command line of the shell and end the process with its exit status.
+    """Run the command line and exit with its status.
 
-    SIGTERM and the end of the terminal act like Ctrl-C. Output to a closed stdout or stderr is dropped.
+    SIGTERM and SIGHUP act like Ctrl-C. Output to a closed stdout or stderr is dropped.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name) or Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
@@ -83,7 +83,7 @@ def run_from_shell() -> NoReturn:
             signal.signal(number, signal.default_int_handler)
     status = main()
     if status == INTERRUPTED:
-        # Threads and libraries take time to end; do not make the user wait for them.
+        # Do not make the user wait for threads and libraries to end.
         sys.stderr.flush()
         os._exit(status)
     sys.exit(status)

@@ -1,4 +1,4 @@
-"""`caryatid benchmark`: methods compared over scenes, sensors and seeds."""
+"""`caryatid benchmark`: compare methods over scenes, sensors and seeds."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ SUITES = (
 
 @dataclass(frozen=True, kw_only=True)
 class Benchmark(options.Command):
-    """Compare methods over scenes and seeds, with figures.
+    """Compare methods over scenes and seeds, and draw figures.
 
-    Every finished episode is kept: stop at any time and start again. Without --suite nothing is run, and the
-    figures of the results in the folder are drawn again.
+    Finished episodes are kept: stop at any time, and run the same command to continue. Without --suite,
+    redraw the figures of the results in the folder.
 
-    To try:
+    Usage examples:
       caryatid benchmark --suite smoke --out bench
       caryatid benchmark --suite planners --planner support --planner random --out bench
       caryatid benchmark --suite fig5 --scenes my-scenes/ --seeds 1 --out bench
@@ -41,37 +41,37 @@ class Benchmark(options.Command):
     """
 
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
-    """Folder of the results; earlier ones are used."""
+    """Folder of the results; existing results are reused."""
     suite: Annotated[str | None, options.one_of(SUITES), options.shown()] = None
-    """What to compare."""
+    """Suite of methods, scenes and conditions to run."""
     scenes: Annotated[options.Words, options.shown("SCENE")] = ()
-    """Scenes instead of the suite's: a built-in name, a scene folder, a folder of them; may be repeated."""
+    """Replace the suite's scenes: a built-in name, a scene folder, or a folder of those; may be repeated."""
     planner: options.Several[Annotated[str, options.planner_name()]] = ()
-    """Planner instead of the suite's methods; may be repeated. The others are compared with the first."""
+    """Replace the suite's planners; may be repeated. The first is the reference for the others."""
     fusion: options.Several[FusionMethod] = ()
-    """Fusion instead of the suite's; may be repeated."""
+    """Replace the suite's fusion; may be repeated."""
     segmentation: options.Several[SegmentationMethod] = ()
-    """Segmentation instead of the suite's conditions; may be repeated. Default: labels."""
+    """Replace the suite's segmentation; may be repeated. Default: labels."""
     noise: options.Several[NoiseModel] = ()
-    """Noise of the camera, instead of the suite's conditions; may be repeated. Default: carmine."""
+    """Replace the suite's camera noise; may be repeated. Default: carmine."""
     preset: Annotated[Preset | None, options.one_of(Preset), options.shown(default="the suite's")] = None
-    """Settings to start from in all episodes: caryatid's own, or those of the paper."""
+    """Settings to start from in all episodes: caryatid's defaults, or those of the paper."""
     set: Annotated[options.Words, options.shown("STAGE.NAME=VALUE")] = ()
-    """One setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
+    """Change one setting of all episodes, such as `--set noise.translation=0.02`; may be repeated."""
     seeds: Annotated[options.OptionalCount, options.shown(default="the suite's")] = None
-    """Seeds 0…N−1 of every episode."""
+    """Number of seeds; every episode runs with seeds 0 to N−1."""
     views: Annotated[options.OptionalCount, options.shown(default="the suite's")] = None
-    """Views of every episode, including the first."""
+    """Number of views of every episode, including the first."""
     jobs: Annotated[options.OptionalCount, options.shown(default="all cores")] = None
     """Number of processes."""
     scheduler: Annotated[str | None, options.shown("ADDRESS")] = None
-    """Run on the workers of this dask.distributed scheduler instead, such as tcp://10.0.0.5:8786."""
+    """Run on the workers of this dask.distributed scheduler, such as tcp://10.0.0.5:8786."""
     retry: options.Flag = False
     """Run failed episodes again."""
     reference: Annotated[str | None, options.shown("METHOD")] = None
-    """Method the others are compared with in the figures, instead of the suite's."""
+    """Reference method in the figures, instead of the suite's."""
     docs: Annotated[Path | None, options.shown("FILE.md")] = None
-    """Write the figures as a Markdown document too."""
+    """Also write the results as a Markdown document."""
 
     def __call__(self) -> None:
         from caryatid.benchmark.report import check_reference
@@ -85,7 +85,8 @@ class Benchmark(options.Command):
             with needs_extra("cluster", "--scheduler"):  # before anything is written
                 import distributed  # noqa: F401
             if self.jobs is not None:
-                raise InputError("--jobs", "a cluster has its own workers", "leave --jobs or --scheduler out")
+                reason = "cannot be combined with --scheduler, which has its own workers"
+                raise InputError("--jobs", reason, "omit one of the two options")
         suite = (
             None
             if self.suite is None
@@ -105,7 +106,7 @@ class Benchmark(options.Command):
         code = fingerprint() if suite else None
         about = collect_provenance()
         with (
-            kept("what is done is kept, start again to continue"),
+            kept("finished episodes are kept; run the same command to continue"),
             ResultStore(self.out / RESULTS, code, about) as store,
         ):
             missing = store.plan(suite.name, suite.members(), retry=self.retry) if suite else []

@@ -1,4 +1,4 @@
-"""All commands by name, the reading of the command line, and the commands that only print text."""
+"""All commands by name, the parsing of the command line, and the commands that only print text."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ import tyro
 
 from caryatid.cli.options import Command, Modelling
 
-DESCRIPTION = """Explore a cluttered table until it is known which object supports which.
+DESCRIPTION = """Explore a cluttered table and find out which object supports which.
 
-To begin:
-  caryatid demo                                     a built-in table, explored in simulation
-  caryatid view clutter                             the same in the browser, view by view
-  caryatid explore tower                            another one, or your own scene or recording
-  caryatid extract sample-cloud                     one cloud, or all views of a recording
-  caryatid order run                                a safe order in which to remove what was found
-  caryatid COMMAND --help                           what a command does, its options, and examples
-  caryatid --version                                the version of caryatid
+Get started:
+  caryatid demo                  explore a built-in table in simulation
+  caryatid view clutter          watch an exploration in the browser, view by view
+  caryatid explore tower         explore another built-in scene, or your own scene or recording
+  caryatid extract sample-cloud  process one cloud, or all views of a recording
+  caryatid order run             find a safe order in which to remove the objects of a run
+  caryatid COMMAND --help        show what a command does, its options, and examples
+  caryatid --version             print the version
 """
-"""Beginning of the help."""
+"""Text at the top of the help."""
 
 COMMANDS = {
     "demo": "run:Demo",
@@ -49,7 +49,7 @@ COMMANDS = {
     "config": "commands:ShowConfig",
     "completion": "commands:Completion",
 }
-"""Modules and classes of the commands, in the order of the help; imported when they are asked for."""
+"""Module and class of each command, in the order of the help; imported on demand."""
 
 MARKERS = (
     tyro.conf.DisallowNone,
@@ -58,7 +58,7 @@ MARKERS = (
     tyro.conf.OmitArgPrefixes,
     tyro.conf.OmitSubcommandPrefixes,
 )
-"""How options look."""
+"""How tyro turns fields into options."""
 
 
 def find_command(name: str) -> type:
@@ -68,7 +68,7 @@ def find_command(name: str) -> type:
 
 
 def read_command(arguments: Sequence[str]) -> Any:
-    """Return the command that the arguments ask for, ready to be called.
+    """Parse the arguments into a command that is ready to be called.
 
     Raises:
         SystemExit: After --help, with 0; on wrong options, with 2.
@@ -115,9 +115,9 @@ def _any_command() -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes(Command):
-    """List the built-in scenes, and the samples that come with caryatid.
+    """List the built-in scenes and the sample recordings.
 
-    To try:
+    Usage examples:
       caryatid scenes
     """
 
@@ -128,17 +128,17 @@ class Scenes(Command):
 
         scenes = list_scenes()
         shown = [
-            table(title, ("name", "what it shows"), what.items())
-            for title, what in (("Scenes to simulate", scenes), ("Samples to read", DESCRIPTIONS))
+            table(title, ("name", "description"), what.items())
+            for title, what in (("Built-in scenes", scenes), ("Samples", DESCRIPTIONS))
         ]
         self.output.result({"scenes": scenes, "samples": DESCRIPTIONS}, *shown)
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShowConfig(Command):
-    """Print all settings as TOML, to edit and pass back with --config.
+    """Print all settings as TOML, to edit and pass to --config.
 
-    To try:
+    Usage examples:
       caryatid config > settings.toml
     """
 
@@ -153,9 +153,9 @@ class ShowConfig(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Completion(Command):
-    """Print a script that lets the shell complete commands and options.
+    """Print a shell completion script for commands and options.
 
-    To try:
+    Usage examples:
       source <(caryatid completion bash)
       caryatid completion bash > ~/.local/share/bash-completion/completions/caryatid
       caryatid completion zsh > "${fpath[1]}/_caryatid"
@@ -164,7 +164,7 @@ class Completion(Command):
     """
 
     shell: Annotated[Literal["bash", "zsh", "fish", "tcsh"], tyro.conf.Positional]
-    """The shell."""
+    """Shell to print the script for."""
 
     def __call__(self) -> None:
         script = io.StringIO()

@@ -1,4 +1,4 @@
-"""Options that commands share, and how they are read and shown."""
+"""Options that commands share, and how they are parsed and shown."""
 
 from __future__ import annotations
 
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
 
 
 def shown(metavar: str | None = None, default: object = "") -> object:
-    """An option whose help text says everything, or else names the default that applies when it is left out.
+    """An option whose help shows no default, or a given one.
 
     Args:
         metavar: Name of its value in the help; None = that of its type.
-        default: What applies when it is left out.
+        default: Default to show.
     """
     return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {default})" if default else "")
 
 
 def default_of(setting: str, metavar: str | None = None) -> object:
-    """An option for a setting, such as `active.max_views`, whose default applies when it is left out."""
+    """An option for a setting, such as `active.max_views`, that shows the default of the setting."""
     from caryatid.config import Config
 
     return shown(metavar, attrgetter(setting)(Config()))
 
 
 def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
-    """One of a few words, or None when left out; anything else is a usage error that lists them.
+    """One of a few words, or None if omitted; anything else is a usage error that lists them.
 
     Args:
         choice: The words, or a Literal of them.
@@ -50,18 +50,18 @@ def one_of(choice: Any) -> PrimitiveConstructorSpec[Any]:
 
 
 def planner_name() -> PrimitiveConstructorSpec[Any]:
-    """The name of a planner, other packages' included."""
+    """The name of a planner, including those of other packages."""
     from caryatid.planning.planners import BUILT_IN, ORACLE, offered
 
     return one_of((*BUILT_IN, *sorted(offered()), ORACLE))
 
 
 def whole_number(least: int) -> PrimitiveConstructorSpec[Any]:
-    """A whole number of at least `least`, or None when left out; anything else is a usage error."""
+    """An integer of at least `least`, or None if omitted; anything else is a usage error."""
 
     def parse(word: str) -> int:
         if not word.isdecimal() or int(word) < least:
-            raise ValueError(f"{word} is not a whole number of at least {least}")
+            raise ValueError(f"{word} is not an integer of at least {least}")
         return int(word)
 
     return _word("N", parse)
@@ -94,14 +94,14 @@ Several = Annotated[tyro.conf.UseAppendAction[tuple[_Value, ...]], shown()]
 
 @dataclass(frozen=True, kw_only=True)
 class General:
-    """What is printed."""
+    """Output options."""
 
     json: Flag = False
-    """Write the result to stdout as one JSON document, and nothing else."""
+    """Print only the result, as one JSON document on stdout."""
     quiet: Flag = False
-    """Print no progress."""
+    """Do not print progress."""
     debug: Flag = False
-    """Show the traceback of an error instead of one line."""
+    """Show the full traceback of an error."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,15 +109,15 @@ class Settings:
     """Settings of the method and the simulation."""
 
     config: Annotated[Path | None, shown("FILE.toml")] = None
-    """File of settings that replace the defaults; `caryatid config` prints one with all of them."""
+    """TOML file of settings that override the defaults; `caryatid config` prints one with all settings."""
     set: Annotated[Words, tyro.conf.arg(metavar="STAGE.NAME=VALUE")] = ()
-    """Set one setting, such as `--set fit.hypotheses=200`; overrides the file."""
+    """Change one setting, such as `--set fit.hypotheses=200`; overrides the file; may be repeated."""
 
     def read(self, options: Mapping[str, object] | None = None, base: Config | None = None) -> Config:
         """The configuration: option > --set > file > default.
 
         Args:
-            options: Name of a setting → value of the option for it, or None when left out.
+            options: Name of a setting → value of its option, or None if omitted.
             base: The defaults; None = those of `Config`.
 
         Raises:
@@ -131,19 +131,19 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class Modelling(Settings):
-    """How views become a scene model."""
+    """Settings that turn views into a scene model."""
 
     preset: Annotated[Preset, one_of(Preset)] = "default"
-    """Settings to start from: caryatid's own, or those of the paper."""
+    """Settings to start from: caryatid's defaults, or those of the paper."""
     fusion: Annotated[FusionMethod | None, one_of(FusionMethod), default_of("fusion.method")] = None
-    """What to fuse over views: points, graphs, or both."""
+    """What to fuse over views: points (pc), graphs (sg), or both."""
     masks: Annotated[
         str | None, tyro.conf.arg(metavar="{scene,per-view,onnx:FILE,FOLDER}"), default_of("fusion.masks")
     ] = None
-    """What a mask's number means: an object in all views (scene) or a segment of one (per-view); or where the
-    masks of each view come from: a model, or a folder of NAME.png or NAME.npy."""
+    """What a mask's number identifies: an object in all views (scene) or a segment of one view (per-view). Or
+    where masks come from: an ONNX model, or a folder with a NAME.png or NAME.npy per view."""
     seed: Annotated[int, whole_number(0)] = 0
-    """Seed of every random choice; the same seed gives the same graph, byte for byte."""
+    """Random seed; the same seed gives the same graph, byte for byte."""
 
     def read(
         self,
@@ -157,15 +157,15 @@ class Modelling(Settings):
         Args:
             options: As for `Settings.read`.
             base: As for `Settings.read`.
-            takes_views: Whether the command takes views, whose masks may come from a model or folder.
+            takes_views: Whether the command reads views, whose masks may come from a model or folder.
 
         Raises:
-            InputError: As for `Settings.read`; or masks are given and the command takes no views.
+            InputError: As for `Settings.read`; or masks are given and the command reads no views.
         """
         from caryatid.config.settings import preset
 
         if self.masks_from is not None and not takes_views:
-            reason = "is neither scene nor per-view, and this command takes no views to give masks to"
+            reason = "this command takes only scene or per-view, because it reads no views"
             raise InputError(f"--masks {self.masks}", reason, "use it with explore, extract, clear or view")
         base = base or preset(self.preset)
         identity = None if self.masks_from else self.masks
@@ -185,7 +185,7 @@ class Command:
 
     @cached_property
     def output(self) -> Output:
-        """Where it prints."""
+        """Progress and results of the command."""
         from caryatid.cli.output import Output
 
         return Output(json=self.general.json, quiet=self.general.quiet)
@@ -205,16 +205,16 @@ class ComputingCommand(Command):
 
 @dataclass(frozen=True, kw_only=True)
 class LookingCommand(ComputingCommand):
-    """A command that looks at views."""
+    """A command that processes views."""
 
     settings: Modelling = Modelling()
     segmentation: Annotated[
-        SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels where there are any")
+        SegmentationMethod | None, one_of(SegmentationMethod), shown(default="labels if available")
     ] = None
-    """Use the masks or labels of the views, or segment automatically."""
+    """Use the given masks or labels, or segment automatically."""
     ignore: Annotated[Path | None, shown("MASK.png")] = None
-    """Mask of the robot's own arm, or of anything else fixed to the camera: a grey PNG, whose pixels other
-    than 0 are ignored in every view; for a recording also a folder with one NAME.png per view."""
+    """Mask of pixels to ignore in every view, such as the robot's arm: a grey PNG, 0 = keep. For a recording,
+    also a folder with one NAME.png per view."""
 
     def mask_source(self, config: Config) -> MaskSource | None:
         """The source of masks, or None.
@@ -228,19 +228,19 @@ class LookingCommand(ComputingCommand):
         if settings.masks_from is None:
             return None
         if self.segmentation == "auto":
-            reason = "gives masks, and --segmentation auto uses none"
-            raise InputError(f"--masks {settings.masks}", reason, "leave one of the two out")
+            reason = "cannot be combined with --segmentation auto, which uses no masks"
+            raise InputError(f"--masks {settings.masks}", reason, "omit one of the two options")
         return mask_source(settings.masks_from, config, settings.seed)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanningCommand(LookingCommand):
-    """A command that plans where to look next."""
+    """A command that plans the next best view."""
 
-    planner: Annotated[str | None, planner_name(), shown(default="support, or paper with that preset")] = None
-    """Planner of the next view; oracle knows the ground truth and needs a simulation."""
+    planner: Annotated[str | None, planner_name(), shown(default="support; paper with --preset paper")] = None
+    """Planner of the next best view; oracle uses the ground truth and requires a simulation."""
     robot: Annotated[str, tyro.conf.arg(metavar="NAME")] = "humanoid"
-    """Robot that carries the camera: humanoid, arm:FILE.npz (its reachability), module:callable."""
+    """Robot that carries the camera: humanoid, arm:FILE.npz (a reachability map), or module:callable."""
 
     @property
     def chosen_planner(self) -> str:
@@ -255,7 +255,7 @@ class ExploringCommand(PlanningCommand):
     views: Annotated[OptionalCount, default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
     level: Flag = False
-    """Turn the world of a recording so that the table is level, for poses whose z is not up."""
+    """Rotate the world frame of a recording so that the table is level; use it if z does not point up."""
     noise: NoiseModel = "carmine"
     """Noise of the simulated camera: depth noise and registration error of a Carmine, or none."""
 

@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 
 
 class Output(logging.Handler):
-    """What a command prints. It also prints what the package logs, such as that kernels are compiled.
+    """Print progress, results, and log messages of the package.
 
-    Nothing moves on stderr unless it is a terminal, not even with FORCE_COLOR.
+    Spinners and bars appear only if stderr is a terminal, even with FORCE_COLOR.
 
     Args:
-        json: Whether the result is one JSON document, and nothing else is printed.
-        quiet: Whether no progress is printed.
+        json: Print only the result, as one JSON document.
+        quiet: Do not print progress.
 
     Attributes:
-        warnings: What the package has warned of so far.
+        warnings: Warnings of the package so far.
     """
 
     def __init__(self, *, json: bool, quiet: bool) -> None:
@@ -50,7 +50,7 @@ class Output(logging.Handler):
         logger.setLevel(logging.INFO)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print what was logged, and keep warnings."""
+        """Print a log message, and keep it if it is a warning."""
         if record.levelno >= logging.WARNING:
             self.warnings.append(record.getMessage())
         self.say(record.getMessage())
@@ -64,7 +64,7 @@ class Output(logging.Handler):
         return self.progress.status(what) if self.progress.is_interactive else nullcontext()
 
     def result(self, document: Mapping[str, Any], *shown: RenderableType) -> None:
-        """Print the result: as one JSON document, or else text as it is and tables."""
+        """Print the result: one JSON document, or text and tables."""
         if self.json or not shown:
             from caryatid.io.json_files import json_text
 
@@ -77,7 +77,7 @@ class Output(logging.Handler):
         sys.stdout.flush()
 
     def step(self, step: Step, before: SupportGraph | None, score: Score | None) -> None:
-        """Print what a view changed, its score if the ground truth is known, and what comes next."""
+        """Print what a view changed, its score if the ground truth is known, and the next view."""
         from caryatid.viz.tables import census, changes
 
         f1 = "" if score is None else f", F1 {score.f1:.3f}"
@@ -85,7 +85,7 @@ class Output(logging.Handler):
         for line in changes(before, step.graph):
             self.say(f"  {line}")
         if step.lift is not None:
-            self.say(f"  took {step.lift.object_id}: {step.lift.why}")
+            self.say(f"  removed {step.lift.object_id}: {step.lift.why}")
         if step.decision is not None:
             self.say(f"  next view: {step.decision.why}")
         if step.stop is not None:
@@ -94,7 +94,7 @@ class Output(logging.Handler):
 
 @contextmanager
 def kept(what: str) -> Iterator[None]:
-    """Make Ctrl-C say what is kept."""
+    """Make Ctrl-C report what is kept."""
     try:
         yield
     except KeyboardInterrupt:
@@ -104,7 +104,7 @@ def kept(what: str) -> Iterator[None]:
 def table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], *, figures: bool = False
 ) -> Table:
-    """A table of text, or of figures aligned to the right."""
+    """A table of text, or of right-aligned numbers."""
     made = Table(title=Text(title), title_justify="left")
     if figures:
         made.box, made.padding, made.pad_edge = box.SIMPLE_HEAD, (0, 0, 0, 0), False
@@ -116,7 +116,7 @@ def table(
 
 
 def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], Table]:
-    """What `--profile` prints: the time of each stage of each view [s], and the same as a table [ms].
+    """Times of all stages of each view [s] for `--profile`, and the same as a table [ms].
 
     Args:
         steps: Number and timings [s] of each view, as in run.json.
@@ -129,9 +129,9 @@ def profile(steps: Sequence[Mapping[str, Any]]) -> tuple[list[dict[str, Any]], T
         [name, *(f"{1000.0 * view[stage]:.1f}" if stage in view else "" for stage in stages)]
         for name, view in times.items()
     ]
-    return views, table("time by view [ms]", ["view", *stages], rows, figures=True)
+    return views, table("time per view [ms]", ["view", *stages], rows, figures=True)
 
 
 def turn(timings: Mapping[str, float]) -> float:
-    """Time of a turn of the loop [s]: all stages but waiting for the camera."""
+    """Time of one turn of the loop [s]: all stages except waiting for the camera."""
     return sum(seconds for stage, seconds in timings.items() if stage != "capture")

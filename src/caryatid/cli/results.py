@@ -1,4 +1,4 @@
-"""`caryatid import`, `evaluate`, `order`, `report` and `export`: from recordings, and from run folders."""
+"""`caryatid import`, `evaluate`, `order`, `report` and `export`: commands on recordings and run folders."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Topic = Annotated[str | None, options.shown("TOPIC")]
 
 @dataclass(frozen=True, kw_only=True)
 class Import(options.Command):
-    """Turn a robot's recording into a scene folder of sharp views from different viewpoints.
+    """Convert a robot's recording to a scene folder of sharp views from different viewpoints.
 
-    Reads bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), and folders of the
-    TUM RGB-D benchmark, which need no topics. Depth must be registered to the colour image.
+    Read bags of ROS 1 (.bag) and ROS 2 (.mcap, .db3, or a folder with metadata.yaml), or a folder of the
+    TUM RGB-D benchmark, which needs no topics. Depth must be registered to the colour image.
 
-    To try:
+    Usage examples:
       caryatid import pour.bag --out pour
       caryatid import pour.bag --depth /depth/image --info /depth/camera_info --tf map --out pour
       caryatid import rgbd_dataset_freiburg1_desk --out desk
@@ -32,21 +32,22 @@ class Import(options.Command):
 
     settings: options.Settings = options.Settings()
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
-    """Bag, or folder with depth.txt."""
+    """Bag, or TUM RGB-D folder with depth.txt."""
     out: Annotated[Path, tyro.conf.arg(metavar="DIR")]
     """Scene folder to write, in the BOP format; must be new or empty."""
     depth: Topic = None
-    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. Without it, the topics are listed."""
+    """Depth images: 16UC1 or mono16 [mm], 32FC1 [m], or PNG-compressed. If omitted, list all topics."""
     info: Topic = None
-    """Camera of the depth images (CameraInfo)."""
+    """CameraInfo of the depth images."""
     rgb: Topic = None
-    """Colour images that depth is registered to; they also show how sharp a frame is."""
+    """Colour images that depth is registered to; also used to pick sharp frames."""
     tf: Annotated[str | None, options.shown("FRAME")] = None
-    """World frame, level with z up, such as map or base_link. Without it, one frame without a pose."""
+    """World frame with z up, such as map or base_link. If omitted, import one frame without a pose."""
     camera: Annotated[Path | None, options.shown("FILE.json")] = None
-    """Camera of a TUM RGB-D folder: fx, fy, cx, cy [px]. Without it, as published."""
+    """Intrinsics of a TUM RGB-D folder: fx, fy, cx, cy [px]. If omitted, the published values."""
     level: options.Flag = False
-    """Rotate the world so that the table is level, for poses whose z is not up; most views must show it."""
+    """Rotate the world frame so that the table is level; use it if z does not point up. Most views must show
+    the table."""
     views: Annotated[options.OptionalCount, options.default_of("recording.max_views")] = None
     """Maximum number of views."""
 
@@ -69,17 +70,17 @@ class Import(options.Command):
             output.say(note)
         skipped = f"; skipped: {reasons(imported.skipped)}" if imported.skipped else ""
         output.say(f"{self.source.name}: {len(imported)} views of {read} frames{skipped}")
-        output.say(f"recording: {self.out}, try `caryatid extract {self.out} --out run`")
+        output.say(f"recording: {self.out}; next, run `caryatid extract {self.out} --out run`")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(options.Command):
     """Score each view of a run: precision, recall and F1 of vertices and edges, mean IoU, probabilities.
 
-    Brier score (0 is perfect) and average precision (1 is perfect) are of the supports' probabilities, among
-    objects that were found.
+    Brier score (0 is perfect) and average precision (1 is perfect) rate the probabilities of supports
+    between objects that were found.
 
-    To try:
+    Usage examples:
       caryatid evaluate run
       caryatid evaluate run scenes/tower
     """
@@ -87,7 +88,7 @@ class Evaluate(options.Command):
     run: options.RunPath
     """Run folder."""
     truth: Annotated[str | None, tyro.conf.Positional, options.shown("GT", "the run's source")] = None
-    """Scene (built-in name, scene.xml or its folder), or recording with masks and gt.json."""
+    """Scene (built-in name, scene.xml or its folder), or a recording with masks and gt.json."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
@@ -107,13 +108,13 @@ class Evaluate(options.Command):
 
 @dataclass(frozen=True, kw_only=True)
 class OrderCommand(options.ComputingCommand):
-    """Find a safe order in which to remove everything, or to reach one object.
+    """Find a safe order in which to remove all objects, or to reach one.
 
-    Each lift is rehearsed in physics before it is chosen, on the extracted shapes and on others equally
-    likely. They give the probability that nothing else moves. If no order is safe, the output gives the least
-    risky one and names the objects in each other's way.
+    Rehearse each lift in physics, on the extracted shapes and on samples of their uncertainty, to estimate
+    the probability that nothing else moves. If no order is safe, print the least risky one and the objects
+    that block each other.
 
-    To try:
+    Usage examples:
       caryatid order run
       caryatid order run --goal o3
       caryatid order run --risk 0.2
@@ -123,11 +124,11 @@ class OrderCommand(options.ComputingCommand):
     run: options.RunPath
     """Run folder."""
     goal: Annotated[str | None, options.shown("ID")] = None
-    """Reach this object only, and remove no more than necessary."""
+    """Object to reach; remove no more than necessary."""
     hands: Literal[1, 2] = 2
-    """With 2, another hand may hold one object while the first lifts one."""
+    """Number of hands; with 2, one may hold an object while the other lifts one."""
     risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
-    """Accept lifts that move another object with at most this probability."""
+    """Maximum probability that a lift moves another object."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import table
@@ -150,9 +151,9 @@ class OrderCommand(options.ComputingCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class ReportCommand(options.Command):
-    """Write the report of a run again, also as a PDF.
+    """Write the report of a run again, optionally also as a PDF.
 
-    To try:
+    Usage examples:
       caryatid report run
       caryatid report run --pdf report.pdf
     """
@@ -160,7 +161,7 @@ class ReportCommand(options.Command):
     run: options.RunPath
     """Run folder; its report.html is replaced."""
     pdf: Annotated[Path | None, options.shown("FILE.pdf")] = None
-    """PDF (A4) to write as well; replaces an earlier one."""
+    """Also write a PDF (A4); replaces an existing file."""
 
     def __call__(self) -> None:
         for path in write_report(self.run, self.pdf):
@@ -170,9 +171,9 @@ class ReportCommand(options.Command):
 
 @dataclass(frozen=True, kw_only=True)
 class Export(options.Command):
-    """Write the scene model of a run for simulators, viewers and graph programs.
+    """Export the scene model of a run to simulators, 3D viewers and graph tools.
 
-    To try:
+    Usage examples:
       caryatid export run --format mjcf --out scene.xml
       caryatid export run --out scene.glb
     """
@@ -181,9 +182,9 @@ class Export(options.Command):
     run: options.RunPath
     """Run folder, or a graph.json."""
     out: Annotated[Path, tyro.conf.arg(metavar="FILE")]
-    """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces an earlier one."""
+    """File to write: .xml (mjcf), .urdf, .glb, .gltf, .graphml, .dot or .gv; replaces an existing file."""
     format: Annotated[
-        ExportFormat | None, options.one_of(ExportFormat), options.shown(default="by the ending of FILE")
+        ExportFormat | None, options.one_of(ExportFormat), options.shown(default="by the suffix of FILE")
     ] = None
     """mjcf: free bodies on a table; urdf: links fixed to the world; gltf: meshes; graphml, dot: the graph."""
 
@@ -199,7 +200,7 @@ class Export(options.Command):
         if size > OBJECT * config.export.max_objects:
             most = f"export.max_objects = {config.export.max_objects:,}"
             remedy = "raise that setting; reading takes ten times as much memory"
-            raise InputError(file, f"is {size / 1e6:,.0f} MB large, more than {most} take", remedy)
+            raise InputError(file, f"{size / 1e6:,.0f} MB is too large for {most}", remedy)
         graph = read_graph(file) if file is self.run else read_run(self.run).graph
         export_graph(graph, self.out, config.export)
         self.output.result({"file": str(self.out), "format": format_}, "")
@@ -211,14 +212,14 @@ def write_report(folder: Path, pdf: Path | None = None) -> list[Path]:
 
     Args:
         folder: The run.
-        pdf: Where to write it as a PDF too.
+        pdf: File of the PDF, or None.
 
     Returns:
-        The files that were written.
+        The files written.
 
     Raises:
-        InputError: It is not a run, a file in it is broken, or a file cannot be written; an older
-            report.html does not change.
+        InputError: It is not a run, a file in it is broken, or a file cannot be written; an existing
+            report.html then remains unchanged.
     """
     from caryatid.io.staging import write_file
     from caryatid.steps import read_config, read_run, read_steps

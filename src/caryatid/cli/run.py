@@ -1,4 +1,4 @@
-"""`caryatid demo`, `explore`, `view`, `extract` and `clear`: from views to a graph, and their page."""
+"""`caryatid demo`, `explore`, `view`, `extract` and `clear`: from views to a graph, and the viewer."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from caryatid.viewer.page import Page, PageProcess
 
 PORT = 8770
-"""Port of the page, or else the next free one."""
+"""Default port of the viewer; if taken, the next free one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,18 +39,18 @@ class RunCommand(options.ComputingCommand):
     source: str
     settings: options.Modelling = options.Modelling()
     out: options.OutPath = Path("run")
-    """Run folder to write; replaces an earlier run."""
+    """Run folder to write; replaces an existing run."""
     no_report: options.Flag = False
-    """Leave out report.html."""
+    """Do not write report.html."""
     profile: options.Flag = False
-    """Print the time of each stage at the end; with --json as part of the document."""
+    """Print the time of each stage; with --json, add it to the document."""
 
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
         """Open the source; returns its name, its ground truth, and the steps of the run."""
         raise NotImplementedError
 
     def run(self, config: Config, page: PageProcess | None = None) -> None:
-        """Keep all steps, write the report and print the result."""
+        """Save all steps, write the report and print the result."""
         from caryatid.cli.output import profile
         from caryatid.io.graph_json import graph_to_json
         from caryatid.steps import RunWriter
@@ -64,7 +64,7 @@ class RunCommand(options.ComputingCommand):
         if not self.no_report:
             _draw_report(self.out, output)
         output.say(f"{name}: {census(graph)} after {count_of(len(writer.steps), 'view')}")
-        output.say(f"run: {self.out}" + ("" if self.no_report else ", open its report.html"))
+        output.say(f"run: {self.out}" if self.no_report else f"report: {self.out / 'report.html'}")
         document: dict[str, Any] = {"run": str(self.out), "graph": graph_to_json(graph)}
         document["warnings"] = output.warnings
         if self.profile:
@@ -76,14 +76,14 @@ class RunCommand(options.ComputingCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Explore(RunCommand, options.ExploringCommand):
-    """Explore a scene until it is known which object supports which.
+    """Explore a scene view by view and infer which object supports which.
 
-    SOURCE is one of
-      an MJCF scene: an .xml file, or the folder of a scene.xml; robot and camera are simulated
-      the name of a built-in scene: tower, clutter, pile-8-0, dense-12-0, …
-      a recording: a folder in the BOP format; the camera can only be where a recorded view is
+    SOURCE is one of:
+      a built-in scene: tower, clutter, pile-8-0, dense-12-0, …
+      an MJCF scene, simulated with robot and camera: an .xml file, or a folder with a scene.xml
+      a recording: a folder in the BOP format; next views are chosen from its views
 
-    To try:
+    Usage examples:
       caryatid explore tower --out run
       caryatid explore clutter --goal o3 --out run
       caryatid explore scene.xml --views 5 --out run
@@ -94,15 +94,14 @@ class Explore(RunCommand, options.ExploringCommand):
     source: options.SourceName
     """Scene or recording."""
     no_early_stop: options.Flag = False
-    """Continue to the maximum number of views; otherwise stop when no view is worth its path."""
+    """Continue to the maximum number of views, even if no view is worth its path."""
     goal: Annotated[str | None, options.shown("ID")] = None
-    """Look only at what matters for removing this object, and stop when it is known what its removal
-    moves.
-    """
+    """Object to remove: explore only what matters for its removal, and stop when it is clear what else
+    would move."""
     until: Annotated[float | None, options.shown("P", "0.95 with --goal, else never")] = None
-    """Stop when every support is known with this probability, or with --goal, what moves and what stays."""
+    """Stop when every support (with --goal, every effect of the removal) is known with this probability."""
     view: options.Flag = False
-    """Show every view in the browser; the page then stays until Ctrl-C."""
+    """Show the exploration in the browser; Ctrl-C closes the page."""
 
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
         from caryatid.evaluation.oracle import planner_for
@@ -125,19 +124,19 @@ class Explore(RunCommand, options.ExploringCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Demo(RunCommand):
-    """Explore a built-in cluttered table in simulation and print what every view finds.
+    """Explore a built-in cluttered table in simulation, and print what each view adds.
 
-    To try:
+    Usage examples:
       caryatid demo
       caryatid demo --scene bridge --view
     """
 
     source: Annotated[str, tyro.conf.arg(name="scene", metavar="NAME")] = "clutter"
-    """A built-in scene, such as tower, bridge or dense-12-0."""
+    """Built-in scene, such as tower, bridge or dense-12-0."""
     views: Annotated[options.OptionalCount, options.default_of("active.max_views")] = None
     """Maximum number of views, including the first."""
     view: options.Flag = False
-    """Show every view in the browser; the page then stays until Ctrl-C."""
+    """Show the exploration in the browser; Ctrl-C closes the page."""
 
     def __call__(self) -> None:
         Explore(**{field.name: getattr(self, field.name) for field in fields(self)})()
@@ -145,15 +144,15 @@ class Demo(RunCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class View(options.ExploringCommand):
-    """Show a finished run in the browser, or control the exploration of a scene or recording there.
+    """Show a finished run in the browser, or explore a scene or recording interactively.
 
-    SOURCE is one of
-      a run folder, as explore, extract and clear write it; it is not changed
-      an MJCF scene, the name of a built-in one, or a recording, as for explore
+    SOURCE is one of:
+      a run folder written by explore, extract or clear; it is not modified
+      a built-in scene, an MJCF scene or a recording, as for explore
 
-    The page is served to this machine only, loads nothing from elsewhere, and stays until Ctrl-C.
+    By default, only this machine can open the page. The page works offline; Ctrl-C closes it.
 
-    To try:
+    Usage examples:
       caryatid view run
       caryatid view clutter
       caryatid view recording/ --segmentation auto --port 8080 --no-browser
@@ -162,13 +161,12 @@ class View(options.ExploringCommand):
     source: options.SourceName
     """Run, scene or recording."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at; with any but 127.0.0.1, other machines can connect if they know the page's full
-    address.
-    """
+    """Address to listen on; with any other than 127.0.0.1, other machines can open the page if they know its
+    full address."""
     port: options.Port = PORT
-    """Port to listen at, or else the next free one; 0 = any free one."""
+    """Port to listen on; if taken, the next free one; 0 = any free port."""
     no_browser: options.Flag = False
-    """Print the address of the page without opening it."""
+    """Print the address of the page, but do not open a browser."""
 
     def __call__(self) -> None:
         from caryatid.steps import is_run
@@ -178,7 +176,7 @@ class View(options.ExploringCommand):
         sys.setswitchinterval(0.0005)
         with closing(self._open_run() if is_run(Path(self.source)) else self._open_loop(config)) as page:
             output.result({"address": page.url, "source": self.source}, "")
-            output.say(f"{self.source} at {page.url}; Ctrl-C ends")
+            output.say(f"{self.source} at {page.url}; press Ctrl-C to quit")
             if not self.no_browser:
                 webbrowser.open(page.url)
             wait_for_interrupt()
@@ -214,9 +212,9 @@ class View(options.ExploringCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Extract(RunCommand, options.LookingCommand):
-    """Extract shapes and support graph from all views of a recording, or from one cloud.
+    """Extract shapes and a support graph from all views of a recording, or from one cloud.
 
-    To try:
+    Usage examples:
       caryatid extract recording/ --out run
       caryatid extract table.pcd --segmentation auto --out run
     """
@@ -224,9 +222,9 @@ class Extract(RunCommand, options.LookingCommand):
     source: options.SourceName
     """Recording (folder in the BOP format) or cloud (.pcd, .ply)."""
     label_divisor: options.Count = 1
-    """For clouds whose labels number parts of objects: object = label // N."""
+    """For clouds with labels of object parts: object = label // N."""
     level: options.Flag = False
-    """Turn the world of a recording so that the table is level, for poses whose z is not up."""
+    """Rotate the world frame of a recording so that the table is level; use it if z does not point up."""
 
     def open(self, config: Config) -> tuple[str, TrueScene | None, Iterator[Step]]:
         from caryatid.sources import extract
@@ -252,29 +250,29 @@ class Extract(RunCommand, options.LookingCommand):
 class Clear(options.ExploringCommand):
     """Clear a simulated table: look until the next lift is safe, remove the object, look again.
 
-    Objects are lifted straight up in physics, one by one. A lift does harm when any other object moves by
-    more than 2 cm or 15°. After a kill, the same command continues.
+    Objects are lifted straight up, one by one. A lift disturbs another object if it moves that object by
+    more than 2 cm or 15°. If interrupted, run the same command to continue.
 
-    To try:
+    Usage examples:
       caryatid clear bridge
       caryatid clear clutter --goal o3 --hands 1
       caryatid clear scene.xml --risk 0.1 --out run
     """
 
     source: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """An MJCF scene, or the name of a built-in one."""
+    """Built-in or MJCF scene."""
     out: options.OutPath = Path("run")
-    """Run folder to write, view by view; replaces an earlier run, unless this command continues it."""
+    """Run folder to write, view by view; replaces an existing run, or continues it if interrupted."""
     goal: Annotated[str | None, options.shown("ID")] = None
-    """Reach this object only, and remove no more than necessary."""
+    """Object to reach; remove no more than necessary."""
     hands: Literal[1, 2] = 2
-    """With 2, another hand may hold one object while the first lifts one."""
+    """Number of hands; with 2, one may hold an object while the other lifts one."""
     risk: Annotated[float | None, options.default_of("rehearsal.risk", "P")] = None
-    """Remove only objects that move another one with at most this probability."""
+    """Maximum probability that a lift moves another object."""
     views: Annotated[options.OptionalCount, options.default_of("active.max_views")] = None
     """Maximum number of views before each lift."""
     no_report: options.Flag = False
-    """Leave out report.html."""
+    """Do not write report.html."""
 
     def config(self) -> Config:
         """All settings."""
@@ -312,7 +310,7 @@ class Clear(options.ExploringCommand):
             lifts: list[dict[str, Any]] = [] if past is None else past.record["lifts"]
             writer.more = {"lifts": lifts, "warnings": output.warnings}
             if past is not None:
-                output.say(f"{self.source}: going on after view {len(past.views)}")
+                output.say(f"{self.source}: continuing after view {len(past.views)}")
                 camera.captures = len(past.views)
             if lifts:
                 hands.state = np.array(lifts[-1]["state"])
@@ -348,7 +346,7 @@ class Clear(options.ExploringCommand):
         ]  # fmt: skip
         outcome = f"{', '.join(harmed)} disturbed" if harmed else "nothing disturbed"
         title = f"{source.name}: {last.stop}; {count_of(last.index + 1, 'view')}, {outcome}"
-        shown = table(title, ("", "take", "body", "hold", "disturbed", "why"), rows)
+        shown = table(title, ("", "remove", "body", "hold", "disturbed", "reason"), rows)
         output.result(document, shown)
 
 
@@ -371,7 +369,7 @@ def wait_for_interrupt() -> None:
 
 @contextmanager
 def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]:
-    """Open a page for an exploration; when that ends by itself, keep the page until Ctrl-C."""
+    """Open a page for an exploration; after its end, keep the page open until Ctrl-C."""
     from caryatid.viewer.page import PageProcess
 
     page = PageProcess(f"caryatid: {name}", config.support, port=PORT)
@@ -379,18 +377,18 @@ def _watched(name: str, config: Config, output: Output) -> Iterator[PageProcess]
     webbrowser.open(page.url)
     try:
         yield page
-        output.say(f"the page stays at {page.url}; Ctrl-C ends")
+        output.say(f"finished; the page stays open at {page.url}, press Ctrl-C to quit")
         wait_for_interrupt()
     finally:
         page.close()
 
 
 def _conditions(command: RunCommand | Clear) -> str:
-    """Where segments come from, and the noise of a simulation."""
+    """Source of the segments, and noise of a simulation."""
     from caryatid.sources import is_cloud, is_recording
 
     simulated = not is_cloud(command.source) and not is_recording(command.source)
-    masks = command.settings.masks_from or ("simulator" if simulated else "of the source, if it has any")
+    masks = command.settings.masks_from or ("simulator" if simulated else "from the source, if any")
     automatic = getattr(command, "segmentation", None) == "auto"
     text = "segments: automatic" if automatic else f"masks: {masks}"
     return f"{text}, noise: {getattr(command, 'noise', 'carmine')}" if simulated else text
@@ -417,7 +415,7 @@ def _record(
     page: PageProcess | None = None,
     heading: str = "",
 ) -> Step:
-    """Score, keep, print and show every step; returns the last."""
+    """Score, save, print and show every step; return the last."""
     from caryatid.evaluation.scores import score
 
     last = None
@@ -440,6 +438,6 @@ def _draw_report(folder: Path, output: Output) -> None:
     from caryatid.cli.output import kept
     from caryatid.cli.results import write_report
 
-    what = f"the run is kept in {folder}; `caryatid report {folder}` makes the report"
+    what = f"the run is kept in {folder}; `caryatid report {folder}` writes the report"
     with kept(what), output.working("drawing the report"):
         write_report(folder)

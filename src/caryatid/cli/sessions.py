@@ -1,4 +1,4 @@
-"""`caryatid session` and `caryatid serve`: a robot's own software drives the loop."""
+"""`caryatid session` and `caryatid serve`: for loops driven by the robot's own software."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Folder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
 ImagePath = Annotated[Path | None, options.shown("FILE")]
-KEPT = "the session keeps every view and report that is in it"
+KEPT = "all views and changes saved so far are kept"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +29,7 @@ class SessionStep(options.ComputingCommand):
     """Folder of the session."""
 
     def show_changed(self, session: Session, lead: str) -> None:
-        """Print number of views and graph after a change."""
+        """Print the number of views and the graph after a change."""
         from caryatid.io.graph_json import graph_to_json
         from caryatid.viz.tables import census
 
@@ -43,9 +43,9 @@ class SessionStep(options.ComputingCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class New(SessionStep, options.PlanningCommand):
-    """Begin a session in a new folder.
+    """Create a session in a new folder.
 
-    To try:
+    Usage examples:
       caryatid session new table
       caryatid session new table --segmentation auto --set "robot.camera_height=[1.2, 1.8]"
       caryatid session new table --robot arm:arm.npz
@@ -76,13 +76,13 @@ class New(SessionStep, options.PlanningCommand):
 
 @dataclass(frozen=True, kw_only=True)
 class Add(SessionStep):
-    """Add a view; once the command ends with status 0, the view is on disk and stays.
+    """Add a view; exit status 0 means that the view is safe on disk.
 
-    camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm of one unit of depth, else 1}
-    The first view needs no T_world_camera: its table then defines the world (z = 0), --json prints its pose,
-    and `next` needs --candidates.
+    camera.json: {"K": 3×3 [px], "T_world_camera": 4×4 [m], "depth_scale": mm per unit of depth (default 1)}
+    The first view may omit T_world_camera: its table then defines the world frame (z = 0), --json prints the
+    camera pose, and `next` requires --candidates.
 
-    To try:
+    Usage examples:
       caryatid session add table --depth depth.png --camera camera.json
       caryatid session add table --depth depth.npy --rgb rgb.png --labels labels.png --camera camera.json
     """
@@ -90,13 +90,13 @@ class Add(SessionStep):
     depth: Annotated[Path, tyro.conf.arg(metavar="D.png")]
     """Depth image: 16-bit PNG, or .npy in metres; 0 or NaN = no reading."""
     camera: Annotated[Path, tyro.conf.arg(metavar="C.json")]
-    """Camera of the view: pinhole matrix, pose, scale of the depth image."""
+    """Camera matrix, camera pose, and scale of the depth image."""
     rgb: ImagePath = None
     """Colour image: PNG, JPEG or .npy."""
     labels: ImagePath = None
-    """Object number of each pixel: grey PNG or .npy; 0 = nothing, an object keeps its number."""
+    """Object number of each pixel: grey PNG or .npy; 0 = no object. An object has one number in all views."""
     number: Annotated[int | None, options.shown("N")] = None
-    """Expected number of the view, from 0; a view that is already there is not added again."""
+    """Number of the view, from 0; makes a repeated command safe: an existing view is not added again."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import kept
@@ -108,23 +108,23 @@ class Add(SessionStep):
             images = {"depth": self.depth, "rgb": self.rgb, "labels": self.labels}
             capture = Capture.from_files(images, self.camera, limits)
             added = session.add(capture, self.number)
-        news = "" if added.changed else ", nothing new"
+        news = "" if added.changed else ", graph unchanged"
         self.show(added.to_json(), f"view {added.number + 1}: {census(added.graph)}{news}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Next(SessionStep):
-    """Print where to look next: camera pose, platform, gaze, expected gain, and why; as JSON.
+    """Print the next best view as JSON: camera pose, platform pose, gaze, expected gain and reason.
 
-    candidates.json: {"T_world_camera": [4×4 …] that the robot reaches, "path_length": [m …], optional}
+    candidates.json: {"T_world_camera": [4×4 …] reachable poses, "path_length": [m …] (optional)}
 
-    To try:
+    Usage examples:
       caryatid session next table
       caryatid session next table --candidates candidates.json
     """
 
     candidates: Annotated[Path | None, options.shown("C.json")] = None
-    """Poses to choose from, instead of those the session's robot reaches."""
+    """Candidate poses to choose from, instead of those that the session's robot reaches."""
 
     def __call__(self) -> None:
         from caryatid.io.json_files import parse_json, read_json
@@ -142,9 +142,9 @@ class Next(SessionStep):
 
 @dataclass(frozen=True, kw_only=True)
 class Graph(SessionStep):
-    """Print the support graph so far, as graph.json.
+    """Print the current support graph in the format of graph.json.
 
-    To try:
+    Usage examples:
       caryatid session graph table > graph.json
     """
 
@@ -158,19 +158,19 @@ class Graph(SessionStep):
 
 @dataclass(frozen=True, kw_only=True)
 class Take(SessionStep):
-    """Report that the robot took an object away, or moved it; once the command ends with status 0, it stays.
+    """Report that the robot removed or moved an object; exit status 0 means that this is safe on disk.
 
-    moved.json: {"T": 4×4 [m], the rigid transform of the world that moved the object}
+    moved.json: {"T": 4×4 [m], the object's motion as a rigid transform in the world frame}
 
-    To try:
+    Usage examples:
       caryatid session take table o3
       caryatid session take table o3 --moved moved.json
     """
 
     object: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ID")]
-    """Id of the object."""
+    """ID of the object."""
     moved: Annotated[Path | None, options.shown("T.json")] = None
-    """How it was moved; when left out, it is gone."""
+    """The object's motion. If omitted, the object was removed."""
 
     def __call__(self) -> None:
         from caryatid.cli.output import kept
@@ -181,14 +181,14 @@ class Take(SessionStep):
         T = None if self.moved is None else parse_json(Moved, read_json(self.moved), self.moved).T
         with kept(KEPT), Session.open(self.folder) as session:
             session.take(self.object, T)
-            self.show_changed(session, f"{self.object} {'taken' if T is None else 'moved'}")
+            self.show_changed(session, f"{self.object} {'removed' if T is None else 'moved'}")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Undo(SessionStep):
-    """Take back the last view, or the last report of an object taken or moved.
+    """Undo the last view, or the last report of a removed or moved object.
 
-    To try:
+    Usage examples:
       caryatid session undo table
     """
 
@@ -203,16 +203,16 @@ class Undo(SessionStep):
 
 @dataclass(frozen=True)
 class SessionCommand:
-    """Keep a scene model in a folder, to which a robot's own software adds views.
+    """Keep a scene model in a folder, and add views from the robot's own software.
 
-    What was added or reported stays, whatever happens to the process. One command writes at a time.
+    Saved data survives a crash. Only one command writes at a time.
     """
 
     step: New | Add | Next | Graph | Take | Undo
 
     @property
     def general(self) -> options.General:
-        """Output options."""
+        """Output options of the step."""
         return self.step.general
 
     def __call__(self) -> None:
@@ -221,12 +221,12 @@ class SessionCommand:
 
 @dataclass(frozen=True, kw_only=True)
 class Serve(SessionStep):
-    """Serve sessions over HTTP to robot software in any language; /openapi.json describes it.
+    """Serve sessions over HTTP, for robot software in any language; /openapi.json describes the API.
 
-    At 127.0.0.1 only programs on this machine can connect, and need no token. Any other --host requires one,
-    sent as `Authorization: Bearer TOKEN`; there is no encryption, so use it within a network you trust.
+    On 127.0.0.1, only programs on this machine can connect, without a token. Any other --host requires
+    requests with `Authorization: Bearer TOKEN`. Traffic is not encrypted: use a network you trust.
 
-    To try:
+    Usage examples:
       caryatid serve sessions
       CARYATID_TOKEN=$(openssl rand -hex 16) caryatid serve sessions --host 0.0.0.0
     """
@@ -235,15 +235,15 @@ class Serve(SessionStep):
     folder: Folder
     """Folder of the sessions; created if missing."""
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """Address to listen at."""
+    """Address to listen on."""
     port: options.Port = 8765
-    """Port to listen at; 0 = any free one."""
+    """Port to listen on; 0 = any free port."""
     token: Annotated[str | None, options.shown("TOKEN")] = None
-    """Token that requests need; better given as CARYATID_TOKEN, where no process list shows it."""
+    """Token that requests must send; prefer CARYATID_TOKEN, which process lists do not show."""
     open_sessions: options.Count = 4
-    """Number of sessions kept open; others are opened from disk on request, in a tenth of a second."""
+    """Number of sessions kept in memory; others are loaded on request in a tenth of a second."""
     waiting: options.Count = 16
-    """Maximum number of waiting requests; further ones are asked to try again."""
+    """Maximum number of waiting requests; further requests get status 503."""
     max_request: options.Count = 16
     """Maximum size of a request [MB]."""
 
@@ -255,7 +255,7 @@ class Serve(SessionStep):
         from caryatid.runtime.compiling import compile_kernels
 
         def listening(address: str) -> None:
-            text = f"serving {self.folder} at {address}, described by {address}/openapi.json; Ctrl-C stops"
+            text = f"serving {self.folder} at {address} (API: {address}/openapi.json); press Ctrl-C to quit"
             self.show({"address": address, "folder": self.folder}, text)
 
         token = self.token or os.environ.get("CARYATID_TOKEN") or None

@@ -25,11 +25,11 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
 
     Args:
         file: TOML with one table per stage: `[fit]`, `hypotheses = 200`. None = defaults.
-        flags: `fit.hypotheses=200`, with values as in TOML; quotes around words may be left out.
+        flags: `fit.hypotheses=200`, with values as in TOML; strings need no quotes.
         base: Configuration to start from.
 
     Raises:
-        InputError: The file cannot be read, or a name or value is not valid; the error says what is.
+        InputError: The file cannot be read, or a name or value is not valid; the error lists what is valid.
     """
     config = base or Config()
     if file is not None:
@@ -38,7 +38,7 @@ def read_settings(file: Path | None, flags: Sequence[str], base: Config | None =
         except OSError as error:
             raise InputError(file, f"cannot be read ({error.strerror})", "give a TOML file") from None
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(file, f"is not TOML: {error}", "correct it, or see `caryatid config`") from None
+            raise InputError(file, f"invalid TOML: {error}", "correct it, or see `caryatid config`") from None
         config = changed_settings(config, document, str(file))
     for flag in flags:
         config = changed_settings(config, _parse_flag(flag), f"--set {flag}")
@@ -55,7 +55,7 @@ def changed_settings(base: Config, document: Mapping[str, Any], source: str) -> 
 
     Args:
         base: Configuration to start from.
-        document: As `tomllib` or `json` read it.
+        document: As read by `tomllib` or `json`.
         source: Name of the document in errors.
 
     Raises:
@@ -88,7 +88,7 @@ def write_settings(config: Config) -> str:
 
 
 def _ranges(stage: Any) -> dict[str, str]:
-    """Range of each setting of a stage in words; empty if it has none."""
+    """Range of each setting of a stage as text; empty if it has none."""
     words = {
         "minimum": "at least",
         "exclusiveMinimum": "above",
@@ -114,13 +114,13 @@ def field_docs(stage: Any) -> dict[str, str]:
 def _parse_flag(flag: str) -> dict[str, Any]:
     name, equals, value = flag.partition("=")
     if not equals or name.count(".") != 1:
-        raise InputError("--set", f"'{flag}' is not of the form stage.name=value", "see `caryatid config`")
+        raise InputError("--set", f"expected STAGE.NAME=VALUE, not '{flag}'", "see `caryatid config`")
     for text in (value, f'"{value}"'):
         try:
             return tomllib.loads(f"{name} = {text}")
         except tomllib.TOMLDecodeError:
             continue
-    raise InputError("--set", f"'{value}' is not a TOML value", "write it as in TOML")
+    raise InputError("--set", f"'{value}' is not a TOML value", "write the value as in TOML")
 
 
 def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -> InputError:
@@ -135,10 +135,10 @@ def _refusal(error: ValidationError, settings: Mapping[str, Any], source: str) -
         listed = [field.name for field in known]
         meant = get_close_matches(name.rpartition(".")[2], listed, 1)
         remedy = f"did you mean {meant[0]}? " if meant else ""
-        remedy += f"there are {', '.join(listed)}"
-        return InputError(source, f"there is no setting '{name}'", remedy)
+        remedy += f"choose from {', '.join(listed)}"
+        return InputError(source, f"unknown setting '{name}'", remedy)
     if not names:
-        return InputError(source, f"'{stage}' is a table of settings", f"write [{stage}]")
+        return InputError(source, f"'{stage}' is a table, not a setting", f"write [{stage}]")
     wanted = fault["msg"].removeprefix("Value error, ").replace("Input should", "the value should")
     value = settings[stage][names[0]]
     return InputError(source, f"{name} = {value!r} is not valid", wanted)

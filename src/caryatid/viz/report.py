@@ -150,7 +150,7 @@ def make_report(
     for number, step in enumerate(steps):
         f1 = f"F1 {scores[number]['f1']:.3f}" if number < len(scores) else ""
         before = seen[-1] if seen else None
-        news = "" if before is None else "; ".join(changes(before.graph, step.graph)) or "nothing new"
+        news = "" if before is None else "; ".join(changes(before.graph, step.graph)) or "no change"
         views.append(_view(step, news, f1, width))
         if step.view is not None:
             picture = draw_image(step.view, step.labels, step.graph, width // 2, shapes=False)
